@@ -1,0 +1,153 @@
+"""Friction laws: the coefficient of friction as a function of the sliding speed.
+
+A law is asked two things: `static`, the coefficient that holds a stuck mass, and `mu(speed)`, the
+coefficient while it slips. A slip mode keeps the sign of its relative velocity (see `modes`), so
+an integrator or a Newton iteration may ask for a speed slightly below zero; each law therefore
+continues smoothly a little beyond its boundary. A law of your own is a subclass of
+`AbstractFriction` with these two.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .checks import (
+    as_array,
+    check_finite,
+    check_nonnegative,
+    check_positive,
+    is_concrete,
+    number,
+    require,
+)
+
+
+def _field(name: str) -> Any:
+    return eqx.field(converter=lambda value: as_array(value, name))
+
+
+class AbstractFriction(eqx.Module):
+    """A friction law: subclass it with `static` and `mu` to use one of your own."""
+
+    static: eqx.AbstractVar[Array]
+
+    @abc.abstractmethod
+    def mu(self, speed: Array) -> Array:
+        """Kinetic friction coefficient at sliding speed |nu_R| (dimensionless, any shape).
+
+        Must be smooth for speed >= 0 and stay finite and smooth slightly below 0. For the exact
+        formulation mu(0) <= static; the two are equal for a law without a jump.
+        """
+
+    def fraction(self, speed: Array) -> tuple[Array, Array]:
+        """mu(speed) as (numerator, denominator), denominator > 0; kernels divide last."""
+        return self.mu(speed), jnp.ones_like(speed)
+
+    def check(self, owner: str) -> None:
+        """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
+        check_nonnegative(self.static, f"static of {owner}")
+
+    def __repr__(self) -> str:
+        values = ", ".join(
+            f"{name}={number(value) if eqx.is_array(value) else value!r}"
+            for name, value in vars(self).items()
+        )
+        return f"{type(self).__name__}({values})"
+
+
+class Conti(AbstractFriction):
+    """Conti's law, eqs. (7) and (16) of the paper: mu falls hyperbolically with the speed.
+
+    mu(r) = (mus - p1) / (1 + p3 r) + p1 + p2 r^2, so mu(0) = mus.
+
+    Arguments, all dimensionless scalars: static (mus >= 0), residual (p1 >= 0), steepness
+    (p3 >= 0), quadratic (p2, default 0). `ValueError` for anything else.
+    """
+
+    static: Float[Array, ""] = _field("static")
+    residual: Float[Array, ""] = _field("residual")
+    steepness: Float[Array, ""] = _field("steepness")
+    quadratic: Float[Array, ""] = eqx.field(
+        converter=lambda value: as_array(value, "quadratic"), default=0.0
+    )
+
+    def __check_init__(self):
+        self.check("Conti")
+
+    def check(self, owner: str) -> None:
+        check_nonnegative(self.static, f"static of {owner}")
+        check_nonnegative(self.residual, f"residual of {owner}")
+        check_nonnegative(self.steepness, f"steepness of {owner}")
+        check_finite(self.quadratic, f"quadratic of {owner}")
+
+    def fraction(self, speed: Array) -> tuple[Array, Array]:
+        mus, p1, p2, p3 = self.static, self.residual, self.quadratic, self.steepness
+        # The formula has a pole at r = -1/p3, close below the boundary; half way there it is cut
+        # off, so that a trial step beyond the boundary meets large errors but never infinity.
+        denominator = 1 + jnp.maximum(p3 * speed, -0.5)
+        return (mus - p1) + (p1 + p2 * speed**2) * denominator, denominator
+
+    def mu(self, speed: Array) -> Array:
+        """Kinetic friction coefficient mu(r), eq. (7) of the paper.
+
+        speed: |nu_R| = |nu - omega x2| >= 0, dimensionless, any shape. Returns the same shape.
+        """
+        numerator, denominator = self.fraction(speed)
+        return numerator / denominator
+
+
+class Coulomb(AbstractFriction):
+    """Coulomb's law with separate static and kinetic coefficients: mu(r) = kinetic for r > 0.
+
+    Arguments, dimensionless scalars: static >= kinetic >= 0. `ValueError` for anything else.
+    """
+
+    static: Float[Array, ""] = _field("static")
+    kinetic: Float[Array, ""] = _field("kinetic")
+
+    def __check_init__(self):
+        self.check("Coulomb")
+
+    def check(self, owner: str) -> None:
+        _check_static_and_kinetic(self.static, self.kinetic, owner)
+
+    def mu(self, speed: Array) -> Array:
+        """Kinetic friction coefficient, the same at every speed (any shape)."""
+        return jnp.broadcast_to(self.kinetic, jnp.shape(speed))
+
+
+class Stribeck(AbstractFriction):
+    """Stribeck's law with exponential decay: mu(r) = kinetic + (static - kinetic) exp(-r/velocity).
+
+    Arguments, dimensionless scalars: static >= kinetic >= 0, and velocity > 0, the Stribeck
+    velocity. `ValueError` for anything else. Used in this form by L. C. Bo and D. Pavelescu, The
+    friction-speed relation and its influence on the critical velocity of stick-slip motion, Wear
+    82 (1982) 277-289.
+    """
+
+    static: Float[Array, ""] = _field("static")
+    kinetic: Float[Array, ""] = _field("kinetic")
+    velocity: Float[Array, ""] = _field("velocity")
+
+    def __check_init__(self):
+        self.check("Stribeck")
+
+    def check(self, owner: str) -> None:
+        _check_static_and_kinetic(self.static, self.kinetic, owner)
+        check_positive(self.velocity, f"velocity of {owner}")
+
+    def mu(self, speed: Array) -> Array:
+        """Kinetic friction coefficient mu(r) at speed r >= 0, dimensionless, any shape."""
+        # Cut off below the boundary like Conti's: an exponential overflows there.
+        decay = jnp.exp(-jnp.maximum(speed / self.velocity, -1.0))
+        return self.kinetic + (self.static - self.kinetic) * decay
+
+
+def _check_static_and_kinetic(static: Array, kinetic: Array, owner: str) -> None:
+    check_nonnegative(static, f"static of {owner}")
+    check_nonnegative(kinetic, f"kinetic of {owner}")
+    if is_concrete((static, kinetic)):
+        require(kinetic <= static, f"kinetic of {owner}", f"<= static = {static}", kinetic)

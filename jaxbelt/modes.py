@@ -1,0 +1,317 @@
+"""Modes: which belts touch, which slip and how, which are stuck; and the one set of rules between them.
+
+A mode holds one contact code a belt:
+
+    +1, -1   slipping, with that sign of the relative velocity r_i = nu_i - omega x2
+     0       stuck: the mass moves with the belt
+    -2, +2   not touching: the mass is below (above) the belt's contact interval
+
+In a slip mode the friction keeps the sign of the mode, not sgn(r_i). So the field of a mode is
+smooth across the mode's own boundaries, and events, derivatives and Newton iterations are right.
+An orbit leaves a mode where one of its guards, positive inside, vanishes. What follows is decided
+by `reach_boundary`, `pass_edge` and `end_stick`, and all three leave the question "stuck or not"
+to `settle`: whether the contacts that are to be stuck can hold the force needed.
+
+Everything here is elementwise: codes and states may be scalars (the trajectories of `simulate`)
+or arrays of lanes (the kernel of `batch`), belts are unrolled.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .oscillator import Oscillator, acceleration
+
+STUCK, BELOW, ABOVE = 0.0, -2.0, 2.0
+
+
+class Mode(eqx.Module):
+    """Contact codes, one array a belt (float64, any common batch shape); see the module's text."""
+
+    codes: tuple[Array, ...]
+
+    @property
+    def touching(self) -> tuple[Array, ...]:
+        return tuple(jnp.abs(code) < 1.5 for code in self.codes)
+
+    @property
+    def stuck(self) -> tuple[Array, ...]:
+        return tuple(code == STUCK for code in self.codes)
+
+    @property
+    def any_stuck(self) -> Array:
+        return any_of(self.stuck)
+
+    @property
+    def signs(self) -> tuple[Array, ...]:
+        """The signs for `acceleration`: 0 for the stuck and the absent."""
+        return tuple(
+            jnp.where(touches, code, 0.0)
+            for code, touches in zip(self.codes, self.touching, strict=True)
+        )
+
+
+def any_of(flags: Sequence[Array]) -> Array:
+    """Elementwise `or` of at least one array of booleans."""
+    out = flags[0]
+    for flag in flags[1:]:
+        out = out | flag
+    return out
+
+
+def first_of(flags: Sequence[Array], values: Sequence[Array], default: Array) -> Array:
+    """Elementwise the value of the first flag that is set, or `default`."""
+    out = default
+    for flag, value in zip(reversed(flags), reversed(values), strict=True):
+        out = jnp.where(flag, value, out)
+    return out
+
+
+def select(condition: Array, on_true: Mode, on_false: Mode) -> Mode:
+    """Elementwise choice between two modes."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), on_true, on_false)
+
+
+def mode_acceleration(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """x2' of a slip mode; of a mode with stuck belts, the force `needed` that they have to hold."""
+    return acceleration(osc, mode.signs, x1, x2)
+
+
+def capacity(osc: Oscillator, mode: Mode) -> Array:
+    """The largest force that the stuck belts can hold together, the sum of u0_k mus_k."""
+    total = jnp.zeros(())
+    for belt, stuck in zip(osc.belts, mode.stuck, strict=True):
+        total = total + jnp.where(stuck, belt.load * belt.friction.static, 0.0)
+    return total
+
+
+def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
+    """Keep the stuck belts of `mode` stuck if they can hold the needed force, else let them slip.
+
+    They slip with sign -sgn(needed): friction opposed the needed force until the limit. That one
+    rule serves arrivals at a boundary (not held: the orbit crosses), contact edges met while
+    sticking (not held: torn off) and starts on a boundary. Belts of equal velocity are stuck
+    together, their capacities add and their signs flip together.
+    """
+    needed = mode_acceleration(osc, mode, x1, x2)
+    slips = jnp.abs(needed) > capacity(osc, mode)
+    codes = tuple(
+        jnp.where(stuck & slips, -jnp.sign(needed), code)
+        for code, stuck in zip(mode.codes, mode.stuck, strict=True)
+    )
+    return Mode(codes)
+
+
+def stick_velocity(osc: Oscillator, mode: Mode, default: Array) -> Array:
+    """Velocity nu_k of the belts that are stuck, or `default` where none is."""
+    return first_of(mode.stuck, [belt.velocity for belt in osc.belts], default)
+
+
+# --- guards: positive inside a mode -------------------------------------------------------------
+
+
+def boundary_guards(osc: Oscillator, mode: Mode, x2: Array) -> list[Array]:
+    """For every belt s_i r_i, positive while it slips with sign s_i; inf where it does not slip."""
+    slipping = [touches & ~stuck for touches, stuck in zip(mode.touching, mode.stuck, strict=True)]
+    return [
+        jnp.where(slips, code * (belt.velocity - osc.omega * x2), jnp.inf)
+        for belt, code, slips in zip(osc.belts, mode.codes, slipping, strict=True)
+    ]
+
+
+def edge_guards(osc: Oscillator, mode: Mode, x1: Array) -> list[Array]:
+    """Distances to the edges that bound the mode: the lower ones of all belts, then the upper."""
+    lower = [
+        jnp.where(code == ABOVE, jnp.inf, jnp.where(code == BELOW, -1.0, 1.0) * (x1 - belt.lower))
+        for belt, code in zip(osc.belts, mode.codes, strict=True)
+    ]
+    upper = [
+        jnp.where(code == BELOW, jnp.inf, jnp.where(code == ABOVE, -1.0, 1.0) * (belt.upper - x1))
+        for belt, code in zip(osc.belts, mode.codes, strict=True)
+    ]
+    return lower + upper
+
+
+def bounds_rightward(mode: Mode) -> list[Array]:
+    """For each of `edge_guards`, whether the edge bounds the mode on its right-hand side."""
+    lower = [code == BELOW for code in mode.codes]
+    return lower + [touches for touches in mode.touching]
+
+
+def bounds_leftward(mode: Mode) -> list[Array]:
+    """For each of `edge_guards`, whether the edge bounds the mode on its left-hand side."""
+    upper = [code == ABOVE for code in mode.codes]
+    return [touches for touches in mode.touching] + upper
+
+
+def edges(osc: Oscillator) -> list[Array]:
+    """Positions of the contact edges in the order of `edge_guards`."""
+    return [belt.lower for belt in osc.belts] + [belt.upper for belt in osc.belts]
+
+
+# --- transitions ----------------------------------------------------------------------------------
+
+
+def reach_boundary(osc: Oscillator, mode: Mode, hit: Sequence[Array], x1: Array) -> tuple[Mode, Array]:
+    """The mode after an orbit reached r_k = 0 of the belt with hit[k] set, and x2 = nu_k/omega.
+
+    All touching belts of that velocity are concerned. They stick, or the orbit crosses.
+    """
+    velocities = [belt.velocity for belt in osc.belts]
+    velocity = first_of(hit, velocities, velocities[0])
+    x2 = velocity / osc.omega
+    codes = tuple(
+        jnp.where(touches & (nu == velocity), STUCK, code)
+        for nu, code, touches in zip(velocities, mode.codes, mode.touching, strict=True)
+    )
+    return settle(osc, Mode(codes), x1, x2), x2
+
+
+def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Array) -> Mode:
+    """The mode after the mass passed a contact edge at x1 = edge with velocity x2, right- or leftward.
+
+    Belts whose interval ends there leave, those whose interval begins there arrive with the sign
+    of their relative velocity. If the mass was stuck it may stay so, be torn off, or, where the
+    belt that it was stuck to is left, slip on.
+    """
+    speed = stick_velocity(osc, mode, osc.omega * x2)
+    codes = []
+    for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
+        at_lower, at_upper = belt.lower == edge, belt.upper == edge
+        arrives = jnp.where(rightward, at_lower & (code == BELOW), at_upper & (code == ABOVE))
+        leaves = touches & jnp.where(rightward, at_upper, at_lower)
+        code = jnp.where(arrives, jnp.sign(belt.velocity - speed), code)
+        codes.append(jnp.where(leaves, jnp.where(rightward, ABOVE, BELOW), code))
+    return settle(osc, Mode(tuple(codes)), edge, x2)
+
+
+class StickPhase(eqx.Module):
+    """A stick phase in closed form, from its entry to its end (arrays of the batch shape).
+
+    duration: inf where it never ends (a belt at rest); x1: where it ends; slips: it ends by slip
+    onset; edge: which of `edges` ends it otherwise, one flag each.
+    """
+
+    duration: Array
+    x1: Array
+    slips: Array
+    edge: list[Array]
+
+
+def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
+    """How the stick phase of `mode` that is at x1 goes on: x1 moves with x2 = nu_k/omega.
+
+    The needed force is linear in x1, eqs. (10), (19), (20): needed = rest - x1. It ends at slip
+    onset, |needed| = capacity, or at the first contact edge ahead.
+    """
+    v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
+    direction = jnp.sign(v)
+    moves = v != 0
+    v_or_one = jnp.where(moves, v, 1.0)
+    rest = mode_acceleration(osc, mode, jnp.zeros(()), v)
+    x1_onset = rest + direction * capacity(osc, mode)
+    onset_distance = jnp.where(moves, direction * (x1_onset - x1), jnp.inf)
+
+    edge_distances = [
+        jnp.where((v > 0) & on_right | (v < 0) & on_left, guard, jnp.inf)
+        for on_right, on_left, guard in zip(
+            bounds_rightward(mode),
+            bounds_leftward(mode),
+            edge_guards(osc, mode, x1),
+            strict=True,
+        )
+    ]
+    distance = onset_distance
+    for edge_distance in edge_distances:
+        distance = jnp.minimum(distance, edge_distance)
+    slips = onset_distance <= distance
+    at_edge = [~slips & (edge_distance <= distance) for edge_distance in edge_distances]
+    x1_end = first_of([slips, *at_edge], [x1_onset, *edges(osc)], x1)
+    # Not distance/|v|: x1_end does not depend on x1, and so neither do its derivatives.
+    duration = jnp.where(moves, jnp.maximum((x1_end - x1) / v_or_one, 0.0), jnp.inf)
+    return StickPhase(duration, x1_end, slips, at_edge)
+
+
+def end_stick(osc: Oscillator, mode: Mode) -> Mode:
+    """The mode after slip onset: tangent to the boundary, with sign -sgn(needed) = sgn(nu_k)."""
+    velocity = stick_velocity(osc, mode, jnp.zeros(()))
+    codes = tuple(
+        jnp.where(stuck, jnp.sign(velocity), code)
+        for code, stuck in zip(mode.codes, mode.stuck, strict=True)
+    )
+    return Mode(codes)
+
+
+# --- starts ---------------------------------------------------------------------------------------
+
+
+def mode_of_state(osc: Oscillator, x1: Array, x2: Array) -> Mode:
+    """The mode in which an orbit goes on from the state (x1, x2), on a boundary or an edge too.
+
+    On an edge the velocity decides which side; at rest there, the acceleration on the right-hand
+    side does: the mass goes right if that is positive, else left.
+    """
+    right = _mode_beside(osc, x1, x2, rightward=True)
+    left = _mode_beside(osc, x1, x2, rightward=False)
+    held = right.any_stuck
+    push = jnp.where(held, 0.0, mode_acceleration(osc, right, x1, x2))
+    return select((x2 > 0) | ((x2 == 0) & (push > 0)), right, left)
+
+
+def _mode_beside(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
+    """The mode of (x1, x2) where every edge that x1 lies on counts as passed to that side."""
+    codes = []
+    for belt in osc.belts:
+        is_below = x1 < belt.lower if rightward else x1 <= belt.lower
+        is_above = x1 >= belt.upper if rightward else x1 > belt.upper
+        speed = osc.omega * x2
+        # Equal but for the rounding of nu/omega counts as equal.
+        on_boundary = jnp.abs(belt.velocity - speed) <= 4e-16 * jnp.abs(belt.velocity)
+        sign = jnp.where(on_boundary, STUCK, jnp.sign(belt.velocity - speed))
+        codes.append(jnp.where(is_below, BELOW, jnp.where(is_above, ABOVE, sign)))
+    return settle(osc, Mode(tuple(codes)), x1, x2)
+
+
+# --- the pseudo-focus at a contact edge -----------------------------------------------------------
+
+
+class EdgeFocus(eqx.Module):
+    """Leading-order motion around a point (edge, 0) with the field a_L on its left, a_R right.
+
+    exists: a_L > 0 > a_R, so that the mass at rest there is pushed back from both sides. The
+    velocity at successive crossings behaves like exp(rate t); a turn takes turn_time * |x2|.
+    """
+
+    exists: Array
+    rate: Array
+    turn_time: Array
+    contraction: Array
+    nonlinearity: Array
+
+
+def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFocus:
+    """The pseudo-focus at x1 = edge between the slip modes to its left and right.
+
+    contraction S = tr_L/a_L + tr_R/|a_R|: a turn multiplies x2 by 1 + (2/3) S |x2| + O(x2^2),
+    where nonlinearity bounds the size of the coefficient of that last term. rate is S over
+    3 (1/a_L + 1/|a_R|) and turn_time is 2/a_L + 2/|a_R|.
+    """
+    rest = jnp.zeros_like(edge)
+
+    def push_and_trace(mode):
+        return jax.jvp(
+            lambda x2: mode_acceleration(osc, mode, edge, x2), (rest,), (jnp.ones_like(rest),)
+        )
+
+    (a_left, trace_left), (a_right, trace_right) = push_and_trace(left), push_and_trace(right)
+    exists = (a_left > 0) & (a_right < 0)
+    a_l, a_r = jnp.where(exists, a_left, 1.0), jnp.where(exists, -a_right, 1.0)
+    contraction = trace_left / a_l + trace_right / a_r
+    slowness = 1 / a_l + 1 / a_r
+    nonlinearity = (
+        1 / a_l**2 + 1 / a_r**2 + (trace_left / a_l) ** 2 + (trace_right / a_r) ** 2
+    )
+    return EdgeFocus(exists, contraction / (3 * slowness), 2 * slowness, contraction, nonlinearity)

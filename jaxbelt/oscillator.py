@@ -1,0 +1,132 @@
+"""The belt-driven oscillator: a mass on a spring and a dashpot, dragged by rough belts.
+
+State y = (x1, x2), displacement and velocity, in the dimensionless time tau = omega t, eq. (6):
+
+    x1' = x2
+    x2' = -x1 - zeta x2 + sum over touching belts of  u0_i mu_i(|r_i|) sgn(r_i)
+
+with the relative velocity r_i = nu_i - omega x2 of belt i. The paper's symbols, and ours:
+
+| symbol | here | meaning |
+|---|---|---|
+| zeta | `Oscillator.damping` | c / sqrt(k m) |
+| omega | `Oscillator.omega` | sqrt(k/m), ties belt velocities to the dimensionless time |
+| nu_i | `Belt.velocity` | driving velocity of belt i |
+| u0_i | `Belt.load` | normal force over stiffness, Fn/k |
+| sigma0, sigma1 | `Belt.lower`, `Belt.upper` | edges of the interval of x1 in which a belt touches |
+| mus, p1, p2, p3 | `Conti.static, residual, quadratic, steepness` | friction, eqs. (7), (16) |
+
+What happens where the field is not smooth is told in `modes`.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .checks import (
+    as_array,
+    check_finite,
+    check_nonnegative,
+    check_positive,
+    is_concrete,
+    number,
+    require,
+)
+from .friction import AbstractFriction
+
+
+class Belt(eqx.Module):
+    """A rough belt that moves at constant velocity and touches the mass while lower < x1 < upper.
+
+    Arguments, dimensionless scalars: velocity (nu), friction (a law), load (u0 = Fn/k >= 0,
+    default 1), lower and upper (edges of the contact interval, default unbounded).
+    `ValueError` for non-finite, negative or wrongly shaped values or an interval turned round.
+    """
+
+    velocity: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "velocity"))
+    friction: AbstractFriction
+    load: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "load"), default=1.0)
+    lower: Float[Array, ""] = eqx.field(
+        converter=lambda value: as_array(value, "lower"), default=-float("inf")
+    )
+    upper: Float[Array, ""] = eqx.field(
+        converter=lambda value: as_array(value, "upper"), default=float("inf")
+    )
+
+    def __check_init__(self):
+        self.check("belt")
+
+    def check(self, owner: str) -> None:
+        """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
+        require(
+            isinstance(self.friction, AbstractFriction),
+            f"friction of {owner}",
+            "a friction law such as jb.Conti(...)",
+            repr(self.friction),
+        )
+        check_finite(self.velocity, f"velocity of {owner}")
+        check_nonnegative(self.load, f"load of {owner}")
+        self.friction.check(f"friction of {owner}")
+        if is_concrete((self.lower, self.upper)):
+            require(not np.isnan(self.lower), f"lower of {owner}", "a number", self.lower)
+            require(self.lower < self.upper, f"lower of {owner}", f"< {self.upper}", self.lower)
+
+    def __repr__(self) -> str:
+        return (
+            f"Belt(velocity={number(self.velocity)}, friction={self.friction!r}, "
+            f"load={number(self.load)}, lower={number(self.lower)}, upper={number(self.upper)})"
+        )
+
+
+class Oscillator(eqx.Module):
+    """A mass on a spring and a dashpot, in contact with one belt or more.
+
+    Arguments: damping (zeta = c/sqrt(k m) >= 0), belts (one `Belt` or more), omega (sqrt(k/m) > 0,
+    default 1); scalars, dimensionless. `ValueError` for anything else. For batches build it
+    inside `jax.vmap`.
+    """
+
+    damping: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "damping"))
+    belts: tuple[Belt, ...] = eqx.field(converter=lambda belts: tuple(belts))
+    omega: Float[Array, ""] = eqx.field(
+        converter=lambda value: as_array(value, "omega"), default=1.0
+    )
+
+    def __check_init__(self):
+        self.check()
+
+    def check(self) -> None:
+        """Raise a `ValueError` that names the first field with an impossible known value."""
+        check_finite(self.damping, "damping")
+        check_positive(self.omega, "omega")
+        require(len(self.belts) > 0, "belts", "at least one Belt", "none")
+        for i, belt in enumerate(self.belts):
+            require(isinstance(belt, Belt), f"belts[{i}]", "a Belt", repr(belt))
+            belt.check(f"belt {i}")
+
+    def check_scalars(self) -> None:
+        """Raise where a parameter is batched; then the right tool is `jax.vmap`."""
+        for path, leaf in jax.tree_util.tree_leaves_with_path(self):
+            if eqx.is_inexact_array(leaf):
+                as_array(leaf, jax.tree_util.keystr(path, simple=True, separator="."))
+
+    def __repr__(self) -> str:
+        belts = ", ".join(map(repr, self.belts))
+        return f"Oscillator(damping={number(self.damping)}, belts=({belts},), omega={number(self.omega)})"
+
+
+def acceleration(osc: Oscillator, signs: tuple[Array, ...], x1: Array, x2: Array) -> Array:
+    """x2' where belt i slips with the fixed sign signs[i] = +1 or -1 of r_i, or does not count (0).
+
+    Eqs. (3), (4), (12)-(14) of the paper for any number of belts, smooth across the boundaries
+    because the signs are given. Arrays may carry any common batch shape. With the sign of a stuck
+    belt 0 this is the force that the stuck contact has to hold.
+    """
+    force = -x1 - osc.damping * x2
+    for belt, sign in zip(osc.belts, signs, strict=True):
+        speed = belt.velocity - osc.omega * x2
+        speed = jnp.where(sign == 0, jnp.abs(speed), sign * speed)
+        force = force + sign * (belt.load * belt.friction.mu(speed))
+    return force

@@ -1,0 +1,95 @@
+"""Published parameter sets and published values, each with its reference.
+
+The four classes of the double-belt oscillator of P. Casini and F. Vestroni, "Nonstandard
+Bifurcations in Oscillators with Multiple Discontinuity Boundaries", Nonlinear Dynamics 35 (2004)
+41-59, "the paper" throughout this package.
+
+For class (a) the paper prints p3 = 3.0 (section 3.2). That is a misprint: only p3 = 10, which it
+prints for class (b), gives its values and figures. With p3 = 3 the Hopf point of eq. (28) lies at
+0.183064 and not at the printed 0.18284, and the fold at 0.215967 and not at the printed 0.26704.
+"""
+
+from typing import NamedTuple
+
+from jaxtyping import Array
+
+from .friction import Conti
+from .oscillator import Belt, Oscillator
+
+DAMPING = 0.5
+
+
+def paper_friction() -> Conti:
+    """Friction of every belt of the paper: mus = 1, p1 = 0.6, p2 = 0 and p3 = 10 (dimensionless).
+
+    p3 = 10 for class (a) too, where the paper prints 3.0 by mistake; see the module's text.
+    """
+    return Conti(static=1.0, residual=0.6, steepness=10.0)
+
+
+def class_a(nu0: float | Array) -> Oscillator:
+    """One belt, always touching: the paper's class (a), eqs. (2)-(4), section 3.2.
+
+    nu0: belt velocity, dimensionless scalar. zeta = 0.5, mus = 1, p1 = 0.6, p2 = 0 and p3 = 10:
+    the 3.0 that the paper prints for p3 in this class is a misprint, see the module's text.
+    """
+    return Oscillator(DAMPING, (Belt(nu0, paper_friction()),))
+
+
+def class_b(nu0: float | Array, nu1: float | Array) -> Oscillator:
+    """Two belts, both always touching: the paper's class (b), eqs. (11)-(14), section 3.3.
+
+    nu0, nu1: belt velocities, dimensionless scalars. zeta = 0.5, mus = 1, p1 = 0.6, p3 = 10.
+    """
+    return Oscillator(DAMPING, (Belt(nu0, paper_friction()), Belt(nu1, paper_friction())))
+
+
+def class_c(nu0: float | Array, nu1: float | Array, sigma: float | Array) -> Oscillator:
+    """One belt at a time: belt 0 touches while x1 < sigma, belt 1 while x1 > sigma; class (c).
+
+    nu0, nu1, sigma: dimensionless scalars. The paper defines the class (section 2.2, Fig. 2c) and
+    leaves it to further research; the other constants are those of class (b).
+    """
+    return class_d(nu0, nu1, sigma, sigma)
+
+
+def class_d(
+    nu0: float | Array, nu1: float | Array, sigma0: float | Array, sigma1: float | Array
+) -> Oscillator:
+    """Overlapping contact: belt 0 touches while x1 < sigma1, belt 1 while x1 > sigma0; class (d).
+
+    nu0, nu1, sigma0 <= sigma1: dimensionless scalars; between sigma0 and sigma1 both touch. The
+    paper defines the class (section 2.2, Fig. 2d) and leaves it to further research; the other
+    constants are those of class (b).
+    """
+    belts = (
+        Belt(nu0, paper_friction(), upper=sigma1),
+        Belt(nu1, paper_friction(), lower=sigma0),
+    )
+    return Oscillator(DAMPING, belts)
+
+
+class PublishedValue(NamedTuple):
+    """A critical belt velocity nu0 as the paper prints it, and what the paper calls it."""
+
+    system: str
+    point: str
+    kind: str
+    printed: float
+
+
+#: Critical values of sections 3.2 (class a) and 3.3 (class b with nu1 = 0.35) of the paper.
+PUBLISHED = (
+    PublishedValue("a", "nu_alpha", "nonsmooth fold", 0.26704),
+    PublishedValue("a", "nu_beta", "Hopf, subcritical", 0.18284),
+    PublishedValue("b", "nu_alpha", "nonsmooth fold on belt 1", 0.53822),
+    PublishedValue("b", "nu_beta", "sliding exchange", 0.35),
+    PublishedValue("b", "nu_gamma", "Hopf, subcritical", 0.26365),
+    PublishedValue("b", "nu_delta", "sudden sliding appearance", 0.0),
+    PublishedValue("b", "nu_epsilon", "Hopf, subcritical", -0.26365),
+    PublishedValue("b", "nu_zeta", "sliding on belt 0 (grazing)", -0.4558),
+    PublishedValue("b", "nu_eta", "nonsmooth fold on belt 1", -0.56050),
+)
+
+#: Velocity of belt 1 in the paper's class (b) diagrams, Figs. 7-13.
+PUBLISHED_NU1 = 0.35

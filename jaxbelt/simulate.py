@@ -1,0 +1,721 @@
+"""Event-driven trajectories: `simulate` and its result, `Trajectory`.
+
+A trajectory is a chain of arcs. In a slip arc the orbit runs in the smooth field of its mode until
+a guard of the mode vanishes; a stick arc is known in closed form. The chain is a `lax.scan` of
+segments, an arc each, so that it works under `jit`, `vmap`, and derivatives forward and reverse.
+
+Slip arcs are integrated by `diffrax.diffeqsolve` (Tsit5) with one scalar event, the smallest
+guard. It is looked at after each step; where it is negative, the step is made once more, shorter,
+so that it ends on the first root. That root cannot hide within the step: besides the boundaries
+and edges, an arc also ends where the acceleration changes its sign (and, before a contact edge,
+where the velocity does), unless no boundary (no edge) is within reach. Between two such turns x2
+(x1) is monotone, so the sign at the end of a step tells all. Between two zeros of x2' lies a zero
+of x2, since x2'' = -x2 there: more than one turn in a step would take a turn of the phase within
+it, which `MAX_STEP` excludes.
+
+Samples at given times are taken from the arcs afterwards, all in parallel.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike
+
+
+from .checks import as_array, check_finite, check_positive, is_concrete, require
+from .modes import (
+    Mode,
+    any_of,
+    boundary_guards,
+    bounds_rightward,
+    edge_focus,
+    edge_guards,
+    edges,
+    end_stick,
+    first_of,
+    mode_acceleration,
+    mode_of_state,
+    pass_edge,
+    reach_boundary,
+    select,
+    stick_phase,
+    stick_velocity,
+)
+from .oscillator import Oscillator
+from .results import EventKind, Status, describe
+
+#: Longest step, in units of 1/(angular frequency of the spring): well below half a turn.
+MAX_STEP = 0.5
+#: Longest slip arc, about one turn; longer ones are cut, so that samples start near their time.
+MAX_ARC = 2.0
+#: Steps that one segment may take before it is given up.
+MAX_STEPS = 100_000
+#: An orbit this close to a stable pseudo-focus (|x2| at the edge) has converged to it.
+FOCUS_RADIUS = 1e-2
+
+
+class Events(eqx.Module):
+    """The events of a trajectory in order; under a transformation padded to a common length.
+
+    t: times (NaN where padded), shape [events]; y: states (x1, x2), [events, 2]; kind: an
+    `EventKind` (0 where padded); belt: index of the belt concerned (-1 where padded), for EDGE
+    the belt whose interval ends or begins there, the lowest index where several are concerned.
+    """
+
+    t: Array
+    y: Array
+    kind: Array
+    belt: Array
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.t) or self.t.ndim != 1:
+            return f"Events(t={self.t.shape})"
+        counts = [f"{np.sum(np.asarray(self.kind) == kind)} {kind.name}" for kind in EventKind]
+        return f"Events({', '.join(counts)})"
+
+
+class Arcs(eqx.Module):
+    """The arcs of a trajectory: smooth pieces, each in one mode; padded like `Events`.
+
+    t: entry times, [arcs]; y: entry states, [arcs, 2]; mode: contact codes, [arcs, belts]
+    (+1/-1 slip with that sign of r, 0 stuck, -2/+2 mass below/above the belt's interval);
+    duration: [arcs]. Consecutive arcs of one mode occur: an arc also ends at a turn.
+    """
+
+    t: Array
+    y: Array
+    mode: Array
+    duration: Array
+
+
+class Trajectory(eqx.Module):
+    """What `simulate` returns.
+
+    ts: sample times, [samples]; ys: states (x1, x2) there, [samples, 2]; modes: contact codes of
+    each belt from that time on, [samples, belts] (+1/-1 slip with that sign of r_i, 0 stuck,
+    -2/+2 mass below/above the belt's interval); events: `Events`; arcs: `Arcs`; status: a
+    `Status` code. Samples that were not reached are NaN.
+    """
+
+    ts: Array
+    ys: Array
+    modes: Array
+    events: Events
+    arcs: Arcs
+    status: Array
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.ts) or self.ts.ndim != 1:
+            return f"Trajectory(ts={self.ts.shape}, ys={self.ys.shape})"
+        return (
+            f"Trajectory(t {self.ts[0]:.6g} to {self.ts[-1]:.6g}, {self.ts.size} samples, "
+            f"{self.events!r}, status {Status(int(self.status)).name}: {describe(self.status)})"
+        )
+
+
+# --- derivatives: forward Jacobians of an integration, usable in reverse ----------------------------
+
+
+def forward_jacobian(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn` with derivatives that come from its forward-mode Jacobian, in both modes.
+
+    An integration with an unknown number of steps has forward derivatives only. A segment has few
+    inputs, so its Jacobian with respect to those that are perturbed is formed in forward mode;
+    the tangent is then a matrix product, which reverse mode can transpose.
+    """
+    wrapped = eqx.filter_custom_jvp(fn)
+
+    @wrapped.def_jvp
+    def _(primals, tangents):
+        perturbed, rest = eqx.partition(
+            primals, jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
+        )
+        flat, unravel = jax.flatten_util.ravel_pytree(perturbed)
+        flat_tangent, _ = jax.flatten_util.ravel_pytree(tangents)
+
+        def of_flat(flat):
+            out = fn(*eqx.combine(unravel(flat), rest))
+            inexact, other = eqx.partition(out, eqx.is_inexact_array)
+            return inexact, other
+
+        def column(direction):
+            out, tangent, other = jax.jvp(of_flat, (flat,), (direction,), has_aux=True)
+            return out, tangent, other
+
+        basis = jnp.eye(flat.size, dtype=flat.dtype)
+        inexact, columns, other = jax.vmap(column, out_axes=(None, -1, None))(basis)
+        tangent_out = jax.tree.map(lambda jacobian: jacobian @ flat_tangent, columns)
+        out = eqx.combine(inexact, other)
+        nothing = jax.tree.map(lambda _: None, other)
+        return out, eqx.combine(tangent_out, nothing)
+
+    return wrapped
+
+
+# --- slip arcs ----------------------------------------------------------------------------------------
+
+
+class _RememberStart(diffrax.AbstractAdaptiveSolver):
+    """A solver whose state also carries where its last step began: ((x1, x2), (t, x1, x2))."""
+
+    solver: diffrax.AbstractSolver
+
+    @property
+    def term_structure(self):
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self):
+        return self.solver.interpolation_cls
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        (y, _), *rest = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        return (y, (t0, *y0[0])), *rest
+
+
+_SOLVER = diffrax.Tsit5(scan_kind="lax")
+
+
+def _controller(rtol, atol):
+    # The error of a step is that of the state, not of the memory beside it.
+    return diffrax.PIDController(
+        rtol=rtol, atol=atol, dtmax=MAX_STEP, norm=lambda y: jnp.maximum(*map(jnp.abs, y[0]))
+    )
+
+
+def _field(osc, mode):
+    def field(t, y, args):
+        (x1, x2), memory = y
+        return (x2, mode_acceleration(osc, mode, x1, x2)), jax.tree.map(jnp.zeros_like, memory)
+
+    return diffrax.ODETerm(field)
+
+
+def _single_step(osc, mode, y, h):
+    """The state one Tsit5 step of size h after y, in the field of the mode."""
+    term = _field(osc, mode)
+    zero = jnp.zeros_like(h)
+    state = (y, (zero, *y))
+    solver_state = _SOLVER.init(term, zero, h, state, None)
+    (y, _), *_ = _SOLVER.step(term, zero, h, state, None, solver_state, False)
+    return y
+
+
+def _guards(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], y) -> Array:
+    """All guards of a slip arc: boundaries, edges, then the turns of x2 and of x1.
+
+    A turn does not count while what it protects is out of reach of one step.
+    """
+    x1, x2 = y
+    a = mode_acceleration(osc, mode, x1, x2)
+    boundary = boundary_guards(osc, mode, x2)
+    edge = edge_guards(osc, mode, x1)
+    reach = jnp.abs(a) + jnp.abs(x2)
+    turn_x2 = jnp.maximum(turn[0] * a, functools.reduce(jnp.minimum, boundary) / osc.omega - reach)
+    turn_x1 = jnp.maximum(turn[1] * x2, functools.reduce(jnp.minimum, edge) - reach)
+    return jnp.stack([*boundary, *edge, turn_x2, turn_x1])
+
+
+def _first_root(fn: Callable[[Array], Array], end: Array) -> Array:
+    """The root in (0, end] of fn, positive just after 0 and negative at end (Illinois).
+
+    fn(0) may vanish, on the boundary that the arc has just left; that root is not the one.
+    """
+    f_end, f_start = fn(end), fn(jnp.zeros_like(end))
+    f_start = jnp.where(f_start > 1e-12, f_start, -f_end)
+
+    def unfinished(state):
+        a, _, b, _, c, fc, count = state
+        return (b - a > 1e-16 * end) & (jnp.abs(fc) > 1e-16) & (count < 60)
+
+    def improve(state):
+        a, fa, b, fb, _, _, count = state
+        c = (a * fb - b * fa) / (fb - fa)
+        fc = fn(c)
+        inside = fc > 0
+        return (
+            jnp.where(inside, c, a),
+            jnp.where(inside, fc, 0.5 * fa),
+            jnp.where(inside, b, c),
+            jnp.where(inside, 0.5 * fb, fc),
+            c,
+            fc,
+            count + 1,
+        )
+
+    start = (jnp.zeros_like(end), f_start, end, f_end, end, f_end, 0)
+    return lax.while_loop(unfinished, improve, start)[4]
+
+
+class _SlipArc(eqx.Module):
+    """End of a slip arc: its duration and state, the guard that fired (-1: none), failure."""
+
+    duration: Array
+    y: tuple[Array, Array]
+    fired: Array
+    failed: Array
+
+
+@forward_jacobian
+def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
+    """Follow the slip arc from y until a guard fires or the time span is over."""
+
+    def left_mode(t, y, args, **kwargs):
+        # A rejected first step leaves t = 0, where a guard may vanish.
+        return (t > 0) & (jnp.min(_guards(osc, mode, turn, y[0])) < 0)
+
+    zero = jnp.zeros_like(span)
+    solution = diffrax.diffeqsolve(
+        _field(osc, mode),
+        _RememberStart(_SOLVER),
+        t0=zero,
+        t1=span,
+        dt0=None,
+        y0=(y, (zero, *y)),
+        saveat=diffrax.SaveAt(t1=True),
+        stepsize_controller=_controller(rtol, atol),
+        event=diffrax.Event(left_mode),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    t_end = solution.ts[-1]
+    y_end, (t_start, *y_start) = jax.tree.map(lambda leaf: leaf[-1], solution.ys)
+    hit = solution.event_mask
+    finished = hit | (t_end >= span)
+
+    # Make the last step once more, to the root instead of beyond it.
+    def guards_after(h):
+        return _guards(osc, mode, turn, _single_step(osc, mode, tuple(y_start), h))
+
+    frozen = jax.tree.map(lax.stop_gradient, (osc, mode, turn, tuple(y_start)))
+
+    def smallest_guard(h):
+        f_osc, f_mode, f_turn, f_start = frozen
+        return jnp.min(_guards(f_osc, f_mode, f_turn, _single_step(f_osc, f_mode, f_start, h)))
+
+    last = lax.stop_gradient(t_end - t_start)
+    root = _first_root(smallest_guard, jnp.where(hit, last, 0.0))
+    fired = jnp.argmin(lax.stop_gradient(guards_after(root)))
+    is_turn = fired >= 3 * len(osc.belts)
+    # Two Newton steps: the digits that are left, and derivatives to second order.
+    polished = root
+    for _ in range(2):
+        guard, slope = jax.jvp(
+            lambda h: guards_after(h)[fired], (polished,), (jnp.ones_like(polished),)
+        )
+        regular = jnp.abs(slope) > 1e-12
+        polished = polished - jnp.where(regular, guard / jnp.where(regular, slope, 1.0), 0.0)
+    # A turn is invisible: nothing depends on where the arc is split.
+    root = jnp.where(is_turn, root, polished)
+    h = jnp.where(hit, root, jnp.where(finished, span - t_start, last))
+    return _SlipArc(
+        duration=t_start + h,
+        y=_single_step(osc, mode, tuple(y_start), h),
+        fired=jnp.where(hit, fired, -1),
+        failed=~finished,
+    )
+
+
+@forward_jacobian
+def _flow(osc, mode, y, duration, rtol, atol):
+    """The state after `duration` in the slip field of the mode, no events looked for."""
+    zero = jnp.zeros_like(duration)
+    solution = diffrax.diffeqsolve(
+        _field(osc, mode),
+        _RememberStart(_SOLVER),
+        t0=zero,
+        t1=duration,
+        dt0=None,
+        y0=(y, (zero, *y)),
+        saveat=diffrax.SaveAt(t1=True),
+        stepsize_controller=_controller(rtol, atol),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    _, (t_start, *y_start) = jax.tree.map(lambda leaf: leaf[-1], solution.ys)
+    return _single_step(osc, mode, tuple(y_start), duration - t_start)
+
+
+# --- segments -------------------------------------------------------------------------------------------
+
+
+class _State(eqx.Module):
+    """Where a run is: time, state, mode, the turn signs of x2' and x2, and how it stands."""
+
+    t: Array
+    y: tuple[Array, Array]
+    mode: Mode
+    turn: tuple[Array, Array]
+    status: Array
+    done: Array
+
+
+class _Step(eqx.Module):
+    """An arc's end: duration, state, next mode, the event, turn signs where they are known."""
+
+    duration: Array
+    y: tuple[Array, Array]
+    mode: Mode
+    turn: tuple[Array, Array]
+    kind: Array
+    status: Array
+    done: Array
+
+
+def _sign(value, tie):
+    return jnp.where(value == 0, tie, jnp.sign(value))
+
+
+def _turn_signs(osc, mode, y):
+    """Signs of x2' and x2 just after y. Where x2' = 0, as at slip onset, x2'' = -x2 decides."""
+    x1, x2 = y
+    a = mode_acceleration(osc, mode, x1, x2)
+    tangent = jnp.abs(a) < 1e-12 * (1 + jnp.abs(x1))
+    a = jnp.where(tangent, -x2, a)
+    return lax.stop_gradient((_sign(a, 1.0), _sign(x2, _sign(a, 1.0))))
+
+
+def _slip_segment(osc: Oscillator, state: _State, t1, rtol, atol) -> _Step:
+    n = len(osc.belts)
+    left = t1 - state.t
+    span = jnp.minimum(left, MAX_ARC)
+    arc = _slip_arc(osc, state.mode, state.turn, state.y, span, rtol, atol)
+    x1, x2 = arc.y
+    fired = arc.fired
+    at_boundary = (fired >= 0) & (fired < n)
+    at_edge = (fired >= n) & (fired < 3 * n)
+    ended = (fired < 0) & (left <= MAX_ARC)
+
+    edge_hit = [fired == n + i for i in range(2 * n)]
+    edge = first_of(edge_hit, edges(osc), x1)
+    rightward = any_of(
+        [hit & right for hit, right in zip(edge_hit, bounds_rightward(state.mode), strict=True)]
+    )
+    after_edge = pass_edge(osc, state.mode, edge, x2, rightward)
+    after_boundary, x2_boundary = reach_boundary(
+        osc, state.mode, [fired == i for i in range(n)], x1
+    )
+    mode = select(at_boundary, after_boundary, select(at_edge, after_edge, state.mode))
+    x1 = jnp.where(at_edge, edge, x1)
+    x2 = jnp.where(at_boundary, x2_boundary, x2)
+
+    focused = at_edge & _has_converged(
+        osc, select(rightward, state.mode, after_edge), select(rightward, after_edge, state.mode),
+        edge, x2,
+    )
+    x2 = jnp.where(focused, 0.0, x2)
+    kind = jnp.where(
+        at_boundary,
+        jnp.where(after_boundary.any_stuck, EventKind.STICK, EventKind.CROSS),
+        jnp.where(at_edge, EventKind.EDGE, 0),
+    )
+    turned = (
+        jnp.where(fired == 3 * n, -state.turn[0], state.turn[0]),
+        jnp.where(fired == 3 * n + 1, -state.turn[1], state.turn[1]),
+    )
+    fresh = _turn_signs(osc, mode, (x1, x2))
+    status = jnp.where(focused, Status.PSEUDO_FOCUS, Status.OK)
+    status = jnp.where(arc.failed, Status.TOO_MANY_STEPS, status)
+    return _Step(
+        duration=arc.duration,
+        y=(x1, x2),
+        mode=mode,
+        turn=select(at_boundary | at_edge, fresh, turned),
+        kind=kind,
+        status=status,
+        done=ended | focused,
+    )
+
+
+def _has_converged(osc, left, right, edge, x2):
+    """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
+
+    The leading term of a turn must outweigh the next one by ten, and no boundary may be near.
+    """
+    focus = edge_focus(osc, left, right, edge)
+    size = jnp.abs(x2)
+    nearest = jnp.inf
+    for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
+        touches = is_left | is_right
+        nearest = jnp.minimum(nearest, jnp.where(touches, jnp.abs(belt.velocity), jnp.inf))
+    captured = (
+        (focus.contraction < 0)
+        & (10 * size * focus.nonlinearity < -focus.contraction)
+        & (size < FOCUS_RADIUS)
+        & (2 * osc.omega * size < nearest)
+    )
+    slips = ~left.any_stuck & ~right.any_stuck
+    return focus.exists & slips & (captured | (size < 1e-13))
+
+
+def _stick_segment(osc: Oscillator, state: _State, t1) -> _Step:
+    x1, x2 = state.y
+    phase = stick_phase(osc, state.mode, x1)
+    left = t1 - state.t
+    ended = phase.duration >= left
+    duration = jnp.where(ended, left, phase.duration)
+    x1_end = jnp.where(ended, x1 + x2 * left, phase.x1)
+    after_edge = pass_edge(osc, state.mode, phase.x1, x2, x2 > 0)
+    after = select(phase.slips, end_stick(osc, state.mode), after_edge)
+    mode = select(ended, state.mode, after)
+    forever = jnp.isinf(phase.duration)
+    return _Step(
+        duration=duration,
+        y=(x1_end, x2),
+        mode=mode,
+        turn=_turn_signs(osc, mode, (x1_end, x2)),
+        kind=jnp.where(ended, 0, jnp.where(phase.slips, EventKind.SLIP, EventKind.EDGE)),
+        status=jnp.where(forever, Status.STUCK_FOREVER, Status.OK),
+        done=ended,
+    )
+
+
+def _belt_concerned(before: Mode, after: Mode) -> Array:
+    """The lowest index of a belt whose contact changed; which sort of change the event tells."""
+    changed = [a != b for a, b in zip(before.codes, after.codes, strict=True)]
+    return first_of(changed, [jnp.asarray(i) for i in range(len(changed))], jnp.asarray(-1))
+
+
+class _Record(eqx.Module):
+    """What a segment leaves behind: its arc and the event at its end."""
+
+    t: Array
+    y: Array
+    mode: Array
+    duration: Array
+    kind: Array
+    belt: Array
+    event_t: Array
+    event_y: Array
+    event_mode: Array
+
+
+def _codes(mode: Mode) -> Array:
+    return jnp.stack([jnp.asarray(code, dtype=jnp.int8) for code in mode.codes])
+
+
+def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _Record]:
+    stuck = state.mode.any_stuck
+    # Under vmap both branches run; a stuck lane then has no slip arc to follow.
+    step = lax.cond(
+        stuck,
+        lambda: _stick_segment(osc, state, t1),
+        lambda: _slip_segment(osc, state, jnp.where(stuck, state.t, t1), rtol, atol),
+    )
+    t = state.t + step.duration
+    finite = jnp.isfinite(t) & jnp.isfinite(step.y[0]) & jnp.isfinite(step.y[1])
+    status = jnp.where(finite, step.status, Status.NOT_FINITE)
+    edge_belt = _belt_concerned(
+        Mode(tuple(map(_is_apart, state.mode.codes))), Mode(tuple(map(_is_apart, step.mode.codes)))
+    )
+    belt = jnp.where(
+        step.kind == EventKind.EDGE, edge_belt, _belt_concerned(state.mode, step.mode)
+    )
+    record = _Record(
+        t=state.t,
+        y=jnp.stack(state.y),
+        mode=_codes(state.mode),
+        duration=step.duration,
+        kind=step.kind,
+        belt=jnp.where(step.kind == 0, -1, belt),
+        event_t=t,
+        event_y=jnp.stack(step.y),
+        event_mode=_codes(step.mode),
+    )
+    new = _State(t, step.y, step.mode, step.turn, status, step.done | (status != Status.OK))
+    return new, record
+
+
+def _is_apart(code):
+    return jnp.where(jnp.abs(code) > 1.5, 1.0, 0.0)
+
+
+def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_State, _Record]:
+    """The chain of arcs from y0: the final state and the stacked records, NaN where unused."""
+    y = (y0[0], y0[1])
+    mode = mode_of_state(osc, *y)
+    finite = jnp.all(jnp.isfinite(y0))
+    for leaf in jax.tree.leaves(osc):
+        finite = finite & jnp.all(~jnp.isnan(leaf))
+    status = jnp.where(finite, Status.OK.value, Status.NOT_FINITE.value)
+    start = _State(t0, y, mode, _turn_signs(osc, mode, y), status, ~finite)
+    blank = jax.tree.map(_blank, eqx.filter_eval_shape(_segment, osc, start, t1, rtol, atol)[1])
+
+    def segment(state, _):
+        def advance():
+            new, record = _segment(osc, state, t1, rtol, atol)
+            keep = functools.partial(jnp.where, state.done)
+            return jax.tree.map(keep, state, new), jax.tree.map(keep, blank, record)
+
+        # A true branch under vmap too: once every lane is done nothing more is computed.
+        return lax.cond(eqxi.unvmap_any(~state.done), advance, lambda: (state, blank))
+
+    final, records = lax.scan(segment, start, length=max_segments)
+    unfinished = jnp.where(final.done, final.status, Status.TOO_MANY_SEGMENTS.value)
+    return eqx.tree_at(lambda s: s.status, final, unfinished), records
+
+
+def _blank(leaf):
+    value = jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0
+    return jnp.full(leaf.shape, value, leaf.dtype)
+
+
+def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
+    """States and modes at the times ts, each from the arc that it lies in."""
+    entries = jnp.where(jnp.isnan(records.t), jnp.inf, lax.stop_gradient(records.t))
+    # Past the end of the last arc the run either rests, with a reason, or is unknown.
+    rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
+
+    def at(t):
+        i = jnp.maximum(jnp.searchsorted(entries, t, side="right") - 1, 0)
+        arc = jax.tree.map(lambda leaf: leaf[i], records)
+        mode = Mode(tuple(arc.mode[j].astype(float) for j in range(len(osc.belts))))
+        beyond = t > final.t
+        since = jnp.where(beyond, 0.0, t - arc.t)
+        y = (arc.y[0], arc.y[1])
+        flown = _flow(osc, mode, y, jnp.where(mode.any_stuck, 0.0, since), rtol, atol)
+        v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
+        x1 = jnp.where(mode.any_stuck, y[0] + v * since, flown[0])
+        x2 = jnp.where(mode.any_stuck, v, flown[1])
+        known = ~beyond | rests
+        x1 = jnp.where(beyond, jnp.where(known, final.y[0], jnp.nan), x1)
+        x2 = jnp.where(beyond, jnp.where(known, final.y[1], jnp.nan), x2)
+        return jnp.stack([x1, x2]), arc.mode
+
+    return jax.vmap(at)(ts)
+
+
+@eqx.filter_jit
+def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> Trajectory:
+    final, records = _run(osc, y0, t0, t1, rtol, atol, max_segments)
+    # Events first, in a stable order; the rest is padding.
+    has_event = records.kind > 0
+    order = jnp.argsort(~has_event, stable=True)
+    has_event = has_event[order]
+    events = Events(
+        t=jnp.where(has_event, records.event_t[order], jnp.nan),
+        y=jnp.where(has_event[:, None], records.event_y[order], jnp.nan),
+        kind=jnp.where(has_event, records.kind[order], 0),
+        belt=jnp.where(has_event, records.belt[order], -1),
+    )
+    if ts is None:
+        grid = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)
+        entries = jnp.where(jnp.isnan(records.t), t1, records.t)
+        ts = jnp.sort(jnp.concatenate([grid, entries]))
+    ys, modes = _sample(osc, final, records, ts, rtol, atol)
+    arcs = Arcs(records.t, records.y, records.mode, records.duration)
+    return Trajectory(ts, ys, modes, events, arcs, final.status)
+
+
+def simulate(
+    osc: Oscillator,
+    y0: ArrayLike | tuple,
+    t1: ArrayLike,
+    *,
+    t0: ArrayLike = 0.0,
+    ts: ArrayLike | None = None,
+    rtol: ArrayLike = 1e-10,
+    atol: ArrayLike = 1e-10,
+    formulation: str = "filippov",
+    v_star: ArrayLike = 1e-3,
+    eps: ArrayLike = 1e-3,
+    max_segments: int | None = None,
+) -> Trajectory:
+    """The motion of the oscillator from y0 over [t0, t1].
+
+    osc: `Oscillator`. y0: start (x1, x2), shape [2]. t0 < t1: time span (dimensionless time
+    tau = omega t). ts: the times wanted, increasing, shape [n]; None gives an even grid with the
+    ends of all arcs in it. rtol, atol: tolerances of the integrator per step.
+
+    formulation: "filippov", the exact event-driven motion; "switch", the paper's switch model,
+    eqs. (21)-(23), with a band of half-width v_star around each boundary; "smooth", with
+    tanh(r/eps) in place of sgn(r). The last two have no events.
+
+    max_segments: budget of arcs; None chooses one from the time span. A run that uses it up
+    returns what it has, with the status TOO_MANY_SEGMENTS.
+
+    Works under `jax.jit`, `jax.vmap` (batches), `jax.jacfwd` and `jax.jacrev`. There the lengths
+    are padded (see `Events`); outside they are cut to what happened.
+
+    `ValueError` names the argument that is impossible. See `Trajectory` for what comes back.
+    """
+    require(
+        isinstance(osc, Oscillator), "osc", "an Oscillator, such as jb.presets.class_b(...)", osc
+    )
+    osc.check_scalars()
+    osc.check()
+    y0 = as_array(y0, "y0", (2,))
+    check_finite(y0, "y0")
+    t0, t1 = as_array(t0, "t0"), as_array(t1, "t1")
+    check_finite(t0, "t0")
+    check_finite(t1, "t1")
+    if is_concrete((t0, t1)):
+        require(t1 > t0, "t1", f"> t0 = {t0}", t1)
+    rtol, atol = as_array(rtol, "rtol"), as_array(atol, "atol")
+    check_positive(rtol, "rtol")
+    check_positive(atol, "atol")
+    if ts is not None:
+        ts = as_array(ts, "ts", (None,))
+        check_finite(ts, "ts")
+        if is_concrete((ts, t0, t1)):
+            inside = np.all(np.asarray(ts) >= t0) and np.all(np.asarray(ts) <= t1)
+            require(inside, "ts", f"within [t0, t1] = [{t0}, {t1}]", ts)
+            require(np.all(np.diff(ts) >= 0), "ts", "increasing", ts)
+    require(
+        formulation in ("filippov", "switch", "smooth"),
+        "formulation",
+        '"filippov", "switch" or "smooth"',
+        repr(formulation),
+    )
+    span = float(t1 - t0) if is_concrete((t0, t1)) else 100.0
+    resolution = _power_of_two(10 * span, 512)
+    if max_segments is None:
+        max_segments = _power_of_two(8 * span, 512)
+    require(
+        isinstance(max_segments, int) and max_segments > 0,
+        "max_segments",
+        "a positive integer",
+        max_segments,
+    )
+    trajectory = _filippov(
+        osc, y0, t0, t1, ts, rtol, atol, max_segments=max_segments, resolution=resolution
+    )
+    return _trim(trajectory, trim_samples=ts is None)
+
+
+def _power_of_two(value: float, least: int) -> int:
+    return max(least, 2 ** math.ceil(math.log2(min(value, 2.0**20))))
+
+
+def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
+    """Cut the padding off where lengths are known, that is, outside of transformations."""
+    if not is_concrete(trajectory) or trajectory.ts.ndim != 1:
+        return trajectory
+    events = jax.tree.map(lambda leaf: leaf[: int(np.sum(trajectory.events.kind > 0))], trajectory.events)
+    arcs = jax.tree.map(lambda leaf: leaf[: int(np.sum(~np.isnan(trajectory.arcs.t)))], trajectory.arcs)
+    ts, ys, modes = trajectory.ts, trajectory.ys, trajectory.modes
+    if trim_samples:
+        _, first = np.unique(np.asarray(ts), return_index=True)
+        ts, ys, modes = ts[first], ys[first], modes[first]
+    return Trajectory(ts, ys, modes, events, arcs, trajectory.status)
