@@ -56,6 +56,8 @@ from .results import EventKind, Status, describe
 
 #: Longest step, in units of 1/(angular frequency of the spring): well below half a turn.
 MAX_STEP = 0.5
+#: Local errors are kept below this fraction of the tolerance; near-grazing events amplify them.
+SAFETY = 0.05
 #: Longest slip arc, about one turn; longer ones are cut, so that samples start near their time.
 MAX_ARC = 2.0
 #: Steps that one segment may take before it is given up.
@@ -198,7 +200,7 @@ _SOLVER = diffrax.Tsit5(scan_kind="lax")
 def _controller(rtol, atol):
     # The error of a step is that of the state, not of the memory beside it.
     return diffrax.PIDController(
-        rtol=rtol, atol=atol, dtmax=MAX_STEP, norm=lambda y: jnp.maximum(*map(jnp.abs, y[0]))
+        rtol=SAFETY * rtol, atol=SAFETY * atol, dtmax=MAX_STEP, norm=lambda y: jnp.maximum(*map(jnp.abs, y[0]))
     )
 
 
@@ -220,7 +222,7 @@ def _single_step(osc, mode, y, h):
     return y
 
 
-def _guards(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], y) -> Array:
+def _guards(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], y) -> list[Array]:
     """All guards of a slip arc: boundaries, edges, then the turns of x2 and of x1.
 
     A turn does not count while what it protects is out of reach of one step.
@@ -230,9 +232,14 @@ def _guards(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], y) -> Array:
     boundary = boundary_guards(osc, mode, x2)
     edge = edge_guards(osc, mode, x1)
     reach = jnp.abs(a) + jnp.abs(x2)
-    turn_x2 = jnp.maximum(turn[0] * a, functools.reduce(jnp.minimum, boundary) / osc.omega - reach)
-    turn_x1 = jnp.maximum(turn[1] * x2, functools.reduce(jnp.minimum, edge) - reach)
-    return jnp.stack([*boundary, *edge, turn_x2, turn_x1])
+    turn_x2 = jnp.maximum(turn[0] * a, _smallest(boundary) / osc.omega - reach)
+    turn_x1 = jnp.maximum(turn[1] * x2, _smallest(edge) - reach)
+    return [*boundary, *edge, turn_x2, turn_x1]
+
+
+def _smallest(values):
+    # A reduction over a stacked array: the values are then computed once, not in every consumer.
+    return jnp.min(jnp.stack(values))
 
 
 def _first_root(fn: Callable[[Array], Array], end: Array) -> Array:
@@ -281,7 +288,7 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
 
     def left_mode(t, y, args, **kwargs):
         # A rejected first step leaves t = 0, where a guard may vanish.
-        return (t > 0) & (jnp.min(_guards(osc, mode, turn, y[0])) < 0)
+        return (t > 0) & (_smallest(_guards(osc, mode, turn, y[0])) < 0)
 
     zero = jnp.zeros_like(span)
     solution = diffrax.diffeqsolve(
@@ -311,18 +318,24 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
 
     def smallest_guard(h):
         f_osc, f_mode, f_turn, f_start = frozen
-        return jnp.min(_guards(f_osc, f_mode, f_turn, _single_step(f_osc, f_mode, f_start, h)))
+        return _smallest(_guards(f_osc, f_mode, f_turn, _single_step(f_osc, f_mode, f_start, h)))
 
     last = lax.stop_gradient(t_end - t_start)
     root = _first_root(smallest_guard, jnp.where(hit, last, 0.0))
-    fired = jnp.argmin(lax.stop_gradient(guards_after(root)))
+    at_root = lax.stop_gradient(guards_after(root))
+    indices = [jnp.asarray(i) for i in range(len(at_root))]
+    lowest = _smallest(at_root)
+    fired = first_of([guard <= lowest for guard in at_root], indices, indices[0])
     is_turn = fired >= 3 * len(osc.belts)
+
+    def guard_fired(h):
+        guards = guards_after(h)
+        return first_of([fired == i for i in indices], guards, guards[0])
+
     # Two Newton steps: the digits that are left, and derivatives to second order.
     polished = root
     for _ in range(2):
-        guard, slope = jax.jvp(
-            lambda h: guards_after(h)[fired], (polished,), (jnp.ones_like(polished),)
-        )
+        guard, slope = jax.jvp(guard_fired, (polished,), (jnp.ones_like(polished),))
         regular = jnp.abs(slope) > 1e-12
         polished = polished - jnp.where(regular, guard / jnp.where(regular, slope, 1.0), 0.0)
     # A turn is invisible: nothing depends on where the arc is split.

@@ -1,0 +1,591 @@
+"""Pictures: time histories, phase portraits, vector fields, and the model itself.
+
+Every function draws one kind of result into the matplotlib axes that it is given (`ax=None` makes
+new ones) and returns the axes. What is drawn is shown in the manner of the paper:
+
+- a discontinuity boundary Sigma_Fi, x2 = nu_i/omega, as a line over the contact interval of its
+  belt, in the colour of the belt; the part where the mass sticks (the sliding set) is a wide pale
+  band behind it. Finite contact edges sigma are dotted vertical lines.
+- stable cycles as thick solid, unstable ones as dashed lines, other orbits thin and grey;
+- stable fixed points filled, unstable ones open, a segment of pseudo-equilibria as a thick bar.
+
+The colours are those of Okabe and Ito, which colour-blind readers can tell apart. This is the only
+module that imports matplotlib, and `import jaxbelt` does not import this module.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import equinox as eqx
+import jax.numpy as jnp
+import matplotlib
+import matplotlib.colors
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.patheffects import withStroke
+
+from .friction import AbstractFriction
+from .modes import mode_acceleration, mode_of_state
+from .oscillator import Oscillator
+from .simulate import Trajectory
+
+#: One colour a belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
+BELT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
+#: A second mark of the belts, for print without colour.
+BELT_HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\")
+ORBIT_COLOUR = "0.55"
+#: What a phase portrait may hold, in the order of its key.
+KEY_ORDER = (
+    "orbit",
+    "stable cycle",
+    "unstable cycle",
+    "sliding set",
+    "stable fixed point",
+    "unstable fixed point",
+    "pseudo-equilibria",
+)
+
+#: Settings for a journal's page, see `journal_style`.
+JOURNAL = {
+    "font.family": "STIXGeneral",
+    "mathtext.fontset": "stix",
+    "font.size": 9,
+    "axes.labelsize": 9,
+    "axes.titlesize": 9,
+    "axes.linewidth": 0.6,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "xtick.direction": "in",
+    "ytick.direction": "in",
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "hatch.linewidth": 0.4,
+}
+
+
+class ClosedOrbit(Protocol):
+    """What `plot_phase_portrait` wants of a cycle: its stability, and states all around it."""
+
+    @property
+    def stable(self) -> Any: ...
+
+    def sample(self, n: int, /) -> Any:
+        """About n states (x1, x2) once around, [samples, 2]."""
+        ...
+
+
+class FixedPoint(Protocol):
+    """What `plot_phase_portrait` wants of an equilibrium (x1, 0).
+
+    One that has `kind == "segment"` is a segment of pseudo-equilibria, and has `x1_lower` and
+    `x1_upper` in place of these two.
+    """
+
+    @property
+    def x1(self) -> Any: ...
+
+    @property
+    def stable(self) -> Any: ...
+
+
+# --- time histories -----------------------------------------------------------------------------
+
+
+def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    """Displacement x1 and velocity x2 over time, stick phases shaded in the colour of their belt.
+
+    trajectory: from `simulate`. ax: two axes, for x1 and for x2. Returns the two.
+    """
+    if ax is None:
+        ax = _new_axes(rows=2)
+    t, ys = _path(trajectory)
+    upper, lower = ax
+    for axes, component, name in ((upper, 0, "displacement $x_1$"), (lower, 1, "velocity $x_2$")):
+        axes.plot(t, ys[:, component], color="black", linewidth=0.9)
+        axes.set_ylabel(name)
+        axes.margins(x=0)
+    for belt, begin, end in stick_phases(trajectory):
+        for axes in ax:
+            axes.axvspan(
+                begin, end, label=f"sticks to belt {belt}", zorder=0, **_belt_shading(belt)
+            )
+    upper.tick_params(labelbottom=False)
+    lower.set_xlabel(r"time $\tau$")
+    handles, labels = upper.get_legend_handles_labels()
+    by_label = dict(sorted(zip(labels, handles, strict=True), key=lambda item: item[0]))
+    if by_label:
+        upper.legend(
+            by_label.values(),
+            by_label.keys(),
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=len(by_label),
+            frameon=False,
+            borderaxespad=0.2,
+        )
+    return ax
+
+
+def stick_phases(trajectory: Trajectory) -> list[tuple[int, float, float]]:
+    """The stick phases of a trajectory as (belt, begin, end), in order of their beginnings."""
+    times = np.asarray(trajectory.arcs.t)
+    begins = times[np.isfinite(times)]
+    ends = begins + np.asarray(trajectory.arcs.duration)[: begins.size]
+    stuck = np.asarray(trajectory.arcs.mode)[: begins.size] == 0
+    phases: list[tuple[int, float, float]] = []
+    for belt in range(stuck.shape[1]):
+        begin = None
+        for i in np.flatnonzero(stuck[:, belt]):
+            if begin is None:
+                begin = begins[i]
+            # Where another belt comes or goes meanwhile, the phase is in several arcs.
+            if i + 1 == begins.size or not stuck[i + 1, belt]:
+                phases.append((belt, float(begin), float(ends[i])))
+                begin = None
+    return sorted(phases, key=lambda phase: phase[1])
+
+
+def _belt_shading(belt: int) -> dict[str, Any]:
+    colour = matplotlib.colors.to_rgba(_belt_colour(belt))
+    pale = tuple(1 - 0.28 * (1 - channel) for channel in colour[:3])
+    hatch = BELT_HATCHES[belt % len(BELT_HATCHES)]
+    return {"facecolor": pale, "edgecolor": (*colour[:3], 0.45), "linewidth": 0.0, "hatch": hatch}
+
+
+def _belt_colour(belt: int) -> str:
+    return BELT_COLOURS[belt % len(BELT_COLOURS)]
+
+
+def _path(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Times and states of a trajectory, its events among the samples so that corners are sharp."""
+    t = np.concatenate([trajectory.ts, trajectory.events.t])
+    ys = np.concatenate([trajectory.ys, trajectory.events.y])
+    known = np.isfinite(t) & np.all(np.isfinite(ys), axis=1)
+    order = np.argsort(t[known], kind="stable")
+    return t[known][order], ys[known][order]
+
+
+# --- phase portraits ----------------------------------------------------------------------------
+
+
+def plot_phase_portrait(
+    osc: Oscillator,
+    trajectories: Trajectory | Sequence[Trajectory] = (),
+    *,
+    cycles: Sequence[ClosedOrbit] = (),
+    equilibria: Sequence[FixedPoint] = (),
+    xlim: tuple[float, float] | None = None,
+    ylim: tuple[float, float] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Orbits in the plane of displacement x1 and velocity x2, with the boundaries of `osc`.
+
+    trajectories: one or several from `simulate`, thin. cycles: see `ClosedOrbit`; stable ones are
+    thick and solid, unstable ones dashed. equilibria: see `FixedPoint`. xlim, ylim: the window;
+    None fits what is drawn. Returns the axes.
+    """
+    if isinstance(trajectories, Trajectory):
+        trajectories = (trajectories,)
+    ax = _new_axes() if ax is None else ax
+    paths = [_path(trajectory)[1] for trajectory in trajectories]
+    loops = [np.asarray(cycle.sample(400)) for cycle in cycles]
+    window = _window(osc, [*paths, *loops], equilibria, xlim, ylim)
+    ax.set(xlim=window[0], ylim=window[1])
+    plot_boundaries(osc, ax)
+    for path in paths:
+        ax.plot(*path.T, color=ORBIT_COLOUR, linewidth=0.7, zorder=2, label="orbit")
+        _draw_arrowheads(ax, path, ORBIT_COLOUR, [_index_at_distance(ax, path, 0.22)])
+    for cycle, loop in zip(cycles, loops, strict=True):
+        if cycle.stable:
+            style = {"linewidth": 1.7, "label": "stable cycle"}
+        else:
+            style = {"linewidth": 1.0, "linestyle": (0, (4, 2.2)), "label": "unstable cycle"}
+        ax.plot(*loop.T, color="black", solid_joinstyle="round", zorder=4, **style)
+        _draw_arrowheads(ax, loop, "black", [int(np.argmin(loop[:, 1]))])
+    for equilibrium in equilibria:
+        _draw_equilibrium(ax, equilibrium)
+    ax.set_xlabel("displacement $x_1$")
+    ax.set_ylabel("velocity $x_2$")
+    return ax
+
+
+def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
+    """The discontinuity boundaries and contact edges of `osc`, in the present window of the axes.
+
+    Sigma_Fi, x2 = nu_i/omega, eqs. (8) and (17) of the paper, over the contact interval of belt i,
+    its sliding set as a pale band. A boundary that reaches the right-hand side of the axes has its
+    name outside of them, another one has it at its left end.
+    """
+    left, right = ax.get_xlim()
+    outside: list[tuple[float, int]] = []
+    levels: list[float] = []
+    for i, belt in enumerate(osc.belts):
+        level = float(belt.velocity / osc.omega)
+        ends = np.clip([float(belt.lower), float(belt.upper)], left, right)
+        bottom, top = ax.get_ylim()
+        if ends[0] == ends[1] or not bottom < level < top:
+            continue
+        colour = _belt_colour(i)
+        # Where two boundaries are one, both colours show.
+        dashes = (0, (5, 5)) if level in levels else "-"
+        ax.plot(ends, [level, level], color=colour, linewidth=0.9, linestyle=dashes, zorder=1.5)
+        levels.append(level)
+        x1 = np.linspace(*ends, 1201)
+        sticks = _sliding_set(osc, jnp.asarray(x1), jnp.full(x1.size, belt.velocity / osc.omega), i)
+        band = np.where(sticks, level, np.nan)
+        style = {"linewidth": 4.5, "alpha": 0.25, "solid_capstyle": "butt"}
+        ax.plot(x1, band, color=colour, zorder=1.2, label="sliding set", **style)
+        if ends[1] == right:
+            outside.append((level, i))
+        else:
+            _name_boundary(ax, i, (ends[0], level), (3, 2.5), "left", "bottom")
+    _name_boundaries_outside(ax, outside)
+    for edge in {float(e) for b in osc.belts for e in (b.lower, b.upper)}:
+        if left < edge < right:
+            ax.axvline(edge, color="0.25", linewidth=0.8, linestyle=":", zorder=1.4)
+            ax.annotate(
+                _edge_name(osc, edge),
+                (edge, 0.0),
+                xycoords=ax.get_xaxis_transform(),
+                xytext=(3, 4),
+                textcoords="offset points",
+                path_effects=[withStroke(linewidth=2.5, foreground="white")],
+                zorder=6,
+            )
+    return ax
+
+
+@eqx.filter_jit
+def _sliding_set(osc, x1, x2, belt):
+    return jnp.stack(mode_of_state(osc, x1, x2).stuck)[belt]
+
+
+def _edge_name(osc: Oscillator, edge: float) -> str:
+    """sigma where all intervals end at one edge, else the paper's sigma0, sigma1 in order."""
+    edges = sorted(
+        {float(e) for b in osc.belts for e in (b.lower, b.upper) if np.isfinite(float(e))}
+    )
+    return r"$\sigma$" if len(edges) == 1 else rf"$\sigma_{{{edges.index(edge)}}}$"
+
+
+def _name_boundary(ax: Axes, belt: int, xy, offset, ha: str, va: str, xycoords: Any = "data"):
+    ax.annotate(
+        rf"$\Sigma_{{\mathrm{{F}}{belt}}}$",
+        xy,
+        xycoords=xycoords,
+        xytext=offset,
+        textcoords="offset points",
+        ha=ha,
+        va=va,
+        color=_belt_colour(belt),
+        path_effects=[withStroke(linewidth=2, foreground="white")],
+        annotation_clip=False,
+        zorder=6,
+    )
+
+
+def _name_boundaries_outside(ax: Axes, names: list[tuple[float, int]]) -> None:
+    """Names beside the right-hand side of the axes, at least a line of text apart."""
+    bottom, top = ax.get_ylim()
+    height = ax.get_window_extent().height * 72 / ax.get_figure(root=True).dpi
+    line = 1.25 * matplotlib.rcParams["font.size"]
+    names = sorted(names)
+    at = np.array([(level - bottom) / (top - bottom) * height for level, _ in names])
+    wanted = at.copy()
+    for _ in range(50):
+        for i in range(1, len(names)):
+            gap = line - (at[i] - at[i - 1])
+            if gap > 1e-9:
+                at[i - 1] -= gap / 2
+                at[i] += gap / 2
+    for (level, belt), shift in zip(names, at - wanted, strict=True):
+        _name_boundary(
+            ax, belt, (1.0, level), (3, shift), "left", "center", ax.get_yaxis_transform()
+        )
+
+
+def _window(osc, paths, equilibria, xlim, ylim):
+    """The given limits, or those that hold all that is drawn with a margin."""
+    segments = [e for e in equilibria if _is_segment(e)]
+    points = [float(e.x1) for e in equilibria if not _is_segment(e)]
+    x1 = [*points, *(float(x) for e in segments for x in (e.x1_lower, e.x1_upper))]
+    x1 += [x for path in paths for x in (path[:, 0].min(), path[:, 0].max())]
+    if not x1:
+        # Nothing but the oscillator: every fixed point lies within the reach of friction.
+        reach = 1 + sum(float(b.load * b.friction.static) for b in osc.belts)
+        x1 = [-reach, reach]
+    x1 += [float(e) for b in osc.belts for e in (b.lower, b.upper) if np.isfinite(float(e))]
+    x2 = [0.0, *(float(b.velocity / osc.omega) for b in osc.belts)]
+    x2 += [x for path in paths for x in (path[:, 1].min(), path[:, 1].max())]
+    if not paths:
+        x2 += [-1.0, 1.0]
+    return (xlim or _with_margin(x1)), (ylim or _with_margin(x2))
+
+
+def _with_margin(values: Sequence[float]) -> tuple[float, float]:
+    margin = 0.08 * (max(values) - min(values)) or 0.5
+    return min(values) - margin, max(values) + margin
+
+
+def _is_segment(equilibrium: Any) -> bool:
+    return getattr(equilibrium, "kind", None) == "segment"
+
+
+def _draw_equilibrium(ax: Axes, equilibrium: Any) -> None:
+    if _is_segment(equilibrium):
+        ends = [float(equilibrium.x1_lower), float(equilibrium.x1_upper)]
+        style = {"linewidth": 3.5, "solid_capstyle": "butt", "label": "pseudo-equilibria"}
+        ax.plot(ends, [0, 0], color="black", zorder=5, **style)
+        return
+    face = "black" if equilibrium.stable else "white"
+    ax.plot(
+        float(equilibrium.x1),
+        0.0,
+        label="stable fixed point" if equilibrium.stable else "unstable fixed point",
+        linestyle="none",
+        marker="o",
+        markersize=5,
+        markerfacecolor=face,
+        markeredgecolor="black",
+        markeredgewidth=1.0,
+        zorder=6,
+    )
+
+
+def _index_at_distance(ax: Axes, path: np.ndarray, distance: float) -> int:
+    """Where a path has gone so far, as a fraction of the axes, or half its length if shorter."""
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    steps = np.diff(path, axis=0) / [right - left, top - bottom]
+    gone = np.concatenate([[0.0], np.cumsum(np.hypot(*steps.T))])
+    return int(np.searchsorted(gone, min(distance, gone[-1] / 2)))
+
+
+def _draw_arrowheads(ax: Axes, path: np.ndarray, colour: str, indices: Sequence[int]) -> None:
+    for i in indices:
+        before, after = path[max(i - 1, 0)], path[min(i + 1, len(path) - 1)]
+        if np.all(before == after):
+            continue
+        ax.annotate(
+            "",
+            xy=tuple(after),
+            xytext=tuple(before),
+            arrowprops={
+                "arrowstyle": "-|>,head_length=0.55,head_width=0.22",
+                "color": colour,
+                "linewidth": 0.5,
+                "shrinkA": 0,
+                "shrinkB": 0,
+                "mutation_scale": 7.5,
+            },
+            zorder=4,
+        )
+
+
+# --- vector field -------------------------------------------------------------------------------
+
+
+def plot_vector_field(
+    osc: Oscillator,
+    *,
+    kind: str = "streamlines",
+    xlim: tuple[float, float] | None = None,
+    ylim: tuple[float, float] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """The vector field of `osc`, eqs. (2) and (11) of the paper, with its boundaries.
+
+    kind: "streamlines", or "arrows" of one length that show the direction. The field jumps at the
+    boundaries. On a sliding set it points along the boundary. xlim, ylim: the window; None takes
+    one that holds all fixed points. Returns the axes.
+    """
+    if kind not in ("streamlines", "arrows"):
+        raise ValueError(f'kind must be "streamlines" or "arrows", got {kind!r}')
+    ax = _new_axes() if ax is None else ax
+    window = _window(osc, [], [], xlim, ylim)
+    ax.set(xlim=window[0], ylim=window[1])
+    shape = (201, 201) if kind == "streamlines" else (17, 21)
+    x1, x2 = np.meshgrid(np.linspace(*window[0], shape[1]), np.linspace(*window[1], shape[0]))
+    v1, v2 = _field(osc, jnp.asarray(x1), jnp.asarray(x2))
+    if kind == "streamlines":
+        ax.streamplot(
+            x1, x2, np.asarray(v1), np.asarray(v2),
+            color="0.65", linewidth=0.6, arrowsize=0.6, density=0.9, zorder=1,
+        )  # fmt: skip
+    else:
+        # One length on paper: scaled by the window, then normed.
+        v1, v2 = v1 / np.ptp(window[0]), v2 / np.ptp(window[1])
+        size = np.hypot(v1, v2)
+        ax.quiver(
+            x1, x2, v1 / size, v2 / size,
+            color="0.6", pivot="mid", scale=28, width=0.003, headwidth=4, zorder=1,
+        )  # fmt: skip
+    plot_boundaries(osc, ax)
+    ax.set_xlabel("displacement $x_1$")
+    ax.set_ylabel("velocity $x_2$")
+    return ax
+
+
+@eqx.filter_jit
+def _field(osc, x1, x2):
+    mode = mode_of_state(osc, x1, x2)
+    return x2, jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
+
+
+# --- the model ----------------------------------------------------------------------------------
+
+
+def plot_friction_law(
+    friction: AbstractFriction, ax: Axes | None = None, *, speed: float = 1.0
+) -> Axes:
+    """Friction coefficient mu(|nu_R|) sgn(nu_R) over the relative velocity nu_R, up to `speed`.
+
+    A stuck mass takes any value on the vertical bar at nu_R = 0. Returns the axes.
+    """
+    ax = _new_axes() if ax is None else ax
+    r = jnp.linspace(0.0, speed, 401)
+    mu, static = np.asarray(friction.mu(r)), float(friction.static)
+    ax.axhline(0, color="0.7", linewidth=0.6)
+    ax.axvline(0, color="0.7", linewidth=0.6)
+    for sign in (1, -1):
+        ax.plot(sign * r, sign * mu, color="black", linewidth=1.4)
+    ax.plot([0, 0], [-static, static], color="black", linewidth=1.4)
+    ax.set_xlim(-speed, speed)
+    ax.set_xlabel(r"relative velocity $\nu_{\mathrm{R}}$")
+    ax.set_ylabel(r"friction coefficient $\mu\,\mathrm{sgn}\,\nu_{\mathrm{R}}$")
+    return ax
+
+
+def draw_mechanical_model(ax: Axes | None = None) -> Axes:
+    """The double-belt oscillator, Fig. 1 of the paper: a mass on spring and dashpot, two belts.
+
+    The mass touches belt 0 while x < sigma1 and belt 1 while x > sigma0; drawn is the overlapping
+    class (d). Returns the axes.
+    """
+    ax = _new_axes() if ax is None else ax
+    ax.set(xlim=(-0.2, 10.6), ylim=(-4.75, 4.1), aspect="equal")
+    ax.axis("off")
+    line = {"color": "black", "linewidth": 1.0, "solid_capstyle": "butt"}
+    x_mass, sigma0, sigma1 = 5.7, 4.3, 7.6
+
+    # The axis of x, and the lines that tell where the belts end.
+    _draw_arrow(ax, (3.0, -4.0), (9.4, -4.0))
+    ax.text(9.55, -4.0, "$x$", ha="left", va="center")
+    for x, top, name in (
+        (sigma0, 1.3, r"$\sigma_0$"),
+        (x_mass, -1.3, "$x(t)$"),
+        (sigma1, -1.3, r"$\sigma_1$"),
+    ):
+        ax.plot([x, x], [-4.1, top], color="0.45", linewidth=0.7, linestyle=":", zorder=0)
+        ax.plot([x, x], [-4.1, -3.9], **line)
+        ax.text(x, -4.2, name, ha="center", va="top")
+
+    # Fixed support, spring k, dashpot c.
+    ax.plot([0.3, 0.3], [-1.1, 1.1], **line)
+    for y in np.linspace(-0.8, 1.1, 7):
+        ax.plot([0.3, 0.0], [y, y - 0.3], color="black", linewidth=0.6)
+    coil = np.array([0.5, *([0.9, 0.1] * 4), 0.5])
+    ax.plot([0.3, *np.linspace(1.3, 3.5, coil.size), 4.8], [0.5, *coil, 0.5], **line)
+    ax.plot([0.3, 1.4], [-0.5, -0.5], **line)
+    ax.plot([2.1, 1.4, 1.4, 2.1], [-0.2, -0.2, -0.8, -0.8], **line)
+    ax.plot([1.8, 1.8], [-0.72, -0.28], color="black", linewidth=2.0, solid_capstyle="butt")
+    ax.plot([1.8, 4.8], [-0.5, -0.5], **line)
+    ax.text(2.4, 1.05, "$k$", ha="center", va="bottom")
+    ax.text(1.75, -0.95, "$c$", ha="center", va="top")
+
+    # The mass, with a foot on each side at x, where it touches.
+    ax.add_patch(Rectangle((4.8, -0.9), 1.8, 1.8, facecolor="0.9", edgecolor="black", lw=1.0))
+    for side in (1, -1):
+        foot = [(-0.3, 0.9), (-0.15, 1.3), (0.15, 1.3), (0.3, 0.9)]
+        corners = [(x_mass + x, side * y) for x, y in foot]
+        ax.add_patch(Polygon(corners, facecolor="0.55", edgecolor="black", lw=0.8))
+    ax.text(x_mass, 0.0, "$m$", ha="center", va="center")
+
+    _draw_belt(ax, 0, (3.1, sigma1), run=-1.3, side=-1, force_at=x_mass)
+    _draw_belt(ax, 1, (sigma0, 8.8), run=1.3, side=1, force_at=x_mass)
+    return ax
+
+
+def _draw_belt(ax: Axes, belt: int, ends, run: float, side: int, force_at: float) -> None:
+    """A belt on two rollers: its run at the height `run`, the rest above (side 1) or below (-1)."""
+    radius, colour = 0.6, _belt_colour(belt)
+    middle, far = run + side * radius, run + side * 2 * radius
+    angle = np.linspace(np.pi / 2, 3 * np.pi / 2, 40)
+    loop_x = np.concatenate([ends[0] + radius * np.cos(angle), ends[1] - radius * np.cos(angle)])
+    loop_y = np.concatenate([middle + radius * np.sin(angle), middle - radius * np.sin(angle)])
+    ax.add_patch(
+        Polygon(
+            np.column_stack([loop_x, loop_y]), facecolor="white", edgecolor=colour, lw=1.8, zorder=2
+        )
+    )
+    for x in ends:
+        ax.add_patch(Circle((x, middle), 0.4, facecolor="0.9", edgecolor="black", lw=0.8, zorder=3))
+        ax.add_patch(Circle((x, middle), 0.07, facecolor="black", zorder=4))
+    centre = (ends[0] + ends[1]) / 2
+    text = {"va": "center", "color": colour, "zorder": 4}
+    ax.text(centre, middle + side * 0.26, f"belt {belt}", ha="center", fontsize="small", **text)
+    at = run + side * 0.3
+    _draw_arrow(ax, (centre - 0.8, at), (centre + 0.4, at), color=colour)
+    ax.text(centre + 0.55, at, rf"$\nu_{belt}$", ha="left", **text)
+    # The normal force presses the belt against the mass.
+    _draw_arrow(ax, (force_at, far + side * 1.05), (force_at, far + side * 0.06))
+    ax.text(
+        force_at + 0.2, far + side * 0.65, rf"$F_{{\mathrm{{n}}{belt}}}$", ha="left", va="center"
+    )
+
+
+def _draw_arrow(ax: Axes, start, end, color: str = "black") -> None:
+    style = {"arrowstyle": "-|>", "color": color, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0}
+    ax.annotate("", xy=end, xytext=start, arrowprops={**style, "mutation_scale": 8}, zorder=5)
+
+
+# --- figures ------------------------------------------------------------------------------------
+
+
+def journal_style():
+    """A context in which figures are made, drawn and saved in the manner of a journal."""
+    return matplotlib.rc_context(JOURNAL)
+
+
+def journal_figure(width: float, height: float) -> Figure:
+    """An empty figure, in inches, that leaves the settings and windows of pyplot alone."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def draw_key(figure: Figure, note: str = "") -> None:
+    """One key below the figure for all that its axes label, and a note below that."""
+    by_label: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            by_label.setdefault(label, handle)
+    labels = [label for label in KEY_ORDER if label in by_label]
+    key = figure.legend(
+        [by_label[label] for label in labels],
+        labels,
+        loc="outside lower center",
+        ncols=len(labels),
+        handlelength=1.8,
+        columnspacing=1.4,
+        title=note or None,
+        title_fontsize="small",
+    )
+    # What is read last stands last: the note under the entries.
+    if note:
+        key._legend_box.get_children().reverse()
+
+
+def save(figure: Figure, path: Path, dpi: int = 220) -> None:
+    """Write a figure as PNG (or what else the ending of the path says)."""
+    figure.savefig(path, dpi=dpi)
+
+
+def _new_axes(rows: int = 1) -> Any:
+    # Only here: a window system is for people at a notebook or prompt.
+    from matplotlib import pyplot
+
+    _, axes = pyplot.subplots(rows, 1, sharex=True, layout="constrained")
+    return axes

@@ -1,0 +1,457 @@
+"""The paper's table of critical velocities and its figures, recomputed: `jaxbelt reproduce`.
+
+`reproduce(folder)` finds the critical values, then simulates every start of every phase portrait
+in one batch, then draws. What a figure shows is said in one place, its line in `FIGURES`: either
+a function that draws it, or `Portraits`, the phase portraits before, at and after a critical
+value. The critical values come to all of them from one tuple, that of `critical_values`.
+
+What cannot be computed yet is None in that tuple and named in `STILL_MISSING`. Portraits at such
+a value take the one that the paper prints, and say so.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from . import plotting
+from .oscillator import Belt, Oscillator, acceleration
+from .presets import (
+    PUBLISHED,
+    PUBLISHED_NU1,
+    class_a,
+    class_b,
+    class_c,
+    class_d,
+    paper_friction,
+)
+from .results import EventKind
+from .simulate import Trajectory, simulate
+
+#: Every portrait runs over this time (dimensionless), sampled at so many times.
+TIME_SPAN, SAMPLES = 60.0, 2401
+
+STILL_MISSING = (
+    "The critical values other than the Hopf points need cycles, which this version cannot "
+    "compute yet; the portraits at those values are drawn at the printed ones.",
+    "So do the unstable cycles, in Figs. 4, 5, 8-10, 12 and 13, and the bifurcation diagrams, "
+    "Figs. 3 and 7.",
+    "Fig. 6, the regions in the plane of both velocities, needs the region map.",
+)
+
+MISPRINT = (
+    r"Class (a) is computed with $p_3 = 10$. The $p_3 = 3.0$ that the paper prints for it is a "
+    "misprint: it does not give the paper's values."
+)
+
+MISSING_REGION = (
+    r"Just below $\nu_0^\delta = 0$ the exact cycle sticks on belt 0 only, panel (c): "
+    "a region between 3a and 4c that the paper does not list."
+)
+
+
+# --- the table ----------------------------------------------------------------------------------
+
+
+class CriticalValue(NamedTuple):
+    """A critical velocity nu0: the published one, and ours where it can be computed, else None.
+
+    residual: of the defining condition at `computed`; iterations: Newton steps from `printed`.
+    """
+
+    system: str
+    point: str
+    kind: str
+    printed: float
+    computed: float | None = None
+    residual: float | None = None
+    iterations: int | None = None
+
+    @property
+    def value(self) -> float:
+        """The best that is known: computed, else printed."""
+        return self.printed if self.computed is None else self.computed
+
+
+def critical_values() -> tuple[CriticalValue, ...]:
+    """The table of section 3 of the paper, recomputed as far as it goes."""
+    return tuple(
+        CriticalValue(*published, *_hopf_point(published.system, published.printed))
+        if published.kind.startswith("Hopf")
+        else CriticalValue(*published)
+        for published in PUBLISHED
+    )
+
+
+def as_json(values: Sequence[CriticalValue]) -> list[dict[str, Any]]:
+    """The table as it stands in critical_values.json."""
+    rows = [value._asdict() for value in values]
+    return [{"class": row.pop("system"), **row} for row in rows]
+
+
+def paper_oscillator(system: str, nu0: Any) -> Oscillator:
+    """The paper's oscillator of class "a", or "b" with its nu1 = 0.35, at the velocity nu0."""
+    return class_a(nu0) if system == "a" else class_b(nu0, PUBLISHED_NU1)
+
+
+def _trace(osc: Oscillator) -> jax.Array:
+    """Trace of the Jacobian at the fixed point, twice the real part of eq. (28).
+
+    At x2 = 0 the friction depends on x2 only, so no x1 is needed.
+    """
+    zero = jnp.zeros(())
+    signs = tuple(jnp.sign(belt.velocity) for belt in osc.belts)
+    return jax.jvp(lambda x2: acceleration(osc, signs, zero, x2), (zero,), (jnp.ones(()),))[1]
+
+
+def _hopf_point(system: str, guess: float) -> tuple[float, float, int]:
+    """(nu0, residual, iterations) of the Hopf point near a guess: Newton on the trace."""
+    residual_and_slope = jax.jit(jax.value_and_grad(lambda nu: _trace(paper_oscillator(system, nu))))
+    nu = guess
+    for iteration in range(20):
+        residual, slope = map(float, residual_and_slope(nu))
+        step = residual / slope
+        if abs(step) < 1e-15:
+            break
+        nu -= step
+    return nu, abs(residual), iteration
+
+
+# --- phase portraits ----------------------------------------------------------------------------
+
+
+class Panel(NamedTuple):
+    """One phase portrait to be: its oscillator and the starts of its orbits."""
+
+    title: str
+    oscillator: Oscillator
+    starts: tuple[tuple[float, float], ...]
+
+
+class Portraits(NamedTuple):
+    """Phase portraits around one critical velocity: before, at, after (as nu0 falls).
+
+    starts: relative to the fixed point, or to the middle of the segment of pseudo-equilibria.
+    """
+
+    system: str
+    point: str
+    before: float
+    after: tuple[float, ...]
+    xlim: tuple[float, float]
+    ylim: tuple[float, float]
+    starts: tuple[tuple[float, float], ...]
+    note: str = ""
+
+    def panels(self, values: Sequence[CriticalValue]) -> list[Panel]:
+        """The panels a, b, c in order, at the best value known of the critical velocity."""
+        (critical,) = (v for v in values if (v.system, v.point) == (self.system, self.point))
+        symbol = rf"\nu_0^\{self.point.removeprefix('nu_')}"
+        source = " (printed)" if critical.computed is None else ""
+        relations = [
+            (self.before, rf"\nu_0 = {self.before:.2f} > {symbol}", ""),
+            (critical.value, rf"\nu_0 = {symbol} = {critical.value:.5g}", source),
+            *((nu0, rf"\nu_0 = {nu0:.2f} < {symbol}", "") for nu0 in self.after),
+        ]
+        panels = []
+        for letter, (nu0, relation, remark) in zip("abcd", relations, strict=False):
+            osc = paper_oscillator(self.system, nu0)
+            centre = _middle(fixed_points(osc)[0])
+            starts = tuple((centre + x1, x2) for x1, x2 in self.starts)
+            panels.append(Panel(f"({letter}) ${relation}${remark}", osc, starts))
+        return panels
+
+
+class FixedPoint(NamedTuple):
+    """An equilibrium (x1, 0) in a region where the field is smooth, eq. (24)."""
+
+    x1: float
+    stable: bool
+    kind: str = "fixed point"
+
+
+class Segment(NamedTuple):
+    """The pseudo-equilibria of a mass stuck to a belt at rest."""
+
+    x1_lower: float
+    x1_upper: float
+    kind: str = "segment"
+
+
+def fixed_points(osc: Oscillator) -> tuple[FixedPoint | Segment]:
+    """The equilibrium of classes (a) and (b), or the segment of them where a belt is at rest."""
+    at_rest = [belt for belt in osc.belts if belt.velocity == 0]
+    signs = tuple(jnp.sign(belt.velocity) for belt in osc.belts)
+    x1 = float(acceleration(osc, signs, jnp.zeros(()), jnp.zeros(())))
+    if at_rest:
+        held = float(sum(belt.load * belt.friction.static for belt in at_rest))
+        return (Segment(x1 - held, x1 + held),)
+    # At a subcritical Hopf point the fixed point repels, if weakly; rounding has no say in it.
+    return (FixedPoint(x1, bool(_trace(osc) < -1e-9)),)
+
+
+def _middle(equilibrium: FixedPoint | Segment) -> float:
+    if isinstance(equilibrium, Segment):
+        return (equilibrium.x1_lower + equilibrium.x1_upper) / 2
+    return equilibrium.x1
+
+
+class SimulatedCycle(NamedTuple):
+    """The steady cycle in which a trajectory ends, as its states once around."""
+
+    states: np.ndarray
+    stable: bool = True
+
+    def sample(self, n: int) -> np.ndarray:
+        return self.states
+
+
+def simulate_panels(panels: Sequence[Panel]) -> list[list[Trajectory]]:
+    """The orbits of every panel, all in one batch, so that one program is compiled."""
+    lanes = [(_with_two_belts(panel.oscillator), start) for panel in panels for start in panel.starts]
+    oscillators = jax.tree.map(lambda *leaves: np.stack(leaves), *(osc for osc, _ in lanes))
+    starts = np.array([start for _, start in lanes])
+    times = np.linspace(0.0, TIME_SPAN, SAMPLES)
+
+    @jax.jit
+    @jax.vmap
+    def run(osc, start):
+        return simulate(osc, start, TIME_SPAN, ts=times, rtol=1e-9, atol=1e-9)
+
+    batch = jax.tree.map(np.asarray, run(oscillators, starts))
+    trajectories = iter([jax.tree.map(lambda leaf: leaf[i], batch) for i in range(len(lanes))])
+    return [[next(trajectories) for _ in panel.starts] for panel in panels]
+
+
+def _with_two_belts(osc: Oscillator) -> Oscillator:
+    """Class (a) as the limit of two belts that it is in the paper: belt 1 is out of reach."""
+    if len(osc.belts) == 2:
+        return osc
+    beyond = Belt(0.0, paper_friction(), lower=1e6)
+    return Oscillator(osc.damping, (*osc.belts, beyond), osc.omega)
+
+
+def steady_cycle(trajectory: Trajectory) -> SimulatedCycle | None:
+    """The sticking cycle that a trajectory reaches, or None.
+
+    The state at slip onset is known in full, so where it comes back, the motion repeats.
+    """
+    onsets = _onsets(trajectory)
+    if onsets.size < 2:
+        return None
+    times, states = trajectory.events.t, trajectory.events.y
+    last = onsets[-1]
+    same = [i for i in onsets[:-1] if np.allclose(states[i], states[last], atol=1e-6)]
+    if not same:
+        return None
+    ts, ys = np.append(trajectory.ts, times), np.vstack([trajectory.ys, states])
+    inside = (ts >= times[same[-1]]) & (ts <= times[last])
+    return SimulatedCycle(ys[inside][np.argsort(ts[inside], kind="stable")])
+
+
+def _onsets(trajectory: Trajectory) -> np.ndarray:
+    return np.flatnonzero(trajectory.events.kind == EventKind.SLIP)
+
+
+def _transient(trajectory: Trajectory, cycle: SimulatedCycle | None, longest: float) -> Trajectory:
+    """The trajectory until it joins the cycle, and no longer than that time."""
+    end = longest
+    if cycle is not None:
+        for i in _onsets(trajectory):
+            if np.allclose(trajectory.events.y[i], cycle.states[0], atol=1e-6):
+                end = min(end, trajectory.events.t[i])
+    shown = np.where(trajectory.ts <= end, trajectory.ts, np.nan)
+    events = trajectory.events
+    events = events.__class__(
+        np.where(events.t <= end, events.t, np.nan), events.y, events.kind, events.belt
+    )
+    return Trajectory(
+        shown, trajectory.ys, trajectory.modes, events, trajectory.arcs, trajectory.status
+    )
+
+
+def draw_portraits(
+    portraits: Portraits, panels: Sequence[Panel], orbits: Sequence[Sequence[Trajectory]]
+) -> plotting.Figure:
+    """The portraits side by side: transients thin, the steady cycle thick, boundaries, equilibria."""
+    figure = plotting.journal_figure(7.2, 2.75 if len(panels) == 3 else 4.9)
+    if len(panels) == 3:
+        axes = figure.subplots(1, 3, sharey=True)
+    else:
+        axes = figure.subplots(2, 2, sharex=True, sharey=True)
+    for ax, panel, trajectories in zip(axes.flat, panels, orbits, strict=True):
+        cycles = [cycle for cycle in map(steady_cycle, trajectories) if cycle is not None][:1]
+        cycle = cycles[0] if cycles else None
+        plotting.plot_phase_portrait(
+            panel.oscillator,
+            [_transient(trajectory, cycle, 30.0) for trajectory in trajectories],
+            cycles=cycles,
+            equilibria=fixed_points(panel.oscillator),
+            xlim=portraits.xlim,
+            ylim=portraits.ylim,
+            ax=ax,
+        )
+        ax.set_title(panel.title, loc="left")
+        ax.label_outer()
+    plotting.draw_key(figure, note=portraits.note)
+    return figure
+
+
+# --- the other figures --------------------------------------------------------------------------
+
+
+def draw_model() -> plotting.Figure:
+    """Fig. 1: the double-belt oscillator and Conti's friction law, eq. (7)."""
+    figure = plotting.journal_figure(7.2, 2.9)
+    model, law = figure.subplots(1, 2, width_ratios=(1.5, 1))
+    plotting.draw_mechanical_model(model)
+    friction = paper_friction()
+    plotting.plot_friction_law(friction, law)
+    mus, p1 = float(friction.static), float(friction.residual)
+    for level in (-p1, p1):
+        law.axhline(level, color="0.6", linewidth=0.6, linestyle=":", zorder=0)
+    law.set_yticks([-mus, -p1, 0, p1, mus], [r"$-\mu_s$", "$-p_1$", "$0$", "$p_1$", r"$\mu_s$"])
+    model.set_title("(a)", loc="left")
+    law.set_title("(b)", loc="left")
+    return figure
+
+
+def draw_classes() -> plotting.Figure:
+    """Fig. 2: the discontinuity boundaries of the four classes, here with the vector field."""
+    figure = plotting.journal_figure(7.2, 5.0)
+    axes = figure.subplots(2, 2, sharex=True, sharey=True)
+    nu0, nu1 = 0.3, 0.7
+    classes = (
+        (class_a(nu0), r"(a) belt 0 only: $\sigma_0, \sigma_1 \to +\infty$"),
+        (class_b(nu0, nu1), r"(b) both belts: $\sigma_0 \to -\infty,\ \sigma_1 \to +\infty$"),
+        (class_c(nu0, nu1, 0.5), r"(c) sequential: $\sigma_0 = \sigma_1 = \sigma$"),
+        (class_d(nu0, nu1, -0.5, 1.0), r"(d) overlapping: $\sigma_0 < \sigma_1$"),
+    )
+    for ax, (osc, title) in zip(axes.flat, classes, strict=True):
+        plotting.plot_vector_field(osc, xlim=(-2.0, 3.0), ylim=(-1.5, 1.5), ax=ax)
+        ax.set_title(title, loc="left")
+        ax.label_outer()
+    return figure
+
+
+#: Every figure of the paper that can be drawn, by the name of its file.
+FIGURES: dict[str, Callable[[], plotting.Figure] | Portraits] = {
+    "fig01": draw_model,
+    "fig02": draw_classes,
+    "fig04": Portraits(
+        "a",
+        "nu_alpha",
+        before=0.30,
+        after=(0.23,),
+        xlim=(0.0, 1.6),
+        ylim=(-0.6, 0.5),
+        starts=((0.5, 0.45), (-0.6, 0.0), (0.3, 0.0), (0.12, 0.0)),
+        note=MISPRINT,
+    ),
+    "fig05": Portraits(
+        "a",
+        "nu_beta",
+        before=0.21,
+        after=(0.14,),
+        xlim=(0.0, 1.6),
+        ylim=(-0.6, 0.5),
+        starts=((0.5, 0.45), (-0.6, 0.0), (0.24, 0.0), (0.1, 0.0)),
+        note=MISPRINT,
+    ),
+    "fig08": Portraits(
+        "b",
+        "nu_alpha",
+        before=0.60,
+        after=(0.45,),
+        xlim=(0.4, 2.3),
+        ylim=(-0.7, 0.8),
+        starts=((0.4, 0.75), (-0.8, 0.0), (0.45, 0.0), (0.15, 0.0)),
+    ),
+    "fig09": Portraits(
+        "b",
+        "nu_beta",
+        before=0.40,
+        after=(0.30,),
+        xlim=(0.4, 2.3),
+        ylim=(-0.7, 0.8),
+        starts=((0.4, 0.75), (-0.8, 0.0), (0.4, 0.0), (0.12, 0.0)),
+    ),
+    "fig10": Portraits(
+        "b",
+        "nu_gamma",
+        before=0.30,
+        after=(0.20,),
+        xlim=(0.4, 2.3),
+        ylim=(-0.7, 0.8),
+        starts=((0.4, 0.75), (-0.8, 0.0), (0.3, 0.0), (0.1, 0.0)),
+    ),
+    "fig11": Portraits(
+        "b",
+        "nu_delta",
+        before=0.10,
+        after=(-0.05, -0.15),
+        xlim=(-1.0, 2.6),
+        ylim=(-0.7, 0.7),
+        starts=((0.6, 0.6), (-0.5, 0.6), (-0.4, -0.6), (0.1, 0.0)),
+        note=MISSING_REGION,
+    ),
+    "fig12": Portraits(
+        "b",
+        "nu_zeta",
+        before=-0.40,
+        after=(-0.50,),
+        xlim=(-1.0, 1.0),
+        ylim=(-0.8, 0.8),
+        starts=((0.4, 0.75), (-0.4, -0.75), (0.415, 0.0), (0.15, 0.0)),
+    ),
+    "fig13": Portraits(
+        "b",
+        "nu_eta",
+        before=-0.52,
+        after=(-0.60,),
+        xlim=(-1.0, 1.0),
+        ylim=(-0.8, 0.8),
+        starts=((0.4, 0.75), (-0.4, -0.75), (0.3, 0.0), (0.15, 0.0)),
+    ),
+}
+
+
+def steps() -> int:
+    """How many times `reproduce` reports progress."""
+    return len(FIGURES) + 2
+
+
+def reproduce(
+    folder: Path, progress: Callable[[str], None] = lambda done: None
+) -> tuple[CriticalValue, ...]:
+    """Write critical_values.json and every figure as PNG into the folder; returns the table.
+
+    folder: made where it is not there. progress: called `steps()` times, with what comes next.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    progress("critical values")
+    values = critical_values()
+    text = json.dumps(as_json(values), indent=2)
+    (folder / "critical_values.json").write_text(text + "\n", encoding="utf-8")
+
+    progress("orbits of the phase portraits")
+    panels = {
+        name: figure.panels(values)
+        for name, figure in FIGURES.items()
+        if isinstance(figure, Portraits)
+    }
+    orbits = iter(simulate_panels([panel for group in panels.values() for panel in group]))
+    with plotting.journal_style():
+        for name, figure in FIGURES.items():
+            progress(name)
+            if isinstance(figure, Portraits):
+                own = [next(orbits) for _ in panels[name]]
+                drawn = draw_portraits(figure, panels[name], own)
+            else:
+                drawn = figure()
+            plotting.save(drawn, folder / f"{name}.png")
+    return values
