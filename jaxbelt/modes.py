@@ -254,15 +254,17 @@ def mode_of_state(osc: Oscillator, x1: Array, x2: Array) -> Mode:
     On an edge the velocity decides which side; at rest there, the acceleration on the right-hand
     side does: the mass goes right if that is positive, else left.
     """
-    right = _mode_beside(osc, x1, x2, rightward=True)
-    left = _mode_beside(osc, x1, x2, rightward=False)
-    held = right.any_stuck
-    push = jnp.where(held, 0.0, mode_acceleration(osc, right, x1, x2))
+    right = settle(osc, contact(osc, x1, x2, rightward=True), x1, x2)
+    left = settle(osc, contact(osc, x1, x2, rightward=False), x1, x2)
+    push = jnp.where(right.any_stuck, 0.0, mode_acceleration(osc, right, x1, x2))
     return select((x2 > 0) | ((x2 == 0) & (push > 0)), right, left)
 
 
-def _mode_beside(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
-    """The mode of (x1, x2) where every edge that x1 lies on counts as passed to that side."""
+def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
+    """Which belts touch at a state, and the sign of each r_i; 0 on the boundary r_i = 0 itself.
+
+    An edge that x1 lies on counts as passed to the right (rightward) or to the left.
+    """
     codes = []
     for belt in osc.belts:
         is_below = x1 < belt.lower if rightward else x1 <= belt.lower
@@ -272,7 +274,7 @@ def _mode_beside(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> M
         on_boundary = jnp.abs(belt.velocity - speed) <= 4e-16 * jnp.abs(belt.velocity)
         sign = jnp.where(on_boundary, STUCK, jnp.sign(belt.velocity - speed))
         codes.append(jnp.where(is_below, BELOW, jnp.where(is_above, ABOVE, sign)))
-    return settle(osc, Mode(tuple(codes)), x1, x2)
+    return Mode(tuple(codes))
 
 
 # --- the pseudo-focus at a contact edge -----------------------------------------------------------

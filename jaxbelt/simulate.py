@@ -19,13 +19,11 @@ Samples at given times are taken from the arcs afterwards, all in parallel.
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -33,11 +31,13 @@ from jaxtyping import Array, ArrayLike
 
 
 from .checks import as_array, check_finite, check_positive, is_concrete, require
+from .derivatives import forward_jacobian
 from .modes import (
     Mode,
     any_of,
     boundary_guards,
     bounds_rightward,
+    contact,
     edge_focus,
     edge_guards,
     edges,
@@ -53,13 +53,14 @@ from .modes import (
 )
 from .oscillator import Oscillator
 from .results import EventKind, Status, describe
+from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
 #: Longest step, in units of 1/(angular frequency of the spring): well below half a turn.
 MAX_STEP = 0.5
 #: Local errors are kept below this fraction of the tolerance; near-grazing events amplify them.
-SAFETY = 0.05
-#: Longest slip arc, about one turn; longer ones are cut, so that samples start near their time.
-MAX_ARC = 2.0
+SAFETY = 0.03
+#: Longest slip arc; longer ones are cut, so that samples start near their time.
+MAX_ARC = 1.0
 #: Steps that one segment may take before it is given up.
 MAX_STEPS = 100_000
 #: An orbit this close to a stable pseudo-focus (|x2| at the edge) has converged to it.
@@ -125,100 +126,70 @@ class Trajectory(eqx.Module):
         )
 
 
-# --- derivatives: forward Jacobians of an integration, usable in reverse ----------------------------
-
-
-def forward_jacobian(fn: Callable[..., Any]) -> Callable[..., Any]:
-    """`fn` with derivatives that come from its forward-mode Jacobian, in both modes.
-
-    An integration with an unknown number of steps has forward derivatives only. A segment has few
-    inputs, so its Jacobian with respect to those that are perturbed is formed in forward mode;
-    the tangent is then a matrix product, which reverse mode can transpose.
-    """
-    wrapped = eqx.filter_custom_jvp(fn)
-
-    @wrapped.def_jvp
-    def _(primals, tangents):
-        perturbed, rest = eqx.partition(
-            primals, jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
-        )
-        flat, unravel = jax.flatten_util.ravel_pytree(perturbed)
-        flat_tangent, _ = jax.flatten_util.ravel_pytree(tangents)
-
-        def of_flat(flat):
-            out = fn(*eqx.combine(unravel(flat), rest))
-            inexact, other = eqx.partition(out, eqx.is_inexact_array)
-            return inexact, other
-
-        def column(direction):
-            out, tangent, other = jax.jvp(of_flat, (flat,), (direction,), has_aux=True)
-            return out, tangent, other
-
-        basis = jnp.eye(flat.size, dtype=flat.dtype)
-        inexact, columns, other = jax.vmap(column, out_axes=(None, -1, None))(basis)
-        tangent_out = jax.tree.map(lambda jacobian: jacobian @ flat_tangent, columns)
-        out = eqx.combine(inexact, other)
-        nothing = jax.tree.map(lambda _: None, other)
-        return out, eqx.combine(tangent_out, nothing)
-
-    return wrapped
-
-
 # --- slip arcs ----------------------------------------------------------------------------------------
 
 
 class _RememberStart(diffrax.AbstractAdaptiveSolver):
-    """A solver whose state also carries where its last step began: ((x1, x2), (t, x1, x2))."""
+    """A solver that also keeps where its last step began: its state is ((x1, x2), (t, x1, x2)).
+
+    The wrapped solver sees (x1, x2) alone; carrying the memory through its stages doubles the time.
+    """
 
     solver: diffrax.AbstractSolver
-
-    @property
-    def term_structure(self):
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self):
-        return self.solver.interpolation_cls
+    term_structure = diffrax.ODETerm
+    interpolation_cls = diffrax.LocalLinearInterpolation
 
     def order(self, terms):
         return self.solver.order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0, args)
+        return self.solver.init(terms, t0, t1, y0[0], args)
 
     def func(self, terms, t0, y0, args):
-        return self.solver.func(terms, t0, y0, args)
+        return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        (y, _), *rest = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        return (y, (t0, *y0[0])), *rest
+        start, memory = y0
+        y, error, _, solver_state, result = self.solver.step(
+            terms, t0, t1, start, args, solver_state, made_jump
+        )
+        y1 = (y, (t0, *start))
+        error = (error, jax.tree.map(jnp.zeros_like, memory))
+        return y1, error, {"y0": y0, "y1": y1}, solver_state, result
 
 
+# Stages in a loop: written out they compile for minutes, each computed again in all later ones.
 _SOLVER = diffrax.Tsit5(scan_kind="lax")
 
 
 def _controller(rtol, atol):
     # The error of a step is that of the state, not of the memory beside it.
+    def norm(y):
+        x1, x2 = y[0] if isinstance(y[0], tuple) else y
+        return jnp.maximum(jnp.abs(x1), jnp.abs(x2))
+
     return diffrax.PIDController(
-        rtol=SAFETY * rtol, atol=SAFETY * atol, dtmax=MAX_STEP, norm=lambda y: jnp.maximum(*map(jnp.abs, y[0]))
+        rtol=SAFETY * rtol, atol=SAFETY * atol, dtmax=MAX_STEP, norm=norm
     )
 
 
 def _field(osc, mode):
+    """The slip field for states (x1, x2), and for those with a memory beside them."""
+
     def field(t, y, args):
-        (x1, x2), memory = y
-        return (x2, mode_acceleration(osc, mode, x1, x2)), jax.tree.map(jnp.zeros_like, memory)
+        if isinstance(y[0], tuple):
+            return field(t, y[0], args), jax.tree.map(jnp.zeros_like, y[1])
+        x1, x2 = y
+        return x2, mode_acceleration(osc, mode, x1, x2)
 
     return diffrax.ODETerm(field)
 
 
 def _single_step(osc, mode, y, h):
-    """The state one Tsit5 step of size h after y, in the field of the mode."""
-    term = _field(osc, mode)
-    zero = jnp.zeros_like(h)
-    state = (y, (zero, *y))
-    solver_state = _SOLVER.init(term, zero, h, state, None)
-    (y, _), *_ = _SOLVER.step(term, zero, h, state, None, solver_state, False)
+    """The state one step of size h after y, in the field of the mode."""
+    term, zero = _field(osc, mode), jnp.zeros_like(h)
+    solver_state = _SOLVER.init(term, zero, h, y, None)
+    y, *_ = _SOLVER.step(term, zero, h, y, None, solver_state, False)
     return y
 
 
@@ -238,8 +209,7 @@ def _guards(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], y) -> list[A
 
 
 def _smallest(values):
-    # A reduction over a stacked array: the values are then computed once, not in every consumer.
-    return jnp.min(jnp.stack(values))
+    return functools.reduce(jnp.minimum, values)
 
 
 def _first_root(fn: Callable[[Array], Array], end: Array) -> Array:
@@ -352,22 +322,20 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
 @forward_jacobian
 def _flow(osc, mode, y, duration, rtol, atol):
     """The state after `duration` in the slip field of the mode, no events looked for."""
-    zero = jnp.zeros_like(duration)
     solution = diffrax.diffeqsolve(
         _field(osc, mode),
-        _RememberStart(_SOLVER),
-        t0=zero,
+        _SOLVER,
+        t0=jnp.zeros_like(duration),
         t1=duration,
         dt0=None,
-        y0=(y, (zero, *y)),
+        y0=y,
         saveat=diffrax.SaveAt(t1=True),
         stepsize_controller=_controller(rtol, atol),
         adjoint=diffrax.ForwardMode(),
         max_steps=MAX_STEPS,
         throw=False,
     )
-    _, (t_start, *y_start) = jax.tree.map(lambda leaf: leaf[-1], solution.ys)
-    return _single_step(osc, mode, tuple(y_start), duration - t_start)
+    return jax.tree.map(lambda leaf: leaf[-1], solution.ys)
 
 
 # --- segments -------------------------------------------------------------------------------------------
@@ -620,6 +588,33 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
 
 
 @eqx.filter_jit
+def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution) -> Trajectory:
+    """A trajectory of the switch or the smooth formulation: samples without events or arcs."""
+    if ts is None:
+        ts = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)
+    field = switch_field if formulation == "switch" else smooth_field
+    ys = integrate(field, osc, width, y0, t0, ts, rtol, atol)
+
+    def mode_at(y):
+        if formulation == "switch":
+            return _codes(switch_mode(osc, y[0], y[1], width))
+        return _codes(contact(osc, y[0], y[1], rightward=True))
+
+    known = jnp.all(jnp.isfinite(ys))
+    start_known = jnp.all(jnp.isfinite(y0))
+    failure = jnp.where(start_known, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
+    integers, states = jnp.zeros(0, dtype=int), jnp.zeros((0, 2))
+    return Trajectory(
+        ts,
+        ys,
+        jax.vmap(mode_at)(ys),
+        Events(jnp.zeros(0), states, integers, integers),
+        Arcs(jnp.zeros(0), states, jnp.zeros((0, len(osc.belts)), jnp.int8), jnp.zeros(0)),
+        jnp.where(known, Status.OK.value, failure),
+    )
+
+
+@eqx.filter_jit
 def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> Trajectory:
     final, records = _run(osc, y0, t0, t1, rtol, atol, max_segments)
     # Events first, in a stable order; the rest is padding.
@@ -703,8 +698,25 @@ def simulate(
     )
     span = float(t1 - t0) if is_concrete((t0, t1)) else 100.0
     resolution = _power_of_two(10 * span, 512)
+    if formulation != "filippov":
+        name = "v_star" if formulation == "switch" else "eps"
+        width = as_array(v_star if formulation == "switch" else eps, name)
+        check_positive(width, name)
+        return _smoothed(
+            osc,
+            y0,
+            t0,
+            t1,
+            ts,
+            rtol,
+            atol,
+            width=width,
+            formulation=formulation,
+            resolution=resolution,
+        )
     if max_segments is None:
-        max_segments = _power_of_two(8 * span, 512)
+        # Around a pseudo-focus at a contact edge a run has many short arcs.
+        max_segments = _power_of_two((64 if _has_edges(osc) else 8) * span, 512)
     require(
         isinstance(max_segments, int) and max_segments > 0,
         "max_segments",
@@ -715,6 +727,12 @@ def simulate(
         osc, y0, t0, t1, ts, rtol, atol, max_segments=max_segments, resolution=resolution
     )
     return _trim(trajectory, trim_samples=ts is None)
+
+
+def _has_edges(osc: Oscillator) -> bool:
+    """Whether a contact edge is finite, or not known to be infinite."""
+    bounds = [(belt.lower, belt.upper) for belt in osc.belts]
+    return not is_concrete(bounds) or bool(np.any(np.isfinite(bounds)))
 
 
 def _power_of_two(value: float, least: int) -> int:

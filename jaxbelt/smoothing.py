@@ -1,0 +1,106 @@
+"""Two approximations of the exact motion in common use: the switch model and tanh smoothing.
+
+`switch_field` is the paper's switch model, eqs. (21)-(23): around each boundary lies a band
+|r_k| <= v_star in which a contact that can hold moves with the belt, while x2 relaxes to the belt's
+velocity. `smooth_field` replaces sgn(r) by tanh(r/eps), so that nothing ever sticks: the mass
+creeps. Both are plain vector fields of the state, integrated without events; as v_star and eps go
+to zero they approach the exact motion at first order. The switch field is discontinuous, and
+derivatives through its integration lack the jumps at the band: take them from the exact one.
+"""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from .derivatives import forward_jacobian
+from .modes import STUCK, Mode, capacity, contact, mode_acceleration, stick_velocity
+from .oscillator import Oscillator
+
+#: Steps between two samples before a run is given up.
+MAX_STEPS = 1_000_000
+
+
+def switch_mode(osc: Oscillator, x1: Array, x2: Array, v_star: Array) -> Mode:
+    """The mode of the switch model at a state: belts of the band that holds have code 0.
+
+    Where the bands of two belts overlap, the first belt that can hold wins; belts of one velocity
+    hold together.
+    """
+    slip = contact(osc, x1, x2, rightward=True)
+    slip = Mode(tuple(jnp.where(code == STUCK, 1.0, code) for code in slip.codes))
+    mode = slip
+    for belt in reversed(osc.belts):
+        group = [
+            touches & (other.velocity == belt.velocity)
+            for other, touches in zip(osc.belts, slip.touching, strict=True)
+        ]
+        held = Mode(
+            tuple(
+                jnp.where(together, STUCK, code)
+                for code, together in zip(slip.codes, group, strict=True)
+            )
+        )
+        in_band = jnp.abs(belt.velocity - osc.omega * x2) <= v_star
+        holds = jnp.abs(mode_acceleration(osc, held, x1, x2)) < capacity(osc, held)
+        mode = jax.tree.map(lambda a, b, use=in_band & holds: jnp.where(use, a, b), held, mode)
+    return mode
+
+
+def switch_field(osc: Oscillator, y: tuple[Array, Array], v_star: Array) -> tuple[Array, Array]:
+    """(x1', x2') of the switch model, eqs. (21)-(23) of the paper."""
+    x1, x2 = y
+    mode = switch_mode(osc, x1, x2, v_star)
+    velocity = stick_velocity(osc, mode, osc.omega * x2)
+    x1_dot = velocity / osc.omega
+    x2_dot = (velocity - osc.omega * x2) / osc.omega
+    return x1_dot, jnp.where(mode.any_stuck, x2_dot, mode_acceleration(osc, mode, x1, x2))
+
+
+def smooth_field(osc: Oscillator, y: tuple[Array, Array], eps: Array) -> tuple[Array, Array]:
+    """(x1', x2') with tanh(r/eps) in place of sgn(r).
+
+    A static coefficient above mu(0) plays no part here: the law jumps nowhere.
+    """
+    x1, x2 = y
+    force = -x1 - osc.damping * x2
+    for belt in osc.belts:
+        r = belt.velocity - osc.omega * x2
+        touches = (belt.lower < x1) & (x1 < belt.upper)
+        friction = belt.load * belt.friction.mu(jnp.abs(r)) * jnp.tanh(r / eps)
+        force = force + jnp.where(touches, friction, 0.0)
+    return x2, force
+
+
+@forward_jacobian
+def _flow(field, osc, width, y, duration, rtol, atol):
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: field(osc, y, width)),
+        diffrax.Tsit5(scan_kind="lax"),
+        t0=jnp.zeros_like(duration),
+        t1=duration,
+        dt0=None,
+        y0=y,
+        saveat=diffrax.SaveAt(t1=True),
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol, dtmax=0.5),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    reached = solution.ts[-1] >= duration
+    return jax.tree.map(lambda leaf: jnp.where(reached, leaf[-1], jnp.nan), solution.ys)
+
+
+def integrate(field, osc: Oscillator, width: Array, y0, t0, ts, rtol, atol) -> Array:
+    """States [n, 2] at the increasing times ts of `field(osc, y, width)` from y0 at t0.
+
+    NaN from where the integrator ran out of steps.
+    """
+
+    def advance(carry, t):
+        now, y = carry
+        y = _flow(field, osc, width, y, t - now, rtol, atol)
+        return (t, y), jnp.stack(y)
+
+    return lax.scan(advance, (t0, (y0[0], y0[1])), ts)[1]
