@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
@@ -17,7 +18,7 @@ TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
 
 def is_concrete(value: Any) -> bool:
     """Whether the numbers in `value` are known now, that is, outside of a trace."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
 
 def require(condition: Any, field: str, expected: str, got: Any) -> None:

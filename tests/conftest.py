@@ -1,0 +1,32 @@
+"""What every test runs under: float64, JAX's strict promotion rules, checked annotations."""
+
+import os
+
+import pytest
+
+os.environ.setdefault("MPLBACKEND", "Agg")  # for the commands that tests start, too
+
+import jax
+
+# Not through the environment: a command that a test starts has to ask for float64 by itself.
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keeps compiled programs for the next run, and checks jaxbelt's annotations as it runs.
+
+    The cache is JAX_COMPILATION_CACHE_DIR where that is set, else a folder of pytest's own cache.
+    Benchmarks measure the package as its users import it, with its annotations unchecked.
+    """
+    cache = getattr(config, "cache", None)  # missing under `-p no:cacheprovider`
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and cache is not None:
+        jax.config.update("jax_compilation_cache_dir", str(cache.mkdir("jax")))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+    if not config.getoption("benchmark_only"):
+        from jaxtyping import install_import_hook
+
+        install_import_hook("jaxbelt", "beartype.beartype")
