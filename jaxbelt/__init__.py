@@ -1,5 +1,63 @@
+"""Belt-driven dry-friction oscillators: exact, batched, differentiable simulation in JAX.
+
+Everything a user needs is `import jaxbelt as jb`. Turn 64-bit floats on first:
+`jax.config.update("jax_enable_x64", True)`.
+"""
+
+import importlib.metadata
+from typing import TYPE_CHECKING, Any
+
 from . import presets
+from .equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
 from .friction import AbstractFriction, Conti, Coulomb, Stribeck
 from .oscillator import Belt, Oscillator
 from .results import EventKind, Status, describe
-from .simulate import Events, Trajectory, simulate
+from .simulate import Arcs, Events, Trajectory, simulate
+
+if TYPE_CHECKING:
+    from .plotting import (
+        plot_friction_law,
+        plot_phase_portrait,
+        plot_time_history,
+        plot_vector_field,
+    )
+
+__version__ = importlib.metadata.version("jaxbelt")
+
+__all__ = [
+    "AbstractFriction",
+    "Arcs",
+    "Belt",
+    "Conti",
+    "Coulomb",
+    "Equilibria",
+    "EquilibriumKind",
+    "EventKind",
+    "Events",
+    "Oscillator",
+    "Status",
+    "Stribeck",
+    "Trajectory",
+    "describe",
+    "equilibria",
+    "lyapunov_coefficient",
+    "plot_friction_law",
+    "plot_phase_portrait",
+    "plot_time_history",
+    "plot_vector_field",
+    "presets",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # Matplotlib is imported when something is drawn, not before.
+    if name.startswith("plot_") and name in __all__:
+        from . import plotting
+
+        return getattr(plotting, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *(name for name in __all__ if name.startswith("plot_"))]

@@ -8,6 +8,7 @@ continues smoothly a little beyond its boundary. A law of your own is a subclass
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -25,8 +26,8 @@ from .checks import (
 )
 
 
-def _field(name: str) -> Any:
-    return eqx.field(converter=lambda value: as_array(value, name))
+def _scalar(name: str) -> Callable[[Any], Array]:
+    return lambda value: as_array(value, name)
 
 
 class AbstractFriction(eqx.Module):
@@ -67,12 +68,10 @@ class Conti(AbstractFriction):
     (p3 >= 0), quadratic (p2, default 0). `ValueError` for anything else.
     """
 
-    static: Float[Array, ""] = _field("static")
-    residual: Float[Array, ""] = _field("residual")
-    steepness: Float[Array, ""] = _field("steepness")
-    quadratic: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_array(value, "quadratic"), default=0.0
-    )
+    static: Float[Array, ""] = eqx.field(converter=_scalar("static"))
+    residual: Float[Array, ""] = eqx.field(converter=_scalar("residual"))
+    steepness: Float[Array, ""] = eqx.field(converter=_scalar("steepness"))
+    quadratic: Float[Array, ""] = eqx.field(converter=_scalar("quadratic"), default=0.0)
 
     def __check_init__(self):
         self.check("Conti")
@@ -105,8 +104,8 @@ class Coulomb(AbstractFriction):
     Arguments, dimensionless scalars: static >= kinetic >= 0. `ValueError` for anything else.
     """
 
-    static: Float[Array, ""] = _field("static")
-    kinetic: Float[Array, ""] = _field("kinetic")
+    static: Float[Array, ""] = eqx.field(converter=_scalar("static"))
+    kinetic: Float[Array, ""] = eqx.field(converter=_scalar("kinetic"))
 
     def __check_init__(self):
         self.check("Coulomb")
@@ -128,9 +127,9 @@ class Stribeck(AbstractFriction):
     82 (1982) 277-289.
     """
 
-    static: Float[Array, ""] = _field("static")
-    kinetic: Float[Array, ""] = _field("kinetic")
-    velocity: Float[Array, ""] = _field("velocity")
+    static: Float[Array, ""] = eqx.field(converter=_scalar("static"))
+    kinetic: Float[Array, ""] = eqx.field(converter=_scalar("kinetic"))
+    velocity: Float[Array, ""] = eqx.field(converter=_scalar("velocity"))
 
     def __check_init__(self):
         self.check("Stribeck")

@@ -17,6 +17,7 @@ or arrays of lanes (the kernel of `batch`), belts are unrolled.
 """
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -25,6 +26,7 @@ from jaxtyping import Array
 
 from .oscillator import Oscillator, acceleration
 
+Tree = TypeVar("Tree")
 STUCK, BELOW, ABOVE = 0.0, -2.0, 2.0
 
 
@@ -70,8 +72,8 @@ def first_of(flags: Sequence[Array], values: Sequence[Array], default: Array) ->
     return out
 
 
-def select(condition: Array, on_true: Mode, on_false: Mode) -> Mode:
-    """Elementwise choice between two modes."""
+def select(condition: Array, on_true: Tree, on_false: Tree) -> Tree:
+    """Elementwise choice between two modes, or two tuples of arrays."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), on_true, on_false)
 
 
@@ -155,7 +157,9 @@ def edges(osc: Oscillator) -> list[Array]:
 # --- transitions ----------------------------------------------------------------------------------
 
 
-def reach_boundary(osc: Oscillator, mode: Mode, hit: Sequence[Array], x1: Array) -> tuple[Mode, Array]:
+def reach_boundary(
+    osc: Oscillator, mode: Mode, hit: Sequence[Array], x1: Array
+) -> tuple[Mode, Array]:
     """The mode after an orbit reached r_k = 0 of the belt with hit[k] set, and x2 = nu_k/omega.
 
     All touching belts of that velocity are concerned. They stick, or the orbit crosses.
@@ -313,7 +317,5 @@ def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFoc
     a_l, a_r = jnp.where(exists, a_left, 1.0), jnp.where(exists, -a_right, 1.0)
     contraction = trace_left / a_l + trace_right / a_r
     slowness = 1 / a_l + 1 / a_r
-    nonlinearity = (
-        1 / a_l**2 + 1 / a_r**2 + (trace_left / a_l) ** 2 + (trace_right / a_r) ** 2
-    )
+    nonlinearity = 1 / a_l**2 + 1 / a_r**2 + (trace_left / a_l) ** 2 + (trace_right / a_r) ** 2
     return EdgeFocus(exists, contraction / (3 * slowness), 2 * slowness, contraction, nonlinearity)

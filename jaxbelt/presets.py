@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array
 
+from .checks import is_concrete, require
 from .friction import Conti
 from .oscillator import Belt, Oscillator
 
@@ -60,8 +61,10 @@ def class_d(
 
     nu0, nu1, sigma0 <= sigma1: dimensionless scalars; between sigma0 and sigma1 both touch. The
     paper defines the class (section 2.2, Fig. 2d) and leaves it to further research; the other
-    constants are those of class (b).
+    constants are those of class (b). `ValueError` where sigma0 > sigma1.
     """
+    if is_concrete((sigma0, sigma1)):
+        require(sigma0 <= sigma1, "sigma0", f"<= sigma1 = {sigma1}", sigma0)
     belts = (
         Belt(nu0, paper_friction(), upper=sigma1),
         Belt(nu1, paper_friction(), lower=sigma0),

@@ -1,0 +1,570 @@
+"""`simulate` against the independent oracle, its derivatives, and every degenerate case."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import EventKind, Status
+
+# One budget for every run with two belts: they then share one compiled program.
+simulate = functools.partial(jb.simulate, max_segments=4096)
+
+SPAN = 60.0
+SAMPLES = jnp.linspace(0.0, SPAN, 241)
+#: Closer to a corner or a tangency than this, the sequence of events is a matter of rounding.
+MARGIN = 1e-6
+
+
+def kinds(trajectory):
+    events = trajectory.events
+    return [(EventKind(int(k)).name, int(b)) for k, b in zip(events.kind, events.belt, strict=True)]
+
+
+def random_case(kind, rng):
+    nu = rng.uniform(-0.8, 0.8, 2)
+    sigma = np.sort(rng.uniform(-1.0, 2.0, 2))
+    parameters = {"a": nu[:1], "b": nu, "c": [*nu, sigma[0]], "d": [*nu, *sigma]}[kind]
+    return [float(p) for p in parameters], tuple(map(float, rng.uniform([-3, -1.5], [3, 1.5])))
+
+
+# --- right ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("kind", ["ab", "c", "d"])
+def test_random_runs_agree_with_the_oracle(kind, seed, record_property):
+    """25 runs a test: 100 of classes (a) and (b), 100 of (c), 100 of (d)."""
+    kind = kind[seed % 2] if kind == "ab" else kind
+    rng = np.random.default_rng([ord(kind), seed])
+    set_aside, foci, magnified, worst = 0, 0, 0, 0.0
+    for _ in range(25):
+        parameters, y0 = random_case(kind, rng)
+        expected = oracle.simulate(getattr(oracle, f"class_{kind}")(*parameters), y0, SPAN)
+        run = simulate(getattr(jb.presets, f"class_{kind}")(*parameters), y0, SPAN, ts=SAMPLES)
+        if expected.status == "pseudo_focus" or run.status == Status.PSEUDO_FOCUS:
+            foci += 1
+            compare_pseudo_focus(expected, run)
+            continue
+        if expected.margin < MARGIN:
+            set_aside += 1
+            continue
+        assert run.status in (Status.OK, Status.STUCK_FOREVER), (parameters, y0, run)
+        assert kinds(run) == [(e.kind, e.belt) for e in expected.events], (parameters, y0)
+        error = difference(run, expected)
+        if error > 1e-8:
+            # Many slow passages of an edge: the clock drifts in the oracle itself as far as here
+            # when it is given our tolerance.
+            there = getattr(oracle, f"class_{kind}")(*parameters)
+            rerun = oracle.simulate(there, y0, SPAN, rtol=1e-11, atol=1e-11)
+            magnified += 1
+            assert error < difference(rerun, expected), (parameters, y0, error)
+        worst = max(worst, error)
+    report = f"{set_aside} set aside, {foci} pseudo-foci, {magnified} above 1e-8, worst {worst:.1e}"
+    record_property("report", report)
+    print(f"class {kind}, seed {seed}: {report}")
+    assert set_aside + magnified <= 5
+
+
+def difference(run, expected):
+    """Largest difference of event times, event states and samples between a run and the oracle."""
+
+    def table(run):
+        if isinstance(run, oracle.Run):
+            events = [(e.t, e.x1, e.x2) for e in run.events]
+            return np.array(events).reshape(-1, 3), [run.at(t) for t in np.asarray(SAMPLES)]
+        return np.column_stack([run.events.t, run.events.y]), run.ys
+
+    (events, states), (expected_events, expected_states) = table(run), table(expected)
+    return max(
+        np.max(np.abs(events - expected_events), initial=0.0),
+        np.max(np.abs(np.asarray(states) - np.asarray(expected_states))),
+    )
+
+
+def compare_pseudo_focus(expected, run):
+    """The two stop at different radii: compare what both saw, and where it ends."""
+    n = min(len(expected.events), len(run.events.t))
+    assert kinds(run)[:n] == [(e.kind, e.belt) for e in expected.events[:n]]
+    if run.status == Status.PSEUDO_FOCUS:
+        edge = run.ys[-1, 0]
+        assert run.ys[-1, 1] == 0
+        assert expected.events[-1].x1 == edge
+        assert abs(expected.events[-1].x2) < 0.011  # still inside the radius of capture
+
+
+def test_error_falls_with_the_tolerance():
+    osc, y0 = (-0.2, 0.35), (2.0, 0.0)
+    expected = oracle.simulate(oracle.class_b(*osc), y0, SPAN)
+    states = np.array([expected.at(t) for t in np.asarray(SAMPLES)])
+    tolerances = np.array([1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10])
+    errors = []
+    for tolerance in tolerances:
+        run = simulate(
+            jb.presets.class_b(*osc), y0, SPAN, ts=SAMPLES, rtol=tolerance, atol=tolerance
+        )
+        errors.append(float(np.max(np.abs(run.ys - states))))
+    order = np.polyfit(np.log(tolerances), np.log(errors), 1)[0]
+    print("errors", errors, "order in the tolerance", order)
+    # Error per step control of a fifth-order pair: between proportional and the power 4/5.
+    assert 0.75 < order < 1.2
+    assert errors[-1] < 1e-9
+
+
+# --- differentiable -------------------------------------------------------------------------------
+
+PARAMETERS = jnp.array([-0.3, 0.35, 0.5, 0.6, 10.0, 2.5, 0.1])  # nu0 nu1 zeta p1 p3 x1 x2
+LATE = 42.0
+N_EVENTS = 12
+
+
+def outcome(p, late=LATE):
+    """Final state, event times, event states of a two-belt run with every parameter traced."""
+    law = jb.Conti(static=1.0, residual=p[3], steepness=p[4])
+    osc = jb.Oscillator(p[2], (jb.Belt(p[0], law), jb.Belt(p[1], law)))
+    run = jb.simulate(osc, p[5:], late, ts=jnp.array([late]), max_segments=256)
+    return run.ys[0], run.events.t[:N_EVENTS], run.events.y[:N_EVENTS], run.events.kind[:N_EVENTS]
+
+
+@functools.cache
+def forward_derivatives():
+    return jax.jit(jax.jacfwd(lambda p: outcome(p)[:3]))(PARAMETERS)
+
+
+def test_derivatives_agree_with_richardson_differences_of_the_oracle():
+    def reference(p):
+        law = oracle.conti(1.0, p[3], p[4])
+        belts = (oracle.Belt(p[0], *law), oracle.Belt(p[1], *law))
+        run = oracle.simulate(oracle.Oscillator(p[2], belts), (p[5], p[6]), LATE)
+        assert len(run.events) >= N_EVENTS
+        return np.concatenate([run.at(LATE), [e.t for e in run.events[:N_EVENTS]]])
+
+    final, times, _ = forward_derivatives()
+    computed = np.concatenate([final, times])
+    base = np.asarray(PARAMETERS)
+    for i in range(len(base)):
+
+        def along(value, i=i):
+            p = base.copy()
+            p[i] = value
+            return reference(p)
+
+        value, error = oracle.richardson(along, base[i], 1e-3 * max(1.0, abs(base[i])))
+        scale = np.maximum(np.abs(value), 1e-2)
+        assert np.max(np.abs(error) / scale) < 5e-8, "the differences are too coarse to tell"
+        np.testing.assert_array_less(np.abs(computed[:, i] - value) / scale, 1e-7)
+
+
+def test_reverse_mode_equals_forward_mode():
+    reverse = jax.jit(jax.jacrev(lambda p: outcome(p)[:3]))(PARAMETERS)
+    for a, b in zip(reverse, forward_derivatives(), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
+
+
+def test_a_stick_phase_forgets_the_start():
+    final, times, states = forward_derivatives()
+    kind = jax.jit(outcome)(PARAMETERS)[3]
+    first = int(np.argmax(kind == EventKind.SLIP))
+    assert kind[first] == EventKind.SLIP
+    by_start = slice(5, 7)
+    onsets = np.flatnonzero(np.asarray(kind) == EventKind.SLIP)
+    assert len(onsets) >= 3
+    assert np.max(np.abs(states[onsets, :, by_start])) == 0
+    intervals = np.diff(np.asarray(times[first:, by_start]), axis=0)
+    np.testing.assert_allclose(intervals, 0, atol=1e-12)
+    # The clock is not forgotten: the final state moves along the orbit, by minus the time shift.
+    run = outcome(PARAMETERS)
+    osc = jb.presets.class_b(-0.3, 0.35)
+    x1, x2 = run[0]
+    mode = jb.simulate(osc, PARAMETERS[5:], LATE, ts=jnp.array([LATE]), max_segments=256).modes[0]
+    push = sum(
+        float(s) * oracle.conti(1.0, 0.6, 10.0)[0](abs(nu - float(x2)))
+        for s, nu in zip(mode, (-0.3, 0.35), strict=True)
+    )
+    field = np.array([x2, -x1 - 0.5 * x2 + push])
+    shift = -np.asarray(times[first, by_start])
+    np.testing.assert_allclose(final[:, by_start], np.outer(field, shift), rtol=1e-8, atol=1e-10)
+
+
+# --- batched --------------------------------------------------------------------------------------
+
+
+def test_vmap_equals_a_loop():
+    rng = np.random.default_rng(5)
+    nu = jnp.asarray(rng.uniform(-0.7, 0.7, (24, 2)))
+    y0 = jnp.asarray(rng.uniform([-3, -1.5], [3, 1.5], (24, 2)))
+    edges = jnp.asarray(np.sort(rng.uniform(-1, 2, (24, 2)), axis=1))
+    edges = edges.at[:8].set(jnp.array([-jnp.inf, jnp.inf]))
+
+    def run(nu, y0, edges):
+        osc = jb.presets.class_d(nu[0], nu[1], edges[0], edges[1])
+        return simulate(osc, y0, 30.0, ts=jnp.linspace(0.0, 30.0, 31), max_segments=512)
+
+    single = jax.jit(run)
+    batch = jax.jit(jax.vmap(run))(nu, y0, edges)
+    seen = set()
+    for i in range(len(nu)):
+        alone = single(nu[i], y0[i], edges[i])
+        assert alone.status == batch.status[i]
+        np.testing.assert_array_equal(alone.events.kind, batch.events.kind[i])
+        np.testing.assert_allclose(alone.events.t, batch.events.t[i], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(alone.ys, batch.ys[i], rtol=0, atol=1e-12)
+        seen |= set(np.asarray(alone.events.kind).tolist())
+    assert seen >= {1, 2, 3, 4}
+
+
+def test_a_lane_that_is_not_finite_harms_no_other():
+    nus = jnp.array([0.3, jnp.nan, 0.4])
+    run = jax.jit(
+        jax.vmap(
+            lambda nu: simulate(
+                jb.presets.class_d(nu, 0.35, -jnp.inf, jnp.inf),
+                jnp.array([2.5, 0.0]),
+                30.0,
+                ts=jnp.linspace(0.0, 30.0, 31),
+                max_segments=512,
+            )
+        )
+    )(nus)
+    assert run.status.tolist() == [Status.OK, Status.NOT_FINITE, Status.OK]
+    assert np.all(np.isnan(run.ys[1]))
+    assert np.all(np.isfinite(run.ys[jnp.array([0, 2])]))
+
+
+# --- formulations ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("formulation", "width"), [("switch", "v_star"), ("smooth", "eps")])
+def test_formulations_converge_to_the_exact_one(formulation, width):
+    osc, y0, ts = jb.presets.class_b(-0.2, 0.35), (2.0, 0.0), jnp.linspace(0.0, 15.0, 31)
+    exact = simulate(osc, y0, 15.0, ts=ts).ys
+    widths = np.array([1e-3, 1e-4, 1e-5])
+    errors = [
+        float(
+            jnp.max(
+                jnp.abs(
+                    jb.simulate(osc, y0, 15.0, ts=ts, formulation=formulation, **{width: w}).ys
+                    - exact
+                )
+            )
+        )
+        for w in widths
+    ]
+    orders = np.diff(np.log10(errors)) / np.diff(np.log10(widths))
+    print(formulation, errors, orders)
+    # First order; the tanh tail brings a logarithm, which the measured order approaches from below.
+    lowest = {"switch": 0.97, "smooth": 0.85}[formulation]
+    assert np.all((orders > lowest) & (orders < 1.05))
+
+
+def test_the_smooth_formulation_has_derivatives():
+    def end(nu):
+        osc = jb.presets.class_b(nu, 0.35)
+        ts = jnp.array([5.0])
+        run = jb.simulate(osc, (2.0, 0.0), 5.0, ts=ts, formulation="smooth", eps=0.05)
+        return run.ys[-1]
+
+    forward, reverse = jax.jacfwd(end)(-0.2), jax.jacrev(end)(-0.2)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
+    difference, _ = oracle.richardson(lambda nu: np.asarray(end(nu)), -0.2, 1e-3)
+    np.testing.assert_allclose(forward, difference, rtol=1e-6)
+
+
+# --- degenerate cases -----------------------------------------------------------------------------
+
+
+def coulomb_belts(*belts, damping=0.0, omega=1.0):
+    """Frictions are constant, so slip arcs are circles around +-mu (undamped): all closed form."""
+    return jb.Oscillator(damping, belts, omega=omega)
+
+
+def agree(osc_here, osc_there, y0, span=SPAN, tolerance=1e-8):
+    """Same events, times and states here and in the oracle; returns the run."""
+    run = simulate(osc_here, y0, span)
+    expected = oracle.simulate(osc_there, y0, span)
+    assert kinds(run) == [(e.kind, e.belt) for e in expected.events]
+    np.testing.assert_allclose(run.events.t, [e.t for e in expected.events], atol=tolerance)
+    np.testing.assert_allclose(run.ys[-1], expected.at(span), atol=tolerance)
+    return run
+
+
+def test_equal_speeds_stick_and_slip_together():
+    run = agree(jb.presets.class_b(0.3, 0.3), oracle.class_b(0.3, 0.3), (3.0, 0.0))
+    stuck = np.asarray(run.modes) == 0
+    assert np.any(stuck)
+    np.testing.assert_array_equal(stuck[:, 0], stuck[:, 1])
+    # Capacities add: slip onset where x1 + zeta nu = 2 mus.
+    onset = run.events.y[run.events.kind == EventKind.SLIP]
+    np.testing.assert_allclose(onset[:, 0], 2 - 0.5 * 0.3, atol=1e-14)
+
+
+def test_a_belt_at_rest_holds_for_ever():
+    run = agree(jb.presets.class_b(0.0, 0.35), oracle.class_b(0.0, 0.35), (2.5, 0.0))
+    assert run.status == Status.STUCK_FOREVER
+    assert run.ys[-1, 1] == 0
+    start = simulate(jb.presets.class_b(0.0, 0.35), (0.5, 0.0), SPAN)
+    assert start.status == Status.STUCK_FOREVER
+    np.testing.assert_array_equal(start.ys, np.broadcast_to([0.5, 0.0], start.ys.shape))
+
+
+def test_both_belts_at_rest():
+    run = agree(jb.presets.class_b(0.0, 0.0), oracle.class_b(0.0, 0.0), (6.0, 0.0))
+    assert run.status == Status.STUCK_FOREVER
+
+
+@pytest.mark.parametrize("x1", [-2.5, -1.2, -0.3, 0.4, 0.83, 1.9])
+@pytest.mark.parametrize("belt", [0, 1])
+def test_starts_on_a_boundary(x1, belt):
+    nu = (-0.25, 0.35)
+    run = agree(jb.presets.class_b(*nu), oracle.class_b(*nu), (x1, nu[belt]), span=20.0)
+    assert run.status == Status.OK
+
+
+def test_start_on_a_boundary_with_a_rounded_velocity():
+    law = jb.Conti(1.0, 0.6, 10.0)
+    osc = jb.Oscillator(0.5, (jb.Belt(0.1, law), jb.Belt(0.7, law)), omega=3.0)
+    run = simulate(osc, (0.2, 0.1 / 3.0), 20.0)
+    assert run.modes[0, 0] == 0
+
+
+@pytest.mark.parametrize("x2", [-0.4, 0.0, 0.4])
+@pytest.mark.parametrize("sigma", [-0.5, 0.3, 1.1])
+def test_starts_on_a_contact_edge(sigma, x2):
+    here = jb.presets.class_c(0.4, -0.3, sigma)
+    there = oracle.class_c(0.4, -0.3, sigma)
+    expected = oracle.simulate(there, (sigma, x2), 10.0)
+    run = simulate(here, (sigma, x2), 10.0)
+    if expected.status == "pseudo_focus" or run.status == Status.PSEUDO_FOCUS:
+        compare_pseudo_focus(expected, run) if expected.events else None
+        return
+    n = min(len(expected.events), 20)
+    assert kinds(run)[:n] == [(e.kind, e.belt) for e in expected.events[:n]]
+
+
+LAW = {"static": 1.0, "kinetic": 0.6}
+OTHER = {"static": 0.3, "kinetic": 0.2}
+
+
+def two_belts(nu0, nu1, lower, upper, other=OTHER):
+    """Belt 0 everywhere, belt 1 on (lower, upper); here and in the oracle."""
+    here = coulomb_belts(
+        jb.Belt(nu0, jb.Coulomb(**LAW)), jb.Belt(nu1, jb.Coulomb(**other), lower=lower, upper=upper)
+    )
+    there = oracle.Oscillator(
+        0.0,
+        (
+            oracle.Belt(nu0, *oracle.coulomb(LAW["static"], LAW["kinetic"])),
+            oracle.Belt(
+                nu1, *oracle.coulomb(other["static"], other["kinetic"]), lower=lower, upper=upper
+            ),
+        ),
+    )
+    return here, there
+
+
+def test_an_edge_met_while_sticking_still_stuck():
+    run = agree(*two_belts(0.3, 2.0, 0.2, np.inf), (-0.5, 0.3), span=15.0)
+    edge = int(np.argmax(np.asarray(run.events.kind) == EventKind.EDGE))
+    assert run.events.belt[edge] == 1
+    assert run.events.y[edge].tolist() == [0.2, 0.3]
+    assert run.events.kind[edge + 1] == EventKind.SLIP  # still stuck in between
+    # Onset where the spring equals belt 0's capacity and the new belt's pull: x1 = 1 + 0.2.
+    np.testing.assert_allclose(run.events.y[edge + 1], [1.2, 0.3], atol=1e-14)
+
+
+def test_an_edge_met_while_sticking_torn_off():
+    run = agree(*two_belts(0.3, -2.0, 0.9, np.inf), (-0.5, 0.3), span=15.0)
+    assert run.events.kind[0] == EventKind.EDGE  # one event, though it ends the stick phase
+    np.testing.assert_allclose(run.events.t[0], (0.9 + 0.5) / 0.3, rtol=1e-14)
+    after = int(np.searchsorted(run.ts, run.events.t[0] + 1e-3))
+    assert run.modes[after].tolist() == [1, -1]
+
+
+def test_an_edge_met_while_sticking_belt_left():
+    here = coulomb_belts(
+        jb.Belt(0.3, jb.Coulomb(**LAW), upper=0.2), jb.Belt(-0.5, jb.Coulomb(**OTHER))
+    )
+    there = oracle.Oscillator(
+        0.0,
+        (
+            oracle.Belt(0.3, *oracle.coulomb(1.0, 0.6), upper=0.2),
+            oracle.Belt(-0.5, *oracle.coulomb(0.3, 0.2)),
+        ),
+    )
+    run = agree(here, there, (-0.5, 0.3), span=15.0)
+    assert (run.events.kind[0], run.events.belt[0]) == (EventKind.EDGE, 0)
+    after = int(np.searchsorted(run.ts, run.events.t[0] + 1e-3))
+    assert run.modes[after].tolist() == [2, -1]
+
+
+def test_equal_speed_belts_meet_and_part_while_sticking():
+    here, there = two_belts(0.3, 0.3, -0.2, 0.4)
+    run = agree(here, there, (-0.5, 0.3), span=15.0)
+    assert kinds(run)[:2] == [("EDGE", 1), ("EDGE", 1)]
+    between = int(np.searchsorted(run.ts, float(run.events.t[0]) + 1e-3))
+    assert run.modes[between].tolist() == [0, 0]
+
+
+def test_static_friction_above_kinetic_jumps_at_onset():
+    here, there = two_belts(0.3, 2.0, 5.0, np.inf)
+    run = agree(here, there, (-0.5, 0.3), span=40.0)
+    np.testing.assert_allclose(run.events.y[0], [1.0, 0.3], atol=1e-14)
+    # The slip arc is a circle around 0.6: back at x2 = nu at x1 = 0.2.
+    np.testing.assert_allclose(run.events.y[1], [0.2, 0.3], atol=1e-9)
+
+
+def test_an_excursion_within_one_step_is_found():
+    """A crossing of depth 1e-7, there and back in 1e-3 of the time that a step may take."""
+    # Undamped, no friction: x2 = 1 * cos; it tops the slow belt's velocity by 1e-7 for 9e-4.
+    law = jb.Coulomb(static=1e-9, kinetic=1e-9)
+    nu = 1.0 - 1e-7
+    osc = coulomb_belts(jb.Belt(nu, law), jb.Belt(50.0, law))
+    run = simulate(osc, (-1.0, 0.0), 12.0, rtol=1e-4, atol=1e-10)
+    assert [kind for kind, _ in kinds(run)] == ["CROSS"] * 4
+    width = 2 * np.arccos(nu)
+    np.testing.assert_allclose(np.diff(run.events.t)[::2], width, rtol=1e-2)
+
+
+def test_an_edge_excursion_within_one_step_is_found():
+    law = jb.Coulomb(static=1e-9, kinetic=1e-9)
+    osc = coulomb_belts(jb.Belt(50.0, law), jb.Belt(60.0, law, lower=1.0 - 1e-7))
+    run = simulate(osc, (-1.0, 0.0), 12.0, rtol=1e-4, atol=1e-10)
+    assert [kind for kind, _ in kinds(run)] == ["EDGE"] * 4
+
+
+def test_grazing_a_boundary_from_both_sides():
+    """Class (b) around the paper's grazing point: the steady cycle sticks on belt 0, or not."""
+
+    def sticks(nu0):
+        run = simulate(jb.presets.class_b(nu0, 0.35), (3.0, 0.0), SPAN)
+        late = run.events.t > SPAN / 2
+        stuck = (run.events.kind == EventKind.STICK) & late
+        return set(np.asarray(run.events.belt)[np.asarray(stuck)].tolist())
+
+    grazing = -0.455724862289
+    assert sticks(grazing + 1e-7) == {0, 1}
+    assert sticks(grazing - 1e-7) == {1}
+
+
+def test_three_belts_and_mixed_laws():
+    here = jb.Oscillator(
+        0.2,
+        (
+            jb.Belt(0.3, jb.Conti(1.0, 0.6, 10.0, quadratic=0.05), load=0.8),
+            jb.Belt(-0.2, jb.Stribeck(0.7, 0.4, 0.1), lower=-0.5),
+            jb.Belt(0.9, jb.Coulomb(0.5, 0.3), upper=1.2),
+        ),
+        omega=1.3,
+    )
+    there = oracle.Oscillator(
+        0.2,
+        (
+            oracle.Belt(0.3, *oracle.conti(1.0, 0.6, 10.0, 0.05), load=0.8),
+            oracle.Belt(-0.2, *oracle.stribeck(0.7, 0.4, 0.1), lower=-0.5),
+            oracle.Belt(0.9, *oracle.coulomb(0.5, 0.3), upper=1.2),
+        ),
+        omega=1.3,
+    )
+    run = agree(here, there, (2.0, 0.0), span=30.0)
+    assert {kind for kind, _ in kinds(run)} == {"STICK", "SLIP", "CROSS", "EDGE"}
+
+
+def test_a_pseudo_focus_is_recognised():
+    run = simulate(jb.presets.class_c(0.6136281850438676, -0.6028933954969964, -0.6432623150623895),
+                   (-1.72283053, 0.66071584), SPAN)  # fmt: skip
+    assert run.status == Status.PSEUDO_FOCUS
+    assert run.ys[-1].tolist() == [-0.6432623150623895, 0.0]
+    at_once = simulate(jb.presets.class_c(0.6, -0.6, -0.6), (-0.6, 0.0), 10.0)
+    assert at_once.status == Status.PSEUDO_FOCUS
+
+
+def test_a_used_up_budget_gives_what_there_is():
+    run = jb.simulate(jb.presets.class_b(-0.2, 0.35), (3.0, 0.0), 100.0, max_segments=16)
+    assert run.status == Status.TOO_MANY_SEGMENTS
+    assert "max_segments" in jb.describe(run.status)
+    assert np.all(np.isfinite(run.ys[run.ts < run.arcs.t[-1]]))
+    assert np.all(np.isnan(run.ys[-1]))
+
+
+def test_samples_stay_increasing_and_show_every_arc():
+    run = simulate(jb.presets.class_b(-0.2, 0.35), (3.0, 0.0), SPAN)
+    assert np.all(np.diff(run.ts) > 0)
+    assert np.all(np.isin(np.asarray(run.arcs.t), np.asarray(run.ts)))
+    assert run.ts[0] == 0
+    assert run.ts[-1] == SPAN
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+OSC = ("class_b", (0.3, 0.35))
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: jb.presets.class_a(np.nan), "velocity of .*belt.* must be finite, got nan"),
+        (lambda: jb.presets.class_a([0.1, 0.2]), "velocity must be a scalar.*got shape"),
+        (lambda: jb.presets.class_a("fast"), "velocity must be a number, got"),
+        (lambda: jb.presets.class_a(np.float32(0.3)), "velocity must be float64, got float32"),
+        (lambda: jb.Conti(-1.0, 0.6, 10.0), "static of Conti must be >= 0, got -1"),
+        (lambda: jb.Conti(1.0, 0.6, -10.0), "steepness of Conti must be >= 0, got -10"),
+        (lambda: jb.Coulomb(0.5, 0.6), "kinetic of Coulomb must be <= static"),
+        (lambda: jb.Stribeck(1.0, 0.6, 0.0), "velocity of Stribeck must be > 0, got 0"),
+        (lambda: jb.Belt(0.1, jb.Coulomb(1, 1), load=-1), "load of .*belt.* must be >= 0, got -1"),
+        (lambda: jb.Belt(0.1, jb.Coulomb(1, 1), lower=2, upper=1), "lower of .* must be < 1"),
+        (lambda: jb.Belt(0.1, 0.5), "friction of .* must be a friction law"),
+        (lambda: jb.presets.class_d(0.1, 0.2, 1.0, 0.0), "sigma0 must be <= sigma1 = 0"),
+        (lambda: jb.Oscillator(0.5, ()), "belts must be at least one Belt, got none"),
+        (lambda: jb.Oscillator(np.inf, (jb.Belt(0.1, jb.Coulomb(1, 1)),)), "damping must be fini"),
+        (
+            lambda: jb.Oscillator(0.5, (jb.Belt(0.1, jb.Coulomb(1, 1)),), omega=0.0),
+            "omega must be > 0, got 0",
+        ),
+    ],
+)
+def test_impossible_parameters_are_named(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"y0": (1.0, 2.0, 3.0)}, r"y0 must be of shape \(2\), got shape \(3,\)"),
+        ({"y0": (1.0, np.inf)}, "y0 must be finite, got"),
+        ({"t1": 0.0}, "t1 must be > t0 = 0.0, got 0.0"),
+        ({"t1": np.nan}, "t1 must be finite, got nan"),
+        ({"rtol": 0.0}, "rtol must be > 0, got 0"),
+        ({"atol": -1e-3}, "atol must be > 0, got -0.001"),
+        ({"ts": jnp.array([1.0, 11.0])}, "ts must be within"),
+        ({"ts": jnp.array([2.0, 1.0])}, "ts must be increasing"),
+        ({"formulation": "exact"}, "formulation must be .* got 'exact'"),
+        ({"formulation": "switch", "v_star": 0.0}, "v_star must be > 0, got 0"),
+        ({"formulation": "smooth", "eps": -1.0}, "eps must be > 0, got -1"),
+        ({"max_segments": 0}, "max_segments must be a positive integer, got 0"),
+    ],
+)
+def test_impossible_arguments_are_named(arguments, message):
+    settings = {"y0": (1.0, 0.0), "t1": 10.0, **arguments}
+    with pytest.raises(ValueError, match=message):
+        jb.simulate(jb.presets.class_b(0.3, 0.35), **settings)
+
+
+def test_a_batched_oscillator_is_referred_to_vmap():
+    batch = jax.vmap(jb.presets.class_a)(jnp.array([0.1, 0.2]))
+    with pytest.raises(ValueError, match=r"velocity must be a scalar \(use jax.vmap"):
+        jb.simulate(batch, (1.0, 0.0), 10.0)
+
+
+def test_float32_is_refused_with_the_remedy():
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(ValueError, match='jax.config.update\\("jax_enable_x64", True\\)'):
+            jb.presets.class_a(0.3)
+    finally:
+        jax.config.update("jax_enable_x64", True)
