@@ -1,4 +1,4 @@
-"""Modes: which belts touch, which slip and how, which are stuck; and the one set of rules between them.
+"""Modes: which belts touch, slip or stick; and the one set of rules that leads between them.
 
 A mode holds one contact code a belt:
 
@@ -112,7 +112,7 @@ def stick_velocity(osc: Oscillator, mode: Mode, default: Array) -> Array:
     return first_of(mode.stuck, [belt.velocity for belt in osc.belts], default)
 
 
-# --- guards: positive inside a mode -------------------------------------------------------------
+# --- guards: positive inside a mode ---------------------------------------------------------------
 
 
 def boundary_guards(osc: Oscillator, mode: Mode, x2: Array) -> list[Array]:
@@ -140,13 +140,13 @@ def edge_guards(osc: Oscillator, mode: Mode, x1: Array) -> list[Array]:
 def bounds_rightward(mode: Mode) -> list[Array]:
     """For each of `edge_guards`, whether the edge bounds the mode on its right-hand side."""
     lower = [code == BELOW for code in mode.codes]
-    return lower + [touches for touches in mode.touching]
+    return lower + list(mode.touching)
 
 
 def bounds_leftward(mode: Mode) -> list[Array]:
     """For each of `edge_guards`, whether the edge bounds the mode on its left-hand side."""
     upper = [code == ABOVE for code in mode.codes]
-    return [touches for touches in mode.touching] + upper
+    return list(mode.touching) + upper
 
 
 def edges(osc: Oscillator) -> list[Array]:
@@ -175,7 +175,7 @@ def reach_boundary(
 
 
 def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Array) -> Mode:
-    """The mode after the mass passed a contact edge at x1 = edge with velocity x2, right- or leftward.
+    """The mode after the mass passed a contact edge at x1 = edge, rightward or leftward.
 
     Belts whose interval ends there leave, those whose interval begins there arrive with the sign
     of their relative velocity. If the mass was stuck it may stay so, be torn off, or, where the

@@ -13,11 +13,13 @@ with the relative velocity r_i = nu_i - omega x2 of belt i. The paper's symbols,
 | omega | `Oscillator.omega` | sqrt(k/m), ties belt velocities to the dimensionless time |
 | nu_i | `Belt.velocity` | driving velocity of belt i |
 | u0_i | `Belt.load` | normal force over stiffness, Fn/k |
-| sigma0, sigma1 | `Belt.lower`, `Belt.upper` | edges of the interval of x1 in which a belt touches |
-| mus, p1, p2, p3 | `Conti.static, residual, quadratic, steepness` | friction, eqs. (7), (16) |
+| sigma0, sigma1 | `Belt.lower`, `Belt.upper` | interval of x1 in which a belt touches |
+| mus, p1, p2, p3 | `Conti.static, residual, quadratic, steepness` | eqs. (7), (16) |
 
 What happens where the field is not smooth is told in `modes`.
 """
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -37,6 +39,11 @@ from .checks import (
 from .friction import AbstractFriction
 
 
+def _as_friction(law: Any) -> AbstractFriction:
+    require(isinstance(law, AbstractFriction), "friction", "a law such as jb.Conti(...)", repr(law))
+    return law
+
+
 class Belt(eqx.Module):
     """A rough belt that moves at constant velocity and touches the mass while lower < x1 < upper.
 
@@ -46,7 +53,7 @@ class Belt(eqx.Module):
     """
 
     velocity: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "velocity"))
-    friction: AbstractFriction
+    friction: AbstractFriction = eqx.field(converter=_as_friction)
     load: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "load"), default=1.0)
     lower: Float[Array, ""] = eqx.field(
         converter=lambda value: as_array(value, "lower"), default=-float("inf")
@@ -60,12 +67,6 @@ class Belt(eqx.Module):
 
     def check(self, owner: str) -> None:
         """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
-        require(
-            isinstance(self.friction, AbstractFriction),
-            f"friction of {owner}",
-            "a friction law such as jb.Conti(...)",
-            repr(self.friction),
-        )
         check_finite(self.velocity, f"velocity of {owner}")
         check_nonnegative(self.load, f"load of {owner}")
         self.friction.check(f"friction of {owner}")
@@ -114,7 +115,8 @@ class Oscillator(eqx.Module):
 
     def __repr__(self) -> str:
         belts = ", ".join(map(repr, self.belts))
-        return f"Oscillator(damping={number(self.damping)}, belts=({belts},), omega={number(self.omega)})"
+        damping, omega = number(self.damping), number(self.omega)
+        return f"Oscillator(damping={damping}, belts=({belts},), omega={omega})"
 
 
 def acceleration(osc: Oscillator, signs: tuple[Array, ...], x1: Array, x2: Array) -> Array:

@@ -11,7 +11,8 @@ prints for class (b), gives its values and figures. With p3 = 3 the Hopf point o
 
 from typing import NamedTuple
 
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import ArrayLike
 
 from .checks import is_concrete, require
 from .friction import Conti
@@ -28,7 +29,7 @@ def paper_friction() -> Conti:
     return Conti(static=1.0, residual=0.6, steepness=10.0)
 
 
-def class_a(nu0: float | Array) -> Oscillator:
+def class_a(nu0: ArrayLike) -> Oscillator:
     """One belt, always touching: the paper's class (a), eqs. (2)-(4), section 3.2.
 
     nu0: belt velocity, dimensionless scalar. zeta = 0.5, mus = 1, p1 = 0.6, p2 = 0 and p3 = 10:
@@ -37,7 +38,7 @@ def class_a(nu0: float | Array) -> Oscillator:
     return Oscillator(DAMPING, (Belt(nu0, paper_friction()),))
 
 
-def class_b(nu0: float | Array, nu1: float | Array) -> Oscillator:
+def class_b(nu0: ArrayLike, nu1: ArrayLike) -> Oscillator:
     """Two belts, both always touching: the paper's class (b), eqs. (11)-(14), section 3.3.
 
     nu0, nu1: belt velocities, dimensionless scalars. zeta = 0.5, mus = 1, p1 = 0.6, p3 = 10.
@@ -45,7 +46,7 @@ def class_b(nu0: float | Array, nu1: float | Array) -> Oscillator:
     return Oscillator(DAMPING, (Belt(nu0, paper_friction()), Belt(nu1, paper_friction())))
 
 
-def class_c(nu0: float | Array, nu1: float | Array, sigma: float | Array) -> Oscillator:
+def class_c(nu0: ArrayLike, nu1: ArrayLike, sigma: ArrayLike) -> Oscillator:
     """One belt at a time: belt 0 touches while x1 < sigma, belt 1 while x1 > sigma; class (c).
 
     nu0, nu1, sigma: dimensionless scalars. The paper defines the class (section 2.2, Fig. 2c) and
@@ -54,9 +55,7 @@ def class_c(nu0: float | Array, nu1: float | Array, sigma: float | Array) -> Osc
     return class_d(nu0, nu1, sigma, sigma)
 
 
-def class_d(
-    nu0: float | Array, nu1: float | Array, sigma0: float | Array, sigma1: float | Array
-) -> Oscillator:
+def class_d(nu0: ArrayLike, nu1: ArrayLike, sigma0: ArrayLike, sigma1: ArrayLike) -> Oscillator:
     """Overlapping contact: belt 0 touches while x1 < sigma1, belt 1 while x1 > sigma0; class (d).
 
     nu0, nu1, sigma0 <= sigma1: dimensionless scalars; between sigma0 and sigma1 both touch. The
@@ -64,7 +63,12 @@ def class_d(
     constants are those of class (b). `ValueError` where sigma0 > sigma1.
     """
     if is_concrete((sigma0, sigma1)):
-        require(sigma0 <= sigma1, "sigma0", f"<= sigma1 = {sigma1}", sigma0)
+        require(
+            np.all(np.asarray(sigma0) <= np.asarray(sigma1)),
+            "sigma0",
+            f"<= sigma1 = {sigma1}",
+            sigma0,
+        )
     belts = (
         Belt(nu0, paper_friction(), upper=sigma1),
         Belt(nu1, paper_friction(), lower=sigma0),

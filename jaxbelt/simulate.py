@@ -29,7 +29,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-
 from .checks import as_array, check_finite, check_positive, is_concrete, require
 from .derivatives import forward_jacobian
 from .modes import (
@@ -126,7 +125,7 @@ class Trajectory(eqx.Module):
         )
 
 
-# --- slip arcs ----------------------------------------------------------------------------------------
+# --- slip arcs ------------------------------------------------------------------------------------
 
 
 class _RememberStart(diffrax.AbstractAdaptiveSolver):
@@ -168,9 +167,7 @@ def _controller(rtol, atol):
         x1, x2 = y[0] if isinstance(y[0], tuple) else y
         return jnp.maximum(jnp.abs(x1), jnp.abs(x2))
 
-    return diffrax.PIDController(
-        rtol=SAFETY * rtol, atol=SAFETY * atol, dtmax=MAX_STEP, norm=norm
-    )
+    return diffrax.PIDController(rtol=SAFETY * rtol, atol=SAFETY * atol, dtmax=MAX_STEP, norm=norm)
 
 
 def _field(osc, mode):
@@ -221,7 +218,7 @@ def _first_root(fn: Callable[[Array], Array], end: Array) -> Array:
     f_start = jnp.where(f_start > 1e-12, f_start, -f_end)
 
     def unfinished(state):
-        a, _, b, _, c, fc, count = state
+        a, _, b, _, _, fc, count = state
         return (b - a > 1e-16 * end) & (jnp.abs(fc) > 1e-16) & (count < 60)
 
     def improve(state):
@@ -275,9 +272,10 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
         max_steps=MAX_STEPS,
         throw=False,
     )
-    t_end = solution.ts[-1]
-    y_end, (t_start, *y_start) = jax.tree.map(lambda leaf: leaf[-1], solution.ys)
-    hit = solution.event_mask
+    t_end, (_, (t_start, *y_start)) = jax.tree.map(
+        lambda leaf: leaf[-1], (solution.ts, solution.ys)
+    )
+    hit = jnp.asarray(solution.event_mask)
     finished = hit | (t_end >= span)
 
     # Make the last step once more, to the root instead of beyond it.
@@ -338,7 +336,7 @@ def _flow(osc, mode, y, duration, rtol, atol):
     return jax.tree.map(lambda leaf: leaf[-1], solution.ys)
 
 
-# --- segments -------------------------------------------------------------------------------------------
+# --- segments -------------------------------------------------------------------------------------
 
 
 class _State(eqx.Module):
@@ -402,8 +400,11 @@ def _slip_segment(osc: Oscillator, state: _State, t1, rtol, atol) -> _Step:
     x2 = jnp.where(at_boundary, x2_boundary, x2)
 
     focused = at_edge & _has_converged(
-        osc, select(rightward, state.mode, after_edge), select(rightward, after_edge, state.mode),
-        edge, x2,
+        osc,
+        select(rightward, state.mode, after_edge),
+        select(rightward, after_edge, state.mode),
+        edge,
+        x2,
     )
     x2 = jnp.where(focused, 0.0, x2)
     kind = jnp.where(
@@ -510,9 +511,7 @@ def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _R
     edge_belt = _belt_concerned(
         Mode(tuple(map(_is_apart, state.mode.codes))), Mode(tuple(map(_is_apart, step.mode.codes)))
     )
-    belt = jnp.where(
-        step.kind == EventKind.EDGE, edge_belt, _belt_concerned(state.mode, step.mode)
-    )
+    belt = jnp.where(step.kind == EventKind.EDGE, edge_belt, _belt_concerned(state.mode, step.mode))
     record = _Record(
         t=state.t,
         y=jnp.stack(state.y),
@@ -743,8 +742,12 @@ def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
     """Cut the padding off where lengths are known, that is, outside of transformations."""
     if not is_concrete(trajectory) or trajectory.ts.ndim != 1:
         return trajectory
-    events = jax.tree.map(lambda leaf: leaf[: int(np.sum(trajectory.events.kind > 0))], trajectory.events)
-    arcs = jax.tree.map(lambda leaf: leaf[: int(np.sum(~np.isnan(trajectory.arcs.t)))], trajectory.arcs)
+    events = jax.tree.map(
+        lambda leaf: leaf[: int(np.sum(trajectory.events.kind > 0))], trajectory.events
+    )
+    arcs = jax.tree.map(
+        lambda leaf: leaf[: int(np.sum(~np.isnan(trajectory.arcs.t)))], trajectory.arcs
+    )
     ts, ys, modes = trajectory.ts, trajectory.ys, trajectory.modes
     if trim_samples:
         _, first = np.unique(np.asarray(ts), return_index=True)

@@ -88,8 +88,8 @@ def _flow(field, osc, width, y, duration, rtol, atol):
         max_steps=MAX_STEPS,
         throw=False,
     )
-    reached = solution.ts[-1] >= duration
-    return jax.tree.map(lambda leaf: jnp.where(reached, leaf[-1], jnp.nan), solution.ys)
+    t_end, y = jax.tree.map(lambda leaf: leaf[-1], (solution.ts, solution.ys))
+    return jax.tree.map(lambda leaf: jnp.where(t_end >= duration, leaf, jnp.nan), y)
 
 
 def integrate(field, osc: Oscillator, width: Array, y0, t0, ts, rtol, atol) -> Array:

@@ -154,7 +154,7 @@ def test_derivatives_agree_with_richardson_differences_of_the_oracle():
             p[i] = value
             return reference(p)
 
-        value, error = oracle.richardson(along, base[i], 1e-3 * max(1.0, abs(base[i])))
+        value, error = oracle.richardson(along, base[i], 3e-4 * max(1.0, abs(base[i])))
         scale = np.maximum(np.abs(value), 1e-2)
         assert np.max(np.abs(error) / scale) < 5e-8, "the differences are too coarse to tell"
         np.testing.assert_array_less(np.abs(computed[:, i] - value) / scale, 1e-7)
@@ -424,7 +424,7 @@ def test_an_excursion_within_one_step_is_found():
     law = jb.Coulomb(static=1e-9, kinetic=1e-9)
     nu = 1.0 - 1e-7
     osc = coulomb_belts(jb.Belt(nu, law), jb.Belt(50.0, law))
-    run = simulate(osc, (-1.0, 0.0), 12.0, rtol=1e-4, atol=1e-10)
+    run = simulate(osc, (-1.0, 0.0), 12.0)
     assert [kind for kind, _ in kinds(run)] == ["CROSS"] * 4
     width = 2 * np.arccos(nu)
     np.testing.assert_allclose(np.diff(run.events.t)[::2], width, rtol=1e-2)
@@ -433,7 +433,7 @@ def test_an_excursion_within_one_step_is_found():
 def test_an_edge_excursion_within_one_step_is_found():
     law = jb.Coulomb(static=1e-9, kinetic=1e-9)
     osc = coulomb_belts(jb.Belt(50.0, law), jb.Belt(60.0, law, lower=1.0 - 1e-7))
-    run = simulate(osc, (-1.0, 0.0), 12.0, rtol=1e-4, atol=1e-10)
+    run = simulate(osc, (-1.0, 0.0), 12.0)
     assert [kind for kind, _ in kinds(run)] == ["EDGE"] * 4
 
 
@@ -508,8 +508,8 @@ OSC = ("class_b", (0.3, 0.35))
     ("build", "message"),
     [
         (lambda: jb.presets.class_a(np.nan), "velocity of .*belt.* must be finite, got nan"),
-        (lambda: jb.presets.class_a([0.1, 0.2]), "velocity must be a scalar.*got shape"),
-        (lambda: jb.presets.class_a("fast"), "velocity must be a number, got"),
+        (lambda: jb.Belt([0.1, 0.2], jb.Coulomb(1, 1)), "velocity must be a scalar.*got shape"),
+        (lambda: jb.Belt("fast", jb.Coulomb(1, 1)), "velocity must be a number, got"),
         (lambda: jb.presets.class_a(np.float32(0.3)), "velocity must be float64, got float32"),
         (lambda: jb.Conti(-1.0, 0.6, 10.0), "static of Conti must be >= 0, got -1"),
         (lambda: jb.Conti(1.0, 0.6, -10.0), "steepness of Conti must be >= 0, got -10"),
@@ -517,7 +517,7 @@ OSC = ("class_b", (0.3, 0.35))
         (lambda: jb.Stribeck(1.0, 0.6, 0.0), "velocity of Stribeck must be > 0, got 0"),
         (lambda: jb.Belt(0.1, jb.Coulomb(1, 1), load=-1), "load of .*belt.* must be >= 0, got -1"),
         (lambda: jb.Belt(0.1, jb.Coulomb(1, 1), lower=2, upper=1), "lower of .* must be < 1"),
-        (lambda: jb.Belt(0.1, 0.5), "friction of .* must be a friction law"),
+        (lambda: jb.Belt(0.1, 0.5), "friction must be a law such as"),
         (lambda: jb.presets.class_d(0.1, 0.2, 1.0, 0.0), "sigma0 must be <= sigma1 = 0"),
         (lambda: jb.Oscillator(0.5, ()), "belts must be at least one Belt, got none"),
         (lambda: jb.Oscillator(np.inf, (jb.Belt(0.1, jb.Coulomb(1, 1)),)), "damping must be fini"),
@@ -557,14 +557,14 @@ def test_impossible_arguments_are_named(arguments, message):
 
 def test_a_batched_oscillator_is_referred_to_vmap():
     batch = jax.vmap(jb.presets.class_a)(jnp.array([0.1, 0.2]))
-    with pytest.raises(ValueError, match=r"velocity must be a scalar \(use jax.vmap"):
+    with pytest.raises(ValueError, match=r"damping must be a scalar \(use jax.vmap"):
         jb.simulate(batch, (1.0, 0.0), 10.0)
 
 
 def test_float32_is_refused_with_the_remedy():
     jax.config.update("jax_enable_x64", False)
     try:
-        with pytest.raises(ValueError, match='jax.config.update\\("jax_enable_x64", True\\)'):
+        with pytest.raises(ValueError, match=r'jax.config.update\("jax_enable_x64", True\)'):
             jb.presets.class_a(0.3)
     finally:
         jax.config.update("jax_enable_x64", True)
