@@ -1,0 +1,305 @@
+"""Where the mass can rest: fixed points, segments of pseudo-equilibria, pseudo-foci; all at x2 = 0.
+
+The contact edges cut the x1 axis into zones. At rest within a zone every touching belt that moves
+pulls with u0_i mu_i(|nu_i|) sgn(nu_i), and the spring balances their sum, the pull, at x1 = pull.
+That is a fixed point, eq. (24) of the paper, if it lies in the zone. Touching belts at rest hold
+whatever is up to their capacity, the sum of u0_k mus_k: then all x1 within the capacity of the
+pull are pseudo-equilibria, a segment. At an edge between two zones whose accelerations both point
+to the edge, a_L > 0 > a_R, there is a pseudo-focus (see `modes.edge_focus`).
+
+Everything is in closed form, so derivatives with respect to any parameter go through. An edge that
+pushes away to both sides, a_L < 0 < a_R, is not listed: nothing that is disturbed stays near it.
+"""
+
+import enum
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from .checks import is_concrete, number, require
+from .modes import (
+    ABOVE,
+    BELOW,
+    STUCK,
+    Mode,
+    capacity,
+    edge_focus,
+    edges,
+    mode_acceleration,
+    settle,
+)
+from .oscillator import Oscillator
+
+
+class EquilibriumKind(enum.IntEnum):
+    """What sort of rest: in a smooth field, held by belts at rest, between the sides of an edge."""
+
+    FIXED_POINT = 1
+    SEGMENT = 2
+    PSEUDO_FOCUS = 3
+
+
+class Equilibria(eqx.Module):
+    """The equilibria (x1, 0) from left to right; what `equilibria` returns.
+
+    Arrays with a row each; under a transformation padded to a common length (four a belt, and
+    one), outside cut to what there is. `equilibria(osc)[i]` is one row, a loop runs over them.
+
+    - kind: an `EquilibriumKind`, [equilibria] (0 where padded).
+    - x1: position, of a segment its middle, [equilibria] (NaN where padded, like all below).
+    - x1_lower, x1_upper: ends of a segment, else both x1.
+    - modes: contact codes, [equilibria, belts] (+1/-1 slip with that sign of r_i, 0 stuck, -2/+2
+      mass below/above the belt's interval; all 0 where padded). At a pseudo-focus those of the
+      left-hand side of the edge.
+    - jacobian: of the field of the mode at a fixed point, [equilibria, 2, 2], else NaN.
+    - eigenvalues: its eigenvalues, eqs. (25) and (26) of the paper, the one with the larger real
+      or imaginary part first, complex [equilibria, 2], else NaN.
+    - rate: small disturbances behave like exp(rate t): the largest real part of the eigenvalues at
+      a fixed point; at a pseudo-focus (tr_L/a_L + tr_R/|a_R|) / (3 (1/a_L + 1/|a_R|)), or -inf
+      where a belt at rest touches, which ends them in a finite time; NaN for a segment.
+    - stable: rate < 0. A segment is stable if disturbances of some part of it end in it again.
+      That is where the needed force is less than the sum of u0_k mu_k(0); the rest of a segment,
+      if mu(0) is less than the static limit, holds but does not attract.
+    """
+
+    kind: Array
+    x1: Array
+    x1_lower: Array
+    x1_upper: Array
+    modes: Array
+    jacobian: Array
+    eigenvalues: Array
+    rate: Array
+    stable: Array
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def __getitem__(self, index) -> "Equilibria":
+        return _pick(self, index)
+
+    def __iter__(self) -> Iterator["Equilibria"]:
+        return (self[i] for i in range(len(self)))
+
+    def __repr__(self) -> str:
+        if not is_concrete(self) or self.kind.ndim > 1:
+            return f"Equilibria(kind={self.kind.shape}, x1={self.x1.shape})"
+        if self.kind.ndim == 1:
+            return f"Equilibria({'; '.join(map(_describe, self))})"
+        return f"Equilibria({_describe(self)})"
+
+
+def _pick(tree, index):
+    """The tree with every array indexed; where it can be in NumPy, which compiles nothing."""
+    if is_concrete((tree, index)):
+        return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[index]), tree)
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def _describe(row: Equilibria) -> str:
+    if row.kind == 0:
+        return "none"
+    kind = EquilibriumKind(int(row.kind))
+    where = number(row.x1)
+    if kind == EquilibriumKind.SEGMENT:
+        where = f"{number(row.x1_lower)} to {number(row.x1_upper)}"
+    return f"{'stable' if row.stable else 'unstable'} {kind.name} at x1 = {where}"
+
+
+def equilibria(osc: Oscillator) -> Equilibria:
+    """All equilibria of the oscillator, sorted by x1: see `Equilibria` for what is known of each.
+
+    osc: `Oscillator` with any friction laws, any number of belts and any contact intervals. Works
+    under `jax.jit`, `jax.vmap` and derivatives; nothing raises there. `ValueError` names a
+    parameter that is impossible.
+
+    A segment that reaches across a contact edge is given in pieces, one a zone, each with its own
+    contact codes. A fixed point exactly on an edge is listed with the zone that it belongs to, and
+    its eigenvalues and stability are those of that side alone.
+    """
+    _check(osc)
+    found = _equilibria(osc)
+    return _trim(found, found)
+
+
+def _check(osc):
+    require(
+        isinstance(osc, Oscillator), "osc", "an Oscillator, such as jb.presets.class_b(...)", osc
+    )
+    osc.check_scalars()
+    osc.check()
+
+
+def _trim(rows, found: Equilibria):
+    """Cut the padding off where it is known, that is, outside of transformations."""
+    if not is_concrete((rows, found)):
+        return rows
+    return _pick(rows, slice(int(np.sum(np.asarray(found.kind) > 0))))
+
+
+@eqx.filter_jit
+def _equilibria(osc: Oscillator) -> Equilibria:
+    """All candidates, one a zone and one an edge, sorted; those that are none come last as NaN."""
+    positions = jnp.sort(jnp.stack(edges(osc)))
+    zones, points = _in_zones(osc, positions), _at_edges(osc, positions)
+    candidates = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), zones, points)
+    return candidates[jnp.argsort(candidates.x1)]
+
+
+# --- within the zones: fixed points and segments ------------------------------------------------
+
+
+def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
+    end = jnp.full(1, jnp.inf)
+    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    mode = _contacts(osc, lower, rightward=True)
+    held = capacity(osc, mode)
+    # A belt at rest that can hold nothing, for lack of load or friction, slips (either sign does).
+    mode = Mode(tuple(jnp.where((c == STUCK) & (held == 0), 1.0, c) for c in mode.codes))
+    rest = jnp.zeros_like(lower)
+    pull = mode_acceleration(osc, mode, rest, rest)
+
+    is_fixed = (held == 0) & (lower <= pull) & (pull <= upper) & (lower < upper)
+    first, last = jnp.maximum(pull - held, lower), jnp.minimum(pull + held, upper)
+    is_segment = (held > 0) & (first < last)
+    exists = is_fixed | is_segment
+
+    jacobian = jax.vmap(lambda mode, x1: _jacobian(osc, mode, x1))(mode, pull)
+    eigenvalues = _eigenvalues(jnp.where(is_fixed[:, None, None], jacobian, jnp.eye(2)[None]))
+    rate = jnp.real(eigenvalues[:, 0])
+
+    moving_hold = jnp.zeros_like(held)
+    for belt, stuck in zip(osc.belts, mode.stuck, strict=True):
+        moving_hold += jnp.where(stuck, belt.load * belt.friction.mu(jnp.zeros(())), 0.0)
+    attracts = jnp.maximum(pull - moving_hold, lower) < jnp.minimum(pull + moving_hold, upper)
+
+    x1 = jnp.where(is_segment, 0.5 * (first + last), pull)
+    kind = jnp.where(is_segment, EquilibriumKind.SEGMENT.value, EquilibriumKind.FIXED_POINT.value)
+    return Equilibria(
+        kind=jnp.where(exists, kind, 0),
+        x1=jnp.where(exists, x1, jnp.nan),
+        x1_lower=jnp.where(exists, jnp.where(is_segment, first, x1), jnp.nan),
+        x1_upper=jnp.where(exists, jnp.where(is_segment, last, x1), jnp.nan),
+        modes=_codes(mode, exists),
+        jacobian=jnp.where(is_fixed[:, None, None], jacobian, jnp.nan),
+        eigenvalues=jnp.where(is_fixed[:, None], eigenvalues, complex(np.nan, np.nan)),
+        rate=jnp.where(is_fixed, rate, jnp.nan),
+        stable=jnp.where(is_segment, attracts, is_fixed & (rate < 0)) & exists,
+    )
+
+
+def _contacts(osc: Oscillator, x1: Array, *, rightward: bool) -> Mode:
+    """The contacts of a mass at rest just right or left of x1: sgn(nu_i) where belt i touches."""
+    codes = []
+    for belt in osc.belts:
+        is_below = x1 < belt.lower if rightward else x1 <= belt.lower
+        is_above = x1 >= belt.upper if rightward else x1 > belt.upper
+        code = jnp.where(is_above, ABOVE, jnp.sign(belt.velocity))
+        codes.append(jnp.where(is_below, BELOW, code))
+    return Mode(tuple(codes))
+
+
+def _codes(mode: Mode, exists: Array) -> Array:
+    codes = [jnp.where(exists, code, 0.0).astype(jnp.int8) for code in mode.codes]
+    return jnp.stack(codes, axis=-1)
+
+
+def _jacobian(osc: Oscillator, mode: Mode, x1: Array) -> Array:
+    """Derivative of the field of a mode, (x1', x2'), by the state at (x1, 0), [2, 2]."""
+
+    def field(y):
+        return jnp.stack([y[1], mode_acceleration(osc, mode, y[0], y[1])])
+
+    return jax.jacfwd(field)(jnp.stack([x1, jnp.zeros(())]))
+
+
+def _eigenvalues(matrix: Array) -> Array:
+    """Eigenvalues of matrices [..., 2, 2] in closed form, like eq. (26), hence differentiable."""
+    half_trace = 0.5 * (matrix[..., 0, 0] + matrix[..., 1, 1])
+    determinant = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
+    discriminant = half_trace**2 - determinant
+    root = jnp.sqrt(jnp.abs(discriminant))
+    real, imaginary = jnp.where(discriminant < 0, 0.0, root), jnp.where(discriminant < 0, root, 0.0)
+    pair = [lax.complex(half_trace + s * real, s * imaginary) for s in (1.0, -1.0)]
+    return jnp.stack(pair, axis=-1)
+
+
+# --- at the edges: pseudo-foci ------------------------------------------------------------------
+
+
+def _at_edges(osc: Oscillator, positions: Array) -> Equilibria:
+    before = jnp.concatenate([jnp.full(1, -jnp.inf), positions[:-1]])
+    # Edges at one place count once; finite numbers stand in for the infinite ones.
+    is_edge = jnp.isfinite(positions) & (positions > before)
+    x1 = jnp.where(is_edge, positions, 0.0)
+    rest = jnp.zeros_like(x1)
+    on_left, on_right = (_contacts(osc, x1, rightward=side) for side in (False, True))
+    left, right = (settle(osc, contacts, x1, rest) for contacts in (on_left, on_right))
+    focus = edge_focus(osc, left, right, x1)
+    # Where a belt at rest holds the mass, the segment on that side ends here.
+    exists = is_edge & focus.exists & ~left.any_stuck & ~right.any_stuck
+    # A belt at rest brakes on the way out and on the way back: each turn takes off a fraction of
+    # the velocity that does not go to 0 with it, so infinitely many turns take a finite time.
+    rubs = capacity(osc, on_left) + capacity(osc, on_right) > 0
+    rate = jnp.where(exists, jnp.where(rubs, -jnp.inf, focus.rate), jnp.nan)
+    x1 = jnp.where(exists, x1, jnp.nan)
+    none = jnp.full_like(x1, jnp.nan)
+    return Equilibria(
+        kind=jnp.where(exists, EquilibriumKind.PSEUDO_FOCUS.value, 0),
+        x1=x1,
+        x1_lower=x1,
+        x1_upper=x1,
+        modes=_codes(left, exists),
+        jacobian=jnp.broadcast_to(none[:, None, None], (*x1.shape, 2, 2)),
+        eigenvalues=jnp.broadcast_to(lax.complex(none, none)[:, None], (*x1.shape, 2)),
+        rate=rate,
+        stable=rate < 0,
+    )
+
+
+# --- the Hopf point -----------------------------------------------------------------------------
+
+
+def lyapunov_coefficient(osc: Oscillator) -> Array:
+    """First Lyapunov coefficient a of each fixed point; positive: the Hopf point is subcritical.
+
+    osc: `Oscillator` at a Hopf point, where the trace of the Jacobian is 0. Returns one number for
+    each row of `equilibria(osc)`, [equilibria], NaN where that is no fixed point. Elsewhere the
+    number still tells of the Hopf point nearby.
+
+    The normalisation is that of J. Guckenheimer and P. Holmes, Nonlinear Oscillations, Dynamical
+    Systems, and Bifurcations of Vector Fields (1983), eq. (3.4.11): the amplitude r of x1 obeys
+    r' = (trace/2) r + a r^3, so near the Hopf point there is a cycle with r^2 = -(trace/2)/a. The
+    l1 of Yu. A. Kuznetsov, Elements of Applied Bifurcation Theory, with eigenvectors of unit
+    length, is 2 a.
+
+    Their formula needs the linear part to be a rotation. It is one with unit frequency: the
+    derivatives of x2' by x1 and x2 are -1 and the trace. And x1' = x2 and the spring are linear,
+    so of its ten derivatives only two do not vanish, d^2 x2'/dx2^2, which enters in products with
+    vanishing ones only, and d^3 x2'/dx2^3: a = (d^3 x2'/dx2^3) / 16.
+    """
+    _check(osc)
+    found, coefficients = _lyapunov_coefficients(osc)
+    return _trim(coefficients, found)
+
+
+@eqx.filter_jit
+def _lyapunov_coefficients(osc: Oscillator) -> tuple[Equilibria, Array]:
+    found = _equilibria(osc)
+    mode = Mode(tuple(codes.astype(found.x1.dtype) for codes in jnp.moveaxis(found.modes, -1, 0)))
+    is_fixed = found.kind == EquilibriumKind.FIXED_POINT
+    rest = jnp.zeros_like(found.x1)
+
+    def derivative(fn):
+        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
+
+    def x2_prime(x2):
+        return mode_acceleration(osc, mode, rest, x2)
+
+    third = derivative(derivative(derivative(x2_prime)))(rest)
+    return found, jnp.where(is_fixed, third / 16, jnp.nan)
