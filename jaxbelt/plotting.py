@@ -7,7 +7,8 @@ new ones) and returns the axes. What is drawn is shown in the manner of the pape
   belt, in the colour of the belt; the part where the mass sticks (the sliding set) is a wide pale
   band behind it. Finite contact edges sigma are dotted vertical lines.
 - stable cycles as thick solid, unstable ones as dashed lines, other orbits thin and grey;
-- stable fixed points filled, unstable ones open, a segment of pseudo-equilibria as a thick bar.
+- stable fixed points filled, unstable ones open, pseudo-foci as diamonds in the same way, a segment
+  of pseudo-equilibria as a thick bar.
 
 The colours are those of Okabe and Ito, which colour-blind readers can tell apart. This is the only
 module that imports matplotlib, and `import jaxbelt` does not import this module.
@@ -15,7 +16,7 @@ module that imports matplotlib, and `import jaxbelt` does not import this module
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,6 +28,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
+from .equilibria import Equilibria, EquilibriumKind
+from .equilibria import equilibria as find_equilibria
 from .friction import AbstractFriction
 from .modes import mode_acceleration, mode_of_state
 from .oscillator import Oscillator
@@ -45,11 +48,13 @@ KEY_ORDER = (
     "sliding set",
     "stable fixed point",
     "unstable fixed point",
+    "stable pseudo-focus",
+    "unstable pseudo-focus",
     "pseudo-equilibria",
 )
 
 #: Settings for a journal's page, see `journal_style`.
-JOURNAL = {
+JOURNAL: dict[Any, Any] = {
     "font.family": "STIXGeneral",
     "mathtext.fontset": "stix",
     "font.size": 9,
@@ -68,6 +73,7 @@ JOURNAL = {
 }
 
 
+@runtime_checkable
 class ClosedOrbit(Protocol):
     """What `plot_phase_portrait` wants of a cycle: its stability, and states all around it."""
 
@@ -79,20 +85,6 @@ class ClosedOrbit(Protocol):
         ...
 
 
-class FixedPoint(Protocol):
-    """What `plot_phase_portrait` wants of an equilibrium (x1, 0).
-
-    One that has `kind == "segment"` is a segment of pseudo-equilibria, and has `x1_lower` and
-    `x1_upper` in place of these two.
-    """
-
-    @property
-    def x1(self) -> Any: ...
-
-    @property
-    def stable(self) -> Any: ...
-
-
 # --- time histories -----------------------------------------------------------------------------
 
 
@@ -102,7 +94,7 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
     trajectory: from `simulate`. ax: two axes, for x1 and for x2. Returns the two.
     """
     if ax is None:
-        ax = _new_axes(rows=2)
+        ax = tuple(_new_figure().subplots(2, sharex=True))
     t, ys = _path(trajectory)
     upper, lower = ax
     for axes, component, name in ((upper, 0, "displacement $x_1$"), (lower, 1, "velocity $x_2$")):
@@ -116,6 +108,7 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
             )
     upper.tick_params(labelbottom=False)
     lower.set_xlabel(r"time $\tau$")
+    _figure_of(lower).align_ylabels(ax)
     handles, labels = upper.get_legend_handles_labels()
     by_label = dict(sorted(zip(labels, handles, strict=True), key=lambda item: item[0]))
     if by_label:
@@ -133,20 +126,21 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
 
 def stick_phases(trajectory: Trajectory) -> list[tuple[int, float, float]]:
     """The stick phases of a trajectory as (belt, begin, end), in order of their beginnings."""
-    times = np.asarray(trajectory.arcs.t)
-    begins = times[np.isfinite(times)]
-    ends = begins + np.asarray(trajectory.arcs.duration)[: begins.size]
-    stuck = np.asarray(trajectory.arcs.mode)[: begins.size] == 0
+    # Approximate formulations have no arcs; their samples have to do.
+    if trajectory.arcs.t.size:
+        begins = np.asarray(trajectory.arcs.t)
+        ends = begins + np.asarray(trajectory.arcs.duration)
+        modes = np.asarray(trajectory.arcs.mode)
+    else:
+        begins, ends = np.asarray(trajectory.ts)[:-1], np.asarray(trajectory.ts)[1:]
+        modes = np.asarray(trajectory.modes)[:-1]
+    stuck = (modes == 0) & np.isfinite(begins)[:, None]
     phases: list[tuple[int, float, float]] = []
     for belt in range(stuck.shape[1]):
-        begin = None
-        for i in np.flatnonzero(stuck[:, belt]):
-            if begin is None:
-                begin = begins[i]
-            # Where another belt comes or goes meanwhile, the phase is in several arcs.
-            if i + 1 == begins.size or not stuck[i + 1, belt]:
-                phases.append((belt, float(begin), float(ends[i])))
-                begin = None
+        # A phase is several arcs where another belt comes or goes meanwhile.
+        switches = np.flatnonzero(np.diff(stuck[:, belt], prepend=False, append=False))
+        for first, after in switches.reshape(-1, 2):
+            phases.append((belt, float(begins[first]), float(ends[after - 1])))
     return sorted(phases, key=lambda phase: phase[1])
 
 
@@ -178,7 +172,7 @@ def plot_phase_portrait(
     trajectories: Trajectory | Sequence[Trajectory] = (),
     *,
     cycles: Sequence[ClosedOrbit] = (),
-    equilibria: Sequence[FixedPoint] = (),
+    equilibria: Equilibria | None = None,
     xlim: tuple[float, float] | None = None,
     ylim: tuple[float, float] | None = None,
     ax: Axes | None = None,
@@ -186,14 +180,15 @@ def plot_phase_portrait(
     """Orbits in the plane of displacement x1 and velocity x2, with the boundaries of `osc`.
 
     trajectories: one or several from `simulate`, thin. cycles: see `ClosedOrbit`; stable ones are
-    thick and solid, unstable ones dashed. equilibria: see `FixedPoint`. xlim, ylim: the window;
-    None fits what is drawn. Returns the axes.
+    thick and solid, unstable ones dashed. equilibria: None takes those of `osc`. xlim, ylim: the
+    window; None fits what is drawn. Returns the axes.
     """
     if isinstance(trajectories, Trajectory):
         trajectories = (trajectories,)
     ax = _new_axes() if ax is None else ax
     paths = [_path(trajectory)[1] for trajectory in trajectories]
     loops = [np.asarray(cycle.sample(400)) for cycle in cycles]
+    equilibria = find_equilibria(osc) if equilibria is None else equilibria
     window = _window(osc, [*paths, *loops], equilibria, xlim, ylim)
     ax.set(xlim=window[0], ylim=window[1])
     plot_boundaries(osc, ax)
@@ -235,7 +230,7 @@ def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
         dashes = (0, (5, 5)) if level in levels else "-"
         ax.plot(ends, [level, level], color=colour, linewidth=0.9, linestyle=dashes, zorder=1.5)
         levels.append(level)
-        x1 = np.linspace(*ends, 1201)
+        x1 = np.linspace(ends[0], ends[1], 1201)
         sticks = _sliding_set(osc, jnp.asarray(x1), jnp.full(x1.size, belt.velocity / osc.omega), i)
         band = np.where(sticks, level, np.nan)
         style = {"linewidth": 4.5, "alpha": 0.25, "solid_capstyle": "butt"}
@@ -292,7 +287,7 @@ def _name_boundary(ax: Axes, belt: int, xy, offset, ha: str, va: str, xycoords: 
 def _name_boundaries_outside(ax: Axes, names: list[tuple[float, int]]) -> None:
     """Names beside the right-hand side of the axes, at least a line of text apart."""
     bottom, top = ax.get_ylim()
-    height = ax.get_window_extent().height * 72 / ax.get_figure(root=True).dpi
+    height = ax.get_window_extent().height * 72 / _figure_of(ax).dpi
     line = 1.25 * matplotlib.rcParams["font.size"]
     names = sorted(names)
     at = np.array([(level - bottom) / (top - bottom) * height for level, _ in names])
@@ -311,14 +306,13 @@ def _name_boundaries_outside(ax: Axes, names: list[tuple[float, int]]) -> None:
 
 def _window(osc, paths, equilibria, xlim, ylim):
     """The given limits, or those that hold all that is drawn with a margin."""
-    segments = [e for e in equilibria if _is_segment(e)]
-    points = [float(e.x1) for e in equilibria if not _is_segment(e)]
-    x1 = [*points, *(float(x) for e in segments for x in (e.x1_lower, e.x1_upper))]
+    ends = [] if equilibria is None else [*equilibria.x1_lower, *equilibria.x1_upper]
+    x1 = [float(x) for x in ends]
     x1 += [x for path in paths for x in (path[:, 0].min(), path[:, 0].max())]
-    if not x1:
+    if not paths:
         # Nothing but the oscillator: every fixed point lies within the reach of friction.
         reach = 1 + sum(float(b.load * b.friction.static) for b in osc.belts)
-        x1 = [-reach, reach]
+        x1 += [-reach, reach]
     x1 += [float(e) for b in osc.belts for e in (b.lower, b.upper) if np.isfinite(float(e))]
     x2 = [0.0, *(float(b.velocity / osc.omega) for b in osc.belts)]
     x2 += [x for path in paths for x in (path[:, 1].min(), path[:, 1].max())]
@@ -332,23 +326,22 @@ def _with_margin(values: Sequence[float]) -> tuple[float, float]:
     return min(values) - margin, max(values) + margin
 
 
-def _is_segment(equilibrium: Any) -> bool:
-    return getattr(equilibrium, "kind", None) == "segment"
-
-
-def _draw_equilibrium(ax: Axes, equilibrium: Any) -> None:
-    if _is_segment(equilibrium):
-        ends = [float(equilibrium.x1_lower), float(equilibrium.x1_upper)]
-        style = {"linewidth": 3.5, "solid_capstyle": "butt", "label": "pseudo-equilibria"}
-        ax.plot(ends, [0, 0], color="black", zorder=5, **style)
+def _draw_equilibrium(ax: Axes, row: Equilibria) -> None:
+    face = "black" if row.stable else "white"
+    ends = [float(row.x1_lower), float(row.x1_upper)]
+    if row.kind == EquilibriumKind.SEGMENT:
+        bar = {"solid_capstyle": "butt", "zorder": 5}
+        ax.plot(ends, [0, 0], color="black", linewidth=3.5, label="pseudo-equilibria", **bar)
+        ax.plot(ends, [0, 0], color=face, linewidth=1.9, **bar)
         return
-    face = "black" if equilibrium.stable else "white"
+    is_focus = row.kind == EquilibriumKind.PSEUDO_FOCUS
+    stability = "stable" if row.stable else "unstable"
     ax.plot(
-        float(equilibrium.x1),
-        0.0,
-        label="stable fixed point" if equilibrium.stable else "unstable fixed point",
+        ends[:1],
+        [0.0],
+        label=f"{stability} {'pseudo-focus' if is_focus else 'fixed point'}",
         linestyle="none",
-        marker="o",
+        marker="D" if is_focus else "o",
         markersize=5,
         markerfacecolor=face,
         markeredgecolor="black",
@@ -406,10 +399,10 @@ def plot_vector_field(
     if kind not in ("streamlines", "arrows"):
         raise ValueError(f'kind must be "streamlines" or "arrows", got {kind!r}')
     ax = _new_axes() if ax is None else ax
-    window = _window(osc, [], [], xlim, ylim)
-    ax.set(xlim=window[0], ylim=window[1])
-    shape = (201, 201) if kind == "streamlines" else (17, 21)
-    x1, x2 = np.meshgrid(np.linspace(*window[0], shape[1]), np.linspace(*window[1], shape[0]))
+    (left, right), (bottom, top) = _window(osc, [], None, xlim, ylim)
+    ax.set(xlim=(left, right), ylim=(bottom, top))
+    columns, rows = (201, 201) if kind == "streamlines" else (21, 17)
+    x1, x2 = np.meshgrid(np.linspace(left, right, columns), np.linspace(bottom, top, rows))
     v1, v2 = _field(osc, jnp.asarray(x1), jnp.asarray(x2))
     if kind == "streamlines":
         ax.streamplot(
@@ -418,7 +411,7 @@ def plot_vector_field(
         )  # fmt: skip
     else:
         # One length on paper: scaled by the window, then normed.
-        v1, v2 = v1 / np.ptp(window[0]), v2 / np.ptp(window[1])
+        v1, v2 = v1 / (right - left), v2 / (top - bottom)
         size = np.hypot(v1, v2)
         ax.quiver(
             x1, x2, v1 / size, v2 / size,
@@ -556,14 +549,27 @@ def journal_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def draw_overview(
+    osc: Oscillator, trajectory: Trajectory, *, cycles: Sequence[ClosedOrbit] = ()
+) -> Figure:
+    """One trajectory on a page: its time histories, and beside them its phase portrait."""
+    figure = journal_figure(7.2, 3.2)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1))
+    x1 = figure.add_subplot(grid[0, 0])
+    x2 = figure.add_subplot(grid[1, 0], sharex=x1)
+    plot_time_history(trajectory, (x1, x2))
+    plot_phase_portrait(osc, trajectory, cycles=cycles, ax=figure.add_subplot(grid[:, 1]))
+    return figure
+
+
 def draw_key(figure: Figure, note: str = "") -> None:
-    """One key below the figure for all that its axes label, and a note below that."""
+    """Below the axes of a figure a note, and one key for all that they label."""
     by_label: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             by_label.setdefault(label, handle)
     labels = [label for label in KEY_ORDER if label in by_label]
-    key = figure.legend(
+    figure.legend(
         [by_label[label] for label in labels],
         labels,
         loc="outside lower center",
@@ -573,9 +579,6 @@ def draw_key(figure: Figure, note: str = "") -> None:
         title=note or None,
         title_fontsize="small",
     )
-    # What is read last stands last: the note under the entries.
-    if note:
-        key._legend_box.get_children().reverse()
 
 
 def save(figure: Figure, path: Path, dpi: int = 220) -> None:
@@ -583,9 +586,19 @@ def save(figure: Figure, path: Path, dpi: int = 220) -> None:
     figure.savefig(path, dpi=dpi)
 
 
-def _new_axes(rows: int = 1) -> Any:
-    # Only here: a window system is for people at a notebook or prompt.
+def _figure_of(ax: Axes) -> Figure:
+    figure = ax.get_figure(root=True)
+    if figure is None:
+        raise ValueError("ax must be part of a figure, got axes that were removed from theirs")
+    return figure
+
+
+def _new_axes() -> Axes:
+    return _new_figure().subplots()
+
+
+def _new_figure() -> Figure:
+    # Imported here only: a window is for people at a notebook or a prompt.
     from matplotlib import pyplot
 
-    _, axes = pyplot.subplots(rows, 1, sharex=True, layout="constrained")
-    return axes
+    return pyplot.figure(layout="constrained")

@@ -9,17 +9,21 @@ What cannot be computed yet is None in that tuple and named in `STILL_MISSING`. 
 a value take the one that the paper prints, and say so.
 """
 
+import functools
 import json
-from collections.abc import Callable, Iterator, Sequence
+import operator
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from . import plotting
-from .oscillator import Belt, Oscillator, acceleration
+from .equilibria import Equilibria, equilibria
+from .oscillator import Belt, Oscillator
 from .presets import (
     PUBLISHED,
     PUBLISHED_NU1,
@@ -34,24 +38,24 @@ from .simulate import Trajectory, simulate
 
 #: Every portrait runs over this time (dimensionless), sampled at so many times.
 TIME_SPAN, SAMPLES = 60.0, 2401
-
-STILL_MISSING = (
-    "The critical values other than the Hopf points need cycles, which this version cannot "
-    "compute yet; the portraits at those values are drawn at the printed ones.",
-    "So do the unstable cycles, in Figs. 4, 5, 8-10, 12 and 13, and the bifurcation diagrams, "
-    "Figs. 3 and 7.",
-    "Fig. 6, the regions in the plane of both velocities, needs the region map.",
-)
+#: Transients that do not join a cycle are drawn until this time.
+TRANSIENT = 25.0
 
 MISPRINT = (
-    r"Class (a) is computed with $p_3 = 10$. The $p_3 = 3.0$ that the paper prints for it is a "
-    "misprint: it does not give the paper's values."
+    "Class (a) is computed with p3 = 10. The 3.0 that the paper prints there is a misprint: it "
+    "does not give the paper's values."
 )
-
 MISSING_REGION = (
-    r"Just below $\nu_0^\delta = 0$ the exact cycle sticks on belt 0 only, panel (c): "
-    "a region between 3a and 4c that the paper does not list."
+    "Just below nu0 = 0 the exact cycle sticks on belt 0 only, Fig. 11 (c): a region between 3a "
+    "and 4c that the paper does not list."
 )
+STILL_MISSING = (
+    "Still missing: the critical values other than the Hopf points, the unstable cycles in "
+    "Figs. 4, 5, 8-10, 12, 13 and the bifurcation diagrams, Figs. 3, 7, need cycles; Fig. 6 needs "
+    "the region map. Portraits at a missing value are drawn at the printed one."
+)
+#: What is to be said beside the table.
+REMARKS = (MISPRINT, MISSING_REGION, STILL_MISSING)
 
 
 # --- the table ----------------------------------------------------------------------------------
@@ -98,27 +102,21 @@ def paper_oscillator(system: str, nu0: Any) -> Oscillator:
     return class_a(nu0) if system == "a" else class_b(nu0, PUBLISHED_NU1)
 
 
-def _trace(osc: Oscillator) -> jax.Array:
-    """Trace of the Jacobian at the fixed point, twice the real part of eq. (28).
-
-    At x2 = 0 the friction depends on x2 only, so no x1 is needed.
-    """
-    zero = jnp.zeros(())
-    signs = tuple(jnp.sign(belt.velocity) for belt in osc.belts)
-    return jax.jvp(lambda x2: acceleration(osc, signs, zero, x2), (zero,), (jnp.ones(()),))[1]
-
-
 def _hopf_point(system: str, guess: float) -> tuple[float, float, int]:
-    """(nu0, residual, iterations) of the Hopf point near a guess: Newton on the trace."""
-    residual_and_slope = jax.jit(jax.value_and_grad(lambda nu: _trace(paper_oscillator(system, nu))))
-    nu = guess
-    for iteration in range(20):
-        residual, slope = map(float, residual_and_slope(nu))
-        step = residual / slope
-        if abs(step) < 1e-15:
-            break
-        nu -= step
-    return nu, abs(residual), iteration
+    """(nu0, residual, iterations) of the Hopf point near a guess: Newton on eq. (28)."""
+    nu0, iterations = guess, 0
+    rate, slope = _rate_and_slope(system, nu0)
+    while abs(rate / slope) > 1e-15 and iterations < 20:
+        nu0, iterations = nu0 - float(rate / slope), iterations + 1
+        rate, slope = _rate_and_slope(system, nu0)
+    return nu0, float(abs(rate)), iterations
+
+
+@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.value_and_grad, argnums=1)
+def _rate_and_slope(system: str, nu0: jax.Array) -> jax.Array:
+    """Growth rate at the fixed point, eq. (28), and its derivative."""
+    return equilibria(paper_oscillator(system, nu0)).rate[0]
 
 
 # --- phase portraits ----------------------------------------------------------------------------
@@ -160,44 +158,10 @@ class Portraits(NamedTuple):
         panels = []
         for letter, (nu0, relation, remark) in zip("abcd", relations, strict=False):
             osc = paper_oscillator(self.system, nu0)
-            centre = _middle(fixed_points(osc)[0])
+            centre = float(equilibria(osc).x1[0])
             starts = tuple((centre + x1, x2) for x1, x2 in self.starts)
             panels.append(Panel(f"({letter}) ${relation}${remark}", osc, starts))
         return panels
-
-
-class FixedPoint(NamedTuple):
-    """An equilibrium (x1, 0) in a region where the field is smooth, eq. (24)."""
-
-    x1: float
-    stable: bool
-    kind: str = "fixed point"
-
-
-class Segment(NamedTuple):
-    """The pseudo-equilibria of a mass stuck to a belt at rest."""
-
-    x1_lower: float
-    x1_upper: float
-    kind: str = "segment"
-
-
-def fixed_points(osc: Oscillator) -> tuple[FixedPoint | Segment]:
-    """The equilibrium of classes (a) and (b), or the segment of them where a belt is at rest."""
-    at_rest = [belt for belt in osc.belts if belt.velocity == 0]
-    signs = tuple(jnp.sign(belt.velocity) for belt in osc.belts)
-    x1 = float(acceleration(osc, signs, jnp.zeros(()), jnp.zeros(())))
-    if at_rest:
-        held = float(sum(belt.load * belt.friction.static for belt in at_rest))
-        return (Segment(x1 - held, x1 + held),)
-    # At a subcritical Hopf point the fixed point repels, if weakly; rounding has no say in it.
-    return (FixedPoint(x1, bool(_trace(osc) < -1e-9)),)
-
-
-def _middle(equilibrium: FixedPoint | Segment) -> float:
-    if isinstance(equilibrium, Segment):
-        return (equilibrium.x1_lower + equilibrium.x1_upper) / 2
-    return equilibrium.x1
 
 
 class SimulatedCycle(NamedTuple):
@@ -212,19 +176,21 @@ class SimulatedCycle(NamedTuple):
 
 def simulate_panels(panels: Sequence[Panel]) -> list[list[Trajectory]]:
     """The orbits of every panel, all in one batch, so that one program is compiled."""
-    lanes = [(_with_two_belts(panel.oscillator), start) for panel in panels for start in panel.starts]
+    lanes = [
+        (_with_two_belts(panel.oscillator), start) for panel in panels for start in panel.starts
+    ]
     oscillators = jax.tree.map(lambda *leaves: np.stack(leaves), *(osc for osc, _ in lanes))
     starts = np.array([start for _, start in lanes])
-    times = np.linspace(0.0, TIME_SPAN, SAMPLES)
-
-    @jax.jit
-    @jax.vmap
-    def run(osc, start):
-        return simulate(osc, start, TIME_SPAN, ts=times, rtol=1e-9, atol=1e-9)
-
-    batch = jax.tree.map(np.asarray, run(oscillators, starts))
-    trajectories = iter([jax.tree.map(lambda leaf: leaf[i], batch) for i in range(len(lanes))])
+    batch = jax.tree.map(np.asarray, _run(oscillators, starts))
+    trajectories = (jax.tree.map(operator.itemgetter(lane), batch) for lane in range(len(lanes)))
     return [[next(trajectories) for _ in panel.starts] for panel in panels]
+
+
+@jax.jit
+@jax.vmap
+def _run(osc: Oscillator, start: jax.Array) -> Trajectory:
+    times = np.linspace(0.0, TIME_SPAN, SAMPLES)
+    return simulate(osc, start, TIME_SPAN, ts=times, rtol=1e-7, atol=1e-7)
 
 
 def _with_two_belts(osc: Oscillator) -> Oscillator:
@@ -257,27 +223,22 @@ def _onsets(trajectory: Trajectory) -> np.ndarray:
     return np.flatnonzero(trajectory.events.kind == EventKind.SLIP)
 
 
-def _transient(trajectory: Trajectory, cycle: SimulatedCycle | None, longest: float) -> Trajectory:
-    """The trajectory until it joins the cycle, and no longer than that time."""
-    end = longest
+def _transient(trajectory: Trajectory, cycle: SimulatedCycle | None) -> Trajectory:
+    """The trajectory until it joins the cycle, or until TRANSIENT if that is earlier."""
+    end = TRANSIENT
     if cycle is not None:
         for i in _onsets(trajectory):
             if np.allclose(trajectory.events.y[i], cycle.states[0], atol=1e-6):
                 end = min(end, trajectory.events.t[i])
-    shown = np.where(trajectory.ts <= end, trajectory.ts, np.nan)
-    events = trajectory.events
-    events = events.__class__(
-        np.where(events.t <= end, events.t, np.nan), events.y, events.kind, events.belt
-    )
-    return Trajectory(
-        shown, trajectory.ys, trajectory.modes, events, trajectory.arcs, trajectory.status
-    )
+    times = trajectory.ts, trajectory.events.t
+    shown = tuple(np.where(t <= end, t, np.nan) for t in times)
+    return eqx.tree_at(lambda run: (run.ts, run.events.t), trajectory, shown)
 
 
 def draw_portraits(
     portraits: Portraits, panels: Sequence[Panel], orbits: Sequence[Sequence[Trajectory]]
 ) -> plotting.Figure:
-    """The portraits side by side: transients thin, the steady cycle thick, boundaries, equilibria."""
+    """The portraits side by side: transients thin, the steady cycle thick, equilibria."""
     figure = plotting.journal_figure(7.2, 2.75 if len(panels) == 3 else 4.9)
     if len(panels) == 3:
         axes = figure.subplots(1, 3, sharey=True)
@@ -288,17 +249,26 @@ def draw_portraits(
         cycle = cycles[0] if cycles else None
         plotting.plot_phase_portrait(
             panel.oscillator,
-            [_transient(trajectory, cycle, 30.0) for trajectory in trajectories],
+            [_transient(trajectory, cycle) for trajectory in trajectories],
             cycles=cycles,
-            equilibria=fixed_points(panel.oscillator),
+            equilibria=_equilibria(panel.oscillator),
             xlim=portraits.xlim,
             ylim=portraits.ylim,
             ax=ax,
         )
         ax.set_title(panel.title, loc="left")
         ax.label_outer()
-    plotting.draw_key(figure, note=portraits.note)
+    # Remarks are for the terminal too, where symbols are words.
+    note = portraits.note.replace("p3", "$p_3$").replace("nu0", r"$\nu_0$")
+    plotting.draw_key(figure, note=note)
     return figure
+
+
+def _equilibria(osc: Oscillator) -> Equilibria:
+    """Where the mass can rest. A subcritical Hopf point repels, whatever rounding says of it."""
+    found = equilibria(osc)
+    attracts = found.stable & ~(jnp.abs(found.rate) < 1e-9)
+    return eqx.tree_at(lambda rows: rows.stable, found, attracts)
 
 
 # --- the other figures --------------------------------------------------------------------------
@@ -326,13 +296,32 @@ def draw_classes() -> plotting.Figure:
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     nu0, nu1 = 0.3, 0.7
     classes = (
-        (class_a(nu0), r"(a) belt 0 only: $\sigma_0, \sigma_1 \to +\infty$"),
-        (class_b(nu0, nu1), r"(b) both belts: $\sigma_0 \to -\infty,\ \sigma_1 \to +\infty$"),
-        (class_c(nu0, nu1, 0.5), r"(c) sequential: $\sigma_0 = \sigma_1 = \sigma$"),
-        (class_d(nu0, nu1, -0.5, 1.0), r"(d) overlapping: $\sigma_0 < \sigma_1$"),
+        (
+            class_a(nu0),
+            r"(a) belt 0 only: $\sigma_0, \sigma_1 \to +\infty$",
+            {"$D_1$": (2.6, -1.2), "$D_2$": (2.6, 1.2)},
+        ),
+        (
+            class_b(nu0, nu1),
+            r"(b) both belts: $\sigma_0 \to -\infty,\ \sigma_1 \to +\infty$",
+            {"$D_1$": (2.6, -1.2), "$D_2$": (2.6, 0.5), "$D_3$": (2.6, 1.2)},
+        ),
+        (
+            class_c(nu0, nu1, 0.5),
+            r"(c) sequential: $\sigma_0 = \sigma_1 = \sigma$",
+            {"belt 0": (-0.75, -1.2), "belt 1": (1.75, -1.2)},
+        ),
+        (
+            class_d(nu0, nu1, -0.5, 1.0),
+            r"(d) overlapping: $\sigma_0 < \sigma_1$",
+            {"belt 0": (-1.25, -1.2), "both": (0.25, -1.2), "belt 1": (2.0, -1.2)},
+        ),
     )
-    for ax, (osc, title) in zip(axes.flat, classes, strict=True):
+    white = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
+    for ax, (osc, title, names) in zip(axes.flat, classes, strict=True):
         plotting.plot_vector_field(osc, xlim=(-2.0, 3.0), ylim=(-1.5, 1.5), ax=ax)
+        for name, (x1, x2) in names.items():
+            ax.text(x1, x2, name, ha="center", va="center", bbox=white)
         ax.set_title(title, loc="left")
         ax.label_outer()
     return figure

@@ -64,6 +64,8 @@ MAX_ARC = 1.0
 MAX_STEPS = 100_000
 #: An orbit this close to a stable pseudo-focus (|x2| at the edge) has converged to it.
 FOCUS_RADIUS = 1e-2
+#: Turns with a smaller |x2| than this are smaller than the rounding of x1.
+FOCUS_ROUNDING = 1e-7
 
 
 class Events(eqx.Module):
@@ -433,7 +435,8 @@ def _slip_segment(osc: Oscillator, state: _State, t1, rtol, atol) -> _Step:
 def _has_converged(osc, left, right, edge, x2):
     """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
 
-    The leading term of a turn must outweigh the next one by ten, and no boundary may be near.
+    The leading term of a turn must outweigh the next one by ten, and no boundary may be near. With
+    a belt at rest the turns shrink to rounding in finite time.
     """
     focus = edge_focus(osc, left, right, edge)
     size = jnp.abs(x2)
@@ -448,7 +451,7 @@ def _has_converged(osc, left, right, edge, x2):
         & (2 * osc.omega * size < nearest)
     )
     slips = ~left.any_stuck & ~right.any_stuck
-    return focus.exists & slips & (captured | (size < 1e-13))
+    return focus.exists & slips & (captured | (size < FOCUS_ROUNDING))
 
 
 def _stick_segment(osc: Oscillator, state: _State, t1) -> _Step:
@@ -627,10 +630,17 @@ def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> T
         belt=jnp.where(has_event, records.belt[order], -1),
     )
     if ts is None:
+        # An even grid, and between its points the entries of the arcs, which are known already.
         grid = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)
-        entries = jnp.where(jnp.isnan(records.t), t1, records.t)
-        ts = jnp.sort(jnp.concatenate([grid, entries]))
-    ys, modes = _sample(osc, final, records, ts, rtol, atol)
+        ys, modes = _sample(osc, final, records, grid, rtol, atol)
+        unused = jnp.isnan(records.t)
+        ts = jnp.concatenate([grid, jnp.where(unused, t1, records.t)])
+        ys = jnp.concatenate([ys, jnp.where(unused[:, None], ys[-1], records.y)])
+        modes = jnp.concatenate([modes, jnp.where(unused[:, None], modes[-1], records.mode)])
+        order = jnp.argsort(ts)
+        ts, ys, modes = ts[order], ys[order], modes[order]
+    else:
+        ys, modes = _sample(osc, final, records, ts, rtol, atol)
     arcs = Arcs(records.t, records.y, records.mode, records.duration)
     return Trajectory(ts, ys, modes, events, arcs, final.status)
 
@@ -742,14 +752,17 @@ def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
     """Cut the padding off where lengths are known, that is, outside of transformations."""
     if not is_concrete(trajectory) or trajectory.ts.ndim != 1:
         return trajectory
-    events = jax.tree.map(
-        lambda leaf: leaf[: int(np.sum(trajectory.events.kind > 0))], trajectory.events
-    )
-    arcs = jax.tree.map(
-        lambda leaf: leaf[: int(np.sum(~np.isnan(trajectory.arcs.t)))], trajectory.arcs
-    )
-    ts, ys, modes = trajectory.ts, trajectory.ys, trajectory.modes
+    kept = np.flatnonzero(trajectory.events.kind)
+    events = jax.tree.map(lambda leaf: _take(leaf, kept), trajectory.events)
+    entered = np.flatnonzero(~np.isnan(trajectory.arcs.t))
+    arcs = jax.tree.map(lambda leaf: _take(leaf, entered), trajectory.arcs)
+    samples = (trajectory.ts, trajectory.ys, trajectory.modes)
     if trim_samples:
-        _, first = np.unique(np.asarray(ts), return_index=True)
-        ts, ys, modes = ts[first], ys[first], modes[first]
-    return Trajectory(ts, ys, modes, events, arcs, trajectory.status)
+        _, distinct = np.unique(trajectory.ts, return_index=True)
+        samples = jax.tree.map(lambda leaf: _take(leaf, distinct), samples)
+    return Trajectory(*samples, events, arcs, trajectory.status)
+
+
+def _take(leaf, indices):
+    # By NumPy: a gather of JAX's would be compiled for each new length.
+    return jnp.asarray(np.asarray(leaf)[indices])

@@ -483,6 +483,19 @@ def test_a_pseudo_focus_is_recognised():
     assert at_once.status == Status.PSEUDO_FOCUS
 
 
+@pytest.mark.parametrize("x2", [0.05, 0.0])
+def test_a_pseudo_focus_with_a_belt_at_rest_is_reached_in_finite_time(x2):
+    law = jb.Conti(1.0, 0.6, 10.0)
+    osc = jb.Oscillator(
+        0.5, (jb.Belt(0.0, law, upper=-1.2), jb.Belt(-0.3, law, load=2.0, lower=-1.2))
+    )
+    run = simulate(osc, (-1.2, x2), 9.0)
+    assert run.status == Status.PSEUDO_FOCUS
+    assert run.ys[-1].tolist() == [-1.2, 0.0]
+    # The oracle's turns have shrunk to nothing by then.
+    assert float(run.arcs.t[-1]) < 0.8724
+
+
 def test_a_used_up_budget_gives_what_there_is():
     run = jb.simulate(jb.presets.class_b(-0.2, 0.35), (3.0, 0.0), 100.0, max_segments=16)
     assert run.status == Status.TOO_MANY_SEGMENTS

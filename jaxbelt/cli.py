@@ -1,0 +1,313 @@
+"""The command line, `jaxbelt reproduce` and `jaxbelt simulate`: words in, files out."""
+
+import csv
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+import jaxbelt as jb
+
+app = typer.Typer(
+    name="jaxbelt",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+)
+
+#: The arguments of the four classes of the paper, and what they are unless given.
+CLASSES = {
+    "a": {"nu0": 0.2},
+    "b": {"nu0": 0.45, "nu1": 0.35},
+    "c": {"nu0": 0.2, "nu1": 0.4, "sigma": 0.8},
+    "d": {"nu0": 0.2, "nu1": 0.4, "sigma0": 0.5, "sigma1": 1.0},
+}
+#: The friction laws by name, and what their arguments are unless given.
+LAWS: dict[str, tuple[type[jb.AbstractFriction], dict[str, float | None]]] = {
+    "conti": (jb.Conti, {"static": 1.0, "residual": 0.6, "steepness": 10.0, "quadratic": 0.0}),
+    "coulomb": (jb.Coulomb, {"static": None, "kinetic": None}),
+    "stribeck": (jb.Stribeck, {"static": None, "kinetic": None, "stribeck_velocity": None}),
+}
+
+
+@app.callback()
+def main() -> None:
+    """Belt-driven dry-friction oscillators: simulation and bifurcation analysis.
+
+    All quantities are dimensionless: displacement x1, velocity x2, time tau = omega t, belt
+    velocities nu0, nu1. **jaxbelt COMMAND --help** explains a command.
+    """
+    # The package never touches JAX's settings; a program of its own may.
+    jax.config.update("jax_enable_x64", True)
+
+
+@contextmanager
+def _plain_errors() -> Iterator[None]:
+    """What a user did wrong is told in its one sentence, with exit code 2."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        typer.secho(f"Error: {error}", err=True, fg=typer.colors.RED)
+        raise typer.Exit(2) from None
+
+
+def _console() -> Console:
+    # A file has no width that lines would have to be folded to.
+    console = Console()
+    return console if console.is_terminal else Console(width=200)
+
+
+# --- reproduce ----------------------------------------------------------------------------------
+
+
+@app.command()
+def reproduce(
+    out: Annotated[
+        Path, typer.Option(help="Folder for the files; made where it is not there.")
+    ] = Path("reproduction"),
+) -> None:
+    """Recompute the table and the figures of Casini and Vestroni (2004).
+
+    Writes **critical_values.json** (the critical belt velocities of sections 3.2 and 3.3
+    of the paper: printed, computed, residual, iterations) and the figures as **figNN.png**,
+    numbered as in the paper, and prints the table. Takes about a minute, most of it compilation.
+
+    Example: **jaxbelt reproduce --out results**
+    """
+    # Imported late, with matplotlib behind it, to keep `--help` quick.
+    from . import reproduce as paper
+
+    console = _console()
+    columns = (
+        TextColumn("{task.description:<32}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with _plain_errors(), Progress(*columns, console=console) as progress:
+        task = progress.add_task("", total=paper.steps())
+        started = False
+
+        def report(description: str) -> None:
+            nonlocal started
+            progress.update(task, advance=int(started), description=description)
+            started = True
+
+        values = paper.reproduce(out, report)
+        progress.update(task, advance=1, description="done")
+    console.print(_table_of(values))
+    for line in (
+        *paper.REMARKS,
+        f"Written to {out}: critical_values.json, {', '.join(paper.FIGURES)}",
+    ):
+        console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
+
+
+def _table_of(values) -> Table:
+    table = Table(title="Critical velocities nu0 of the paper, recomputed")
+    for name in ("class", "point", "kind"):
+        table.add_column(name)
+    for name in ("printed", "computed", "difference", "residual", "iterations"):
+        table.add_column(name, justify="right")
+    for value in values:
+        first = (value.system, value.point, value.kind, f"{value.printed:.5g}")
+        if value.computed is None:
+            table.add_row(*first, "missing: needs cycles", "", "", "")
+            continue
+        table.add_row(
+            *first,
+            f"{value.computed:.12f}",
+            f"{value.computed - value.printed:+.1e}",
+            f"{value.residual:.0e}",
+            str(value.iterations),
+        )
+    return table
+
+
+# --- simulate -----------------------------------------------------------------------------------
+
+
+@app.command()
+def simulate(
+    system: Annotated[
+        str, typer.Option("--class", help="The paper's class of contact: a, b, c or d.")
+    ] = "b",
+    nu0: Annotated[float | None, typer.Option(help="Velocity of belt 0.")] = None,
+    nu1: Annotated[float | None, typer.Option(help="Velocity of belt 1 (classes b, c, d).")] = None,
+    sigma: Annotated[float | None, typer.Option(help="Edge between the belts (class c).")] = None,
+    sigma0: Annotated[float | None, typer.Option(help="Where belt 1 begins (class d).")] = None,
+    sigma1: Annotated[float | None, typer.Option(help="Where belt 0 ends (class d).")] = None,
+    belt: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A belt in full, instead of a class; give it once a belt. A velocity, then "
+            "name=value with commas between: load, lower, upper (its contact interval), law."
+        ),
+    ] = None,
+    damping: Annotated[float, typer.Option(help="zeta = c / sqrt(k m).")] = 0.5,
+    omega: Annotated[float, typer.Option(help="sqrt(k / m).")] = 1.0,
+    start: Annotated[
+        tuple[float, float],
+        typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0."),
+    ] = (3.0, 0.0),
+    t1: Annotated[float, typer.Option(help="End of the time span, which begins at 0.")] = 100.0,
+    samples: Annotated[
+        int, typer.Option(help="How many times, evenly spread over the span, are written.")
+    ] = 2001,
+    formulation: Annotated[
+        str,
+        typer.Option(
+            help="filippov (exact), switch (the paper's switch model) or smooth (tanh for sgn)."
+        ),
+    ] = "filippov",
+    v_star: Annotated[float, typer.Option(help="Half-width of the switch model's band.")] = 1e-3,
+    eps: Annotated[float, typer.Option(help="Width of the smooth model's tanh.")] = 1e-3,
+    tolerance: Annotated[
+        float, typer.Option(help="Relative and absolute tolerance of the integrator.")
+    ] = 1e-10,
+    out: Annotated[
+        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
+    ] = Path("trajectory"),
+) -> None:
+    """Follow one oscillator from one start; write a picture and the numbers.
+
+    - **OUT.png**: time histories with the stick phases shaded, and the phase portrait.
+
+    - **OUT.csv**: t, x1, x2 and the contact of each belt: 1 or -1 slip with that sign of the
+      relative velocity nu - omega x2, 0 stuck, -2 or 2 the mass below or above the belt's interval.
+
+    - **OUT_events.csv**: t, x1, x2, kind (STICK, SLIP, CROSS, EDGE) and belt of every event.
+
+    The classes have the friction of the paper (Conti's law, mus = 1, p1 = 0.6, p3 = 10):
+
+    - a: one belt. Give --nu0.
+
+    - b: two belts that always touch. Give --nu0 --nu1.
+
+    - c: belt 0 below sigma, belt 1 above it. Give --nu0 --nu1 --sigma.
+
+    - d: belt 0 below sigma1, belt 1 above sigma0. Give --nu0 --nu1 --sigma0 --sigma1.
+
+    The laws of a --belt are conti (static, residual, steepness, quadratic; those of the paper
+    unless given), coulomb (static, kinetic) and stribeck (static, kinetic, stribeck_velocity).
+
+    Examples:
+
+    - jaxbelt simulate --class a --nu0 0.2 --start 1.5 0 --t1 60
+
+    - jaxbelt simulate --class d --nu1 -0.3 --sigma0 0 --sigma1 0.5 --out overlap
+
+    - jaxbelt simulate --belt 0.3 --belt 0.5,law=coulomb,static=0.8,kinetic=0.5,lower=0.2
+    """
+    from . import plotting
+    from .reproduce import steady_cycle
+
+    console = _console()
+    with _plain_errors():
+        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
+        if samples < 2:
+            raise ValueError(f"samples must be at least 2, got {samples}")
+        given = {name: value for name, value in arguments.items() if value is not None}
+        belts = _belts_of_class(system, given) if not belt else _belts_in_full(belt, given)
+        osc = jb.Oscillator(damping, belts, omega)
+        with console.status("simulating (the first seconds are compilation)"):
+            trajectory = jb.simulate(
+                osc,
+                start,
+                t1,
+                ts=np.array([t1 * i / (samples - 1) for i in range(samples)]),
+                rtol=tolerance,
+                atol=tolerance,
+                formulation=formulation,
+                v_star=v_star,
+                eps=eps,
+            )
+        out.parent.mkdir(parents=True, exist_ok=True)
+        written = [out.with_name(out.name + end) for end in (".png", ".csv", "_events.csv")]
+        cycle = steady_cycle(trajectory)
+        with plotting.journal_style():
+            figure = plotting.draw_overview(osc, trajectory, cycles=[cycle] if cycle else [])
+            plotting.save(figure, written[0])
+        write_samples(trajectory, written[1])
+        write_events(trajectory, written[2])
+    for line in (repr(trajectory), f"Written: {', '.join(map(str, written))}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    if int(trajectory.status) >= jb.Status.TOO_MANY_SEGMENTS:
+        raise typer.Exit(1)
+
+
+def _belts_of_class(system: str, given: dict[str, float]) -> tuple[jb.Belt, ...]:
+    if system not in CLASSES:
+        raise ValueError(f"class must be a, b, c or d, got {system}")
+    arguments = CLASSES[system]
+    for name in given:
+        if name not in arguments:
+            raise ValueError(f"class {system} must have only {', '.join(arguments)}, got {name}")
+    make = getattr(jb.presets, f"class_{system}")
+    return make(**{**arguments, **given}).belts
+
+
+def _belts_in_full(texts: list[str], given: dict[str, float]) -> list[jb.Belt]:
+    if given:
+        raise ValueError(f"with --belt no class must be described, got {', '.join(given)}")
+    return [parse_belt(text) for text in texts]
+
+
+def parse_belt(text: str) -> jb.Belt:
+    """The belt that a text such as `0.3,load=0.5,law=coulomb,static=0.8,kinetic=0.5` describes."""
+    velocity, *parts = text.split(",")
+    words = dict.fromkeys(["velocity"], velocity)
+    for part in parts:
+        name, equals, value = part.partition("=")
+        if not equals:
+            raise ValueError(f"belt {text!r} must have name=value after its velocity, got {part!r}")
+        words[name.strip()] = value
+    name_of_law = words.pop("law", "conti").strip()
+    if name_of_law not in LAWS:
+        raise ValueError(f"law of belt {text!r} must be {', '.join(LAWS)}, got {name_of_law}")
+    law, defaults = LAWS[name_of_law]
+    known = ("velocity", "load", "lower", "upper", *defaults)
+    numbers: dict[str, Any] = {}
+    for name, word in words.items():
+        if name not in known:
+            raise ValueError(f"belt {text!r} must have only {', '.join(known)}, got {name}")
+        try:
+            numbers[name] = float(word)
+        except ValueError:
+            raise ValueError(f"{name} of belt {text!r} must be a number, got {word!r}") from None
+    friction = {}
+    for name, default in defaults.items():
+        friction[name.removeprefix("stribeck_")] = numbers.pop(name, default)
+        if friction[name.removeprefix("stribeck_")] is None:
+            raise ValueError(f"belt {text!r} must have {name}, which {name_of_law} needs")
+    return jb.Belt(friction=law(**friction), **numbers)
+
+
+def write_samples(trajectory: jb.Trajectory, path: Path) -> None:
+    """t, x1, x2 and the contact code of every belt, a row a sample; numbers to the last digit."""
+    modes = np.asarray(trajectory.modes)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "x1", "x2", *(f"mode{i}" for i in range(modes.shape[1]))])
+        ts, ys = np.asarray(trajectory.ts).tolist(), np.asarray(trajectory.ys).tolist()
+        for t, y, mode in zip(ts, ys, modes.tolist(), strict=True):
+            writer.writerow([t, *y, *mode])
+
+
+def write_events(trajectory: jb.Trajectory, path: Path) -> None:
+    """t, x1, x2, kind and belt, a row an event."""
+    events = trajectory.events
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "x1", "x2", "kind", "belt"])
+        columns = (np.asarray(events.t).tolist(), np.asarray(events.y).tolist())
+        kinds = [jb.EventKind(kind).name for kind in np.asarray(events.kind).tolist()]
+        for t, y, kind, belt in zip(*columns, kinds, np.asarray(events.belt).tolist(), strict=True):
+            writer.writerow([t, *y, kind, belt])

@@ -1,0 +1,285 @@
+"""The command line: files that read back as what was computed, and errors in one sentence."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import jaxbelt as jb
+from jaxbelt import reproduce
+from jaxbelt.cli import _belts_of_class, app, parse_belt
+
+runner = CliRunner()
+
+#: Every run of these tests has one shape, and so one compiled program.
+SPAN, TIMES = "--t1 50 --samples 401", np.arange(401) * 50.0 / 400
+
+
+def read(path):
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def column(rows, name):
+    return np.array([float(row[name]) for row in rows])
+
+
+# --- simulate -----------------------------------------------------------------------------------
+
+
+def test_simulate_writes_what_simulate_returns(tmp_path):
+    out = tmp_path / "new" / "cross"
+    arguments = "--class b --nu0 0.3 --nu1 0.4 --start 1.5 1.5 " + SPAN
+    result = runner.invoke(app, ["simulate", *arguments.split(), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    trajectory = jb.simulate(jb.presets.class_b(0.3, 0.4), (1.5, 1.5), 50.0, ts=TIMES)
+    rows = read(tmp_path / "new" / "cross.csv")
+    assert list(rows[0]) == ["t", "x1", "x2", "mode0", "mode1"]
+    # Written to the last digit.
+    np.testing.assert_array_equal(column(rows, "t"), trajectory.ts)
+    np.testing.assert_array_equal(column(rows, "x1"), trajectory.ys[:, 0])
+    np.testing.assert_array_equal(column(rows, "x2"), trajectory.ys[:, 1])
+    for belt in (0, 1):
+        np.testing.assert_array_equal(column(rows, f"mode{belt}"), trajectory.modes[:, belt])
+    events = read(tmp_path / "new" / "cross_events.csv")
+    np.testing.assert_array_equal(column(events, "t"), trajectory.events.t)
+    np.testing.assert_array_equal(column(events, "x1"), trajectory.events.y[:, 0])
+    np.testing.assert_array_equal(column(events, "belt"), trajectory.events.belt)
+    kinds = [jb.EventKind(int(kind)).name for kind in trajectory.events.kind]
+    assert [row["kind"] for row in events] == kinds
+    assert {"STICK", "SLIP", "CROSS"} <= set(kinds)
+    assert (tmp_path / "new" / "cross.png").read_bytes().startswith(b"\x89PNG")
+    assert repr(trajectory) in result.output
+
+
+def test_simulate_takes_belts_in_full(tmp_path):
+    arguments = "--belt 0.3,steepness=8 --belt=-0.1,load=0.5 --damping 0.4 --omega 1.1 " + SPAN
+    result = runner.invoke(app, ["simulate", *arguments.split(), "--out", str(tmp_path / "run")])
+    assert result.exit_code == 0, result.output
+    steep, weak = (jb.Conti(static=1.0, residual=0.6, steepness=p3) for p3 in (8.0, 10.0))
+    osc = jb.Oscillator(0.4, (jb.Belt(0.3, steep), jb.Belt(-0.1, weak, load=0.5)), omega=1.1)
+    expected = jb.simulate(osc, (3.0, 0.0), 50.0, ts=TIMES)
+    rows = read(tmp_path / "run.csv")
+    np.testing.assert_array_equal(column(rows, "x1"), expected.ys[:, 0])
+
+
+def test_classes_are_those_of_the_presets():
+    def belts(system, **given):
+        return repr(_belts_of_class(system, given))
+
+    assert belts("a", nu0=0.1) == repr(jb.presets.class_a(0.1).belts)
+    assert belts("c", nu0=0.1, nu1=-0.2, sigma=0.3) == repr(
+        jb.presets.class_c(0.1, -0.2, 0.3).belts
+    )
+    assert belts("d", nu0=0.1, nu1=-0.2, sigma0=0.3, sigma1=0.4) == repr(
+        jb.presets.class_d(0.1, -0.2, 0.3, 0.4).belts
+    )
+
+
+def test_belts_are_parsed():
+    belt = parse_belt("-0.3, law=stribeck, static=0.9, kinetic=0.5, stribeck_velocity=0.1,load=2")
+    expected = jb.Belt(-0.3, jb.Stribeck(static=0.9, kinetic=0.5, velocity=0.1), load=2.0)
+    assert repr(belt) == repr(expected)
+    belt = parse_belt("0.5,law=coulomb,static=0.8,kinetic=0.5,lower=0.2")
+    assert repr(belt) == repr(jb.Belt(0.5, jb.Coulomb(static=0.8, kinetic=0.5), lower=0.2))
+    belt = parse_belt("0.5,steepness=3")
+    assert repr(belt) == repr(jb.Belt(0.5, jb.Conti(static=1.0, residual=0.6, steepness=3.0)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ("--class q", "class must be a, b, c or d, got q"),
+        ("--class b --sigma 1", "class b must have only nu0, nu1, got sigma"),
+        ("--class a --nu0 nan", "velocity of belt must be finite, got nan"),
+        ("--belt 0.3 --nu0 1", "with --belt no class must be described, got nu0"),
+        ("--belt fast", "velocity of belt 'fast' must be a number, got 'fast'"),
+        (
+            "--belt 0.3,static",
+            "belt '0.3,static' must have name=value after its velocity, got 'static'",
+        ),
+        (
+            "--belt 0.3,law=dry",
+            "law of belt '0.3,law=dry' must be conti, coulomb, stribeck, got dry",
+        ),
+        (
+            "--belt 0.3,law=coulomb,grip=1",
+            "belt '0.3,law=coulomb,grip=1' must have only velocity, load, lower, upper, static, "
+            "kinetic, got grip",
+        ),
+        (
+            "--belt 0.3,law=coulomb,static=1",
+            "belt '0.3,law=coulomb,static=1' must have kinetic, which coulomb needs",
+        ),
+        ("--belt 0.3,load=-1", "load of belt must be >= 0, got -1.0"),
+        ("--omega 0", "omega must be > 0, got 0.0"),
+        ("--t1 -1", "t1 must be > t0 = 0.0, got -1.0"),
+        ("--t1 inf", "t1 must be finite, got inf"),
+        ("--start nan 0", "y0 must be finite, got [nan  0.]"),
+        ("--samples 1", "samples must be at least 2, got 1"),
+        ("--tolerance 0", "rtol must be > 0, got 0.0"),
+        (
+            "--formulation exact",
+            'formulation must be "filippov", "switch" or "smooth", got \'exact\'',
+        ),
+    ],
+)
+def test_simulate_tells_what_is_wrong_in_one_sentence(tmp_path, arguments, sentence):
+    out = tmp_path / "run"
+    result = runner.invoke(app, ["simulate", *arguments.split(), "--out", str(out)])
+    assert result.exit_code == 2
+    assert result.stderr == f"Error: {sentence}\n"
+    assert result.stdout == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_is_cut_short_is_written_and_exits_with_1(tmp_path, monkeypatch):
+    whole = jb.simulate
+
+    def cut_short(*args, **kwargs):
+        trajectory = whole(*args, **kwargs)
+        status = jnp.asarray(jb.Status.TOO_MANY_SEGMENTS.value)
+        ys = trajectory.ys.at[200:].set(jnp.nan)
+        return eqx.tree_at(lambda run: (run.status, run.ys), trajectory, (status, ys))
+
+    monkeypatch.setattr(jb, "simulate", cut_short)
+    out = tmp_path / "run"
+    result = runner.invoke(app, ["simulate", *SPAN.split(), "--out", str(out)])
+    assert result.exit_code == 1
+    assert "TOO_MANY_SEGMENTS" in result.output
+    assert (
+        np.isfinite(column(read(tmp_path / "run.csv"), "x1")).tolist()
+        == [True] * 200 + [False] * 201
+    )
+
+
+def test_the_command_turns_on_float64_by_itself(tmp_path):
+    program = "from jaxbelt.cli import app; app(prog_name='jaxbelt')"
+    environment = {key: value for key, value in os.environ.items() if key != "JAX_ENABLE_X64"}
+    run = subprocess.run(
+        [sys.executable, "-c", program, "simulate", "--t1", "-1"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=environment,
+        timeout=120,
+    )
+    assert (run.returncode, run.stderr) == (2, "Error: t1 must be > t0 = 0.0, got -1.0\n")
+
+
+@pytest.mark.parametrize("command", ["reproduce", "simulate"])
+def test_help_teaches(command):
+    result = runner.invoke(app, [command, "--help"])
+    assert result.exit_code == 0
+    assert f"jaxbelt {command} -" in result.output
+    assert "Example" in result.output
+
+
+# --- reproduce ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def reproduced(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reproduction") / "results"
+    return folder, runner.invoke(app, ["reproduce", "--out", str(folder)])
+
+
+@pytest.mark.slow
+def test_reproduce_writes_the_table_and_every_figure(reproduced):
+    folder, result = reproduced
+    assert result.exit_code == 0, result.output
+    names = {f"fig{number:02}.png" for number in (1, 2, 4, 5, *range(8, 14))}
+    assert {path.name for path in folder.iterdir()} == names | {"critical_values.json"}
+    for name in names:
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_critical_values_json(reproduced):
+    folder, _ = reproduced
+    rows = json.loads((folder / "critical_values.json").read_text(encoding="utf-8"))
+    keys = ["class", "point", "kind", "printed", "computed", "residual", "iterations"]
+    assert [list(row) for row in rows] == [keys] * 9
+    assert [(r["class"], r["point"], r["kind"], r["printed"]) for r in rows] == [
+        tuple(value) for value in jb.presets.PUBLISHED
+    ]
+    computed = {(r["class"], r["point"]): r["computed"] for r in rows}
+    # The growth rate has a slope of order one there: rounding moves its root by a few 1e-16.
+    assert computed["a", "nu_beta"] == pytest.approx((np.sqrt(8) - 1) / 10, abs=1e-14)
+    # 4 / (1 + 10 nu0)^2 + 4 / (1 + 10 nu1)^2 = zeta = 0.5, eq. (28) for two belts
+    hopf = (np.sqrt(4 / (0.5 - 4 / 4.5**2)) - 1) / 10
+    assert computed["b", "nu_gamma"] == pytest.approx(hopf, abs=1e-14)
+    assert computed["b", "nu_epsilon"] == pytest.approx(-hopf, abs=1e-14)
+    for row in rows:
+        if row["computed"] is None:
+            assert row["residual"] is None
+            assert row["iterations"] is None
+        else:
+            assert row["residual"] <= 1e-11
+            assert 1 <= row["iterations"] <= 8
+
+
+@pytest.mark.slow
+def test_reproduce_says_what_is_missing_and_what_the_paper_misprints(reproduced):
+    _, result = reproduced
+    text = " ".join(result.output.split())
+    for remark in reproduce.REMARKS:
+        assert remark in text
+    assert text.count("missing: needs cycles") == 6
+    assert "0.182842712475" in text
+
+
+def test_reproduce_tells_in_one_sentence_where_it_cannot_write(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.touch()
+    result = runner.invoke(app, ["reproduce", "--out", str(blocked)])
+    assert result.exit_code == 2
+    assert result.stderr.startswith("Error: ")
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_portraits_show_what_the_paper_says_of_the_regions():
+    """Which panels have a steady cycle, and on which belts it sticks."""
+    values = reproduce.critical_values()
+    figures = {
+        name: figure
+        for name, figure in reproduce.FIGURES.items()
+        if isinstance(figure, reproduce.Portraits)
+    }
+    panels = {name: figure.panels(values) for name, figure in figures.items()}
+    orbits = iter(
+        reproduce.simulate_panels([panel for group in panels.values() for panel in group])
+    )
+    seen = {}
+    for name, group in panels.items():
+        seen[name] = []
+        for panel in group:
+            runs = next(orbits)
+            cycles = [cycle for cycle in map(reproduce.steady_cycle, runs) if cycle]
+            levels = [float(belt.velocity) for belt in panel.oscillator.belts]
+            on = ""
+            if cycles:
+                x2 = cycles[0].states[:, 1]
+                on = "".join(
+                    str(i) for i, v in enumerate(levels) if np.sum(np.abs(x2 - v) < 1e-9) > 2
+                )
+            seen[name].append(on)
+    # One letter a belt, nothing for no steady cycle; at the printed folds there still is one.
+    assert seen == {
+        "fig04": ["", "0", "0"],
+        "fig05": ["0", "0", "0"],
+        "fig08": ["", "1", "1"],
+        "fig09": ["1", "01", "0"],
+        "fig10": ["0", "0", "0"],
+        "fig11": ["0", "", "0", "01"],
+        "fig12": ["01", "1", "1"],
+        "fig13": ["1", "1", ""],
+    }

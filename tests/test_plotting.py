@@ -1,0 +1,255 @@
+"""Pictures show what the results hold: spans, boundaries, stability; and touch nothing else."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+import jaxbelt as jb
+from jaxbelt import plotting, reproduce
+
+
+def run(nu0: float, start=(3.0, 0.0)) -> jb.Trajectory:
+    """Class (b) with nu1 = 0.35, in the shapes of test_cli: one compiled program serves all."""
+    times = np.linspace(0.0, 50.0, 401)
+    return jb.simulate(jb.presets.class_b(nu0, 0.35), start, 50.0, ts=times)
+
+
+@pytest.fixture(scope="module")
+def two_sided():
+    """Where the steady cycle sticks to both belts in turn."""
+    return jb.presets.class_b(-0.2, 0.35), run(-0.2)
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+def spans(ax):
+    """(begin, end) of the shaded spans of some axes, in order."""
+    boxes = [patch.get_path().get_extents(patch.get_patch_transform()) for patch in ax.patches]
+    return sorted((box.x0, box.x1) for box in boxes)
+
+
+def states(artist) -> np.ndarray:
+    """The points of a drawn line, [n, 2]."""
+    return np.asarray(artist.get_xydata())
+
+
+def line(ax, label: str):
+    (found,) = (artist for artist in ax.get_lines() if artist.get_label() == label)
+    return found
+
+
+def test_stick_phases_are_those_of_the_events(two_sided):
+    _, trajectory = two_sided
+    events = trajectory.events
+    sticks = np.flatnonzero(events.kind == jb.EventKind.STICK)
+    # Both belts always touch, so what follows STICK is its SLIP, or the end of the run.
+    ends = np.append(np.asarray(events.t), trajectory.ts[-1])[sticks + 1]
+    phases = plotting.stick_phases(trajectory)
+    assert {belt for belt, *_ in phases} == {0, 1}
+    assert [belt for belt, *_ in phases] == events.belt[sticks].tolist()
+    np.testing.assert_allclose([begin for _, begin, _ in phases], events.t[sticks], atol=1e-12)
+    # The begin of an arc plus its duration is the time of its event, but for rounding.
+    np.testing.assert_allclose([end for *_, end in phases], ends, atol=1e-12)
+
+
+def test_time_history_shades_every_stick_phase_in_the_colour_of_its_belt(two_sided):
+    _, trajectory = two_sided
+    axes = jb.plot_time_history(trajectory)
+    phases = plotting.stick_phases(trajectory)
+    for ax in axes:
+        np.testing.assert_allclose(spans(ax), [phase[1:] for phase in phases])
+    labels = set(axes[0].get_legend_handles_labels()[1])
+    assert labels == {"sticks to belt 0", "sticks to belt 1"}
+    assert len({to_hex(patch.get_facecolor()) for patch in axes[0].patches}) == 2
+    (x1,) = axes[0].get_lines()
+    np.testing.assert_array_equal(np.interp(trajectory.ts, *states(x1).T), trajectory.ys[:, 0])
+    assert [ax.get_ylabel() for ax in axes] == ["displacement $x_1$", "velocity $x_2$"]
+
+
+def test_a_stick_phase_across_a_contact_edge_is_one(two_sided):
+    arcs = jb.Arcs(
+        t=jnp.array([0.0, 1.0, 3.0, 4.0, jnp.nan]),
+        y=jnp.zeros((5, 2)),
+        mode=jnp.array([[0, -2], [0, 1], [1, 1], [1, 0], [0, 0]], dtype=jnp.int8),
+        duration=jnp.array([1.0, 2.0, 1.0, 0.5, jnp.nan]),
+    )
+    _, trajectory = two_sided
+    made = eqx.tree_at(lambda run: run.arcs, trajectory, arcs)
+    assert plotting.stick_phases(made) == [(0, 0.0, 3.0), (1, 4.0, 4.5)]
+
+
+def test_padding_is_not_drawn(two_sided):
+    """A lane of a batch is padded with NaN, its kinds and modes with zeros."""
+    osc, trajectory = two_sided
+
+    def pad(leaf):
+        blank = jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0
+        return jnp.concatenate([leaf, jnp.full((3, *leaf.shape[1:]), blank, leaf.dtype)])
+
+    lane = eqx.tree_at(
+        lambda run: (run.events, run.arcs),
+        trajectory,
+        jax.tree.map(pad, (trajectory.events, trajectory.arcs)),
+    )
+    assert plotting.stick_phases(lane) == plotting.stick_phases(trajectory)
+    alone, padded = (jb.plot_phase_portrait(osc, drawn) for drawn in (trajectory, lane))
+    np.testing.assert_array_equal(states(line(padded, "orbit")), states(line(alone, "orbit")))
+    assert len(states(line(alone, "orbit"))) == 401 + trajectory.events.t.size
+
+
+def test_without_arcs_the_samples_tell_what_sticks(two_sided):
+    _, exact = two_sided
+    nothing = jax.tree.map(lambda leaf: leaf[:0], exact.arcs)
+    trajectory = eqx.tree_at(lambda run: run.arcs, exact, nothing)
+    np.testing.assert_allclose(
+        [phase[1:] for phase in plotting.stick_phases(trajectory)],
+        [phase[1:] for phase in plotting.stick_phases(exact)],
+        atol=50.0 / 400,
+    )
+
+
+def test_phase_portrait_draws_boundaries_over_their_contact_intervals():
+    osc = jb.presets.class_d(0.2, -0.3, 0.0, 0.5)
+    ax = jb.plot_phase_portrait(osc, xlim=(-2.0, 2.0), ylim=(-1.0, 1.0))
+    boundaries = {
+        colour: [
+            states(artist).tolist()
+            for artist in ax.get_lines()
+            if artist.get_color() == colour and len(states(artist)) == 2
+        ]
+        for colour in plotting.BELT_COLOURS[:2]
+    }
+    assert boundaries[plotting.BELT_COLOURS[0]] == [[[-2.0, 0.2], [0.5, 0.2]]]
+    assert boundaries[plotting.BELT_COLOURS[1]] == [[[0.0, -0.3], [2.0, -0.3]]]
+    names = {text.get_text() for text in ax.texts}
+    assert {r"$\Sigma_{\mathrm{F}0}$", r"$\Sigma_{\mathrm{F}1}$"} <= names
+    assert {r"$\sigma_{0}$", r"$\sigma_{1}$"} <= names
+
+
+def test_the_sliding_set_is_where_the_contact_holds():
+    nu0 = 0.2
+    ax = jb.plot_phase_portrait(jb.presets.class_a(nu0), xlim=(-3.0, 3.0))
+    x1, band = states(line(ax, "sliding set")).T
+    # Eq. (10): |-x1 - zeta nu0| < u0 mus, here with u0 = mus = omega = 1.
+    np.testing.assert_array_equal(np.isfinite(band), np.abs(-x1 - 0.5 * nu0) < 1)
+
+
+def test_names_of_close_boundaries_keep_apart():
+    ax = jb.plot_phase_portrait(jb.presets.class_b(0.35, 0.35))
+    ax.figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in ax.texts if "Sigma" in text.get_text()]
+    assert len(boxes) == 2
+    assert not boxes[0].overlaps(boxes[1])
+
+
+class Loop:
+    """A cycle to draw."""
+
+    def __init__(self, radius: float, stable: bool):
+        self.radius, self.stable = radius, stable
+
+    def sample(self, n: int):
+        angle = np.linspace(0, 2 * np.pi, n)
+        return self.radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def test_stability_shows():
+    osc = jb.presets.class_b(0.45, 0.35)
+    ax = jb.plot_phase_portrait(osc, cycles=[Loop(0.5, True), Loop(0.3, False)])
+    assert line(ax, "stable cycle").get_linestyle() == "-"
+    assert line(ax, "unstable cycle").get_linestyle() == "--"
+    assert line(ax, "stable fixed point").get_markerfacecolor() == "black"
+    ((x1, x2),) = states(line(ax, "stable fixed point"))
+    # Eq. (24) with both belts.
+    assert x1 == pytest.approx(1.2 + 0.4 / 5.5 + 0.4 / 4.5, abs=1e-12)
+    assert x2 == 0
+    unstable = jb.plot_phase_portrait(jb.presets.class_a(0.1))
+    assert line(unstable, "unstable fixed point").get_markerfacecolor() == "white"
+
+
+def test_segment_and_pseudo_focus():
+    ax = jb.plot_phase_portrait(jb.presets.class_b(0.0, 0.35))
+    middle = 0.6 + 0.4 / 4.5
+    ends = states(line(ax, "pseudo-equilibria"))[:, 0]
+    np.testing.assert_allclose(ends, [middle - 1, middle + 1], atol=1e-12)
+    ax = jb.plot_phase_portrait(jb.presets.class_c(0.3, -0.4, 0.1))
+    (focus,) = (artist for artist in ax.get_lines() if "pseudo-focus" in str(artist.get_label()))
+    assert focus.get_xdata() == [0.1]
+
+
+@pytest.mark.parametrize("kind", ["streamlines", "arrows"])
+def test_vector_field_jumps_at_the_boundary_and_slides_on_it(kind):
+    osc = jb.presets.class_a(0.3)
+    ax = jb.plot_vector_field(osc, kind=kind, xlim=(-2.0, 2.0), ylim=(-1.0, 1.0))
+    assert ax.collections
+    x2 = jnp.array([0.3 - 1e-9, 0.3, 0.3 + 1e-9])
+    x1_dot, x2_dot = plotting._field(osc, jnp.zeros(3), x2)
+    np.testing.assert_array_equal(x1_dot, x2)
+    # -zeta nu0 + mus, stuck, -zeta nu0 - mus
+    np.testing.assert_allclose(x2_dot, [0.85, 0.0, -1.15], atol=1e-7)
+
+
+def test_vector_field_refuses_an_unknown_kind():
+    with pytest.raises(ValueError, match='kind must be "streamlines" or "arrows", got \'dots\''):
+        jb.plot_vector_field(jb.presets.class_a(0.3), kind="dots")
+
+
+def test_friction_law():
+    ax = jb.plot_friction_law(jb.presets.paper_friction(), speed=0.5)
+    assert ax.get_xlim() == (-0.5, 0.5)
+    curves = [points for points in map(states, ax.get_lines()) if len(points) == 401]
+    np.testing.assert_allclose(curves[0][-1], [0.5, 0.6 + 0.4 / 6])
+    np.testing.assert_allclose(curves[1][-1], [-0.5, -0.6 - 0.4 / 6])
+
+
+def test_pictures_leave_the_settings_and_windows_of_matplotlib_alone(two_sided, tmp_path):
+    osc, trajectory = two_sided
+    before = dict(plt.rcParams)
+    with plotting.journal_style():
+        figure = plotting.draw_overview(osc, trajectory)
+        plotting.save(figure, tmp_path / "overview.png")
+    assert (tmp_path / "overview.png").read_bytes().startswith(b"\x89PNG")
+    assert dict(plt.rcParams) == before
+    assert plt.get_fignums() == []
+
+
+# --- the steady cycles of the reproduction -------------------------------------------------------
+
+
+def test_steady_cycle_is_closed_and_sticks(two_sided):
+    _, trajectory = two_sided
+    cycle = reproduce.steady_cycle(trajectory)
+    assert cycle is not None
+    np.testing.assert_allclose(cycle.states[0], cycle.states[-1], atol=1e-9)
+    # It reaches both belts and stays between them.
+    assert cycle.states[:, 1].min() == pytest.approx(-0.2, abs=1e-12)
+    assert cycle.states[:, 1].max() == pytest.approx(0.35, abs=1e-12)
+
+
+def test_no_steady_cycle_where_the_mass_comes_to_rest():
+    assert reproduce.steady_cycle(run(0.7)) is None
+
+
+def test_class_a_is_the_limit_of_two_belts():
+    osc = jb.presets.class_a(0.23)
+    x1, x2 = np.random.default_rng(0).uniform(-3, 3, (2, 50))
+    alone, beside = (plotting._field(o, x1, x2) for o in (osc, reproduce._with_two_belts(osc)))
+    np.testing.assert_array_equal(alone, beside)
+
+
+def test_missing_region_below_nu_delta():
+    """Between nu0 = 0 and a grazing point near -0.0788 the cycle sticks on belt 0 only."""
+    belts = {}
+    for nu0 in (-0.07, -0.09):
+        events = run(nu0, start=(0.1, 0.0)).events
+        sticks = (events.t > 20) & (events.kind == jb.EventKind.STICK)
+        belts[nu0] = set(events.belt[sticks].tolist())
+    assert belts == {-0.07: {0}, -0.09: {0, 1}}
