@@ -8,8 +8,29 @@ import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 from . import presets
+from .bifurcations import (
+    BifurcationPoint,
+    GrazingSliding,
+    Hopf,
+    NonsmoothFold,
+    SlidingExchange,
+    SuddenSliding,
+    refine,
+)
+from .cycles import Cycle, find_cycle, unstable_cycle
 from .equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
 from .friction import AbstractFriction, Conti, Coulomb, Stribeck
+from .functionals import (
+    amplitude,
+    energy_dissipated,
+    energy_fed,
+    gap,
+    peak,
+    period,
+    slip_duration,
+    stick_duration,
+    stick_fraction,
+)
 from .oscillator import Belt, Oscillator
 from .results import EventKind, Status, describe
 from .simulate import Arcs, Events, Trajectory, simulate
@@ -28,25 +49,44 @@ __all__ = [
     "AbstractFriction",
     "Arcs",
     "Belt",
+    "BifurcationPoint",
     "Conti",
     "Coulomb",
+    "Cycle",
     "Equilibria",
     "EquilibriumKind",
     "EventKind",
     "Events",
+    "GrazingSliding",
+    "Hopf",
+    "NonsmoothFold",
     "Oscillator",
+    "SlidingExchange",
     "Status",
     "Stribeck",
+    "SuddenSliding",
     "Trajectory",
+    "amplitude",
     "describe",
+    "energy_dissipated",
+    "energy_fed",
     "equilibria",
+    "find_cycle",
+    "gap",
     "lyapunov_coefficient",
+    "peak",
+    "period",
     "plot_friction_law",
     "plot_phase_portrait",
     "plot_time_history",
     "plot_vector_field",
     "presets",
+    "refine",
     "simulate",
+    "slip_duration",
+    "stick_duration",
+    "stick_fraction",
+    "unstable_cycle",
 ]
 
 

@@ -17,6 +17,15 @@ class Status(enum.IntEnum):
     TOO_MANY_SEGMENTS = 3
     TOO_MANY_STEPS = 4
     NOT_FINITE = 5
+    EQUILIBRIUM = 6
+    NOT_SETTLED = 7
+    TOO_MANY_ARCS = 8
+    NO_CONVERGENCE = 9
+    NOT_ADMISSIBLE = 10
+    NO_UNSTABLE_CYCLE = 11
+    NOT_TOUCHED = 12
+    OTHER_KIND = 13
+    NO_FIXED_POINT = 14
 
 
 ADVICE = {
@@ -39,6 +48,35 @@ ADVICE = {
     Status.NOT_FINITE: (
         "A parameter, the start or the solution is not a finite number; look for NaN in the input."
     ),
+    Status.EQUILIBRIUM: (
+        "The orbit comes to rest at an equilibrium: this start leads to no cycle. Start further "
+        "out, or look at equilibria(osc)."
+    ),
+    Status.NOT_SETTLED: (
+        "No turn of the orbit repeated within the budget of arcs: it approaches its attractor very "
+        "slowly. Start nearer to the cycle, or move away from the bifurcation point."
+    ),
+    Status.TOO_MANY_ARCS: "One turn of the cycle has more arcs than there was room for: pass max_arcs.",
+    Status.NO_CONVERGENCE: (
+        "Newton's method did not converge from this guess; there may be no such solution near it."
+    ),
+    Status.NOT_ADMISSIBLE: (
+        "The solution of the equations leaves its modes (an arc passes a boundary, or ends before "
+        "it begins), so the oscillator does not move along it."
+    ),
+    Status.NO_UNSTABLE_CYCLE: (
+        "There is no unstable cycle between a stable equilibrium and the motion outside of it: no "
+        "equilibrium is stable, or everything comes to rest there."
+    ),
+    Status.NOT_TOUCHED: (
+        "No cycle comes near the boundary of that belt here, so no such point is near; try another "
+        "belt or another value of the parameter."
+    ),
+    Status.OTHER_KIND: (
+        "The cycle does touch the boundary at a point near here, but the point is of another kind: "
+        "a nonsmooth fold ends the cycle, at a grazing point it goes on to both sides."
+    ),
+    Status.NO_FIXED_POINT: "There is no fixed point in a smooth field here whose trace could vanish.",
 }
 
 

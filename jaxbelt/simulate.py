@@ -221,7 +221,7 @@ def _first_root(fn: Callable[[Array], Array], end: Array) -> Array:
 
     def unfinished(state):
         a, _, b, _, _, fc, count = state
-        return (b - a > 1e-16 * end) & (jnp.abs(fc) > 1e-16) & (count < 60)
+        return (b - a > 1e-15 * end) & (fc != 0) & (count < 60)
 
     def improve(state):
         a, fa, b, fb, _, _, count = state
@@ -302,11 +302,11 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
         guards = guards_after(h)
         return first_of([fired == i for i in indices], guards, guards[0])
 
-    # Two Newton steps: the digits that are left, and derivatives to second order.
+    # Two Newton steps, small ones: the digits that are left, and derivatives to second order.
     polished = root
     for _ in range(2):
         guard, slope = jax.jvp(guard_fired, (polished,), (jnp.ones_like(polished),))
-        regular = jnp.abs(slope) > 1e-12
+        regular = jnp.abs(slope) * 1e-3 * last > jnp.abs(lax.stop_gradient(guard))
         polished = polished - jnp.where(regular, guard / jnp.where(regular, slope, 1.0), 0.0)
     # A turn is invisible: nothing depends on where the arc is split.
     root = jnp.where(is_turn, root, polished)
