@@ -453,6 +453,26 @@ def plot_friction_law(
     return ax
 
 
+def plot_convergence(
+    widths: np.ndarray, errors: dict[str, np.ndarray], ax: Axes | None = None
+) -> Axes:
+    """Largest error of approximate formulations over the width of their band, by label.
+
+    A thin line of slope one goes along. Returns the axes.
+    """
+    ax = _new_axes() if ax is None else ax
+    for belt, (label, values) in enumerate(errors.items()):
+        marker = ("o", "s", "^", "D")[belt % 4]
+        ax.loglog(widths, values, marker=marker, color=_belt_colour(belt), label=label)
+    smallest = min(values.min() for values in errors.values())
+    guide = 0.4 * smallest * widths / widths.min()
+    ax.loglog(widths, guide, color="0.5", linewidth=0.7, linestyle=":", label="slope 1")
+    ax.set_xlabel(r"half-width of the band $v_\ast$ or $\varepsilon$")
+    ax.set_ylabel(r"largest error of $(x_1, x_2)$")
+    ax.legend(frameon=False)
+    return ax
+
+
 def draw_mechanical_model(ax: Axes | None = None) -> Axes:
     """The double-belt oscillator, Fig. 1 of the paper: a mass on spring and dashpot, two belts.
 

@@ -327,10 +327,47 @@ def draw_classes() -> plotting.Figure:
     return figure
 
 
-#: Every figure of the paper that can be drawn, by the name of its file.
+def formulation_errors(
+    formulation: str, width: str, widths: Sequence[float]
+) -> tuple[np.ndarray, float]:
+    """Largest error of a formulation over [0, 15] for each width of its band, and its order.
+
+    Class (b) with nu0 = -0.2, nu1 = 0.35 from (2, 0): four stick phases, both belts. The order is
+    the slope over the three smallest widths.
+    """
+    osc, y0, span, ts = class_b(-0.2, PUBLISHED_NU1), (2.0, 0.0), 15.0, jnp.linspace(0.0, 15.0, 31)
+    exact = simulate(osc, y0, span, ts=ts).ys
+
+    def error(value):
+        run = simulate(osc, y0, span, ts=ts, formulation=formulation, **{width: value})
+        return float(jnp.max(jnp.abs(run.ys - exact)))
+
+    errors = np.array([error(value) for value in widths])
+    order = np.polyfit(np.log(widths[-3:]), np.log(errors[-3:]), 1)[0]
+    return errors, float(order)
+
+
+def draw_formulations() -> plotting.Figure:
+    """How the switch and the smooth formulation approach the exact motion."""
+    figure = plotting.journal_figure(4.2, 3.2)
+    axes = figure.subplots()
+    widths = np.logspace(-2, -5, 7)
+    curves = {}
+    for formulation, width, symbol in (
+        ("switch", "v_star", r"$v_\ast$"),
+        ("smooth", "eps", r"$\varepsilon$"),
+    ):
+        errors, order = formulation_errors(formulation, width, widths)
+        curves[f"{formulation}, {symbol}: order {order:.2f}"] = errors
+    plotting.plot_convergence(widths, curves, axes)
+    return figure
+
+
+#: Every figure of the paper that can be drawn, by the name of its file, and one of our own.
 FIGURES: dict[str, Callable[[], plotting.Figure] | Portraits] = {
     "fig01": draw_model,
     "fig02": draw_classes,
+    "formulations": draw_formulations,
     "fig04": Portraits(
         "a",
         "nu_alpha",

@@ -10,6 +10,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
+from jaxbelt.reproduce import formulation_errors
 
 # One budget for every run with two belts: they then share one compiled program.
 simulate = functools.partial(jb.simulate, max_segments=4096)
@@ -241,20 +242,8 @@ def test_a_lane_that_is_not_finite_harms_no_other():
 
 @pytest.mark.parametrize(("formulation", "width"), [("switch", "v_star"), ("smooth", "eps")])
 def test_formulations_converge_to_the_exact_one(formulation, width):
-    osc, y0, ts = jb.presets.class_b(-0.2, 0.35), (2.0, 0.0), jnp.linspace(0.0, 15.0, 31)
-    exact = simulate(osc, y0, 15.0, ts=ts).ys
     widths = np.array([1e-3, 1e-4, 1e-5])
-    errors = [
-        float(
-            jnp.max(
-                jnp.abs(
-                    jb.simulate(osc, y0, 15.0, ts=ts, formulation=formulation, **{width: w}).ys
-                    - exact
-                )
-            )
-        )
-        for w in widths
-    ]
+    errors, _ = formulation_errors(formulation, width, widths)
     orders = np.diff(np.log10(errors)) / np.diff(np.log10(widths))
     print(formulation, errors, orders)
     # First order; the tanh tail brings a logarithm, which the measured order approaches from below.
