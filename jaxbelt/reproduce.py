@@ -328,7 +328,7 @@ def draw_classes() -> plotting.Figure:
 
 
 def formulation_errors(
-    formulation: str, width: str, widths: Sequence[float]
+    formulation: str, width: str, widths: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Largest error of a formulation over [0, 15] for each width of its band, and its order.
 

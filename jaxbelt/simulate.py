@@ -56,10 +56,13 @@ from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
 #: Longest step, in units of 1/(angular frequency of the spring): well below half a turn.
 MAX_STEP = 0.5
-#: Local errors are kept below this fraction of the tolerance; near-grazing events amplify them.
+#: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
+#: because near-grazing events amplify them.
 SAFETY = 0.03
 #: Longest slip arc; longer ones are cut, so that samples start near their time.
 MAX_ARC = 1.0
+#: Segments are run in blocks of so many; the budget is rounded up to whole blocks.
+BLOCK = 32
 #: Steps that one segment may take before it is given up.
 MAX_STEPS = 100_000
 #: An orbit this close to a stable pseudo-focus (|x2| at the edge) has converged to it.
@@ -169,7 +172,7 @@ def _controller(rtol, atol):
         x1, x2 = y[0] if isinstance(y[0], tuple) else y
         return jnp.maximum(jnp.abs(x1), jnp.abs(x2))
 
-    return diffrax.PIDController(rtol=SAFETY * rtol, atol=SAFETY * atol, dtmax=MAX_STEP, norm=norm)
+    return diffrax.PIDController(rtol=rtol, atol=atol, dtmax=MAX_STEP, norm=norm)
 
 
 def _field(osc, mode):
@@ -268,7 +271,7 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
         dt0=None,
         y0=(y, (zero, *y)),
         saveat=diffrax.SaveAt(t1=True),
-        stepsize_controller=_controller(rtol, atol),
+        stepsize_controller=_controller(SAFETY * rtol, SAFETY * atol),
         event=diffrax.Event(left_mode),
         adjoint=diffrax.ForwardMode(),
         max_steps=MAX_STEPS,
@@ -554,7 +557,19 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
         # A true branch under vmap too: once every lane is done nothing more is computed.
         return lax.cond(eqxi.unvmap_any(~state.done), advance, lambda: (state, blank))
 
-    final, records = lax.scan(segment, start, length=max_segments)
+    # In blocks, because stepping over what is left of the budget is not free.
+    length = min(BLOCK, max_segments)
+    blank_block = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length, *leaf.shape)), blank)
+
+    def block(state, _):
+        return lax.cond(
+            eqxi.unvmap_any(~state.done),
+            lambda: lax.scan(segment, state, length=length),
+            lambda: (state, blank_block),
+        )
+
+    final, records = lax.scan(block, start, length=-(-max_segments // length))
+    records = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), records)
     unfinished = jnp.where(final.done, final.status, Status.TOO_MANY_SEGMENTS.value)
     return eqx.tree_at(lambda s: s.status, final, unfinished), records
 
@@ -756,11 +771,11 @@ def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
     events = jax.tree.map(lambda leaf: _take(leaf, kept), trajectory.events)
     entered = np.flatnonzero(~np.isnan(trajectory.arcs.t))
     arcs = jax.tree.map(lambda leaf: _take(leaf, entered), trajectory.arcs)
-    samples = (trajectory.ts, trajectory.ys, trajectory.modes)
+    ts, ys, modes = trajectory.ts, trajectory.ys, trajectory.modes
     if trim_samples:
-        _, distinct = np.unique(trajectory.ts, return_index=True)
-        samples = jax.tree.map(lambda leaf: _take(leaf, distinct), samples)
-    return Trajectory(*samples, events, arcs, trajectory.status)
+        _, distinct = np.unique(ts, return_index=True)
+        ts, ys, modes = (_take(leaf, distinct) for leaf in (ts, ys, modes))
+    return Trajectory(ts, ys, modes, events, arcs, trajectory.status)
 
 
 def _take(leaf, indices):

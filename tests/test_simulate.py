@@ -88,6 +88,44 @@ def difference(run, expected):
     )
 
 
+@pytest.mark.slow
+def test_random_systems_of_two_and_three_belts():
+    """Laws mixed, intervals at random, half of the cases on a grid full of exact corners."""
+    rng = np.random.default_rng(1)
+    laws = (
+        (jb.Conti(1.0, 0.6, 10.0), oracle.conti(1.0, 0.6, 10.0)),
+        (jb.Coulomb(0.8, 0.6), oracle.coulomb(0.8, 0.6)),
+        (jb.Stribeck(0.9, 0.5, 0.2), oracle.stribeck(0.9, 0.5, 0.2)),
+    )
+    compared = 0
+    for _ in range(60):
+        on_grid, n = rng.random() < 0.5, int(rng.integers(2, 4))
+
+        def draw(low, high, on_grid=on_grid):
+            value = rng.uniform(low, high)
+            return float(np.round(5 * value) / 5 if on_grid else value)
+
+        here, there = [], []
+        for law, reference in laws[:n]:
+            velocity, load = draw(-0.8, 0.8), draw(0.2, 1.4)
+            lower = draw(-2.0, 0.5) if rng.random() < 0.5 else -np.inf
+            upper = draw(0.6, 2.0) if rng.random() < 0.5 else np.inf
+            here.append(jb.Belt(velocity, law, load, lower, upper))
+            there.append(oracle.Belt(velocity, *reference, load, lower, upper))
+        damping, omega = draw(0.0, 0.6), draw(0.6, 1.6)
+        y0 = (draw(-2, 2), draw(-1, 1))
+        run = simulate(jb.Oscillator(damping, here, omega), y0, SPAN, ts=SAMPLES)
+        expected = oracle.simulate(oracle.Oscillator(damping, tuple(there), omega), y0, SPAN)
+        if Status.PSEUDO_FOCUS == run.status or expected.status == "pseudo_focus":
+            compare_pseudo_focus(expected, run)
+        elif expected.margin > MARGIN:
+            assert kinds(run) == [(e.kind, e.belt) for e in expected.events], (here, y0)
+            assert difference(run, expected) < 1e-8 * max(1.0, 1e-3 / expected.margin), (here, y0)
+            compared += 1
+    print(compared, "of 60 compared to the end")
+    assert compared > 45
+
+
 def compare_pseudo_focus(expected, run):
     """The two stop at different radii: compare what both saw, and where it ends."""
     n = min(len(expected.events), len(run.events.t))

@@ -1,0 +1,154 @@
+"""Bifurcation points against the exact values of the paper's table and the oracle elsewhere."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import Status
+
+
+def nu0(osc):
+    return osc.belts[0].velocity
+
+
+def class_b(nu):
+    return jb.presets.class_b(nu, 0.35)
+
+
+# (class, condition, value computed twice independently to about 1e-11)
+TABLE = [
+    (jb.presets.class_a, jb.NonsmoothFold(0), 0.267134534361),
+    (jb.presets.class_a, jb.Hopf(), (np.sqrt(8) - 1) / 10),
+    (class_b, jb.NonsmoothFold(1), 0.538734800481),
+    (class_b, jb.SlidingExchange((0, 1)), 0.35),
+    (class_b, jb.Hopf(), 0.263654916039),
+    (class_b, jb.SuddenSliding(0), 0.0),
+    (class_b, jb.Hopf(), -0.263654916039),
+    (class_b, jb.GrazingSliding(0), -0.455724862289),
+    (class_b, jb.NonsmoothFold(1), -0.561302406210),
+]
+
+
+@pytest.mark.parametrize("offset", [-0.02, 0.02])
+@pytest.mark.parametrize(("make", "condition", "exact"), TABLE)
+def test_the_papers_table(make, condition, exact, offset):
+    point = jb.refine(condition, make(exact + offset), where=nu0)
+    assert point.status == Status.OK, point
+    # The table is good to 1e-11, the asked precision is 1e-10.
+    assert point.value == pytest.approx(exact, abs=1e-11)
+    assert abs(point.value - exact) <= point.error + 1e-11
+    assert point.error < 1e-11 and point.residual < 1e-11
+    assert point.iterations <= 8
+    assert nu0(point.oscillator) == point.value
+
+
+def test_cycle_at_a_fold_has_a_stick_phase_of_no_duration():
+    point = jb.refine(jb.NonsmoothFold(1), class_b(0.53), where=nu0)
+    assert point.cycle.status == Status.OK
+    assert jb.stick_duration(point.cycle, 1) == pytest.approx(0, abs=1e-10)
+    assert jb.gap(point.cycle, 1) == pytest.approx(0, abs=1e-12)
+    assert point.multiplier > 1
+
+
+def test_cycle_at_a_grazing_point_goes_on():
+    point = jb.refine(jb.GrazingSliding(0), class_b(-0.44), where=nu0)
+    assert point.cycle.stick_durations[0] == pytest.approx(0, abs=1e-10)
+    assert point.cycle.stick_durations[1] > 0.5 and point.multiplier == 0
+
+
+def test_grazing_that_the_paper_does_not_list():
+    """Just below nu0 = 0 the cycle sticks to belt 0 only; belt 1 comes at a grazing point."""
+    point = jb.refine(jb.GrazingSliding(1), class_b(-0.06), where=nu0)
+    expected = oracle_cycles.grazing(lambda nu: oracle.class_b(nu, 0.35), (-0.09, -0.06), 1)
+    assert point.value == pytest.approx(expected, abs=1e-10)
+
+
+def other_system():
+    """Every parameter away from the paper's, the belts unlike each other."""
+    frictions = (jb.Conti(1.05, 0.62, 9.0, 0.02), jb.Conti(0.98, 0.6, 11.0))
+    belts = (jb.Belt(0.5, frictions[0], load=0.95), jb.Belt(0.4, frictions[1], load=1.1))
+    return jb.Oscillator(0.52, belts, omega=1.1)
+
+
+def other_oracle(nu):
+    def belt(velocity, load, *law):
+        mu, static = oracle.conti(*law)
+        return oracle.Belt(velocity, mu, static, load)
+
+    belts = (belt(nu, 0.95, 1.05, 0.62, 9.0, 0.02), belt(0.4, 1.1, 0.98, 0.6, 11.0))
+    return oracle.Oscillator(0.52, belts, 1.1)
+
+
+def at_nu0(osc, nu):
+    return jb.Oscillator(
+        osc.damping,
+        (jb.Belt(nu, osc.belts[0].friction, osc.belts[0].load), osc.belts[1]),
+        osc.omega,
+    )
+
+
+def test_points_of_another_system():
+    osc = other_system()
+    hopf = jb.refine(jb.Hopf(), osc, where=nu0)
+    value = float(hopf.value)
+    expected = oracle_cycles.hopf(other_oracle, (value - 0.02, value + 0.02))
+    assert value == pytest.approx(expected, abs=1e-10)
+    fold = jb.refine(jb.NonsmoothFold(1), at_nu0(osc, value + 0.3), where=nu0)
+    assert fold.status == Status.OK, fold
+    expected = oracle_cycles.nonsmooth_fold(
+        other_oracle, (float(fold.value) - 0.01, float(fold.value) + 0.01), 1
+    )
+    assert fold.value == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("condition", "nu", "status"),
+    [
+        (jb.GrazingSliding(0), 0.52, Status.NOT_TOUCHED),
+        (jb.GrazingSliding(1), 0.52, Status.OTHER_KIND),
+        (jb.NonsmoothFold(0), -0.45, Status.OTHER_KIND),
+        (jb.SlidingExchange((0, 1)), 0.6, Status.NOT_TOUCHED),
+        (jb.SuddenSliding(1), 0.3, Status.NO_CONVERGENCE),
+    ],
+)
+def test_a_guess_that_fits_no_such_point_is_told_so(condition, nu, status):
+    point = jb.refine(condition, class_b(nu), where=nu0)
+    assert point.status == status
+    assert jnp.isnan(point.value) and jb.describe(status) in repr(point)
+
+
+def test_convergence_is_quadratic():
+    """Each Newton step is about the square of the one before, until rounding ends it."""
+    point = jb.refine(jb.NonsmoothFold(0), jb.presets.class_a(0.28), where=nu0)
+    steps = np.asarray(point.steps[: int(point.iterations)])
+    fast = steps[steps < 0.1]
+    assert len(fast) >= 3
+    assert np.all(fast[1:] <= np.maximum(20 * fast[:-1] ** 2, 1e-12))
+
+
+def test_a_batch_of_folds_and_the_slope_of_their_curve():
+    def fold(nu1):
+        osc = jb.presets.class_b(0.53 - 2.4 * (nu1 - 0.35), nu1)
+        return jb.refine(jb.NonsmoothFold(1), osc, where=nu0, max_arcs=8)
+
+    nu1s = jnp.linspace(0.345, 0.355, 5)
+    points = jax.jit(jax.vmap(fold))(nu1s)
+    assert points.status.tolist() == [Status.OK] * 5
+    expected = oracle_cycles.nonsmooth_fold(
+        lambda nu: oracle.class_b(nu, float(nu1s[1])), (0.53, 0.56), 1
+    )
+    assert points.value[1] == pytest.approx(expected, abs=1e-10)
+    # The slope of the curve by the implicit function theorem, in reverse.
+    slope = jax.grad(lambda nu1: fold(nu1).value)(0.35)
+    difference, _ = oracle.richardson(
+        lambda nu1: oracle_cycles.nonsmooth_fold(
+            lambda nu: oracle.class_b(nu, nu1), (0.5, 0.58), 1
+        ),
+        0.35,
+        2e-3,
+    )
+    assert slope == pytest.approx(difference, rel=1e-7)

@@ -1,0 +1,142 @@
+"""Cycles and their functionals against the oracle, published numbers and balances.
+
+Tolerances: the fixed steps of shooting are good to about 1e-12 per arc, the oracle to 1e-12 per
+turn; 1e-10 leaves room for the amplification by an unstable multiplier of 20.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import EventKind, Status
+
+START = (3.0, 0.0)
+EXTREMA = ("x1_min", "x1_max", "x2_min", "x2_max")
+
+
+@pytest.mark.parametrize("nu", [0.45, 0.535, 0.3, 0.05, -0.05, -0.3, -0.5])
+def test_sticking_cycle_is_that_of_the_oracle(nu):
+    cycle = jb.find_cycle(jb.presets.class_b(nu, 0.35), START)
+    expected = oracle_cycles.sticking_cycle(oracle.class_b(nu, 0.35))
+    assert cycle.status == Status.OK and cycle.stable
+    assert tuple((kind.name, belt) for kind, belt in cycle.signature) == expected.signature
+    assert cycle.period == pytest.approx(expected.period, abs=1e-10)
+    assert cycle.stick_durations == pytest.approx(expected.stick_durations, abs=1e-10)
+    for name in EXTREMA:
+        assert getattr(cycle, name) == pytest.approx(getattr(expected, name), abs=1e-10)
+    assert cycle.multiplier == 0
+    assert cycle.residual < 1e-12 and cycle.iterations <= 3
+
+
+@pytest.mark.parametrize(
+    ("name", "velocities"),
+    [
+        ("class_b", (0.28, 0.35)),
+        ("class_b", (0.3, 0.35)),
+        ("class_b", (0.45, 0.35)),
+        ("class_b", (0.53, 0.35)),
+        ("class_b", (0.5387, 0.35)),
+        ("class_b", (-0.3, 0.35)),
+        ("class_b", (-0.55, 0.35)),
+        ("class_a", (0.184,)),
+        ("class_a", (0.22,)),
+        ("class_a", (0.265,)),
+    ],
+)
+def test_unstable_cycle_is_that_of_the_oracle(name, velocities):
+    cycle = jb.unstable_cycle(getattr(jb.presets, name)(*velocities))
+    expected = oracle_cycles.unstable_cycle(getattr(oracle, name)(*velocities))
+    assert cycle.status == Status.OK and not cycle.stable and cycle.signature == ()
+    assert cycle.period == pytest.approx(expected.period, abs=1e-9)
+    assert cycle.multiplier == pytest.approx(expected.multiplier, rel=1e-8)
+    for extremum in EXTREMA:
+        assert getattr(cycle, extremum) == pytest.approx(getattr(expected, extremum), abs=1e-9)
+
+
+@pytest.mark.parametrize("nu", [0.2, 0.6])
+def test_there_is_no_unstable_cycle_outside_of_hopf_point_and_fold(nu):
+    cycle = jb.unstable_cycle(jb.presets.class_b(nu, 0.35))
+    assert cycle.status == Status.NO_UNSTABLE_CYCLE and jnp.isnan(cycle.period)
+
+
+def test_a_start_that_comes_to_rest_leads_to_no_cycle():
+    cycle = jb.find_cycle(jb.presets.class_b(0.6, 0.35), START)
+    assert cycle.status == Status.EQUILIBRIUM and jnp.isnan(cycle.period)
+    assert "equilibrium" in repr(cycle)
+
+
+@pytest.mark.parametrize(
+    ("steepness", "period", "stick"), [(3.0, 12.0010313, 7.7050318), (1.0, 9.2307705, None)]
+)
+def test_published_stick_slip_cycles(steepness, period, stick):
+    """R. I. Leine and others' block on a belt, and the same with another steepness; as printed."""
+    friction = jb.Conti(static=1.0, residual=0.0, steepness=steepness)
+    cycle = jb.find_cycle(jb.Oscillator(0.0, (jb.Belt(0.2, friction),)), START)
+    assert cycle.period == pytest.approx(period, abs=6e-8)
+    if stick is not None:
+        assert jb.stick_duration(cycle, 0) == pytest.approx(stick, abs=6e-8)
+        assert jb.slip_duration(cycle, 0) == pytest.approx(4.2959995, abs=6e-8)
+
+
+@pytest.fixture(scope="module")
+def cycle():
+    return jb.find_cycle(jb.presets.class_b(-0.3, 0.35), START)
+
+
+def test_functionals(cycle):
+    assert jb.period(cycle) == cycle.period
+    sticks = jb.stick_duration(cycle, 0) + jb.stick_duration(cycle, 1)
+    assert jb.stick_duration(cycle) == pytest.approx(float(sticks), rel=1e-15)
+    assert jb.slip_duration(cycle) + sticks == pytest.approx(float(cycle.period), rel=1e-15)
+    assert jb.stick_fraction(cycle) == pytest.approx(float(sticks / cycle.period), rel=1e-15)
+    assert jb.amplitude(cycle) == pytest.approx(float(cycle.x1_max - cycle.x1_min) / 2, rel=1e-15)
+    assert jb.peak(cycle, "x2") == pytest.approx(0.35, abs=1e-12)
+    assert jb.gap(cycle, 0) == pytest.approx(0, abs=1e-12)
+    # What the drives put in is what becomes heat; both are integrals of their own.
+    assert jb.energy_fed(cycle) == pytest.approx(float(jb.energy_dissipated(cycle)), abs=1e-12)
+    with pytest.raises(ValueError, match=r"belt must be 0 to 1, got 2"):
+        jb.stick_duration(cycle, 2)
+
+
+def test_samples_lie_on_the_orbit(cycle):
+    run = oracle.simulate(oracle.class_b(-0.3, 0.35), cycle.arcs.y[0].tolist(), 6.9)
+    ts = np.linspace(0.0, 1.0, 12) * float(cycle.period)
+    expected = [run.at(float(t)) for t in ts[1:-1]]
+    samples = np.asarray(cycle.sample(12))
+    assert samples[1:-1] == pytest.approx(np.array(expected), abs=1e-10)
+    assert samples[-1] == pytest.approx(samples[0], abs=1e-12)
+
+
+def test_signature_begins_after_the_longest_stick_phase(cycle):
+    stick, slip = EventKind.STICK, EventKind.SLIP
+    assert cycle.signature == ((stick, 1), (slip, 1), (stick, 0), (slip, 0))
+
+
+def test_derivatives_forward_and_reverse():
+    """Against Richardson differences of the oracle; 1e-8 relative is what those are good to."""
+
+    def functionals(nu):
+        cycle = jb.find_cycle(jb.presets.class_b(nu, 0.35), START)
+        return jnp.stack([jb.stick_duration(cycle, belt=1), cycle.period, jb.amplitude(cycle)])
+
+    def expected(nu):
+        cycle = oracle_cycles.sticking_cycle(oracle.class_b(nu, 0.35))
+        return [cycle.stick_durations[1], cycle.period, (cycle.x1_max - cycle.x1_min) / 2]
+
+    slopes, _ = oracle.richardson(expected, 0.45, 8e-3, levels=4)
+    assert jax.jacfwd(functionals)(0.45) == pytest.approx(slopes, rel=1e-8)
+    assert jax.jacrev(functionals)(0.45) == pytest.approx(slopes, rel=1e-8)
+
+
+def test_a_batch_of_cycles_is_each_of_them():
+    nus = jnp.array([0.45, -0.3, 0.6])
+    batch = jax.jit(jax.vmap(lambda nu: jb.find_cycle(jb.presets.class_b(nu, 0.35), START)))(nus)
+    for i, nu in enumerate(nus[:2]):
+        one = jb.find_cycle(jb.presets.class_b(nu, 0.35), START)
+        assert batch.period[i] == pytest.approx(float(one.period), abs=1e-12)
+        assert batch.stick_durations[i] == pytest.approx(one.stick_durations.tolist(), abs=1e-12)
+    assert batch.status.tolist() == [Status.OK, Status.OK, Status.EQUILIBRIUM]
