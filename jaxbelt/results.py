@@ -56,7 +56,7 @@ ADVICE = {
         "No turn of the orbit repeated within the budget of arcs: it approaches its attractor very "
         "slowly. Start nearer to the cycle, or move away from the bifurcation point."
     ),
-    Status.TOO_MANY_ARCS: "One turn of the cycle has more arcs than there was room for: pass max_arcs.",
+    Status.TOO_MANY_ARCS: "A turn has more arcs than there is room for: pass a larger max_arcs.",
     Status.NO_CONVERGENCE: (
         "Newton's method did not converge from this guess; there may be no such solution near it."
     ),
@@ -76,7 +76,7 @@ ADVICE = {
         "The cycle does touch the boundary at a point near here, but the point is of another kind: "
         "a nonsmooth fold ends the cycle, at a grazing point it goes on to both sides."
     ),
-    Status.NO_FIXED_POINT: "There is no fixed point in a smooth field here whose trace could vanish.",
+    Status.NO_FIXED_POINT: "There is no fixed point in a smooth field whose trace could vanish.",
 }
 
 
