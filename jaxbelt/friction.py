@@ -13,7 +13,8 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 from .checks import (
     as_array,
@@ -145,8 +146,13 @@ class Stribeck(AbstractFriction):
         return self.kinetic + (self.static - self.kinetic) * decay
 
 
-def _check_static_and_kinetic(static: Array, kinetic: Array, owner: str) -> None:
+def _check_static_and_kinetic(static: ArrayLike, kinetic: ArrayLike, owner: str) -> None:
     check_nonnegative(static, f"static of {owner}")
     check_nonnegative(kinetic, f"kinetic of {owner}")
     if is_concrete((static, kinetic)):
-        require(kinetic <= static, f"kinetic of {owner}", f"<= static = {static}", kinetic)
+        require(
+            np.all(np.asarray(kinetic) <= np.asarray(static)),
+            f"kinetic of {owner}",
+            f"<= static = {static}",
+            kinetic,
+        )

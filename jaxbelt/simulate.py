@@ -214,12 +214,11 @@ def _smallest(values):
     return functools.reduce(jnp.minimum, values)
 
 
-def _first_root(fn: Callable[[Array], Array], end: Array) -> Array:
+def _first_root(fn: Callable[[Array], Array], f_start: Array, end: Array, f_end: Array) -> Array:
     """The root in (0, end] of fn, positive just after 0 and negative at end (Illinois).
 
     fn(0) may vanish, on the boundary that the arc has just left; that root is not the one.
     """
-    f_end, f_start = fn(end), fn(jnp.zeros_like(end))
     f_start = jnp.where(f_start > 1e-12, f_start, -f_end)
 
     def unfinished(state):
@@ -277,7 +276,7 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
         max_steps=MAX_STEPS,
         throw=False,
     )
-    t_end, (_, (t_start, *y_start)) = jax.tree.map(
+    t_end, (y_end, (t_start, *y_start)) = jax.tree.map(
         lambda leaf: leaf[-1], (solution.ts, solution.ys)
     )
     hit = jnp.asarray(solution.event_mask)
@@ -287,14 +286,19 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
     def guards_after(h):
         return _guards(osc, mode, turn, _single_step(osc, mode, tuple(y_start), h))
 
-    frozen = jax.tree.map(lax.stop_gradient, (osc, mode, turn, tuple(y_start)))
+    f_osc, f_mode, f_turn = jax.tree.map(lax.stop_gradient, (osc, mode, turn))
+    start, end = jax.tree.map(lax.stop_gradient, (tuple(y_start), y_end))
+
+    def smallest_guard_at(y):
+        return _smallest(_guards(f_osc, f_mode, f_turn, y))
 
     def smallest_guard(h):
-        f_osc, f_mode, f_turn, f_start = frozen
-        return _smallest(_guards(f_osc, f_mode, f_turn, _single_step(f_osc, f_mode, f_start, h)))
+        return smallest_guard_at(_single_step(f_osc, f_mode, start, h))
 
     last = lax.stop_gradient(t_end - t_start)
-    root = _first_root(smallest_guard, jnp.where(hit, last, 0.0))
+    root = _first_root(
+        smallest_guard, smallest_guard_at(start), jnp.where(hit, last, 0.0), smallest_guard_at(end)
+    )
     at_root = lax.stop_gradient(guards_after(root))
     indices = [jnp.asarray(i) for i in range(len(at_root))]
     lowest = _smallest(at_root)
@@ -306,11 +310,12 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
         return first_of([fired == i for i in indices], guards, guards[0])
 
     # Two Newton steps, small ones: the digits that are left, and derivatives to second order.
-    polished = root
-    for _ in range(2):
-        guard, slope = jax.jvp(guard_fired, (polished,), (jnp.ones_like(polished),))
+    def polish(_, h):
+        guard, slope = jax.jvp(guard_fired, (h,), (jnp.ones_like(h),))
         regular = jnp.abs(slope) * 1e-3 * last > jnp.abs(lax.stop_gradient(guard))
-        polished = polished - jnp.where(regular, guard / jnp.where(regular, slope, 1.0), 0.0)
+        return h - jnp.where(regular, guard / jnp.where(regular, slope, 1.0), 0.0)
+
+    polished = lax.fori_loop(0, 2, polish, root)
     # A turn is invisible: nothing depends on where the arc is split.
     root = jnp.where(is_turn, root, polished)
     h = jnp.where(hit, root, jnp.where(finished, span - t_start, last))
