@@ -97,7 +97,7 @@ def test_points_of_another_system():
     value = float(hopf.value)
     expected = oracle_cycles.hopf(other_oracle, (value - 0.02, value + 0.02))
     assert value == pytest.approx(expected, abs=1e-10)
-    fold = jb.refine(jb.NonsmoothFold(1), at_nu0(osc, value + 0.3), where=nu0)
+    fold = jb.refine(jb.NonsmoothFold(1), at_nu0(osc, 0.5), where=nu0)
     assert fold.status == Status.OK, fold
     expected = oracle_cycles.nonsmooth_fold(
         other_oracle, (float(fold.value) - 0.01, float(fold.value) + 0.01), 1

@@ -1,0 +1,555 @@
+"""Bifurcation points refined by Newton's method: `refine`, and the conditions that it solves.
+
+A condition is one more equation, in one more unknown: the parameter. It is written so that the
+whole system is regular at the point, which "stick duration of the cycle = 0" is not: solved for
+the cycle at every parameter, the duration goes like a square root and Newton's method fails. In the
+unknowns of fixed-signature shooting (see `cycles`) the same equation is harmless:
+
+- `NonsmoothFold`, `GrazingSliding`: the arc before the stick phase meets the boundary tangentially,
+  r = 0 and x2' = 0, which for a law without a jump is the very point of slip onset. That arc is
+  followed backwards from the point of tangency, so trial solutions cannot overshoot. Both
+  kinds are this same event. What tells them apart is the multiplier m of the cycle at the point
+  with that stick arc left out. The return map has slope 0 where the
+  cycle sticks and slope m where it does not: for m > 1 both its fixed points lie on one side and
+  vanish together (fold); for m < 1, one lies on either side, and the cycle goes on (grazing). A
+  cycle with another stick phase has m = 0.
+- `SlidingExchange`: nu_i = nu_j, and a cycle that sticks to i or j. The friction of each mode keeps
+  its sign, so the cycle with its signature fixed goes smoothly through the point.
+- `SuddenSliding`: nu_k = 0, with the mass at rest on the belt, x2' = x2 = 0: an equilibrium lies on
+  the boundary. No cycle can be an unknown here: as nu_k goes to zero the stick phase lasts ever
+  longer, the slip arc takes ever longer to leave the equilibrium, and in the limit there is none.
+- `Hopf`: trace zero at a fixed point (its determinant is always one).
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from .checks import is_concrete, number, require
+from .cycles import (
+    SIZES,
+    Chain,
+    Cycle,
+    Ends,
+    admissible,
+    chain_of,
+    cycle_of,
+    follow,
+    jacobian,
+    last_turn,
+    meshed,
+    multiplier_without_sticking,
+    newton,
+    residual,
+    residual_and_blocks,
+    trace_of,
+)
+from .equilibria import EquilibriumKind, equilibria
+from .modes import (
+    STUCK,
+    Mode,
+    boundary_guards,
+    capacity,
+    edge_guards,
+    mode_acceleration,
+    mode_of_state,
+)
+from .oscillator import Oscillator
+from .results import Status, describe
+
+#: Arcs for which the orbit from slip onset is followed in search of the signature.
+HINT_BUDGET = 32
+
+
+class AbstractCondition(eqx.Module):
+    """What is to happen at a bifurcation point."""
+
+
+class Hopf(AbstractCondition):
+    """A fixed point changes its stability: eqs. (27), (28) of the paper, for any friction law."""
+
+
+class _BeltCondition(AbstractCondition):
+    belt: int = eqx.field(static=True)
+
+
+class NonsmoothFold(_BeltCondition):
+    """The stick phase on a belt shrinks to a point and the cycle vanishes with an unstable one."""
+
+
+class GrazingSliding(_BeltCondition):
+    """The cycle touches the boundary of a belt and begins to stick to it there, but goes on."""
+
+
+class SuddenSliding(_BeltCondition):
+    """A belt comes to rest: the time that the mass sticks to it in each turn goes to infinity."""
+
+
+class SlidingExchange(AbstractCondition):
+    """Two belts run at one velocity: the cycle changes from sticking to one to the other."""
+
+    belts: tuple[int, int] = eqx.field(static=True)
+
+
+class BifurcationPoint(eqx.Module):
+    """What `refine` returns.
+
+    condition: the condition that holds there; value: of the parameter; residual: largest error in
+    the defining equations; iterations: Newton steps; steps: how far each went, NaN padded; error: a
+    bound on |value - exact value|, from the same equations with every integration step halved, and
+    rounding; oscillator: at the point;
+    cycle: at the point, with a status that says why where there is none (at a Hopf point it has
+    shrunk to the equilibrium, at `SuddenSliding` its period is infinite); multiplier: of the cycle
+    on the side where it does not stick to the belt, for `NonsmoothFold` and `GrazingSliding`, else
+    NaN; status: a `Status` code. Where it is not OK the value is NaN.
+    """
+
+    condition: AbstractCondition
+    value: Array
+    residual: Array
+    iterations: Array
+    steps: Array
+    error: Array
+    multiplier: Array
+    oscillator: Oscillator
+    cycle: Cycle
+    status: Array
+
+    @property
+    def kind(self) -> str:
+        """Name of the condition."""
+        return type(self.condition).__name__
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.value) or self.value.ndim:
+            return f"BifurcationPoint({self.condition!r}, value={self.value.shape})"
+        if int(self.status) != Status.OK:
+            name = Status(int(self.status)).name
+            return f"BifurcationPoint({self.condition!r}, {name}: {describe(self.status)})"
+        return (
+            f"BifurcationPoint({self.condition!r}, value {number(self.value)}, "
+            f"residual {float(self.residual):.1e}, {int(self.iterations)} iterations, "
+            f"error < {float(self.error):.1e})"
+        )
+
+
+def refine(
+    condition: AbstractCondition,
+    osc: Oscillator,
+    *,
+    where: Callable[[Oscillator], Any],
+    max_arcs: int | None = None,
+) -> BifurcationPoint:
+    """The bifurcation point near an oscillator, by Newton's method with exact derivatives.
+
+    condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`, `SlidingExchange(belts)` or
+    `SuddenSliding(belt)`. osc: a rough guess, on either side of the point. where: selects the
+    parameter that is varied, such as `lambda osc: osc.belts[0].velocity`. max_arcs: room for the
+    arcs of one turn (default 16).
+
+    Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`; `value` and
+    `cycle` are differentiable with respect to the other parameters. A guess that leads to no such
+    point gives a status that says why, and NaN. `ValueError` names an impossible argument.
+    """
+    require(isinstance(condition, AbstractCondition), "condition", "such as jb.Hopf()", condition)
+    require(
+        isinstance(osc, Oscillator), "osc", "an Oscillator, such as jb.presets.class_b(...)", osc
+    )
+    osc.check_scalars()
+    osc.check()
+    n = len(osc.belts)
+    belts = condition.belts if isinstance(condition, SlidingExchange) else ()
+    belts = (condition.belt,) if isinstance(condition, _BeltCondition) else belts
+    for belt in belts:
+        require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
+    size = SIZES[1] if max_arcs is None else max_arcs
+    return _refine(condition, osc, _leaf_index(osc, where), size)
+
+
+def _leaf_index(osc: Oscillator, where: Callable[[Oscillator], Any]) -> int:
+    # By its number, not by the function: a new lambda in every call would compile anew every time.
+    leaves, structure = jax.tree.flatten(osc)
+    index = where(jax.tree.unflatten(structure, list(range(len(leaves)))))
+    require(isinstance(index, int), "where", "a function that selects one parameter", repr(index))
+    return index
+
+
+def _vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
+    """The oscillator with the parameter of that number replaced by p, [1]."""
+    leaves, structure = jax.tree.flatten(osc)
+    leaves[index] = p[0]
+    return jax.tree.unflatten(structure, leaves)
+
+
+@eqx.filter_jit
+def _refine(condition, osc: Oscillator, index: int, size: int) -> BifurcationPoint:
+    p0 = jax.tree.leaves(osc)[index][None]
+    # Derivatives with respect to the varied parameter itself would be those of the guess.
+    osc = _vary(osc, index, lax.stop_gradient(p0))
+    if isinstance(condition, Hopf):
+        return _refine_hopf(condition, osc, index)
+    if isinstance(condition, SuddenSliding):
+        return _refine_sudden(condition, osc, index)
+    if isinstance(condition, SlidingExchange):
+        return _refine_exchange(condition, osc, index, size)
+    return _refine_touch(condition, osc, index, size)
+
+
+# --- systems of a cycle and one condition ---------------------------------------------------------
+
+# 3N + 1 equations in 3N + 1 unknowns: those of the cycle, and the parameter with the condition.
+
+
+class _System(eqx.Module):
+    """A fixed signature and a condition, for the parameter of that number.
+
+    The condition: two belts run at one velocity, or else, an arc is tangent to a boundary.
+    """
+
+    chain: Chain
+    index: int = eqx.field(static=True)
+    equal: tuple[int, ...] = eqx.field(static=True)
+
+    def _difference(self, osc: Oscillator) -> Array:
+        i, j = self.equal
+        return osc.belts[i].velocity - osc.belts[j].velocity
+
+    def residual(self, osc: Oscillator, z: Array, p: Array) -> Array:
+        osc = _vary(osc, self.index, p)
+        value, miss = residual(osc, self.chain, z)
+        return jnp.append(value.reshape(-1), self._difference(osc) if self.equal else miss)
+
+    def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
+        """The residual, and its Jacobian with respect to (z, p)."""
+
+        def osc_of(p):
+            return _vary(osc, self.index, p)
+
+        value, g, blocks = residual_and_blocks(osc_of, self.chain, z, p)
+        row = jnp.append(blocks[:, 3, :3].reshape(-1), jnp.sum(blocks[:, 3, 3]))
+        if self.equal:
+            g, slope = jax.value_and_grad(lambda p: self._difference(osc_of(p)))(p)
+            row = jnp.zeros_like(row).at[-1].set(slope[0])
+        equations = jnp.concatenate(
+            [jacobian(blocks[:, :3, :3]), blocks[:, :3, 3].reshape(-1, 1)], axis=1
+        )
+        matrix = jnp.concatenate([equations, row[None]])
+        return jnp.append(value.reshape(-1), g), matrix
+
+    @property
+    def ordinary(self) -> Chain:
+        """The chain with every tangency as an ordinary arrival at the boundary."""
+        tangent = Ends(self.chain.codes.shape[-1]).tangent
+        ends = jnp.where(self.chain.ends >= tangent, self.chain.ends - tangent, self.chain.ends)
+        return Chain(self.chain.codes, ends, self.chain.mesh)
+
+
+@eqx.filter_custom_jvp
+def _solve_system(osc, system, z0, p0):
+    def step(unknowns):
+        value, matrix = system.linearized(osc, *unknowns)
+        change = jnp.linalg.solve(matrix, -value)
+        return (change[:-1].reshape(z0.shape), change[-1:]), jnp.max(jnp.abs(value))
+
+    solved = newton(step, (z0, p0))
+    return (*solved.z, solved.lengths)
+
+
+@_solve_system.def_jvp
+def _(primals, tangents):
+    osc, system, z0, p0 = primals
+    z, p, steps = _solve_system(osc, system, z0, p0)
+    moved, fixed = eqx.partition(
+        osc, jax.tree.map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
+    )
+    _, shift = jax.jvp(
+        lambda moved: system.residual(eqx.combine(moved, fixed), z, p),
+        (moved,),
+        (tangents[0],),
+    )
+    _, matrix = system.linearized(osc, z, p)
+    change = jnp.linalg.solve(matrix, -shift)
+    return (z, p, steps), (change[:-1].reshape(z.shape), change[-1:], None)
+
+
+def _error(osc: Oscillator, system: _System, z: Array, p: Array) -> Array:
+    """A bound on the error of p: what the residual with halved steps and rounding do to it."""
+    halved = jnp.repeat(0.5 * system.chain.mesh, 2, axis=1)
+    finer = eqx.tree_at(lambda s: s.chain.mesh, system, halved)
+    value = finer.residual(osc, z, p)
+    _, matrix = system.linearized(osc, z, p)
+    last = jnp.zeros(value.size).at[-1].set(1.0)
+    weights = jnp.linalg.solve(matrix.T, last)
+    rounding = 1e-15 * (1 + jnp.max(jnp.abs(z))) * jnp.sum(jnp.abs(weights))
+    return 2 * jnp.abs(jnp.sum(weights * value)) + rounding
+
+
+def _solved_point(condition, osc, system, z0, p0, status, judge) -> BifurcationPoint:
+    """Solve; judge(osc, z, cycle) -> (status, multiplier) says whether it is what was meant."""
+    z, p, steps = _solve_system(osc, system, z0, p0)
+    iterations = jnp.sum(~jnp.isnan(steps))
+    at_point = _vary(osc, system.index, p)
+    cycle = cycle_of(at_point, system.ordinary, z, iterations, status)
+    error = _error(*lax.stop_gradient((osc, system, z, p)))
+    status, multiplier = judge(at_point, z, cycle)
+    size = jnp.max(jnp.abs(system.residual(osc, z, p)))
+    known = functools.partial(jnp.where, status == Status.OK)
+    return BifurcationPoint(
+        condition=condition,
+        value=known(p[0], jnp.nan),
+        residual=known(size, jnp.nan),
+        iterations=iterations,
+        steps=steps,
+        error=known(error, jnp.nan),
+        multiplier=known(multiplier, jnp.nan),
+        oscillator=_vary(osc, system.index, known(p, jnp.nan)),
+        cycle=cycle,
+        status=status,
+    )
+
+
+# --- touching a boundary --------------------------------------------------------------------------
+
+
+def _before_onset(osc: Oscillator, belt: int) -> Array:
+    """A state stuck to a belt shortly before slip onset.
+
+    Which belts touch there depends on x1, which depends on them: three rounds settle it.
+    """
+    v = osc.belts[belt].velocity / osc.omega
+    x1 = jnp.zeros(())
+    for _ in range(3):
+        mode = mode_of_state(osc, x1, v)
+        held = tuple(
+            jnp.where(
+                (jnp.abs(code) < 1.5) & (other.velocity == osc.belts[belt].velocity), STUCK, code
+            )
+            for code, other in zip(mode.codes, osc.belts, strict=True)
+        )
+        mode = Mode(held)
+        rest = mode_acceleration(osc, mode, jnp.zeros(()), v)
+        x1 = rest + 0.99 * jnp.sign(v) * capacity(osc, mode)
+    return jnp.stack([x1, v])
+
+
+def _refine_touch(condition, osc, index, size) -> BifurcationPoint:
+    belt, n = condition.belt, len(osc.belts)
+    names = Ends(n)
+    still = lax.stop_gradient(osc)
+    velocity = still.belts[belt].velocity
+    orbit = follow(still, _before_onset(still, belt), HINT_BUDGET)
+    repeated = orbit.status == Status.OK
+
+    # Either a cycle was found, or the orbit left the boundary for good: then its first turn from
+    # slip onset to the next extremum of x2 on that side, closed there, is nearly the cycle.
+    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
+    rows = jnp.arange(HINT_BUDGET)
+    near = (orbit.ends == names.turn_x2) & (exits[:, 1] * jnp.sign(velocity) > 0) & (rows > 0)
+    last = jnp.argmax(near)
+    first_turn = eqx.tree_at(lambda o: (o.repeats, o.count), orbit, (jnp.asarray(0), last + 1))
+    returns = jnp.any(near) & ~jnp.any(
+        (rows > 0) & (rows <= last) & jnp.any(orbit.codes == 0, axis=-1)
+    )
+    orbit = jax.tree.map(lambda a, b: jnp.where(repeated, a, b), orbit, first_turn)
+    _, count = last_turn(orbit)
+    chain, z = chain_of(still, orbit, size)
+    chain, z, row, found = _with_stick(still, chain, z, belt)
+
+    usable = (repeated | returns) & found
+    status = jnp.where(usable, Status.OK.value, Status.NOT_TOUCHED.value)
+    fits = count < size
+    status = jnp.where(usable & ~fits, Status.TOO_MANY_ARCS.value, status)
+    status = jnp.where(velocity == 0, Status.STUCK_FOREVER.value, status)
+
+    def judge(osc, z, cycle):
+        chain = cycle.chain
+        others = jnp.any(chain.codes == 0, axis=-1) & chain.used & (jnp.arange(size) != row)
+        slope = jnp.where(jnp.any(others), 0.0, multiplier_without_sticking(osc, chain, z))
+        is_kind = slope > 1 if isinstance(condition, NonsmoothFold) else slope < 1
+        other = (cycle.status == Status.OK) & ~is_kind
+        return jnp.where(other, Status.OTHER_KIND.value, cycle.status), slope
+
+    # The arc before the stick arc is the one that becomes tangent.
+    before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
+    tangent = chain.ends.at[before].set(names.tangent + belt)
+    system = _System(Chain(chain.codes, tangent, chain.mesh), index, ())
+    p0 = jax.tree.leaves(still)[index][None]
+    return _solved_point(condition, osc, system, z, p0, status, judge)
+
+
+def _with_stick(osc: Oscillator, chain: Chain, z: Array, belt: int):
+    """The chain with a stick arc on the belt: (chain, guess, its row, whether there is one).
+
+    Its own shortest, or one of duration zero where x2 comes closest to the boundary from inside.
+    """
+    velocity = osc.belts[belt].velocity
+    rows = jnp.arange(chain.ends.size)
+    own = chain.used & (chain.codes[:, belt] == 0)
+    shortest = jnp.argmin(jnp.where(own, z[:, 2], jnp.inf))
+
+    count = jnp.sum(chain.used)
+    following = jnp.where((rows == count - 1)[:, None], z[0], jnp.roll(z, -1, axis=0))
+    turns = chain.used & (chain.ends == Ends(len(osc.belts)).turn_x2)
+    turns = turns & (chain.codes[:, belt] == jnp.sign(velocity))
+    turns = turns & (following[:, 1] * jnp.sign(velocity) > 0)
+    distance = jnp.abs(velocity - osc.omega * following[:, 1])
+    at = jnp.argmin(jnp.where(turns, distance, jnp.inf))
+
+    def inserted(array, new):
+        shifted = jnp.roll(array, 1, axis=0)
+        after = (rows > at + 1).reshape(-1, *[1] * (array.ndim - 1))
+        return jnp.where(after, shifted, array).at[at + 1].set(new)
+
+    x1 = following[at, 0]
+    stick = jnp.stack([x1, velocity / osc.omega, jnp.zeros(())])
+    names = Ends(len(osc.belts))
+    codes = inserted(chain.codes, chain.codes[at].at[belt].set(STUCK))
+    ends = inserted(chain.ends.at[at].set(belt), jnp.asarray(names.onset))
+    z_new = inserted(z, stick)
+    # Where the chain is full, the last row was shifted out; the caller knows.
+    has_own = jnp.any(own)
+    choose = functools.partial(jnp.where, has_own)
+    z = choose(z, z_new)
+    chain, z = meshed(osc, choose(chain.codes, codes), choose(chain.ends, ends), z[:, :2], z[:, 2])
+    return chain, z, choose(shortest, at + 1), has_own | jnp.any(turns)
+
+
+# --- the other conditions -------------------------------------------------------------------------
+
+
+def _refine_exchange(condition, osc, index, size) -> BifurcationPoint:
+    i, j = condition.belts
+    still = lax.stop_gradient(osc)
+    orbit = follow(still, _before_onset(still, i), HINT_BUDGET)
+    _, count = last_turn(orbit)
+    chain, z = chain_of(still, orbit, size)
+    on_i, on_j = (jnp.any(chain.used & (chain.codes[:, k] == 0)) for k in (i, j))
+    fits = (orbit.status == Status.OK) & (count <= size) & (on_i != on_j)
+    status = jnp.where(fits, Status.OK.value, Status.NOT_TOUCHED.value)
+    swap = np.arange(len(osc.belts))
+    swap[[i, j]] = j, i
+
+    def judge(osc, z, cycle):
+        chain = cycle.chain
+        swapped = Chain(chain.codes[:, swap], chain.ends, chain.mesh)
+        other = (cycle.status == Status.OK) & ~admissible(osc, swapped, z)
+        return jnp.where(other, Status.OTHER_KIND.value, cycle.status), jnp.asarray(jnp.nan)
+
+    system = _System(chain, index, (i, j))
+    p0 = jax.tree.leaves(still)[index][None]
+    return _solved_point(condition, osc, system, z, p0, status, judge)
+
+
+def _small_newton(equations, osc, unknowns):
+    """Newton's method for a few equations(osc, unknowns).
+
+    Returns the solution, its steps, its residual and the error of the last unknown.
+    """
+
+    def step(u):
+        value = equations(lax.stop_gradient(osc), u)
+        matrix = jax.jacfwd(lambda u: equations(lax.stop_gradient(osc), u))(u)
+        return jnp.linalg.solve(matrix, -value), jnp.max(jnp.abs(value))
+
+    solved = newton(step, lax.stop_gradient(unknowns))
+    u = lax.stop_gradient(solved.z)
+    # One more step carries the derivatives with respect to the other parameters.
+    matrix = jax.jacfwd(lambda u: equations(osc, u))(u)
+    value = equations(osc, u)
+    u = u - jnp.linalg.solve(matrix, value)
+    weights = jnp.linalg.solve(matrix.T, jnp.zeros(u.size).at[-1].set(1.0))
+    error = 1e-15 * (1 + jnp.max(jnp.abs(u))) * jnp.sum(jnp.abs(weights))
+    return u, solved.lengths, jnp.max(jnp.abs(value)), error
+
+
+def _point_without_cycle(condition, osc, index, p, steps, size, error, status, why):
+    iterations = jnp.sum(~jnp.isnan(steps))
+    known = functools.partial(jnp.where, status == Status.OK)
+    at_point = _vary(osc, index, known(p, jnp.nan)[None])
+    nan = jnp.full((SIZES[0], 3), jnp.nan)
+    n = len(osc.belts)
+    chain = Chain(
+        jnp.ones((SIZES[0], n)), jnp.full(SIZES[0], Ends(n).unused), jnp.zeros((SIZES[0], 1))
+    )
+    none = jnp.asarray(jnp.nan)
+    cycle = Cycle(at_point, chain, nan, none, none, iterations, jnp.asarray(why.value))
+    return BifurcationPoint(
+        condition=condition,
+        value=known(p, jnp.nan),
+        residual=known(size, jnp.nan),
+        iterations=iterations,
+        steps=steps,
+        error=known(error, jnp.nan),
+        multiplier=none,
+        oscillator=at_point,
+        cycle=cycle,
+        status=status,
+    )
+
+
+def _refine_hopf(condition, osc, index) -> BifurcationPoint:
+    rests = equilibria(lax.stop_gradient(osc))
+    fixed = rests.kind == EquilibriumKind.FIXED_POINT
+    row = jnp.argmin(jnp.where(fixed, jnp.abs(rests.rate), jnp.inf))
+    codes = rests.modes[row].astype(float)
+    mode = Mode(tuple(codes[i] for i in range(len(osc.belts))))
+    rest = jnp.zeros(())
+
+    def equations(osc, u):
+        osc = _vary(osc, index, u[1:])
+        return jnp.append(
+            mode_acceleration(osc, mode, u[0], rest)[None], trace_of(osc, mode, u[0], rest)
+        )
+
+    p0 = jax.tree.leaves(osc)[index]
+    x1 = jnp.where(fixed[row], rests.x1[row], 0.0)
+    u, steps, size, error = _small_newton(equations, osc, jnp.stack([x1, p0]))
+    at_point = _vary(osc, index, u[1:])
+    inside = [*boundary_guards(at_point, mode, rest), *edge_guards(at_point, mode, u[0])]
+    status = jnp.where(jnp.all(jnp.stack(inside) > 0), Status.OK.value, Status.NOT_ADMISSIBLE.value)
+    status = jnp.where(size < 1e-9, status, Status.NO_CONVERGENCE.value)
+    status = jnp.where(jnp.any(fixed), status, Status.NO_FIXED_POINT.value)
+    return _point_without_cycle(
+        condition, osc, index, u[1], steps, size, error, status, Status.EQUILIBRIUM
+    )
+
+
+def _refine_sudden(condition, osc, index) -> BifurcationPoint:
+    belt = condition.belt
+    still = lax.stop_gradient(osc)
+    # From a guess on the point itself there is no orbit to follow; its cycles lie beside it.
+    at_rest = still.belts[belt].velocity == 0
+    beside = eqx.tree_at(
+        lambda o: o.belts[belt].velocity,
+        still,
+        jnp.where(at_rest, 1e-2, still.belts[belt].velocity),
+    )
+    start = _before_onset(beside, belt)
+    orbit = follow(beside, start, HINT_BUDGET)
+    rows = jnp.arange(HINT_BUDGET)
+    turn = (rows > orbit.repeats) & (rows < orbit.count)
+    sticks = (orbit.status == Status.OK) & jnp.any(turn & (orbit.codes[:, belt] == 0))
+    # The contacts at slip onset are those at the equilibrium that it meets.
+    mode = Mode(tuple(orbit.codes[0, i] for i in range(len(osc.belts))))
+    rest = jnp.zeros(())
+
+    def equations(osc, u):
+        osc = _vary(osc, index, u[1:])
+        nu = osc.belts[belt].velocity
+        limit = jnp.sign(beside.belts[belt].velocity) * capacity(osc, mode)
+        return jnp.stack([mode_acceleration(osc, mode, u[0], rest) + limit, nu])
+
+    p0 = jax.tree.leaves(osc)[index]
+    u, steps, size, error = _small_newton(equations, osc, jnp.stack([start[0], p0]))
+    status = jnp.where(sticks, Status.OK.value, Status.NOT_TOUCHED.value)
+    status = jnp.where(size < 1e-9, status, Status.NO_CONVERGENCE.value)
+    return _point_without_cycle(
+        condition, osc, index, u[1], steps, size, error, status, Status.STUCK_FOREVER
+    )

@@ -1,0 +1,934 @@
+"""Steady cycles, stable and unstable: `find_cycle`, `unstable_cycle` and what they return, `Cycle`.
+
+A cycle is a closed chain of arcs, and its signature, (the mode, what ends it) arc by arc, is all
+that has to be known to compute it: the numbers then follow from a square system of equations
+without any event detection (fixed-signature multiple shooting). An arc ends at a boundary r_k = 0,
+at a contact edge, at slip onset, or at a turn, x2' = 0 or x2 = 0. The turns make x1 and x2 monotone
+on every arc, so all extrema of a cycle are ends of arcs. Counted for N arcs:
+
+    3N unknowns    entry state (x1, x2) and duration T of every arc
+     N equations   the guard of the arc's end vanishes at its end
+    2N equations   the end of an arc is the entry of the next, after the last comes the first
+
+The number N is padded to a few fixed sizes and modes are data, so that one compiled program serves
+all signatures. Slip arcs are integrated by a fixed number of steps of a scheme of order
+twelve, spread over the arc so that they are short where the friction law bends; all arcs at
+once, each step smooth in everything. Derivatives of a solution come from the implicit function
+theorem and work in forward and reverse mode and under `jax.vmap`.
+
+The signature comes from following the orbit, with the same steps and with the transition rules of
+`modes`, until a turn repeats.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike
+
+from .checks import as_array, check_finite, is_concrete, number, require
+from .equilibria import EquilibriumKind, equilibria
+from .modes import (
+    Mode,
+    any_of,
+    boundary_guards,
+    bounds_rightward,
+    capacity,
+    edge_focus,
+    edge_guards,
+    edges,
+    end_stick,
+    first_of,
+    mode_acceleration,
+    mode_of_state,
+    pass_edge,
+    reach_boundary,
+    select,
+    stick_phase,
+    stick_velocity,
+)
+from .oscillator import Oscillator
+from .results import EventKind, Status, describe
+from .simulate import Arcs
+
+#: Arcs in a chain: what is needed is rounded up to one of these; the second one under a trace.
+SIZES = (8, 16, 32, 64)
+#: Integration steps per slip arc (an arc is about a quarter of a turn at most).
+STEPS = 8
+#: Arcs that an orbit is followed for before it is given up.
+BUDGET = 1024
+#: A turn that repeats to this fraction of the amplitude has repeated; Newton does the rest.
+REPEATED = 1e-7
+#: Amplitudes below this one are an equilibrium, up to what can be told.
+AT_REST = 1e-5
+NEWTON_STEPS = 12
+#: Longer Newton steps are cut to this length: guesses are good to that.
+LONGEST = 0.5
+
+
+# --- smooth arcs ----------------------------------------------------------------------------------
+
+
+def _extrapolation(*sizes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The midpoint rule with so many substeps each, extrapolated to substeps of length zero.
+
+    One row a substep: its length, whether it is the first of its rule, and, at the last, the weight
+    of that rule's result. Gragg's method: the error is even in the length.
+    """
+    rows = []
+    for n in sizes:
+        weight = np.prod([n**2 / (n**2 - m**2) for m in sizes if m != n])
+        rows += [(1 / n, float(k == 0), weight if k == n - 1 else 0.0) for k in range(n)]
+    return tuple(np.array(rows).T)
+
+
+# Of order 12 for the arcs, of order 8 for following an orbit, of order 4 for placing the steps.
+_FINE = _extrapolation(2, 4, 6, 8, 10, 12)
+_MEDIUM = _extrapolation(2, 4, 6, 8)
+_COARSE = _extrapolation(2, 4)
+
+
+def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme) -> Array:
+    """One step of size h of an extrapolated midpoint rule.
+
+    Not a Runge-Kutta scheme: unrolled, its stages take minutes to compile, and as an array they
+    make a batch of thousands of arcs several times slower than these three states, kept apart by
+    component.
+    """
+    start = tuple(y[i] for i in range(y.size))
+
+    def substep(carry, row):
+        before, now, total = carry
+        length, first, weight = row
+        now = tuple(jnp.where(first == 1, a, b) for a, b in zip(start, now, strict=True))
+        before = tuple(jnp.where(first == 1, a, b) for a, b in zip(start, before, strict=True))
+        slopes = field(jnp.stack(now))
+        stride = (2 - first) * length * h
+        new = tuple(a + stride * slopes[i] for i, a in enumerate(before))
+        moved = zip(total, new, start, strict=True)
+        total = tuple(sum_ + weight * (a - a0) for sum_, a, a0 in moved)
+        return (now, new, total), None
+
+    nothing = tuple(jnp.zeros_like(part) for part in start)
+    rows = tuple(map(jnp.asarray, scheme))
+    (_, _, total), _ = lax.scan(substep, (start, start, nothing), rows)
+    return y + jnp.stack(total)
+
+
+def _mode(codes: Array) -> Mode:
+    return Mode(tuple(codes[i] for i in range(codes.shape[0])))
+
+
+def _field(osc: Oscillator, codes: Array, y: Array) -> Array:
+    return jnp.stack([y[1], mode_acceleration(osc, _mode(codes), y[0], y[1])])
+
+
+def density(osc: Oscillator, codes: Array, y: Array) -> Array:
+    """How many steps per unit of time an orbit at y wants: more where the friction law bends.
+
+    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0.
+    """
+    a = mode_acceleration(osc, _mode(codes), y[0], y[1])
+    bend = jnp.zeros(())
+    for i, belt in enumerate(osc.belts):
+        speed = jnp.maximum(jnp.sign(codes[i]) * (belt.velocity - osc.omega * y[1]), 0.0)
+
+        def slope(r, belt=belt):
+            return jax.jvp(belt.friction.mu, (r,), (jnp.ones_like(r),))[1]
+
+        curvature = jax.jvp(slope, (speed,), (jnp.ones_like(speed),))[1]
+        slips = jnp.abs(codes[i]) == 1
+        bend = bend + jnp.where(slips, jnp.sqrt(jnp.abs(belt.load * curvature)), 0.0)
+    turning = jnp.sqrt(bend * jnp.abs(osc.omega * y[1]))  # where x2' = 0, x2'' = -x2
+    return 1 + 0.4 * bend * jnp.abs(osc.omega * a) + turning
+
+
+def _mesh(osc: Oscillator, codes: Array, y: Array, duration: Array) -> Array:
+    """Steps as fractions of the duration, [STEPS], so that each has about the same share of it."""
+    n = 24
+    h = duration / n
+
+    def advance(y, _):
+        y = _step(functools.partial(_field, osc, codes), y, h, _COARSE)
+        return y, density(osc, codes, y)
+
+    _, rest = lax.scan(advance, y, None, length=n)
+    rho = jnp.concatenate([density(osc, codes, y)[None], rest])
+    # Clipped: where a guess is poor the mesh is only less good.
+    rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
+    share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
+    grid = jnp.interp(
+        jnp.linspace(0.0, 1.0, STEPS + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
+    )
+    return jnp.diff(grid)
+
+
+class Chain(eqx.Module):
+    """A signature: contact codes [arcs, belts], what ends each arc [arcs], and the step fractions.
+
+    ends: i < n the boundary of belt i; n <= i < 3n the edge i - n of `modes.edges`; then the turn
+    x2' = 0, the turn x2 = 0, slip onset, an unused arc, of duration zero, and from there on a
+    tangency to the boundary of belt i (see `_arc_equations`).
+    """
+
+    codes: Array
+    ends: Array
+    mesh: Array
+
+    @property
+    def used(self) -> Array:
+        return self.ends != Ends(self.codes.shape[-1]).unused
+
+
+class Ends:
+    """Numbers for what ends an arc, for n belts."""
+
+    def __init__(self, n: int):
+        self.turn_x2, self.turn_x1, self.onset, self.unused, self.tangent = range(3 * n, 3 * n + 5)
+
+
+def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, extra=None):
+    """End of one arc, (x1, x2), and the integrals of `extra(osc, mode, x1, x2)`, a vector, over it.
+
+    A stick arc is a straight line; Simpson's rule is exact there for what is at most cubic.
+    """
+    mode = _mode(codes)
+    stuck = mode.any_stuck
+    n_extra = 0 if extra is None else extra(osc, mode, y[0], y[1]).size
+
+    def field(state):
+        smooth = _field(osc, codes, state[:2])
+        if extra is None:
+            return smooth
+        return jnp.concatenate([smooth, extra(osc, mode, state[0], state[1])])
+
+    start = jnp.concatenate([y, jnp.zeros(n_extra)])
+    slip_time = jnp.where(stuck, 0.0, duration)
+
+    def advance(state, fraction):
+        return _step(field, state, slip_time * fraction, _FINE), None
+
+    slipped, _ = lax.scan(advance, start, mesh)
+    v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
+    stuck_end = jnp.stack([y[0] + v * duration, v])
+    if extra is not None:
+        values = [
+            weight * extra(osc, mode, y[0] + fraction * v * duration, v)
+            for fraction, weight in ((0.0, 1 / 6), (0.5, 4 / 6), (1.0, 1 / 6))
+        ]
+        stuck_end = jnp.concatenate([stuck_end, duration * (values[0] + values[1] + values[2])])
+    return jnp.where(stuck, stuck_end, slipped)
+
+
+def onset_position(osc: Oscillator, mode: Mode) -> Array:
+    """x1 where a stick phase of the mode ends by slip onset, eqs. (10), (19), (20)."""
+    v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
+    return mode_acceleration(osc, mode, jnp.zeros(()), v) + jnp.sign(v) * capacity(osc, mode)
+
+
+def _guard(osc: Oscillator, codes: Array, end: Array, y: Array, duration: Array) -> Array:
+    """What vanishes at the end y of an arc."""
+    mode = _mode(codes)
+    values = [
+        *[belt.velocity - osc.omega * y[1] for belt in osc.belts],
+        *[jnp.where(jnp.isfinite(edge), y[0] - edge, 1.0) for edge in edges(osc)],
+        mode_acceleration(osc, mode, y[0], y[1]),
+        y[1],
+        y[0] - onset_position(osc, mode),
+        duration,
+    ]
+    return sum((jnp.where(end == i, value, 0.0) for i, value in enumerate(values)), jnp.zeros(()))
+
+
+def _arc_equations(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
+    """(x1, x2, guard, 0) at the end of one arc, from its unknowns (x1, x2, T).
+
+    An arc that is to end tangent to the boundary of a belt ends at the point of it with x2' = 0.
+    Trial arcs that run past there meet the pole of the friction law, so this one is followed
+    backwards, from that point, to where it begins: (x1, x2) are the point's, the last two the
+    misses of x1 and of x2. That is one equation more, a condition on the oscillator.
+    """
+    names = Ends(len(osc.belts))
+    is_tangent = end >= names.tangent
+    velocity = jnp.zeros(())
+    for i, belt in enumerate(osc.belts):
+        velocity = velocity + jnp.where(end == names.tangent + i, belt.velocity / osc.omega, 0.0)
+    x1 = mode_acceleration(osc, _mode(codes), jnp.zeros(()), velocity)
+    point = jnp.stack([x1, velocity])
+    start = jnp.where(is_tangent, point, unknown[:2])
+    duration = jnp.where(is_tangent, -unknown[2], unknown[2])
+    after = flow(osc, codes, jnp.where(is_tangent, jnp.flip(mesh), mesh), start, duration)
+    guard = _guard(osc, codes, end, after, unknown[2])
+    ordinary = jnp.concatenate([after, guard[None], jnp.zeros(1)])
+    return jnp.where(is_tangent, jnp.concatenate([point, after - unknown[:2]]), ordinary)
+
+
+def residual(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
+    """The 3N equations at the unknowns z, [N, 3]: mismatch of x1, of x2, guard, for every arc; and
+    the miss of the tangent arcs, zero where there is none."""
+    out = jax.vmap(functools.partial(_arc_equations, osc))(chain.codes, chain.ends, chain.mesh, z)
+    return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3])
+
+
+def _next_entries(z):
+    return jnp.roll(z, -1, axis=0).at[:, 2].set(0.0)
+
+
+def residual_and_blocks(
+    osc_of: Callable[[Array], Oscillator], chain: Chain, z: Array, p: Array
+) -> tuple[Array, Array, Array]:
+    """`residual` at the parameters p, a vector, of an oscillator osc_of(p), and its derivatives:
+    those of the equations of each arc with respect to its (x1, x2, T, p), [N, 4, 3 + len(p)]."""
+
+    def one(codes, end, mesh, unknown):
+        def equations(u):
+            return _arc_equations(osc_of(u[3:]), codes, end, mesh, u[:3])
+
+        def column(direction):
+            return jax.jvp(equations, (unknown,), (direction,))
+
+        value, columns = jax.vmap(column, out_axes=(None, -1))(jnp.eye(unknown.size))
+        return value, columns
+
+    unknowns = jnp.concatenate([z, jnp.broadcast_to(p, (z.shape[0], p.size))], axis=1)
+    out, blocks = jax.vmap(one)(chain.codes, chain.ends, chain.mesh, unknowns)
+    return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3]), blocks
+
+
+def jacobian(blocks: Array) -> Array:
+    """The 3N x 3N matrix of the system: the blocks, and minus one at the next arc's entry."""
+    n = blocks.shape[0]
+    following = jnp.asarray(np.roll(np.eye(n), 1, axis=1))
+    same = jnp.eye(n)[:, None, :, None] * blocks[:, :, None, :]
+    then = following[:, None, :, None] * jnp.asarray(np.diag([1.0, 1.0, 0.0]))[None, :, None, :]
+    return (same - then).reshape(3 * n, 3 * n)
+
+
+class Newton(eqx.Module):
+    """State of a Newton iteration: unknowns, largest residual, steps made, and how long each was,
+    [NEWTON_STEPS], NaN where there was none."""
+
+    z: Any
+    residual: Array
+    iterations: Array
+    lengths: Array
+
+
+def newton(step: Callable[[Any], tuple[Any, Array]], start: Any) -> Newton:
+    """Newton's method: step(z) gives the correction and the residual at z.
+
+    Steps longer than LONGEST are cut. Ends where steps are as small as rounding lets them be, and
+    where they are not finite.
+    """
+
+    def unfinished(n):
+        last = n.lengths[n.iterations - 1]
+        before = n.lengths[jnp.maximum(n.iterations - 2, 0)]
+        settled = (last < 1e-13) | ((n.iterations > 1) & (before < 1e-9) & (last < 1e-9))
+        going = (n.iterations < NEWTON_STEPS) & ~settled & jnp.isfinite(last)
+        return going | (n.iterations == 0)
+
+    def improve(n):
+        change, size = step(n.z)
+        length = jnp.max(jnp.stack([jnp.max(jnp.abs(c)) for c in jax.tree.leaves(change)]))
+        shorter = jnp.minimum(1.0, LONGEST / length)
+        z = jax.tree.map(lambda a, b: a + shorter * b, n.z, change)
+        return Newton(z, size, n.iterations + 1, n.lengths.at[n.iterations].set(length))
+
+    none = jnp.full(NEWTON_STEPS, jnp.nan)
+    return lax.while_loop(unfinished, improve, Newton(start, jnp.zeros(()), jnp.asarray(0), none))
+
+
+def _newton_step(osc, chain, z):
+    value, _, blocks = residual_and_blocks(lambda _: osc, chain, z, jnp.zeros(0))
+    step = jnp.linalg.solve(jacobian(blocks[:, :3]), -value.reshape(-1))
+    return step.reshape(z.shape), jnp.max(jnp.abs(value))
+
+
+@eqx.filter_custom_jvp
+def _solve(osc: Oscillator, chain: Chain, z0: Array) -> tuple[Array, Array]:
+    """Unknowns that solve the system, [N, 3], and the number of Newton steps."""
+    solved = newton(functools.partial(_newton_step, osc, chain), z0)
+    return solved.z, solved.iterations
+
+
+@_solve.def_jvp
+def _(primals, tangents):
+    osc, chain, z0 = primals
+    z, iterations = _solve(osc, chain, z0)
+    moved, fixed = eqx.partition(
+        osc, jax.tree.map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
+    )
+    _, shift = jax.jvp(
+        lambda moved: residual(eqx.combine(moved, fixed), chain, z)[0], (moved,), (tangents[0],)
+    )
+    _, _, blocks = residual_and_blocks(lambda _: osc, chain, z, jnp.zeros(0))
+    z_dot = jnp.linalg.solve(jacobian(blocks[:, :3]), -shift.reshape(-1)).reshape(z.shape)
+    return (z, iterations), (z_dot, None)
+
+
+# --- following an orbit ---------------------------------------------------------------------------
+
+
+class Orbit(eqx.Module):
+    """The arcs of an orbit, in rows up to `count`: entry, duration, codes, and what ended each.
+
+    tops: x1 where an arc ended in a maximum of x1, else NaN. repeats: row of the top that the last
+    one repeats, else -1. y, code: where it stands now.
+    """
+
+    entries: Array
+    durations: Array
+    codes: Array
+    ends: Array
+    tops: Array
+    count: Array
+    y: Array
+    code: Array
+    low: Array
+    repeats: Array
+    status: Array
+    done: Array
+
+
+def _after(osc: Oscillator, codes: Array, y: Array):
+    """Sign of x2' and x2 just after y; where x2' = 0, x2'' = -x2 decides."""
+    a = mode_acceleration(osc, _mode(codes), y[0], y[1])
+    still, moving = jnp.abs(a) < 1e-9 * (1 + jnp.abs(y[0])), jnp.abs(y[1]) >= 1e-9
+    return jnp.sign(jnp.where(still, -y[1], a)), jnp.sign(jnp.where(moving, y[1], a))
+
+
+def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
+    """Follow a slip arc to the first of its guards: duration, end state, index of the guard."""
+    mode = _mode(codes)
+    a_sign, v_sign = _after(osc, codes, y)
+    field = functools.partial(_field, osc, codes)
+
+    def guards(y):
+        a = mode_acceleration(osc, mode, y[0], y[1])
+        values = [*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])]
+        return jnp.stack([*values, a_sign * a, v_sign * y[1]])
+
+    def inside(state):
+        _, _, _, y_end, steps = state
+        # A stuck lane has no slip arc to follow; it must not keep a batch waiting.
+        going = (steps < 200) & ~mode.any_stuck & jnp.all(jnp.isfinite(y_end))
+        return jnp.all(guards(y_end) >= 0) & going
+
+    def advance(state):
+        t, _, h, y, steps = state
+        h_new = 0.3 / density(osc, codes, y)
+        return t + h, y, h_new, _step(field, y, h_new, _MEDIUM), steps + 1
+
+    # The first step is one of length zero, into which y itself is put.
+    t, y0, h, y1, steps = lax.while_loop(
+        inside, advance, advance((jnp.zeros(()), y, jnp.zeros(()), y, jnp.asarray(0)))
+    )
+    # The root on the step's cubic, then two Newton steps of the true state.
+    d0, d1 = field(y0) * h, field(y1) * h
+
+    def cubic(s):
+        return (
+            (1 + 2 * s) * (1 - s) ** 2 * y0
+            + s * (1 - s) ** 2 * d0
+            + s**2 * (3 - 2 * s) * y1
+            + s**2 * (s - 1) * d1
+        )
+
+    def halve(_, bracket):
+        left, right = bracket
+        middle = 0.5 * (left + right)
+        out = jnp.any(guards(cubic(middle)) < 0)
+        return jnp.where(out, left, middle), jnp.where(out, middle, right)
+
+    _, root = lax.fori_loop(0, 30, halve, (jnp.zeros(()), jnp.ones(())))
+    fired = jnp.argmin(guards(cubic(root)))
+
+    def polish(_, h_root):
+        y_root = _step(field, y0, h_root, _MEDIUM)
+        value, slope = jax.jvp(guards, (y_root,), (field(y_root),))
+        slope = slope[fired]
+        regular = jnp.abs(slope) > 1e-6
+        shift = jnp.where(regular, value[fired] / jnp.where(regular, slope, 1.0), 0.0)
+        return jnp.clip(h_root - shift, 0.0, 1.01 * h)
+
+    h_root = lax.fori_loop(0, 2, polish, root * h)
+    return t + h_root, _step(field, y0, h_root, _MEDIUM), fired, steps >= 200
+
+
+def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
+    n = len(osc.belts)
+    names = Ends(n)
+    y, codes = orbit.y, orbit.code
+    mode = _mode(codes)
+    stuck = mode.any_stuck
+
+    phase = stick_phase(osc, mode, y[0])
+    stick_end = jnp.stack([phase.x1, y[1]])
+    forever = jnp.isinf(phase.duration)
+    after_stick = select(
+        phase.slips, end_stick(osc, mode), pass_edge(osc, mode, phase.x1, y[1], y[1] > 0)
+    )
+    edge_indices = [jnp.asarray(n + i) for i in range(2 * n)]
+    stick_fired = first_of(phase.edge, edge_indices, jnp.asarray(names.onset))
+
+    t_slip, slip_end, fired, lost = _slip_to_guard(osc, codes, y)
+    at_boundary, at_edge = fired < n, (fired >= n) & (fired < 3 * n)
+    edge_hit = [fired == i for i in edge_indices]
+    edge = first_of(edge_hit, edges(osc), slip_end[0])
+    flags = zip(edge_hit, bounds_rightward(mode), strict=True)
+    rightward = any_of([hit & right for hit, right in flags])
+    after_edge = pass_edge(osc, mode, edge, slip_end[1], rightward)
+    hit = [fired == i for i in range(n)]
+    after_boundary, x2_boundary = reach_boundary(osc, mode, hit, slip_end[0])
+    after_slip = select(at_boundary, after_boundary, select(at_edge, after_edge, mode))
+    slip_end = jnp.stack(
+        [
+            jnp.where(at_edge, edge, slip_end[0]),
+            jnp.where(at_boundary, x2_boundary, slip_end[1]),
+        ]
+    )
+    focus = edge_focus(
+        osc, select(rightward, mode, after_edge), select(rightward, after_edge, mode), edge
+    )
+    speed = jnp.abs(slip_end[1])
+    captured = at_edge & focus.exists & (focus.contraction < 0)
+    captured = captured & (10 * speed * focus.nonlinearity < -focus.contraction) & (speed < 1e-2)
+
+    y_end = jnp.where(stuck, stick_end, slip_end)
+    end = jnp.where(stuck, stick_fired, fired)
+    new = select(stuck, after_stick, after_slip)
+    code = jnp.stack([jnp.asarray(c, dtype=y.dtype) for c in new.codes])
+    duration = jnp.where(stuck, phase.duration, t_slip)
+
+    is_top = ~stuck & (fired == names.turn_x1) & (y[1] > 0)
+    top = jnp.where(is_top, y_end[0], jnp.nan)
+    amplitude = top - orbit.low
+    rows = jnp.arange(orbit.tops.size)
+    same = jnp.abs(orbit.tops - top) < REPEATED * amplitude
+    repeats = jnp.max(jnp.where(same, rows, -1))
+    resting = is_top & (orbit.count > 8) & (amplitude < AT_REST)
+
+    status = jnp.where(stuck & forever, Status.STUCK_FOREVER.value, Status.OK.value)
+    status = jnp.where(~stuck & captured, Status.PSEUDO_FOCUS.value, status)
+    status = jnp.where(resting, Status.EQUILIBRIUM.value, status)
+    bad = ~jnp.all(jnp.isfinite(y_end)) | (~stuck & lost)
+    status = jnp.where(bad, Status.NOT_FINITE.value, status)
+    i = orbit.count
+    return Orbit(
+        entries=orbit.entries.at[i].set(y),
+        durations=orbit.durations.at[i].set(duration),
+        codes=orbit.codes.at[i].set(codes),
+        ends=orbit.ends.at[i].set(end),
+        tops=orbit.tops.at[i].set(top),
+        count=i + 1,
+        y=y_end,
+        code=code,
+        low=jnp.where(is_top, y_end[0], jnp.minimum(orbit.low, y_end[0])),
+        repeats=repeats,
+        status=status,
+        done=(status != Status.OK) | (repeats >= 0),
+    )
+
+
+def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
+    """The orbit from y0 until a turn repeats, it comes to rest, or the budget is used up."""
+    osc, y0 = lax.stop_gradient((osc, y0))
+    n = len(osc.belts)
+    mode = mode_of_state(osc, y0[0], y0[1])
+    start = Orbit(
+        entries=jnp.zeros((budget, 2)),
+        durations=jnp.zeros(budget),
+        codes=jnp.ones((budget, n)),
+        ends=jnp.full(budget, Ends(n).unused),
+        tops=jnp.full(budget, jnp.nan),
+        count=jnp.asarray(0),
+        y=y0,
+        code=jnp.stack([jnp.asarray(c, dtype=y0.dtype) for c in mode.codes]),
+        low=y0[0],
+        repeats=jnp.asarray(-1),
+        status=jnp.asarray(Status.OK.value),
+        done=jnp.asarray(False),
+    )
+    orbit = lax.while_loop(
+        lambda orbit: ~orbit.done & (orbit.count < budget), functools.partial(_next_arc, osc), start
+    )
+    status = jnp.where(orbit.done, orbit.status, Status.NOT_SETTLED.value)
+    return eqx.tree_at(lambda orbit: orbit.status, orbit, status)
+
+
+def last_turn(orbit: Orbit) -> tuple[Array, Array]:
+    """(first row, number of rows) of the turn that repeats; it begins at the end of a stick phase.
+
+    That of the longest one, if there are several; if there is none, at the top. Rows are to be
+    taken modulo the number, see `chain_of`.
+    """
+    rows = jnp.arange(orbit.durations.size)
+    size = orbit.count - 1 - orbit.repeats
+    inside = (rows > orbit.repeats) & (rows < orbit.count)
+    stuck = inside & jnp.any(orbit.codes == 0, axis=-1)
+    longest = jnp.argmax(jnp.where(stuck, orbit.durations, -1.0))
+    shift = jnp.where(jnp.any(stuck), longest - orbit.repeats, 0)
+    return shift, size
+
+
+def chain_of(osc: Oscillator, orbit: Orbit, size: int) -> tuple[Chain, Array]:
+    """The signature of the turn that repeats, padded to `size` arcs, and its unknowns."""
+    shift, count = last_turn(orbit)
+    rows = jnp.arange(size)
+    used = rows < count
+    source = orbit.repeats + 1 + jnp.where(used, shift + rows, shift) % jnp.maximum(count, 1)
+    ends = jnp.where(used, orbit.ends[source], Ends(len(osc.belts)).unused)
+    durations = jnp.where(used, orbit.durations[source], 0.0)
+    return meshed(osc, orbit.codes[source], ends, orbit.entries[source], durations)
+
+
+def meshed(osc: Oscillator, codes, ends, entries, durations) -> tuple[Chain, Array]:
+    """A chain with its mesh, and its unknowns, from a guess."""
+    stuck = jnp.any(codes == 0, axis=-1)
+    mesh = jax.vmap(functools.partial(_mesh, osc))(codes, entries, jnp.where(stuck, 0.0, durations))
+    z = jnp.concatenate([entries, durations[:, None]], axis=1)
+    return lax.stop_gradient((Chain(codes, ends, mesh), z))
+
+
+# --- the cycle ------------------------------------------------------------------------------------
+
+
+class Cycle(eqx.Module):
+    """A steady cycle, differentiable with respect to every parameter of its oscillator.
+
+    oscillator: whose cycle it is; chain: its signature, see `Chain`; unknowns: (x1, x2, T) at the
+    entry of every arc, [arcs, 3]; both padded. multiplier: nontrivial Floquet multiplier, the
+    determinant of the monodromy matrix with its saltation matrices, exactly 0 where the cycle
+    sticks. residual: largest error in the shooting equations. iterations: Newton steps. status: a
+    `Status` code; where it is not OK every number is NaN.
+
+    `period`; `stick_durations`, [belts], summed over the phases of one turn; `x1_min`, `x1_max`,
+    `x2_min`, `x2_max`; `stable`; `signature`, ((kind, belt), ...) of the events of one turn;
+    `arcs`, as of a trajectory; `sample(n)`. A cycle that sticks begins at the end of its longest
+    stick phase, any other at its largest x1.
+    """
+
+    oscillator: Oscillator
+    chain: Chain
+    unknowns: Array
+    multiplier: Array
+    residual: Array
+    iterations: Array
+    status: Array
+
+    @property
+    def period(self) -> Array:
+        return jnp.sum(self.unknowns[..., 2], axis=-1)
+
+    @property
+    def stick_durations(self) -> Array:
+        stuck = self.chain.codes == 0
+        return jnp.sum(jnp.where(stuck, self.unknowns[..., 2:], 0.0), axis=-2)
+
+    @property
+    def x1_min(self) -> Array:
+        return jnp.min(self.unknowns[..., 0], axis=-1)
+
+    @property
+    def x1_max(self) -> Array:
+        return jnp.max(self.unknowns[..., 0], axis=-1)
+
+    @property
+    def x2_min(self) -> Array:
+        return jnp.min(self.unknowns[..., 1], axis=-1)
+
+    @property
+    def x2_max(self) -> Array:
+        return jnp.max(self.unknowns[..., 1], axis=-1)
+
+    @property
+    def stable(self) -> Array:
+        return jnp.abs(self.multiplier) < 1
+
+    @property
+    def arcs(self) -> Arcs:
+        """The arcs, smooth pieces in one mode each; NaN, or cut off, where unused."""
+        used = self.chain.used
+        nan = functools.partial(jnp.where, used)
+        entries = jnp.cumsum(self.unknowns[..., 2], axis=-1) - self.unknowns[..., 2]
+        arcs = Arcs(
+            t=nan(entries, jnp.nan),
+            y=jnp.where(used[..., None], self.unknowns[..., :2], jnp.nan),
+            mode=self.chain.codes,
+            duration=nan(self.unknowns[..., 2], jnp.nan),
+        )
+        if is_concrete(self.unknowns) and used.ndim == 1:
+            arcs = jax.tree.map(lambda leaf: leaf[: int(np.sum(used))], arcs)
+        return arcs
+
+    @property
+    def signature(self) -> tuple[tuple[EventKind, int], ...]:
+        """The events of one turn, (kind, belt) each; outside of transformations only."""
+        require(
+            is_concrete(self.chain) and self.chain.ends.ndim == 1,
+            "signature",
+            "asked of one cycle outside of transformations",
+            "a traced or batched cycle",
+        )
+        codes, ends = np.asarray(self.chain.codes), np.asarray(self.chain.ends)
+        n = codes.shape[-1]
+        names = Ends(n)
+        count = int(np.sum(ends != names.unused))
+        events = []
+        for i in range(count if int(self.status) == Status.OK else 0):
+            end, following = int(ends[i]), codes[(i + 1) % count]
+            if end < n:
+                kind = EventKind.STICK if following[end] == 0 else EventKind.CROSS
+                events.append((kind, end))
+            elif end < 3 * n:
+                events.append((EventKind.EDGE, (end - n) % n))
+            elif end == names.onset:
+                events.append((EventKind.SLIP, int(np.argmax(codes[i] == 0))))
+        return tuple(events)
+
+    def sample(self, n: int) -> Array:
+        """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
+        return _sample(self, n)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.unknowns) or self.unknowns.ndim != 2:
+            return f"Cycle(unknowns={self.unknowns.shape})"
+        if int(self.status) != Status.OK:
+            return f"Cycle({Status(int(self.status)).name}: {describe(self.status)})"
+        events = " ".join(f"{kind.name} {belt}" for kind, belt in self.signature) or "smooth"
+        sticks = ", ".join(map(number, self.stick_durations))
+        return (
+            f"Cycle({events}; period {number(self.period)}, sticks ({sticks}), "
+            f"multiplier {number(self.multiplier)}, {'' if self.stable else 'un'}stable, "
+            f"residual {float(self.residual):.1e})"
+        )
+
+
+@eqx.filter_jit
+def _sample(cycle: Cycle, n: int) -> Array:
+    durations = cycle.unknowns[:, 2]
+    ends = jnp.cumsum(durations)
+
+    def at(t):
+        i = jnp.minimum(jnp.searchsorted(ends, t).astype(int), jnp.sum(cycle.chain.used) - 1)
+        since = t - ends[i] + durations[i]
+        chain = cycle.chain
+        return flow(cycle.oscillator, chain.codes[i], chain.mesh[i], cycle.unknowns[i, :2], since)
+
+    return jax.vmap(at)(jnp.linspace(0.0, 1.0, n) * ends[-1])
+
+
+def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """Divergence of the field of a slip mode, d(x2')/d(x2), as a vector of one."""
+    _, slope = jax.jvp(lambda v: mode_acceleration(osc, mode, x1, v), (x2,), (jnp.ones_like(x2),))
+    return slope[None]
+
+
+def multiplier_without_sticking(osc: Oscillator, chain: Chain, z: Array) -> Array:
+    """Determinant of the monodromy matrix, stick phases left out: exp of the mean divergence, and
+    at each crossing of a boundary the determinant of its saltation matrix, x2' after over before.
+
+    One multiplier of a planar cycle is 1, so this is the other one. Contact edges have determinant
+    one: their saltation matrix is [[1, 0], [jump of x2' / x2, 1]].
+    """
+    n = len(osc.belts)
+
+    def one(codes, mesh, unknown, following, entry, end):
+        after = flow(osc, codes, mesh, unknown[:2], unknown[2], trace_of)
+        before_crossing = mode_acceleration(osc, _mode(codes), after[0], after[1])
+        after_crossing = mode_acceleration(osc, _mode(following), entry[0], entry[1])
+        slips = jnp.all(codes != 0) & (unknown[2] != 0)
+        crosses = (end < n) & jnp.all(following != 0)
+        ratio = after_crossing / jnp.where(crosses, before_crossing, 1.0)
+        growth = jnp.where(slips, jnp.exp(jnp.where(slips, after[2], 0.0)), 1.0)
+        return growth * jnp.where(crosses, ratio, 1.0)
+
+    following = following_codes(chain)
+    factors = jax.vmap(one)(
+        chain.codes, chain.mesh, z, following, jnp.roll(z[:, :2], -1, axis=0), chain.ends
+    )
+    return jnp.prod(factors)
+
+
+def following_codes(chain: Chain) -> Array:
+    """Contact codes of the arc after each; after the last used one comes the first."""
+    following = jnp.roll(chain.codes, -1, axis=0)
+    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
+    return jnp.where(last[:, None], chain.codes[0], following)
+
+
+def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
+    """Whether every arc stays inside its mode and has a duration >= 0, up to rounding.
+
+    Both ends are looked at; between them x1, x2 and the needed force are monotone.
+    """
+    slack = 1e-9
+
+    def one(codes, unknown, following):
+        mode = _mode(codes)
+        fine = unknown[2] >= -slack
+        for y in (unknown, following):
+            inside = jnp.stack([*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])])
+            needed = mode_acceleration(osc, mode, y[0], y[1])
+            held = ~mode.any_stuck | (jnp.abs(needed) <= capacity(osc, mode) + slack)
+            fine = fine & jnp.all(inside >= -slack) & held
+        return fine
+
+    each = jax.vmap(one)(chain.codes, z, jnp.roll(z, -1, axis=0))
+    return jnp.all(each | ~chain.used)
+
+
+def cycle_of(osc: Oscillator, chain: Chain, z: Array, iterations: Array, status: Array) -> Cycle:
+    """The `Cycle` of a solution z; NaN with a status where it is none."""
+    error = jnp.max(jnp.abs(residual(osc, chain, z)[0]))
+    found = error < 1e-9
+    status = _first_failure(status, found, Status.NO_CONVERGENCE)
+    status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
+    sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
+    multiplier = jnp.where(sticks, 0.0, multiplier_without_sticking(osc, chain, z))
+    known = functools.partial(jnp.where, status == Status.OK)
+    return Cycle(
+        oscillator=osc,
+        chain=chain,
+        unknowns=known(z, jnp.nan),
+        multiplier=known(multiplier, jnp.nan),
+        residual=known(error, jnp.nan),
+        iterations=iterations,
+        status=status,
+    )
+
+
+def _first_failure(status: Array, fine: Array, code: Status) -> Array:
+    return jnp.where((status == Status.OK) & ~fine, code.value, status)
+
+
+@eqx.filter_jit
+def _follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
+    return follow(osc, y0, budget)
+
+
+@eqx.filter_jit
+def _polish(osc: Oscillator, orbit: Orbit, size: int) -> Cycle:
+    _, count = last_turn(orbit)
+    status = _first_failure(orbit.status, count <= size, Status.TOO_MANY_ARCS)
+    # Where there is no cycle a turn of the orbit still gives finite numbers to calculate with.
+    chain, guess = chain_of(lax.stop_gradient(osc), orbit, size)
+    z, iterations = _solve(osc, chain, guess)
+    return cycle_of(osc, chain, z, iterations, status)
+
+
+def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Cycle:
+    """The steady cycle that the start y0 leads to.
+
+    osc: `Oscillator`; y0: start (x1, x2), shape [2]. max_arcs: room for the arcs of one turn, where
+    under a transformation 16 are not enough.
+
+    The orbit is followed until a turn repeats; then all arcs are polished together by Newton's
+    method. Differentiable with respect to the parameters (the derivative with respect to y0 is
+    zero: a cycle does not depend on where it was approached from), forward and reverse, and under
+    `jax.vmap`. Where the start leads to an equilibrium, or nothing repeats, the status says so.
+    `ValueError` names an argument that is impossible.
+    """
+    require(
+        isinstance(osc, Oscillator), "osc", "an Oscillator, such as jb.presets.class_b(...)", osc
+    )
+    osc.check_scalars()
+    osc.check()
+    y0 = as_array(y0, "y0", (2,))
+    check_finite(y0, "y0")
+    orbit = _follow(osc, y0, BUDGET)
+    return _polish(osc, orbit, _room(orbit, max_arcs))
+
+
+def _room(orbit: Orbit, max_arcs: int | None) -> int:
+    if max_arcs is not None:
+        return max_arcs
+    if not is_concrete(orbit):
+        return SIZES[1]
+    needed = int(orbit.count - 1 - orbit.repeats) if int(orbit.status) == Status.OK else 0
+    return next((size for size in SIZES if size >= needed), SIZES[-1])
+
+
+# --- the unstable cycle ---------------------------------------------------------------------------
+
+#: Starts that are compared in one batch, and how often the interval between two of them is refined.
+STARTS, REFINEMENTS = 32, 3
+
+
+def unstable_cycle(osc: Oscillator, *, max_arcs: int | None = None) -> Cycle:
+    """The unstable cycle around a stable equilibrium, that touches no boundary (no sliding).
+
+    It separates the starts that come to rest from those that go on to the motion outside of it. It
+    may pass contact edges. osc: `Oscillator`; max_arcs as for `find_cycle`. Differentiable like
+    any `Cycle`. Where there is none, or none of this sort, the status is NO_UNSTABLE_CYCLE.
+
+    Starts to the right of the equilibrium at different distances are followed for one turn. The
+    first one that does not come nearer, or that touches a boundary, lies outside of the cycle;
+    between it and its neighbour the search is repeated, and Newton's method does the rest. With
+    several stable equilibria the leftmost is taken.
+    """
+    require(
+        isinstance(osc, Oscillator), "osc", "an Oscillator, such as jb.presets.class_b(...)", osc
+    )
+    osc.check_scalars()
+    osc.check()
+    size = SIZES[1] if max_arcs is None else max_arcs
+    return _unstable_cycle(osc, size)
+
+
+@eqx.filter_jit
+def _unstable_cycle(osc: Oscillator, size: int) -> Cycle:
+    still = lax.stop_gradient(osc)
+    rests = equilibria(still)
+    eligible = rests.stable & (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
+    exists = jnp.any(eligible)
+    x1 = jnp.where(exists, rests.x1[jnp.argmax(eligible)], 0.0)
+
+    def turn(distance):
+        orbit = follow(still, jnp.stack([x1 + distance, jnp.zeros(())]), size)
+        rows = jnp.arange(size)
+        is_top = ~jnp.isnan(orbit.tops)
+        top = jnp.where(jnp.any(is_top), jnp.argmax(is_top), size)
+        touches = jnp.any((rows <= top) & (orbit.ends < len(osc.belts)))
+        nearer = orbit.tops[jnp.minimum(top, size - 1)] - x1 < distance
+        captured = orbit.status == Status.PSEUDO_FOCUS
+        inside = ~touches & (captured & (top == size) | (top < size) & nearer)
+        return eqx.tree_at(
+            lambda o: (o.repeats, o.count), orbit, (jnp.asarray(-1), top + 1)
+        ), inside
+
+    def narrow(bracket, _):
+        distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
+        _, inside = jax.vmap(turn)(distances)
+        first = jnp.argmin(inside)
+        bounded = ~inside[-1] & (first > 0)
+        low, high = distances[jnp.maximum(first - 1, 0)], distances[first]
+        return jnp.where(bounded, jnp.stack([low, high]), bracket), inside[0] & ~jnp.all(inside)
+
+    bracket, found = lax.scan(narrow, jnp.array([1e-4, 10.0]), None, length=REFINEMENTS)
+    orbit, _ = turn(bracket[0])
+    chain, guess = chain_of(still, orbit, size)
+    z, iterations = _solve(osc, chain, guess)
+    status = jnp.where(exists & found[0], Status.OK.value, Status.NO_UNSTABLE_CYCLE.value)
+    cycle = cycle_of(osc, chain, z, iterations, status)
+    # A cycle that Newton found elsewhere, or shrunk to the equilibrium, is not the one meant.
+    same = (jnp.abs(z[0, 0] - guess[0, 0]) < 0.1 * bracket[0]) & (cycle.multiplier > 1)
+    missing = (cycle.status == Status.OK) & ~same | (cycle.status == Status.NOT_ADMISSIBLE)
+    missing = missing | (cycle.status == Status.NO_CONVERGENCE)
+    status = jnp.where(missing, Status.NO_UNSTABLE_CYCLE.value, cycle.status)
+    known = functools.partial(jnp.where, status == Status.OK)
+    return Cycle(
+        oscillator=osc,
+        chain=chain,
+        unknowns=known(cycle.unknowns, jnp.nan),
+        multiplier=known(cycle.multiplier, jnp.nan),
+        residual=known(cycle.residual, jnp.nan),
+        iterations=iterations,
+        status=status,
+    )

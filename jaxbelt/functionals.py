@@ -1,0 +1,133 @@
+"""Functionals: one number of a cycle, to be swept, plotted, fitted or driven to a wanted value.
+
+Each takes a `Cycle` and gives a scalar that is differentiable with respect to the oscillator's
+parameters, forward and reverse, and works on batches under `jax.vmap`. All quantities are
+dimensionless: times in units of 1/omega, energies in units of k L^2 where L is the unit of length.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .checks import require
+from .cycles import Chain, Cycle, flow
+from .modes import Mode, mode_acceleration
+from .oscillator import Oscillator
+
+_COORDINATES = {"x1": 0, "x2": 1}
+
+
+def period(cycle: Cycle) -> Array:
+    """Duration of one turn."""
+    return cycle.period
+
+
+def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
+    """Time per turn for which the mass sticks to a belt, summed over its stick phases.
+
+    belt: index of the belt; None: any belt. `ValueError` if there is no such belt.
+    """
+    if belt is None:
+        return jnp.sum(jnp.where(_is_stuck(cycle), cycle.unknowns[..., 2], 0.0), axis=-1)
+    return cycle.stick_durations[..., _belt_index(cycle, belt)]
+
+
+def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
+    """Time per turn for which the mass touches a belt and slips on it.
+
+    belt: index of the belt; None: time for which the mass sticks to no belt. `ValueError` if there
+    is no such belt.
+    """
+    if belt is None:
+        return cycle.period - stick_duration(cycle)
+    codes = cycle.chain.codes[..., _belt_index(cycle, belt)]
+    return jnp.sum(jnp.where(jnp.abs(codes) == 1, cycle.unknowns[..., 2], 0.0), axis=-1)
+
+
+def stick_fraction(cycle: Cycle, belt: int | None = None) -> Array:
+    """Fraction of a turn for which the mass sticks to a belt (None: to any), from 0 to 1."""
+    return stick_duration(cycle, belt) / cycle.period
+
+
+def amplitude(cycle: Cycle, coordinate: str = "x1") -> Array:
+    """Half the difference of the largest and the smallest value of "x1" or "x2"."""
+    values = _values(cycle, coordinate)
+    return 0.5 * (jnp.max(values, axis=-1) - jnp.min(values, axis=-1))
+
+
+def peak(cycle: Cycle, coordinate: str = "x1") -> Array:
+    """Largest absolute value of "x1" or "x2" in a turn."""
+    return jnp.max(jnp.abs(_values(cycle, coordinate)), axis=-1)
+
+
+def gap(cycle: Cycle, belt: int) -> Array:
+    """Signed distance in x2 from the cycle to the boundary r = 0 of a belt, nu/omega.
+
+    Positive where the boundary lies outside of the cycle's range of x2, by how far; negative where
+    the cycle reaches across it, by how far; zero where it touches it, as all that stick to that
+    belt and do not cross it do.
+    """
+    belt = _belt_index(cycle, belt)
+    osc = cycle.oscillator
+    boundary = osc.belts[belt].velocity / osc.omega
+    return jnp.maximum(boundary - cycle.x2_max, cycle.x2_min - boundary)
+
+
+def energy_fed(cycle: Cycle) -> Array:
+    """Work that the drives of the belts do in one turn: the sum of friction times belt velocity.
+
+    In a steady cycle it equals `energy_dissipated`. Negative parts occur: a belt can brake.
+    """
+    return _energies(cycle)[0]
+
+
+def energy_dissipated(cycle: Cycle) -> Array:
+    """Energy that damping and slipping contacts turn into heat in one turn."""
+    return _energies(cycle)[1]
+
+
+def _is_stuck(cycle: Cycle) -> Array:
+    return jnp.any(cycle.chain.codes == 0, axis=-1)
+
+
+def _belt_index(cycle: Cycle, belt: int) -> int:
+    n = len(cycle.oscillator.belts)
+    require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
+    return belt
+
+
+def _values(cycle: Cycle, coordinate: str) -> Array:
+    require(coordinate in _COORDINATES, "coordinate", '"x1" or "x2"', repr(coordinate))
+    return cycle.unknowns[..., _COORDINATES[coordinate]]
+
+
+@eqx.filter_jit
+def _energies(cycle: Cycle) -> Array:
+    """[fed, dissipated] in one turn, each the integral of a power over every arc."""
+    return _energies_of(cycle.oscillator, cycle.chain, cycle.unknowns)
+
+
+def _energies_of(osc: Oscillator, chain: Chain, unknowns: Array) -> Array:
+    def one(codes, mesh, unknown):
+        return flow(osc, codes, mesh, unknown[:2], unknown[2], _powers)[2:]
+
+    return jnp.sum(jax.vmap(one)(chain.codes, chain.mesh, unknowns), axis=0)
+
+
+def _powers(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """Power [fed, dissipated] in a mode. A stuck contact holds the needed force, with sign turned.
+
+    Belts that are stuck together share one velocity, so only the sum of their forces counts.
+    """
+    held = jnp.where(mode.any_stuck, -mode_acceleration(osc, mode, x1, x2), 0.0)
+    fed, heat = jnp.zeros(()), osc.damping * x2**2
+    counted = jnp.asarray(False)
+    for belt, sign, stuck in zip(osc.belts, mode.signs, mode.stuck, strict=True):
+        slip = belt.velocity - osc.omega * x2
+        friction = sign * (belt.load * belt.friction.mu(jnp.where(stuck, 0.0, sign * slip)))
+        friction = jnp.where(stuck & ~counted, held, friction)
+        counted = counted | stuck
+        fed = fed + friction * (belt.velocity / osc.omega)
+        heat = heat + jnp.where(stuck, 0.0, friction * (slip / osc.omega))
+    return jnp.stack([fed, heat])
