@@ -117,12 +117,11 @@ def _table_of(values) -> Table:
     for name in ("printed", "computed", "difference", "residual", "iterations"):
         table.add_column(name, justify="right")
     for value in values:
-        first = (value.system, value.point, value.kind, f"{value.printed:.5g}")
-        if value.computed is None:
-            table.add_row(*first, "missing: needs cycles", "", "", "")
-            continue
         table.add_row(
-            *first,
+            value.system,
+            value.point,
+            value.kind,
+            f"{value.printed:.5g}",
             f"{value.computed:.12f}",
             f"{value.computed - value.printed:+.1e}",
             f"{value.residual:.0e}",

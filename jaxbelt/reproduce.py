@@ -5,11 +5,9 @@ in one batch, then draws. What a figure shows is said in one place, its line in 
 a function that draws it, or `Portraits`, the phase portraits before, at and after a critical
 value. The critical values come to all of them from one tuple, that of `critical_values`.
 
-What cannot be computed yet is None in that tuple and named in `STILL_MISSING`. Portraits at such
-a value take the one that the paper prints, and say so.
+What is still missing beside the paper is named in `STILL_MISSING`.
 """
 
-import functools
 import json
 import operator
 from collections.abc import Callable, Sequence
@@ -22,6 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import plotting
+from .bifurcations import (
+    AbstractCondition,
+    GrazingSliding,
+    Hopf,
+    NonsmoothFold,
+    SlidingExchange,
+    SuddenSliding,
+    refine,
+)
+from .cycles import Cycle, unstable_cycle
 from .equilibria import Equilibria, equilibria
 from .oscillator import Belt, Oscillator
 from .presets import (
@@ -33,7 +41,7 @@ from .presets import (
     class_d,
     paper_friction,
 )
-from .results import EventKind
+from .results import EventKind, Status
 from .simulate import Trajectory, simulate
 
 #: Every portrait runs over this time (dimensionless), sampled at so many times.
@@ -46,13 +54,11 @@ MISPRINT = (
     "does not give the paper's values."
 )
 MISSING_REGION = (
-    "Just below nu0 = 0 the exact cycle sticks on belt 0 only, Fig. 11 (c): a region between 3a "
-    "and 4c that the paper does not list."
+    "Just below nu0 = 0 the exact cycle sticks on belt 0 only, Fig. 11 (c), until belt 1 joins in "
+    "a grazing point at -0.0788: a region between 3a and 4c that the paper does not list."
 )
 STILL_MISSING = (
-    "Still missing: the critical values other than the Hopf points, the unstable cycles in "
-    "Figs. 4, 5, 8-10, 12, 13 and the bifurcation diagrams, Figs. 3, 7, need cycles; Fig. 6 needs "
-    "the region map. Portraits at a missing value are drawn at the printed one."
+    "Still missing: the bifurcation diagrams, Figs. 3 and 7, and the region map, Fig. 6."
 )
 #: What is to be said beside the table.
 REMARKS = (MISPRINT, MISSING_REGION, STILL_MISSING)
@@ -61,40 +67,73 @@ REMARKS = (MISPRINT, MISSING_REGION, STILL_MISSING)
 # --- the table ----------------------------------------------------------------------------------
 
 
-class CriticalValue(NamedTuple):
-    """A critical velocity nu0: the published one, and ours where it can be computed, else None.
+#: What defines each critical value, exactly.
+CONDITIONS: dict[tuple[str, str], AbstractCondition] = {
+    ("a", "nu_alpha"): NonsmoothFold(0),
+    ("a", "nu_beta"): Hopf(),
+    ("b", "nu_alpha"): NonsmoothFold(1),
+    ("b", "nu_beta"): SlidingExchange((0, 1)),
+    ("b", "nu_gamma"): Hopf(),
+    ("b", "nu_delta"): SuddenSliding(0),
+    ("b", "nu_epsilon"): Hopf(),
+    ("b", "nu_zeta"): GrazingSliding(0),
+    ("b", "nu_eta"): NonsmoothFold(1),
+}
+#: Newton's method starts this far from the printed value.
+AWAY = 0.02
 
-    residual: of the defining condition at `computed`; iterations: Newton steps from `printed`.
+
+class CriticalValue(NamedTuple):
+    """A critical velocity nu0 of the paper, recomputed.
+
+    computed: ours; residual: of the defining equations there; iterations: Newton steps from a
+    guess `AWAY` from the printed value; cycle: at the point, where there is one.
     """
 
     system: str
     point: str
     kind: str
     printed: float
-    computed: float | None = None
-    residual: float | None = None
-    iterations: int | None = None
-
-    @property
-    def value(self) -> float:
-        """The best that is known: computed, else printed."""
-        return self.printed if self.computed is None else self.computed
+    computed: float
+    residual: float
+    iterations: int
+    cycle: Cycle | None
 
 
 def critical_values() -> tuple[CriticalValue, ...]:
-    """The table of section 3 of the paper, recomputed as far as it goes."""
-    return tuple(
-        CriticalValue(*published, *_hopf_point(published.system, published.printed))
-        if published.kind.startswith("Hopf")
-        else CriticalValue(*published)
-        for published in PUBLISHED
-    )
+    """The table of section 3 of the paper, recomputed; NaN where Newton's method failed."""
+    values = []
+    for published in PUBLISHED:
+        guess = paper_oscillator(published.system, published.printed + AWAY)
+        condition = CONDITIONS[published.system, published.point]
+        point = refine(condition, guess, where=lambda osc: osc.belts[0].velocity)
+        has_cycle = int(point.cycle.status) == Status.OK and isinstance(condition, NonsmoothFold)
+        values.append(
+            CriticalValue(
+                *published,
+                computed=float(point.value),
+                residual=float(point.residual),
+                iterations=int(point.iterations),
+                cycle=point.cycle if has_cycle else None,
+            )
+        )
+    return tuple(values)
 
 
 def as_json(values: Sequence[CriticalValue]) -> list[dict[str, Any]]:
     """The table as it stands in critical_values.json."""
-    rows = [value._asdict() for value in values]
-    return [{"class": row.pop("system"), **row} for row in rows]
+    return [
+        {
+            "class": value.system,
+            "point": value.point,
+            "kind": value.kind,
+            "printed": value.printed,
+            "computed": value.computed,
+            "residual": value.residual,
+            "iterations": value.iterations,
+        }
+        for value in values
+    ]
 
 
 def paper_oscillator(system: str, nu0: Any) -> Oscillator:
@@ -102,32 +141,16 @@ def paper_oscillator(system: str, nu0: Any) -> Oscillator:
     return class_a(nu0) if system == "a" else class_b(nu0, PUBLISHED_NU1)
 
 
-def _hopf_point(system: str, guess: float) -> tuple[float, float, int]:
-    """(nu0, residual, iterations) of the Hopf point near a guess: Newton on eq. (28)."""
-    nu0, iterations = guess, 0
-    rate, slope = _rate_and_slope(system, nu0)
-    while abs(rate / slope) > 1e-15 and iterations < 20:
-        nu0, iterations = nu0 - float(rate / slope), iterations + 1
-        rate, slope = _rate_and_slope(system, nu0)
-    return nu0, float(abs(rate)), iterations
-
-
-@functools.partial(jax.jit, static_argnums=0)
-@functools.partial(jax.value_and_grad, argnums=1)
-def _rate_and_slope(system: str, nu0: jax.Array) -> jax.Array:
-    """Growth rate at the fixed point, eq. (28), and its derivative."""
-    return equilibria(paper_oscillator(system, nu0)).rate[0]
-
-
 # --- phase portraits ----------------------------------------------------------------------------
 
 
 class Panel(NamedTuple):
-    """One phase portrait to be: its oscillator and the starts of its orbits."""
+    """One phase portrait to be: its oscillator, starts of orbits, the cycle where it is known."""
 
     title: str
     oscillator: Oscillator
     starts: tuple[tuple[float, float], ...]
+    cycle: Cycle | None
 
 
 class Portraits(NamedTuple):
@@ -146,21 +169,20 @@ class Portraits(NamedTuple):
     note: str = ""
 
     def panels(self, values: Sequence[CriticalValue]) -> list[Panel]:
-        """The panels a, b, c in order, at the best value known of the critical velocity."""
+        """The panels a, b, c in order."""
         (critical,) = (v for v in values if (v.system, v.point) == (self.system, self.point))
         symbol = rf"\nu_0^\{self.point.removeprefix('nu_')}"
-        source = " (printed)" if critical.computed is None else ""
         relations = [
-            (self.before, rf"\nu_0 = {self.before:.2f} > {symbol}", ""),
-            (critical.value, rf"\nu_0 = {symbol} = {critical.value:.5g}", source),
-            *((nu0, rf"\nu_0 = {nu0:.2f} < {symbol}", "") for nu0 in self.after),
+            (self.before, rf"\nu_0 = {self.before:.2f} > {symbol}", None),
+            (critical.computed, rf"\nu_0 = {symbol} = {critical.computed:.5g}", critical.cycle),
+            *((nu0, rf"\nu_0 = {nu0:.2f} < {symbol}", None) for nu0 in self.after),
         ]
         panels = []
-        for letter, (nu0, relation, remark) in zip("abcd", relations, strict=False):
+        for letter, (nu0, relation, cycle) in zip("abcd", relations, strict=False):
             osc = paper_oscillator(self.system, nu0)
             centre = float(equilibria(osc).x1[0])
             starts = tuple((centre + x1, x2) for x1, x2 in self.starts)
-            panels.append(Panel(f"({letter}) ${relation}${remark}", osc, starts))
+            panels.append(Panel(f"({letter}) ${relation}$", osc, starts, cycle))
         return panels
 
 
@@ -245,8 +267,14 @@ def draw_portraits(
     else:
         axes = figure.subplots(2, 2, sharex=True, sharey=True)
     for ax, panel, trajectories in zip(axes.flat, panels, orbits, strict=True):
-        cycles = [cycle for cycle in map(steady_cycle, trajectories) if cycle is not None][:1]
-        cycle = cycles[0] if cycles else None
+        steady = [cycle for cycle in map(steady_cycle, trajectories) if cycle is not None]
+        cycle = steady[0] if steady else None
+        unstable = unstable_cycle(_with_two_belts(panel.oscillator))
+        cycles: list[plotting.ClosedOrbit] = [unstable] if int(unstable.status) == Status.OK else []
+        if panel.cycle is not None:
+            cycles.append(panel.cycle)
+        elif cycle is not None:
+            cycles.append(cycle)
         plotting.plot_phase_portrait(
             panel.oscillator,
             [_transient(trajectory, cycle) for trajectory in trajectories],
