@@ -54,7 +54,7 @@ class AbstractFriction(eqx.Module):
 
     def __repr__(self) -> str:
         values = ", ".join(
-            f"{name}={number(value) if eqx.is_array(value) else value!r}"
+            f"{name}={number(value) if eqx.is_array(value) else repr(value)}"
             for name, value in vars(self).items()
         )
         return f"{type(self).__name__}({values})"
