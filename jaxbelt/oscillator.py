@@ -84,7 +84,7 @@ class Belt(eqx.Module):
 class Oscillator(eqx.Module):
     """A mass on a spring and a dashpot, in contact with one belt or more.
 
-    Arguments: damping (zeta = c/sqrt(k m) >= 0), belts (one `Belt` or more), omega (sqrt(k/m) > 0,
+    Arguments: damping (zeta = c/sqrt(k m)), belts (one `Belt` or more), omega (sqrt(k/m) > 0,
     default 1); scalars, dimensionless. `ValueError` for anything else. For batches build it
     inside `jax.vmap`.
     """
