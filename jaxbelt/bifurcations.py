@@ -170,18 +170,21 @@ def refine(
     for belt in belts:
         require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
     size = SIZES[1] if max_arcs is None else max_arcs
-    return _refine(condition, osc, _leaf_index(osc, where), size)
+    return _refine(condition, osc, leaf_index(osc, where), size)
 
 
-def _leaf_index(osc: Oscillator, where: Callable[[Oscillator], Any]) -> int:
-    # By its number, not by the function: a new lambda in every call would compile anew every time.
+def leaf_index(osc: Oscillator, where: Callable[[Oscillator], Any]) -> int:
+    """The number of the parameter that `where` selects, among the leaves of the oscillator.
+
+    By its number, not by the function: a new lambda in every call would compile anew every time.
+    """
     leaves, structure = jax.tree.flatten(osc)
     index = where(jax.tree.unflatten(structure, list(range(len(leaves)))))
     require(isinstance(index, int), "where", "a function that selects one parameter", repr(index))
     return index
 
 
-def _vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
+def vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
     """The oscillator with the parameter of that number replaced by p, [1]."""
     leaves, structure = jax.tree.flatten(osc)
     leaves[index] = p[0]
@@ -192,7 +195,7 @@ def _vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
 def _refine(condition, osc: Oscillator, index: int, size: int) -> BifurcationPoint:
     p0 = jax.tree.leaves(osc)[index][None]
     # Derivatives with respect to the varied parameter itself would be those of the guess.
-    osc = _vary(osc, index, lax.stop_gradient(p0))
+    osc = vary(osc, index, lax.stop_gradient(p0))
     if isinstance(condition, Hopf):
         return _refine_hopf(condition, osc, index)
     if isinstance(condition, SuddenSliding):
@@ -222,7 +225,7 @@ class _System(eqx.Module):
         return osc.belts[i].velocity - osc.belts[j].velocity
 
     def residual(self, osc: Oscillator, z: Array, p: Array) -> Array:
-        osc = _vary(osc, self.index, p)
+        osc = vary(osc, self.index, p)
         value, miss = residual(osc, self.chain, z)
         return jnp.append(value.reshape(-1), self._difference(osc) if self.equal else miss)
 
@@ -230,7 +233,7 @@ class _System(eqx.Module):
         """The residual, and its Jacobian with respect to (z, p)."""
 
         def osc_of(p):
-            return _vary(osc, self.index, p)
+            return vary(osc, self.index, p)
 
         value, g, blocks = residual_and_blocks(osc_of, self.chain, z, p)
         row = jnp.append(blocks[:, 3, :3].reshape(-1), jnp.sum(blocks[:, 3, 3]))
@@ -295,7 +298,7 @@ def _solved_point(condition, osc, system, z0, p0, status, judge) -> BifurcationP
     """Solve; judge(osc, z, cycle) -> (status, multiplier) says whether it is what was meant."""
     z, p, steps = _solve_system(osc, system, z0, p0)
     iterations = jnp.sum(~jnp.isnan(steps))
-    at_point = _vary(osc, system.index, p)
+    at_point = vary(osc, system.index, p)
     cycle = cycle_of(at_point, system.ordinary, z, iterations, status)
     error = _error(*lax.stop_gradient((osc, system, z, p)))
     status, multiplier = judge(at_point, z, cycle)
@@ -309,7 +312,7 @@ def _solved_point(condition, osc, system, z0, p0, status, judge) -> BifurcationP
         steps=steps,
         error=known(error, jnp.nan),
         multiplier=known(multiplier, jnp.nan),
-        oscillator=_vary(osc, system.index, known(p, jnp.nan)),
+        oscillator=vary(osc, system.index, known(p, jnp.nan)),
         cycle=cycle,
         status=status,
     )
@@ -318,19 +321,22 @@ def _solved_point(condition, osc, system, z0, p0, status, judge) -> BifurcationP
 # --- touching a boundary --------------------------------------------------------------------------
 
 
-def _before_onset(osc: Oscillator, belt: int) -> Array:
+def _velocity(osc: Oscillator, belt: int | Array) -> Array:
+    return jnp.stack([one.velocity for one in osc.belts])[belt]
+
+
+def before_onset(osc: Oscillator, belt: int | Array) -> Array:
     """A state stuck to a belt shortly before slip onset.
 
     Which belts touch there depends on x1, which depends on them: three rounds settle it.
     """
-    v = osc.belts[belt].velocity / osc.omega
+    velocity = _velocity(osc, belt)
+    v = velocity / osc.omega
     x1 = jnp.zeros(())
     for _ in range(3):
         mode = mode_of_state(osc, x1, v)
         held = tuple(
-            jnp.where(
-                (jnp.abs(code) < 1.5) & (other.velocity == osc.belts[belt].velocity), STUCK, code
-            )
+            jnp.where((jnp.abs(code) < 1.5) & (other.velocity == velocity), STUCK, code)
             for code, other in zip(mode.codes, osc.belts, strict=True)
         )
         mode = Mode(held)
@@ -340,11 +346,33 @@ def _before_onset(osc: Oscillator, belt: int) -> Array:
 
 
 def _refine_touch(condition, osc, index, size) -> BifurcationPoint:
-    belt, n = condition.belt, len(osc.belts)
+    point = touch(condition, osc, condition.belt, index, size)
+    is_fold = isinstance(condition, NonsmoothFold)
+    other = (point.status == Status.OK) & (is_fold != (point.multiplier > 1))
+    status = jnp.where(other, Status.OTHER_KIND.value, point.status)
+    known = functools.partial(jnp.where, status == Status.OK)
+    return eqx.tree_at(
+        lambda q: (q.value, q.residual, q.error, q.multiplier, q.oscillator, q.status),
+        point,
+        (
+            *(known(x, jnp.nan) for x in (point.value, point.residual, point.error)),
+            known(point.multiplier, jnp.nan),
+            vary(osc, index, known(point.value, jnp.nan)[None]),
+            status,
+        ),
+    )
+
+
+def touch(condition, osc: Oscillator, belt: int | Array, index: int, size: int) -> BifurcationPoint:
+    """The point near an oscillator where a cycle is tangent to the boundary of a belt.
+
+    Its multiplier m tells the kind: m > 1 a nonsmooth fold, m < 1 grazing.
+    """
+    n = len(osc.belts)
     names = Ends(n)
     still = lax.stop_gradient(osc)
-    velocity = still.belts[belt].velocity
-    orbit = follow(still, _before_onset(still, belt), HINT_BUDGET)
+    velocity = _velocity(still, belt)
+    orbit = follow(still, before_onset(still, belt), HINT_BUDGET)
     repeated = orbit.status == Status.OK
 
     # Either a cycle was found, or the orbit left the boundary for good: then its first turn from
@@ -372,9 +400,7 @@ def _refine_touch(condition, osc, index, size) -> BifurcationPoint:
         chain = cycle.chain
         others = jnp.any(chain.codes == 0, axis=-1) & chain.used & (jnp.arange(size) != row)
         slope = jnp.where(jnp.any(others), 0.0, multiplier_without_sticking(osc, chain, z))
-        is_kind = slope > 1 if isinstance(condition, NonsmoothFold) else slope < 1
-        other = (cycle.status == Status.OK) & ~is_kind
-        return jnp.where(other, Status.OTHER_KIND.value, cycle.status), slope
+        return cycle.status, slope
 
     # The arc before the stick arc is the one that becomes tangent.
     before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
@@ -384,12 +410,12 @@ def _refine_touch(condition, osc, index, size) -> BifurcationPoint:
     return _solved_point(condition, osc, system, z, p0, status, judge)
 
 
-def _with_stick(osc: Oscillator, chain: Chain, z: Array, belt: int):
+def _with_stick(osc: Oscillator, chain: Chain, z: Array, belt: int | Array):
     """The chain with a stick arc on the belt: (chain, guess, its row, whether there is one).
 
     Its own shortest, or one of duration zero where x2 comes closest to the boundary from inside.
     """
-    velocity = osc.belts[belt].velocity
+    velocity = _velocity(osc, belt)
     rows = jnp.arange(chain.ends.size)
     own = chain.used & (chain.codes[:, belt] == 0)
     shortest = jnp.argmin(jnp.where(own, z[:, 2], jnp.inf))
@@ -427,7 +453,7 @@ def _with_stick(osc: Oscillator, chain: Chain, z: Array, belt: int):
 def _refine_exchange(condition, osc, index, size) -> BifurcationPoint:
     i, j = condition.belts
     still = lax.stop_gradient(osc)
-    orbit = follow(still, _before_onset(still, i), HINT_BUDGET)
+    orbit = follow(still, before_onset(still, i), HINT_BUDGET)
     _, count = last_turn(orbit)
     chain, z = chain_of(still, orbit, size)
     on_i, on_j = (jnp.any(chain.used & (chain.codes[:, k] == 0)) for k in (i, j))
@@ -472,7 +498,7 @@ def _small_newton(equations, osc, unknowns):
 def _point_without_cycle(condition, osc, index, p, steps, size, error, status, why):
     iterations = jnp.sum(~jnp.isnan(steps))
     known = functools.partial(jnp.where, status == Status.OK)
-    at_point = _vary(osc, index, known(p, jnp.nan)[None])
+    at_point = vary(osc, index, known(p, jnp.nan)[None])
     nan = jnp.full((SIZES[0], 3), jnp.nan)
     n = len(osc.belts)
     chain = Chain(
@@ -503,7 +529,7 @@ def _refine_hopf(condition, osc, index) -> BifurcationPoint:
     rest = jnp.zeros(())
 
     def equations(osc, u):
-        osc = _vary(osc, index, u[1:])
+        osc = vary(osc, index, u[1:])
         return jnp.append(
             mode_acceleration(osc, mode, u[0], rest)[None], trace_of(osc, mode, u[0], rest)
         )
@@ -511,7 +537,7 @@ def _refine_hopf(condition, osc, index) -> BifurcationPoint:
     p0 = jax.tree.leaves(osc)[index]
     x1 = jnp.where(fixed[row], rests.x1[row], 0.0)
     u, steps, size, error = _small_newton(equations, osc, jnp.stack([x1, p0]))
-    at_point = _vary(osc, index, u[1:])
+    at_point = vary(osc, index, u[1:])
     inside = [*boundary_guards(at_point, mode, rest), *edge_guards(at_point, mode, u[0])]
     status = jnp.where(jnp.all(jnp.stack(inside) > 0), Status.OK.value, Status.NOT_ADMISSIBLE.value)
     status = jnp.where(size < 1e-9, status, Status.NO_CONVERGENCE.value)
@@ -531,7 +557,7 @@ def _refine_sudden(condition, osc, index) -> BifurcationPoint:
         still,
         jnp.where(at_rest, 1e-2, still.belts[belt].velocity),
     )
-    start = _before_onset(beside, belt)
+    start = before_onset(beside, belt)
     orbit = follow(beside, start, HINT_BUDGET)
     rows = jnp.arange(HINT_BUDGET)
     turn = (rows > orbit.repeats) & (rows < orbit.count)
@@ -541,7 +567,7 @@ def _refine_sudden(condition, osc, index) -> BifurcationPoint:
     rest = jnp.zeros(())
 
     def equations(osc, u):
-        osc = _vary(osc, index, u[1:])
+        osc = vary(osc, index, u[1:])
         nu = osc.belts[belt].velocity
         limit = jnp.sign(beside.belts[belt].velocity) * capacity(osc, mode)
         return jnp.stack([mode_acceleration(osc, mode, u[0], rest) + limit, nu])
