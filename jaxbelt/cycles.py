@@ -31,23 +31,20 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .checks import as_array, check_finite, is_concrete, number, require
+from .checks import as_array, check_finite, is_concrete, number, pick, require
 from .equilibria import EquilibriumKind, equilibria
 from .modes import (
     Mode,
-    any_of,
     boundary_guards,
-    bounds_rightward,
     capacity,
-    edge_focus,
     edge_guards,
     edges,
-    end_stick,
     first_of,
+    leave_slip,
+    leave_stick,
     mode_acceleration,
     mode_of_state,
-    pass_edge,
-    reach_boundary,
+    onset_position,
     select,
     stick_phase,
     stick_velocity,
@@ -223,12 +220,6 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
         ]
         stuck_end = jnp.concatenate([stuck_end, duration * (values[0] + values[1] + values[2])])
     return jnp.where(stuck, stuck_end, slipped)
-
-
-def onset_position(osc: Oscillator, mode: Mode) -> Array:
-    """x1 where a stick phase of the mode ends by slip onset, eqs. (10), (19), (20)."""
-    v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
-    return mode_acceleration(osc, mode, jnp.zeros(()), v) + jnp.sign(v) * capacity(osc, mode)
 
 
 def _guard(osc: Oscillator, codes: Array, end: Array, y: Array, duration: Array) -> Array:
@@ -471,38 +462,16 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     phase = stick_phase(osc, mode, y[0])
     stick_end = jnp.stack([phase.x1, y[1]])
     forever = jnp.isinf(phase.duration)
-    after_stick = select(
-        phase.slips, end_stick(osc, mode), pass_edge(osc, mode, phase.x1, y[1], y[1] > 0)
-    )
     edge_indices = [jnp.asarray(n + i) for i in range(2 * n)]
     stick_fired = first_of(phase.edge, edge_indices, jnp.asarray(names.onset))
 
     t_slip, slip_end, fired, lost = _slip_to_guard(osc, codes, y)
-    at_boundary, at_edge = fired < n, (fired >= n) & (fired < 3 * n)
-    edge_hit = [fired == i for i in edge_indices]
-    edge = first_of(edge_hit, edges(osc), slip_end[0])
-    flags = zip(edge_hit, bounds_rightward(mode), strict=True)
-    rightward = any_of([hit & right for hit, right in flags])
-    after_edge = pass_edge(osc, mode, edge, slip_end[1], rightward)
-    hit = [fired == i for i in range(n)]
-    after_boundary, x2_boundary = reach_boundary(osc, mode, hit, slip_end[0])
-    after_slip = select(at_boundary, after_boundary, select(at_edge, after_edge, mode))
-    slip_end = jnp.stack(
-        [
-            jnp.where(at_edge, edge, slip_end[0]),
-            jnp.where(at_boundary, x2_boundary, slip_end[1]),
-        ]
-    )
-    focus = edge_focus(
-        osc, select(rightward, mode, after_edge), select(rightward, after_edge, mode), edge
-    )
-    speed = jnp.abs(slip_end[1])
-    captured = at_edge & focus.exists & (focus.contraction < 0)
-    captured = captured & (10 * speed * focus.nonlinearity < -focus.contraction) & (speed < 1e-2)
+    after = leave_slip(osc, mode, fired, slip_end[0], slip_end[1])
+    slip_end = jnp.stack([after.x1, after.x2])
 
     y_end = jnp.where(stuck, stick_end, slip_end)
     end = jnp.where(stuck, stick_fired, fired)
-    new = select(stuck, after_stick, after_slip)
+    new = select(stuck, leave_stick(osc, mode, phase, y[1]), after.mode)
     code = jnp.stack([jnp.asarray(c, dtype=y.dtype) for c in new.codes])
     duration = jnp.where(stuck, phase.duration, t_slip)
 
@@ -515,7 +484,7 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     resting = is_top & (orbit.count > 8) & (amplitude < AT_REST)
 
     status = jnp.where(stuck & forever, Status.STUCK_FOREVER.value, Status.OK.value)
-    status = jnp.where(~stuck & captured, Status.PSEUDO_FOCUS.value, status)
+    status = jnp.where(~stuck & after.captured, Status.PSEUDO_FOCUS.value, status)
     status = jnp.where(resting, Status.EQUILIBRIUM.value, status)
     bad = ~jnp.all(jnp.isfinite(y_end)) | (~stuck & lost)
     status = jnp.where(bad, Status.NOT_FINITE.value, status)
@@ -664,7 +633,7 @@ class Cycle(eqx.Module):
             duration=nan(self.unknowns[..., 2], jnp.nan),
         )
         if is_concrete(self.unknowns) and used.ndim == 1:
-            arcs = jax.tree.map(lambda leaf: leaf[: int(np.sum(used))], arcs)
+            arcs = pick(arcs, slice(int(np.sum(used))))
         return arcs
 
     @property

@@ -21,7 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .checks import is_concrete, number, require
+from .checks import is_concrete, number, pick, require
 from .modes import (
     ABOVE,
     BELOW,
@@ -81,7 +81,7 @@ class Equilibria(eqx.Module):
         return len(self.kind)
 
     def __getitem__(self, index) -> "Equilibria":
-        return _pick(self, index)
+        return pick(self, index)
 
     def __iter__(self) -> Iterator["Equilibria"]:
         return (self[i] for i in range(len(self)))
@@ -92,13 +92,6 @@ class Equilibria(eqx.Module):
         if self.kind.ndim == 1:
             return f"Equilibria({'; '.join(map(_describe, self))})"
         return f"Equilibria({_describe(self)})"
-
-
-def _pick(tree, index):
-    """The tree with every array indexed; where it can be in NumPy, which compiles nothing."""
-    if is_concrete((tree, index)):
-        return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[index]), tree)
-    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def _describe(row: Equilibria) -> str:
@@ -139,7 +132,7 @@ def _trim(rows, found: Equilibria):
     """Cut the padding off where it is known, that is, outside of transformations."""
     if not is_concrete((rows, found)):
         return rows
-    return _pick(rows, slice(int(np.sum(np.asarray(found.kind) > 0))))
+    return pick(rows, slice(int(np.sum(np.asarray(found.kind) > 0))))
 
 
 @eqx.filter_jit

@@ -9,8 +9,8 @@ A mode holds one contact code a belt:
 In a slip mode the friction keeps the sign of the mode, not sgn(r_i). So the field of a mode is
 smooth across the mode's own boundaries, and events, derivatives and Newton iterations are right.
 An orbit leaves a mode where one of its guards, positive inside, vanishes. What follows is decided
-by `reach_boundary`, `pass_edge` and `end_stick`, and all three leave the question "stuck or not"
-to `settle`: whether the contacts that are to be stuck can hold the force needed.
+by `leave_slip` and `leave_stick`, and both leave the question "stuck or not" to `settle`: whether
+the contacts that are to be stuck can hold the force needed.
 
 Everything here is elementwise: codes and states may be scalars (the trajectories of `simulate`)
 or arrays of lanes (the kernel of `batch`), belts are unrolled.
@@ -28,6 +28,10 @@ from .oscillator import Oscillator, acceleration
 
 Tree = TypeVar("Tree")
 STUCK, BELOW, ABOVE = 0.0, -2.0, 2.0
+#: An orbit this close to a stable pseudo-focus (|x2| at the edge) has converged to it.
+FOCUS_RADIUS = 1e-2
+#: Turns with a smaller |x2| than this are smaller than the rounding of x1.
+FOCUS_ROUNDING = 1e-7
 
 
 class Mode(eqx.Module):
@@ -205,19 +209,26 @@ class StickPhase(eqx.Module):
     edge: list[Array]
 
 
+def onset_position(osc: Oscillator, mode: Mode) -> Array:
+    """x1 where a stick phase of the mode comes to slip onset, eqs. (10), (19), (20).
+
+    The needed force is linear in x1, needed = rest - x1; it reaches the capacity there.
+    """
+    v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
+    rest = mode_acceleration(osc, mode, jnp.zeros(()), v)
+    return rest + jnp.sign(v) * capacity(osc, mode)
+
+
 def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
     """How the stick phase of `mode` that is at x1 goes on: x1 moves with x2 = nu_k/omega.
 
-    The needed force is linear in x1, eqs. (10), (19), (20): needed = rest - x1. It ends at slip
-    onset, |needed| = capacity, or at the first contact edge ahead.
+    It ends at slip onset or at the first contact edge ahead.
     """
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
-    direction = jnp.sign(v)
     moves = v != 0
     v_or_one = jnp.where(moves, v, 1.0)
-    rest = mode_acceleration(osc, mode, jnp.zeros(()), v)
-    x1_onset = rest + direction * capacity(osc, mode)
-    onset_distance = jnp.where(moves, direction * (x1_onset - x1), jnp.inf)
+    x1_onset = onset_position(osc, mode)
+    onset_distance = jnp.where(moves, jnp.sign(v) * (x1_onset - x1), jnp.inf)
 
     edge_distances = [
         jnp.where((v > 0) & on_right | (v < 0) & on_left, guard, jnp.inf)
@@ -239,14 +250,60 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
     return StickPhase(duration, x1_end, slips, at_edge)
 
 
-def end_stick(osc: Oscillator, mode: Mode) -> Mode:
-    """The mode after slip onset: tangent to the boundary, with sign -sgn(needed) = sgn(nu_k)."""
+def leave_stick(osc: Oscillator, mode: Mode, phase: StickPhase, x2: Array) -> Mode:
+    """The mode after a stick phase at its end: slip onset, or an edge passed while sticking.
+
+    Slip onset is tangent to the boundary; the new sign is -sgn(needed) = sgn(nu_k).
+    """
     velocity = stick_velocity(osc, mode, jnp.zeros(()))
-    codes = tuple(
-        jnp.where(stuck, jnp.sign(velocity), code)
-        for code, stuck in zip(mode.codes, mode.stuck, strict=True)
+    slipping = Mode(
+        tuple(
+            jnp.where(stuck, jnp.sign(velocity), code)
+            for code, stuck in zip(mode.codes, mode.stuck, strict=True)
+        )
     )
-    return Mode(codes)
+    return select(phase.slips, slipping, pass_edge(osc, mode, phase.x1, x2, x2 > 0))
+
+
+class Departure(eqx.Module):
+    """How an orbit goes on after a guard of its slip mode vanished (arrays of the batch shape).
+
+    mode, x1, x2: from there on, x2 = nu/omega (x1 = edge) put exactly on a boundary (an edge);
+    captured: by a pseudo-focus at the edge, see `is_captured`.
+    """
+
+    mode: Mode
+    x1: Array
+    x2: Array
+    at_boundary: Array
+    at_edge: Array
+    captured: Array
+
+
+def leave_slip(osc: Oscillator, mode: Mode, fired: Array, x1: Array, x2: Array) -> Departure:
+    """What follows where the guard number `fired` of a slip mode vanishes at (x1, x2).
+
+    The n `boundary_guards` come first, then the 2n `edge_guards`; any other number is no
+    transition.
+    """
+    n = len(osc.belts)
+    at_boundary, at_edge = (fired >= 0) & (fired < n), (fired >= n) & (fired < 3 * n)
+    edge_hit = [fired == n + i for i in range(2 * n)]
+    edge = first_of(edge_hit, edges(osc), x1)
+    flags = zip(edge_hit, bounds_rightward(mode), strict=True)
+    rightward = any_of([hit & right for hit, right in flags])
+    after_edge = pass_edge(osc, mode, edge, x2, rightward)
+    hit = [fired == i for i in range(n)]
+    after_boundary, x2_boundary = reach_boundary(osc, mode, hit, x1)
+    left, right = select(rightward, (mode, after_edge), (after_edge, mode))
+    return Departure(
+        mode=select(at_boundary, after_boundary, select(at_edge, after_edge, mode)),
+        x1=jnp.where(at_edge, edge, x1),
+        x2=jnp.where(at_boundary, x2_boundary, x2),
+        at_boundary=at_boundary,
+        at_edge=at_edge,
+        captured=at_edge & is_captured(osc, left, right, edge, x2),
+    )
 
 
 # --- starts ---------------------------------------------------------------------------------------
@@ -319,3 +376,25 @@ def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFoc
     slowness = 1 / a_l + 1 / a_r
     nonlinearity = 1 / a_l**2 + 1 / a_r**2 + (trace_left / a_l) ** 2 + (trace_right / a_r) ** 2
     return EdgeFocus(exists, contraction / (3 * slowness), 2 * slowness, contraction, nonlinearity)
+
+
+def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array) -> Array:
+    """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
+
+    The leading term of a turn must outweigh the next one by ten, and no boundary may be near. With
+    a belt at rest the turns shrink to rounding in finite time.
+    """
+    focus = edge_focus(osc, left, right, edge)
+    size = jnp.abs(x2)
+    nearest = jnp.inf
+    for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
+        touches = is_left | is_right
+        nearest = jnp.minimum(nearest, jnp.where(touches, jnp.abs(belt.velocity), jnp.inf))
+    captured = (
+        (focus.contraction < 0)
+        & (10 * size * focus.nonlinearity < -focus.contraction)
+        & (size < FOCUS_RADIUS)
+        & (2 * osc.omega * size < nearest)
+    )
+    slips = ~left.any_stuck & ~right.any_stuck
+    return focus.exists & slips & (captured | (size < FOCUS_ROUNDING))

@@ -29,23 +29,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .checks import as_array, check_finite, check_positive, is_concrete, require
+from .checks import as_array, check_finite, check_positive, is_concrete, pick, require
 from .derivatives import forward_jacobian
 from .modes import (
     Mode,
-    any_of,
     boundary_guards,
-    bounds_rightward,
     contact,
-    edge_focus,
     edge_guards,
-    edges,
-    end_stick,
     first_of,
+    leave_slip,
+    leave_stick,
     mode_acceleration,
     mode_of_state,
-    pass_edge,
-    reach_boundary,
     select,
     stick_phase,
     stick_velocity,
@@ -65,10 +60,6 @@ MAX_ARC = 1.0
 BLOCK = 32
 #: Steps that one segment may take before it is given up.
 MAX_STEPS = 100_000
-#: An orbit this close to a stable pseudo-focus (|x2| at the edge) has converged to it.
-FOCUS_RADIUS = 1e-2
-#: Turns with a smaller |x2| than this are smaller than the rounding of x1.
-FOCUS_ROUNDING = 1e-7
 
 
 class Events(eqx.Module):
@@ -390,76 +381,32 @@ def _slip_segment(osc: Oscillator, state: _State, t1, rtol, atol) -> _Step:
     left = t1 - state.t
     span = jnp.minimum(left, MAX_ARC)
     arc = _slip_arc(osc, state.mode, state.turn, state.y, span, rtol, atol)
-    x1, x2 = arc.y
     fired = arc.fired
-    at_boundary = (fired >= 0) & (fired < n)
-    at_edge = (fired >= n) & (fired < 3 * n)
     ended = (fired < 0) & (left <= MAX_ARC)
 
-    edge_hit = [fired == n + i for i in range(2 * n)]
-    edge = first_of(edge_hit, edges(osc), x1)
-    rightward = any_of(
-        [hit & right for hit, right in zip(edge_hit, bounds_rightward(state.mode), strict=True)]
-    )
-    after_edge = pass_edge(osc, state.mode, edge, x2, rightward)
-    after_boundary, x2_boundary = reach_boundary(
-        osc, state.mode, [fired == i for i in range(n)], x1
-    )
-    mode = select(at_boundary, after_boundary, select(at_edge, after_edge, state.mode))
-    x1 = jnp.where(at_edge, edge, x1)
-    x2 = jnp.where(at_boundary, x2_boundary, x2)
-
-    focused = at_edge & _has_converged(
-        osc,
-        select(rightward, state.mode, after_edge),
-        select(rightward, after_edge, state.mode),
-        edge,
-        x2,
-    )
-    x2 = jnp.where(focused, 0.0, x2)
+    after = leave_slip(osc, state.mode, fired, *arc.y)
+    x1, x2 = after.x1, jnp.where(after.captured, 0.0, after.x2)
     kind = jnp.where(
-        at_boundary,
-        jnp.where(after_boundary.any_stuck, EventKind.STICK, EventKind.CROSS),
-        jnp.where(at_edge, EventKind.EDGE, 0),
+        after.at_boundary,
+        jnp.where(after.mode.any_stuck, EventKind.STICK, EventKind.CROSS),
+        jnp.where(after.at_edge, EventKind.EDGE, 0),
     )
     turned = (
         jnp.where(fired == 3 * n, -state.turn[0], state.turn[0]),
         jnp.where(fired == 3 * n + 1, -state.turn[1], state.turn[1]),
     )
-    fresh = _turn_signs(osc, mode, (x1, x2))
-    status = jnp.where(focused, Status.PSEUDO_FOCUS, Status.OK)
+    fresh = _turn_signs(osc, after.mode, (x1, x2))
+    status = jnp.where(after.captured, Status.PSEUDO_FOCUS, Status.OK)
     status = jnp.where(arc.failed, Status.TOO_MANY_STEPS, status)
     return _Step(
         duration=arc.duration,
         y=(x1, x2),
-        mode=mode,
-        turn=select(at_boundary | at_edge, fresh, turned),
+        mode=after.mode,
+        turn=select(after.at_boundary | after.at_edge, fresh, turned),
         kind=kind,
         status=status,
-        done=ended | focused,
+        done=ended | after.captured,
     )
-
-
-def _has_converged(osc, left, right, edge, x2):
-    """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
-
-    The leading term of a turn must outweigh the next one by ten, and no boundary may be near. With
-    a belt at rest the turns shrink to rounding in finite time.
-    """
-    focus = edge_focus(osc, left, right, edge)
-    size = jnp.abs(x2)
-    nearest = jnp.inf
-    for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
-        touches = is_left | is_right
-        nearest = jnp.minimum(nearest, jnp.where(touches, jnp.abs(belt.velocity), jnp.inf))
-    captured = (
-        (focus.contraction < 0)
-        & (10 * size * focus.nonlinearity < -focus.contraction)
-        & (size < FOCUS_RADIUS)
-        & (2 * osc.omega * size < nearest)
-    )
-    slips = ~left.any_stuck & ~right.any_stuck
-    return focus.exists & slips & (captured | (size < FOCUS_ROUNDING))
 
 
 def _stick_segment(osc: Oscillator, state: _State, t1) -> _Step:
@@ -469,9 +416,7 @@ def _stick_segment(osc: Oscillator, state: _State, t1) -> _Step:
     ended = phase.duration >= left
     duration = jnp.where(ended, left, phase.duration)
     x1_end = jnp.where(ended, x1 + x2 * left, phase.x1)
-    after_edge = pass_edge(osc, state.mode, phase.x1, x2, x2 > 0)
-    after = select(phase.slips, end_stick(osc, state.mode), after_edge)
-    mode = select(ended, state.mode, after)
+    mode = select(ended, state.mode, leave_stick(osc, state.mode, phase, x2))
     forever = jnp.isinf(phase.duration)
     return _Step(
         duration=duration,
@@ -484,9 +429,9 @@ def _stick_segment(osc: Oscillator, state: _State, t1) -> _Step:
     )
 
 
-def _belt_concerned(before: Mode, after: Mode) -> Array:
-    """The lowest index of a belt whose contact changed; which sort of change the event tells."""
-    changed = [a != b for a, b in zip(before.codes, after.codes, strict=True)]
+def _first_change(before, after) -> Array:
+    """The lowest index of a belt for which two tuples of arrays differ, or -1."""
+    changed = [a != b for a, b in zip(before, after, strict=True)]
     return first_of(changed, [jnp.asarray(i) for i in range(len(changed))], jnp.asarray(-1))
 
 
@@ -501,7 +446,6 @@ class _Record(eqx.Module):
     belt: Array
     event_t: Array
     event_y: Array
-    event_mode: Array
 
 
 def _codes(mode: Mode) -> Array:
@@ -519,10 +463,11 @@ def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _R
     t = state.t + step.duration
     finite = jnp.isfinite(t) & jnp.isfinite(step.y[0]) & jnp.isfinite(step.y[1])
     status = jnp.where(finite, step.status, Status.NOT_FINITE)
-    edge_belt = _belt_concerned(
-        Mode(tuple(map(_is_apart, state.mode.codes))), Mode(tuple(map(_is_apart, step.mode.codes)))
+    belt = jnp.where(
+        step.kind == EventKind.EDGE,
+        _first_change(state.mode.touching, step.mode.touching),
+        _first_change(state.mode.codes, step.mode.codes),
     )
-    belt = jnp.where(step.kind == EventKind.EDGE, edge_belt, _belt_concerned(state.mode, step.mode))
     record = _Record(
         t=state.t,
         y=jnp.stack(state.y),
@@ -532,14 +477,9 @@ def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _R
         belt=jnp.where(step.kind == 0, -1, belt),
         event_t=t,
         event_y=jnp.stack(step.y),
-        event_mode=_codes(step.mode),
     )
     new = _State(t, step.y, step.mode, step.turn, status, step.done | (status != Status.OK))
     return new, record
-
-
-def _is_apart(code):
-    return jnp.where(jnp.abs(code) > 1.5, 1.0, 0.0)
 
 
 def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_State, _Record]:
@@ -601,10 +541,8 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
         v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
         x1 = jnp.where(mode.any_stuck, y[0] + v * since, flown[0])
         x2 = jnp.where(mode.any_stuck, v, flown[1])
-        known = ~beyond | rests
-        x1 = jnp.where(beyond, jnp.where(known, final.y[0], jnp.nan), x1)
-        x2 = jnp.where(beyond, jnp.where(known, final.y[1], jnp.nan), x2)
-        return jnp.stack([x1, x2]), arc.mode
+        afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
+        return jnp.where(beyond, afterwards, jnp.stack([x1, x2])), arc.mode
 
     return jax.vmap(at)(ts)
 
@@ -772,17 +710,11 @@ def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
     """Cut the padding off where lengths are known, that is, outside of transformations."""
     if not is_concrete(trajectory) or trajectory.ts.ndim != 1:
         return trajectory
-    kept = np.flatnonzero(trajectory.events.kind)
-    events = jax.tree.map(lambda leaf: _take(leaf, kept), trajectory.events)
-    entered = np.flatnonzero(~np.isnan(trajectory.arcs.t))
-    arcs = jax.tree.map(lambda leaf: _take(leaf, entered), trajectory.arcs)
-    ts, ys, modes = trajectory.ts, trajectory.ys, trajectory.modes
+    events = pick(trajectory.events, np.flatnonzero(trajectory.events.kind))
+    arcs = pick(trajectory.arcs, np.flatnonzero(~np.isnan(trajectory.arcs.t)))
+    samples = (trajectory.ts, trajectory.ys, trajectory.modes)
     if trim_samples:
-        _, distinct = np.unique(ts, return_index=True)
-        ts, ys, modes = (_take(leaf, distinct) for leaf in (ts, ys, modes))
+        _, distinct = np.unique(trajectory.ts, return_index=True)
+        samples = pick(samples, distinct)
+    ts, ys, modes = samples
     return Trajectory(ts, ys, modes, events, arcs, trajectory.status)
-
-
-def _take(leaf, indices):
-    # By NumPy: a gather of JAX's would be compiled for each new length.
-    return jnp.asarray(np.asarray(leaf)[indices])

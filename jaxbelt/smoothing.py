@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .derivatives import forward_jacobian
-from .modes import STUCK, Mode, capacity, contact, mode_acceleration, stick_velocity
+from .modes import STUCK, Mode, capacity, contact, mode_acceleration, select, stick_velocity
 from .oscillator import Oscillator
 
 #: Steps between two samples before a run is given up.
@@ -44,7 +44,7 @@ def switch_mode(osc: Oscillator, x1: Array, x2: Array, v_star: Array) -> Mode:
         )
         in_band = jnp.abs(belt.velocity - osc.omega * x2) <= v_star
         holds = jnp.abs(mode_acceleration(osc, held, x1, x2)) < capacity(osc, held)
-        mode = jax.tree.map(lambda a, b, use=in_band & holds: jnp.where(use, a, b), held, mode)
+        mode = select(in_band & holds, held, mode)
     return mode
 
 
