@@ -34,6 +34,7 @@ from jaxtyping import Array
 
 from .checks import is_concrete, number, require
 from .cycles import (
+    NEWTON_STEPS,
     SIZES,
     Chain,
     Cycle,
@@ -96,6 +97,10 @@ class SlidingExchange(AbstractCondition):
     """Two belts run at one velocity: the cycle changes from sticking to one to the other."""
 
     belts: tuple[int, int] = eqx.field(static=True)
+
+
+class Unexplained(AbstractCondition):
+    """What the oscillator does changes, and no other condition explains it; from `scan` only."""
 
 
 class BifurcationPoint(eqx.Module):
@@ -518,6 +523,23 @@ def _point_without_cycle(condition, osc, index, p, steps, size, error, status, w
         cycle=cycle,
         status=status,
     )
+
+
+def unexplained_point(osc: Oscillator, index: int, value: float, width: float) -> BifurcationPoint:
+    """A point where something changes, within an interval of that width, that nothing explains."""
+    p, error, none = jnp.asarray(value), jnp.asarray(width), jnp.asarray(jnp.nan)
+    point = _point_without_cycle(
+        Unexplained(),
+        osc,
+        index,
+        p,
+        jnp.full(NEWTON_STEPS, jnp.nan),
+        none,
+        error,
+        jnp.asarray(Status.OK.value),
+        Status.UNEXPLAINED,
+    )
+    return eqx.tree_at(lambda q: q.status, point, jnp.asarray(Status.UNEXPLAINED.value))
 
 
 def _refine_hopf(condition, osc, index) -> BifurcationPoint:

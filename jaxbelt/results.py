@@ -26,6 +26,7 @@ class Status(enum.IntEnum):
     NOT_TOUCHED = 12
     OTHER_KIND = 13
     NO_FIXED_POINT = 14
+    UNEXPLAINED = 15
 
 
 ADVICE = {
@@ -77,6 +78,10 @@ ADVICE = {
         "a nonsmooth fold ends the cycle, at a grazing point it goes on to both sides."
     ),
     Status.NO_FIXED_POINT: "There is no fixed point in a smooth field whose trace could vanish.",
+    Status.UNEXPLAINED: (
+        "What the oscillator does changes here, and no condition known to the search explains how. "
+        "Simulate on both sides."
+    ),
 }
 
 
