@@ -34,6 +34,7 @@ LADDER = (
     "functionals",
     "sweep",
     "bifurcations",
+    "detection",
     "diagrams",
     "basins",
     "inverse",
