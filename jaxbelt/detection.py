@@ -1,0 +1,360 @@
+"""Bifurcation points along a path in one parameter, found without a guess: `scan`.
+
+What the oscillator does at one value of the parameter is summed up in a label: the kind and the
+stability of every equilibrium, and the signature of every attracting cycle, that is, which belts
+it sticks to and crosses and which contact edges it passes, in the order of one turn. Every cycle
+that sticks comes by a slip onset, so it is found by following the orbits from there; a few starts
+beside the equilibria find the rest.
+
+Between two values with one label nothing is taken to happen. Where labels differ the interval is
+narrowed until Newton's method converges from its ends. The conditions that could make this
+difference are refined from there, and what is found inside the interval is a bifurcation point. The
+same is then asked of what is left of the interval on either side, so that points are found that lie
+closer together than the first values did. A difference that no condition explains is narrowed as
+far as numbers go, and reported. Values are looked at in batches by one compiled program.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from .bifurcations import (
+    AbstractCondition,
+    BifurcationPoint,
+    GrazingSliding,
+    Hopf,
+    NonsmoothFold,
+    SlidingExchange,
+    SuddenSliding,
+    before_onset,
+    leaf_index,
+    refine,
+    touch,
+    unexplained_point,
+    vary,
+)
+from .checks import as_array, check_finite, pick, require
+from .cycles import SIZES, Orbit, follow, last_turn
+from .equilibria import equilibria
+from .oscillator import Oscillator
+from .results import EventKind, Status
+
+#: Values of the parameter in one batch, and guesses refined in one batch.
+BATCH, GUESSES = 32, 8
+#: Arcs for which each orbit is followed, and room for those of one turn.
+FOLLOWED, ROOM = 96, SIZES[2]
+#: Starts to the right of an equilibrium, so far from it.
+DISTANCES = (0.02, 0.3, 3.0)
+#: Intervals narrower than this fraction of the span are good guesses for Newton's method.
+NEAR = 1 / 400
+#: Nothing closer than this fraction of the span is told apart.
+CLOSE = 1e-6
+
+
+def scan(
+    osc: Oscillator,
+    where: Callable[[Oscillator], Any],
+    span: tuple[float, float],
+    *,
+    resolution: int = 96,
+) -> tuple[BifurcationPoint, ...]:
+    """Every bifurcation point along a path in one parameter, in order, each as from `refine`.
+
+    osc: the oscillator; where: selects the parameter, such as `lambda osc: osc.belts[0].velocity`;
+    span: its first and last value, dimensionless like itself; resolution: how many intervals are
+    looked at first. Points of which one undoes what the other did are seen if one of these values
+    lies between them.
+
+    Each point has `kind`, `value`, and the rest of a `BifurcationPoint`. Where something changes
+    and no condition explains it, there is a point of kind `Unexplained`, with the status
+    UNEXPLAINED and the value where it happens, good to about 1e-9 of the span. A contact edge or an
+    equilibrium meeting an edge are such changes. `ValueError` names an impossible argument.
+    """
+    path = Path(osc, where, span)
+    points = [point for at in path.breaks for point in _at_break(path, at)]
+    ends = [path.first, *(v for at in path.breaks for v in path.beside(at)), path.last]
+    width = (path.last - path.first) / resolution
+    stretches = []
+    for a, b in zip(ends[::2], ends[1::2], strict=True):
+        if b > a:
+            stretches.append(np.linspace(a, b, 1 + max(1, round((b - a) / width))))
+    path.look(np.concatenate(stretches))
+    intervals = [pair for stretch in stretches for pair in pairwise(stretch)]
+    while intervals := [(a, b) for a, b in intervals if path.label(a) != path.label(b)]:
+        near = [(a, b) for a, b in intervals if b - a <= NEAR * path.length]
+        found = _explain(path, near)
+        points += [point for point in found.values() if point is not None]
+        cut = []
+        for a, b in intervals:
+            point = found.get((a, b))
+            if point is not None:
+                before, after = path.beside(float(point.value))
+                cut += [[a, max(a, before)], [min(b, after), b]]
+            elif b - a <= 1e-9 * path.length:
+                points.append(unexplained_point(path.osc, path.index, 0.5 * (a + b), b - a))
+            else:
+                cut.append(list(np.linspace(a, b, 3 if b - a <= NEAR * path.length else 9)))
+        path.look([value for values in cut for value in values])
+        intervals = [pair for values in cut for pair in pairwise(values) if pair[0] < pair[1]]
+    return tuple(sorted(points, key=lambda point: float(point.value)))
+
+
+# --- what the oscillator does at one value --------------------------------------------------------
+
+
+class Label(NamedTuple):
+    """What there is at one value: (kind, stable) of the equilibria from left to right, and the
+    signatures of the attracting cycles, each from the same place in the turn."""
+
+    equilibria: tuple[tuple[int, bool], ...]
+    cycles: frozenset[tuple[tuple[EventKind, int], ...]]
+
+    @property
+    def sticks(self) -> Counter[int]:
+        """How often the cycles stick to each belt, together."""
+        return Counter(
+            belt for cycle in self.cycles for kind, belt in cycle if kind == EventKind.STICK
+        )
+
+
+class Path:
+    """A path in one parameter: its labels, each computed once."""
+
+    def __init__(self, osc, where, span):
+        require(
+            isinstance(osc, Oscillator),
+            "osc",
+            "an Oscillator, such as jb.presets.class_b(...)",
+            osc,
+        )
+        osc.check_scalars()
+        osc.check()
+        span = as_array(span, "span", (2,))
+        check_finite(span, "span")
+        self.first, self.last = (float(end) for end in span)
+        require(self.first < self.last, "span", "(first, last) with first < last", tuple(span))
+        self.osc, self.index = osc, leaf_index(osc, where)
+        for value in (self.first, self.last):
+            self.at(value).check()
+        self.length = self.last - self.first
+        self.labels: dict[float, Label] = {}
+        self.breaks = self._coincidences()
+
+    def at(self, value: float) -> Oscillator:
+        """The oscillator there."""
+        return vary(self.osc, self.index, jnp.full(1, value))
+
+    def beside(self, value: float) -> tuple[float, float]:
+        """The values just below and just above."""
+        return value - CLOSE * self.length, value + CLOSE * self.length
+
+    @property
+    def belt(self) -> int | None:
+        """The belt whose velocity is varied, if it is one."""
+        for belt in range(len(self.osc.belts)):
+            if leaf_index(self.osc, lambda osc, belt=belt: osc.belts[belt].velocity) == self.index:
+                return belt
+        return None
+
+    def _coincidences(self) -> list[float]:
+        """Where the belt that is varied is at rest, or runs with another one."""
+        if self.belt is None:
+            return []
+        others = [float(b.velocity) for i, b in enumerate(self.osc.belts) if i != self.belt]
+        inside = [v for v in {0.0, *others} if self.first <= v <= self.last]
+        return sorted(inside)
+
+    def look(self, values: Sequence[float] | np.ndarray) -> None:
+        """Find the labels there, in batches."""
+        new = np.array(sorted({float(v) for v in values} - self.labels.keys()))
+        for batch in (new[i : i + BATCH] for i in range(0, new.size, BATCH)):
+            filled = np.concatenate([batch, np.full(BATCH - batch.size, new[0])])
+            seen = jax.tree.map(np.asarray, _look(self.osc, self.index, jnp.asarray(filled)))
+            for lane, value in enumerate(batch):
+                self.labels[float(value)] = _label(jax.tree.map(lambda x, i=lane: x[i], seen))
+
+    def label(self, value: float) -> Label:
+        """The label there, which `look` has found."""
+        return self.labels[float(value)]
+
+
+class _Seen(NamedTuple):
+    """Equilibria, [rows], and of every orbit its status and last turn, [starts, ROOM]."""
+
+    kind: Any
+    stable: Any
+    status: Any
+    codes: Any
+    ends: Any
+    count: Any
+
+
+@eqx.filter_jit
+def _look(osc: Oscillator, index: int, values: Array) -> _Seen:
+    return jax.vmap(lambda p: _look_at(vary(osc, index, p[None])))(values)
+
+
+def _look_at(osc: Oscillator) -> _Seen:
+    rests = equilibria(osc)
+    exists = rests.kind > 0
+    repels = exists & ~rests.stable
+    row = jnp.where(jnp.any(repels), jnp.argmax(repels), jnp.maximum(jnp.sum(exists) - 1, 0))
+    centre = jnp.where(jnp.any(exists), rests.x1[row], 0.0)
+    onsets = [before_onset(osc, belt) for belt in range(len(osc.belts))]
+    others = [jnp.stack([centre + distance, jnp.zeros(())]) for distance in DISTANCES]
+
+    def run(start):
+        orbit = follow(osc, start, FOLLOWED)
+        orbit, status = _approach(orbit, jnp.where(exists, rests.x1, jnp.inf))
+        shift, count = last_turn(orbit)
+        rows = jnp.arange(ROOM)
+        source = orbit.repeats + 1 + (shift + rows) % jnp.maximum(count, 1)
+        codes, ends = orbit.codes[source], orbit.ends[source]
+        status = jnp.where(count > ROOM, Status.TOO_MANY_ARCS.value, status)
+        return status, codes.astype(jnp.int8), ends.astype(jnp.int8), count
+
+    status, codes, ends, count = jax.vmap(run)(jnp.stack([*onsets, *others]))
+    return _Seen(rests.kind, rests.stable, status, codes, ends, count)
+
+
+def _approach(orbit: Orbit, rests: Array) -> tuple[Orbit, Array]:
+    """Tell what an orbit approaches that has not settled, from its last three tops.
+
+    Their differences form a geometric sequence, so its limit is known (Aitken). It is a cycle if
+    the limit is much nearer to the last top than that is to any equilibrium. It then counts as
+    settled, the last turn as the one that repeats.
+    """
+    rows = jnp.arange(orbit.tops.size)
+    last = jnp.sort(jnp.where(jnp.isnan(orbit.tops), -1, rows))[-3:]
+    tops = orbit.tops[last]
+    before, after = tops[1] - tops[0], tops[2] - tops[1]
+    ratio = after / jnp.where(before == 0, 1.0, before)
+    limit = tops[2] + after * ratio / (1 - ratio)
+    distance = jnp.min(jnp.abs(tops[2] - rests))
+    away = jnp.abs(limit - tops[2]) < 0.2 * distance
+    pending = (orbit.status == Status.NOT_SETTLED) & (last[0] >= 0) & (before != 0)
+    is_cycle = pending & (jnp.abs(ratio) < 1) & away
+    ended = eqx.tree_at(lambda o: (o.repeats, o.count), orbit, (last[1], last[2] + 1))
+    orbit = jax.tree.map(lambda a, b: jnp.where(is_cycle, a, b), ended, orbit)
+    return orbit, jnp.where(is_cycle, Status.OK.value, orbit.status)
+
+
+def _label(seen: _Seen) -> Label:
+    exists = seen.kind > 0
+    rests = tuple(zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), strict=True))
+    cycles = {
+        _signature(codes[:count], ends[:count])
+        for status, codes, ends, count in zip(
+            seen.status, seen.codes, seen.ends, seen.count, strict=True
+        )
+        if status == Status.OK
+    }
+    if not cycles and not any(stable for _, stable in rests):
+        # Nothing holds the orbits but a cycle that they approach slowly.
+        cycles = {()}
+    return Label(rests, frozenset(cycles))
+
+
+def _signature(codes: np.ndarray, ends: np.ndarray) -> tuple[tuple[EventKind, int], ...]:
+    """The events of a turn, from the one that makes the smallest sequence; slip goes unsaid."""
+    n = codes.shape[-1]
+    events = []
+    for i, end in enumerate(ends.tolist()):
+        following = codes[(i + 1) % len(codes)]
+        if end < n:
+            events.append((EventKind.STICK if following[end] == 0 else EventKind.CROSS, end))
+        elif end < 3 * n:
+            events.append((EventKind.EDGE, (end - n) % n))
+    return min((tuple(events[i:] + events[:i]) for i in range(len(events))), default=())
+
+
+# --- what makes the difference between two values -------------------------------------------------
+
+
+def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoint | None]:
+    """For every interval a bifurcation point inside it, or None."""
+    found: dict[tuple[float, float], BifurcationPoint | None] = dict.fromkeys(intervals)
+    guesses: list[tuple[tuple[float, float], float, int]] = []
+    for a, b in intervals:
+        before, after = path.label(a), path.label(b)
+        if before.equilibria != after.equilibria:
+            guesses += [((a, b), value, -1) for value in (a, b)]
+        changed = (before.sticks - after.sticks) + (after.sticks - before.sticks)
+        guesses += [((a, b), value, belt) for belt in changed for value in (a, b)]
+    for kind in (True, False):
+        chosen = [guess for guess in guesses if (guess[2] < 0) == kind]
+        points = _refined(path, chosen)
+        for ((a, b), _, _), point in zip(chosen, points, strict=True):
+            inside = a <= point.value <= b
+            if point.status == Status.OK and inside and found[a, b] is None:
+                found[a, b] = point
+    return found
+
+
+def _refined(path: Path, guesses) -> list[BifurcationPoint]:
+    """Hopf points (belt -1) or tangencies to a belt from each guess, in batches."""
+    points = []
+    for batch in (guesses[i : i + GUESSES] for i in range(0, len(guesses), GUESSES)):
+        filled = [*batch, *[batch[0]] * (GUESSES - len(batch))]
+        values = jnp.asarray(np.array([value for _, value, _ in filled]))
+        if batch[0][2] < 0:
+            solved = _hopf_points(path.osc, path.index, values)
+        else:
+            belts = jnp.asarray(np.array([belt for _, _, belt in filled]))
+            solved = _touches(path.osc, path.index, values, belts)
+        for lane, (_, _, belt) in enumerate(batch):
+            point = pick(solved, lane)
+            if belt >= 0:
+                is_fold = float(point.multiplier) > 1
+                kind = NonsmoothFold(belt) if is_fold else GrazingSliding(belt)
+                point = replace(point, condition=kind)
+            points.append(point)
+    return points
+
+
+@eqx.filter_jit
+def _hopf_points(osc: Oscillator, index: int, values: Array) -> BifurcationPoint:
+    here = lambda o: jax.tree.leaves(o)[index]  # noqa: E731
+    return jax.vmap(lambda p: refine(Hopf(), vary(osc, index, p[None]), where=here))(values)
+
+
+@eqx.filter_jit
+def _touches(osc: Oscillator, index: int, values: Array, belts: Array) -> BifurcationPoint:
+    def one(p, belt):
+        at = vary(osc, index, lax.stop_gradient(p)[None])
+        return touch(AbstractCondition(), at, belt, index, SIZES[1])
+
+    return jax.vmap(one)(values, belts)
+
+
+def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
+    """The points where the varied belt is at rest or runs with another one."""
+    belt = path.belt
+    assert belt is not None
+    conditions: list[AbstractCondition] = [SuddenSliding(belt)] if value == 0 else []
+    for other, its in enumerate(path.osc.belts):
+        if other != belt and float(its.velocity) == value:
+            conditions.append(SlidingExchange((min(belt, other), max(belt, other))))
+    points = []
+    for condition in conditions:
+        for guess in (value + 1e-2, value - 1e-2):
+            point = refine(
+                condition, path.at(guess), where=lambda o: jax.tree.leaves(o)[path.index]
+            )
+            if point.status == Status.OK:
+                points.append(point)
+                break
+    path.look(path.beside(value))
+    before, after = map(path.label, path.beside(value))
+    if not points and before != after:
+        points.append(unexplained_point(path.osc, path.index, value, 0.0))
+    return points
