@@ -1,0 +1,225 @@
+"""Curves of solutions followed by pseudo-arclength: `continue_curve`. It knows no friction.
+
+A residual R^(n+1) -> R^n that is regular vanishes along a curve. From a point u of it and its unit
+tangent t, the kernel of the Jacobian, the next point is where the residual vanishes in the plane
+that is normal to t at the distance of one step. Newton's method solves these n + 1 equations,
+
+    F(v) = 0,    t . (v - u) = step,
+
+which are regular where the curve turns round with respect to any of its coordinates, too. The
+tangent comes from the exact Jacobian, the same one that Newton's method ends with. The step grows
+where Newton's method is quick, and is halved where it is slow, fails, or the tangent turns by more
+than an angle; that is the control of the error as well, for every point is a solution to rounding.
+Along a regular curve the determinant of the n + 1 equations keeps its sign, so where it does not,
+the step has gone over to another branch, and is halved, too.
+"""
+
+import enum
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike
+
+from .checks import as_array, check_finite, require
+
+#: Newton's method may take so many steps; half of it is quick.
+NEWTON_STEPS = 8
+#: A correction or a residual of this size is rounding.
+ROUNDING = 1e-12
+#: Cosine of the largest angle between the tangents of two neighbours.
+STRAIGHT = 0.95
+
+
+class End(enum.Enum):
+    """Why a curve ends where it does."""
+
+    LEFT_SPAN = "it leaves the given span"
+    STEP_TOO_SMALL = "no step is short enough for Newton's method"
+    STOPPED = "the given condition on its points no longer holds"
+    CLOSED = "it is closed, and back where it began"
+    POINT_COUNT = "the number of points asked for is reached"
+
+
+class CurvePoint(NamedTuple):
+    """A point of a curve.
+
+    u: the solution, [n + 1]; tangent: of unit length, in the sense of the motion, [n + 1];
+    arclength: along the chords from the start; iterations: Newton steps that it took; end: why the
+    curve ends here, None where it goes on; orientation: sign of the determinant.
+    """
+
+    u: np.ndarray
+    tangent: np.ndarray
+    arclength: float
+    iterations: int
+    end: End | None
+    orientation: float
+
+
+def continue_curve(
+    residual: Callable[..., Array],
+    start: ArrayLike | tuple,
+    direction: ArrayLike | tuple,
+    *,
+    args: Any = None,
+    span: tuple[Any, Any] | None = None,
+    step: float = 0.01,
+    min_step: float = 1e-8,
+    max_step: float = 0.1,
+    max_points: int = 1000,
+    goes_on: Callable[[np.ndarray], bool] | None = None,
+    jacobian: Callable[..., tuple[Array, Array]] | None = None,
+) -> Iterator[CurvePoint]:
+    """The points of the curve residual(u, args) = 0 from near `start`, as they are found.
+
+    residual: maps u, [n + 1], to [n], and is traced once; keep the function and pass what varies as
+    `args`, any pytree of arrays. start: a guess of the first point. direction: [n + 1], the way to
+    go from there, as its angle with the tangent tells. span: smallest and largest u, numbers or
+    [n + 1]; the curve ends with a point on the first side that it meets. step, min_step, max_step:
+    lengths of the first, the shortest and the longest chord. goes_on: asked of every u; where it says no
+    the curve ends, with the last point for which it said yes. jacobian: gives the residual and its
+    matrix, [n, n + 1], where that is cheaper than by differentiation.
+
+    The last point says why it is the last. Where Newton's method fails at the start there is no
+    point. `ValueError` names an impossible argument.
+    """
+    start = as_array(start, "start", (None,))
+    check_finite(start, "start")
+    direction = as_array(direction, "direction", start.shape)
+    check_finite(direction, "direction")
+    require(np.any(np.asarray(direction) != 0), "direction", "not zero", direction)
+    steps = (min_step, step, max_step)
+    ordered = 0 < min_step <= step <= max_step
+    require(ordered, "step", "such that 0 < min_step <= step <= max_step", steps)
+    lower, upper = (-np.inf, np.inf) if span is None else span
+    limits = np.broadcast_to(lower, start.shape), np.broadcast_to(upper, start.shape)
+
+    # A number that is no array would be a constant of the program, compiled anew for every value.
+    args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, args)
+
+    def solve(u, tangent, length):
+        return jax.tree.map(
+            np.asarray, _correct(residual, jacobian, args, u, tangent, jnp.asarray(length))
+        )
+
+    first = solve(start, direction / jnp.linalg.norm(direction), 0.0)
+    if not first.found:
+        return
+    point = _point(first, 0.0)
+    origin = point
+    for count in range(2, max_points + 2):
+        if count > max_points:
+            yield point._replace(end=End.POINT_COUNT)
+            return
+        new, step, end = _advance(solve, point, step, (min_step, max_step), goes_on)
+        if new is None:
+            yield point._replace(end=end)
+            return
+        yield point
+        if np.any(new.u < limits[0]) or np.any(new.u > limits[1]):
+            yield _at_limit(solve, point, new, limits)._replace(end=End.LEFT_SPAN)
+            return
+        if count > 2 and _passes(origin, point, new):
+            yield origin._replace(
+                arclength=point.arclength + float(np.linalg.norm(origin.u - point.u)),
+                end=End.CLOSED,
+            )
+            return
+        point = new
+
+
+def _point(solved, arclength: float) -> CurvePoint:
+    iterations, orientation = int(solved.iterations), float(solved.orientation)
+    return CurvePoint(solved.u, solved.tangent, arclength, iterations, None, orientation)
+
+
+def _advance(solve, point: CurvePoint, step: float, steps, goes_on):
+    """The next point, the step to try after it; or None, and why there is none."""
+    shortest, longest = steps
+    end = End.STEP_TOO_SMALL
+    while step >= shortest:
+        solved = solve(point.u, point.tangent, step)
+        turned = float(solved.tangent @ point.tangent)
+        same_branch = float(solved.orientation) == point.orientation
+        allowed = bool(solved.found) and turned > STRAIGHT and same_branch
+        if allowed and (goes_on is None or goes_on(solved.u)):
+            chord = float(np.linalg.norm(solved.u - point.u))
+            new = _point(solved, point.arclength + chord)
+            quick = new.iterations <= NEWTON_STEPS // 2 and turned > 0.5 * (1 + STRAIGHT)
+            return new, min(longest, 1.5 * step if quick else step), None
+        end = End.STOPPED if allowed else End.STEP_TOO_SMALL
+        step *= 0.5
+    return None, step, end
+
+
+def _at_limit(solve, point: CurvePoint, beyond: CurvePoint, limits) -> CurvePoint:
+    """The point where the curve meets the first side of the span, between two others."""
+    # Newton's method in the length of the step, with the plane's normal along the coordinate.
+    change = beyond.u - point.u
+    with np.errstate(divide="ignore", invalid="ignore"):
+        parts = np.where(change < 0, (limits[0] - point.u) / change, (limits[1] - point.u) / change)
+    parts = np.where((change != 0) & (parts >= 0), parts, np.inf)
+    axis = int(np.argmin(parts))
+    guess = point.u + parts[axis] * change
+    normal = np.zeros_like(guess)
+    normal[axis] = np.sign(change[axis])
+    solved = solve(guess, normal, 0.0)
+    u = solved.u if solved.found else guess
+    chord = float(np.linalg.norm(u - point.u))
+    return _point(solved._replace(u=u), point.arclength + chord)
+
+
+def _passes(origin: CurvePoint, before: CurvePoint, after: CurvePoint) -> bool:
+    """Whether the step from one point to the next passes the first point of the curve."""
+    chord = after.u - before.u
+    length = float(np.linalg.norm(chord))
+    along = float((origin.u - before.u) @ chord) / length
+    off = float(np.linalg.norm(origin.u - before.u - along / length * chord))
+    same_way = float(origin.tangent @ after.tangent) > STRAIGHT
+    return 0 < along <= length and off < 0.5 * length and same_way
+
+
+class _Corrected(NamedTuple):
+    u: Any
+    tangent: Any
+    iterations: Any
+    orientation: Any
+    found: Any
+
+
+@eqx.filter_jit
+def _correct(residual, jacobian, args, u: Array, tangent: Array, step: Array) -> _Corrected:
+    """Newton's method in the plane normal to the tangent, `step` ahead of u."""
+
+    def linearized(v):
+        if jacobian is not None:
+            return jacobian(v, args)
+        return residual(v, args), jax.jacfwd(lambda v: residual(v, args))(v)
+
+    last_row = jnp.zeros_like(u).at[-1].set(1.0)
+
+    def improve(state):
+        v, _, count, _, _ = state
+        value, matrix = linearized(v)
+        value = jnp.append(value, tangent @ (v - u) - step)
+        matrix = jnp.concatenate([matrix, tangent[None]])
+        # One factorisation: the correction, and the kernel of the Jacobian for the tangent.
+        solved = jnp.linalg.solve(matrix, jnp.stack([-value, last_row], axis=1))
+        size = jnp.max(jnp.abs(solved[:, 0]))
+        sign, _ = jnp.linalg.slogdet(matrix)
+        return v + solved[:, 0], solved[:, 1], count + 1, sign, size
+
+    def unfinished(state):
+        _, _, count, _, size = state
+        return (count < NEWTON_STEPS) & (size > ROUNDING) & jnp.isfinite(size)
+
+    one = jnp.asarray(1.0)
+    start = (u + step * tangent, tangent, jnp.asarray(0), one, one)
+    v, kernel, count, sign, size = lax.while_loop(unfinished, improve, start)
+    found = (size <= 1e3 * ROUNDING) & jnp.all(jnp.isfinite(kernel))
+    return _Corrected(v, kernel / jnp.linalg.norm(kernel), count, sign, found)

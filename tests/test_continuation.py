@@ -1,0 +1,100 @@
+"""Pseudo-arclength on curves whose equations are known, and every way in which one can end."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbelt.continuation import End, continue_curve
+
+# Points solve their equation to rounding; Newton's method ends below this.
+ROUNDING = 1e-12
+
+
+def circle(u, radius):
+    return jnp.array([u[0] ** 2 + u[1] ** 2 - radius**2])
+
+
+def cubic(u, _):
+    # Two folds: u[1] = x^3 - x turns round at x = -1/sqrt(3) and 1/sqrt(3).
+    return jnp.array([u[0] ** 3 - u[0] - u[1]])
+
+
+def imperfect_pitchfork(u, offset):
+    return jnp.array([offset + u[1] * u[0] - u[0] ** 3])
+
+
+def test_a_circle_closes_on_itself():
+    points = list(continue_curve(circle, (1.9, 0.1), (0.0, 1.0), args=2.0, max_step=0.3))
+    u = np.array([point.u for point in points])
+    assert np.allclose(np.hypot(*u.T), 2.0, rtol=0, atol=ROUNDING)
+    assert points[-1].end is End.CLOSED and np.all(u[-1] == u[0])
+    assert [point.end for point in points[:-1]] == [None] * (len(points) - 1)
+    # Once round, no more: the angle grows from one point to the next.
+    angle = np.unwrap(np.arctan2(u[:, 1], u[:, 0]))
+    assert np.all(np.diff(angle) > 0) and angle[-1] - angle[0] == pytest.approx(2 * np.pi)
+    # Chords of at most 0.3 on a radius of 2: shorter than the arcs by h^2/24 of them.
+    assert points[-1].arclength == pytest.approx(4 * np.pi, rel=1e-3)
+
+
+def test_folds_are_passed_and_the_span_is_met_exactly():
+    points = list(continue_curve(cubic, (-1.5, -1.9), (1.0, 0.0), span=((-2, -3), (2, 2.5))))
+    u = np.array([point.u for point in points])
+    assert np.allclose(u[:, 0] ** 3 - u[:, 0], u[:, 1], rtol=0, atol=ROUNDING)
+    assert np.sum(np.diff(np.sign(np.diff(u[:, 1]))) != 0) == 2
+    assert points[-1].end is End.LEFT_SPAN and u[-1, 1] == pytest.approx(2.5, abs=ROUNDING)
+    # The tangent has unit length, goes the way of the motion, and is vertical at the folds only.
+    tangents = np.array([point.tangent for point in points])
+    assert np.allclose(np.linalg.norm(tangents, axis=1), 1.0, rtol=0, atol=1e-14)
+    assert np.all(np.sum(tangents[:-1] * np.diff(u, axis=0), axis=1) > 0)
+    assert points[0].end is None and points[0].arclength == 0
+
+
+def test_a_pitchfork_off_its_axis_is_followed_round_the_bend():
+    branch = continue_curve(
+        imperfect_pitchfork, (-0.7, 0.49), (0.0, -1.0), args=-1e-4, span=(-1, 1)
+    )
+    u = np.array([point.u for point in branch])
+    # With the offset the branch comes down one side and leaves along the axis, x = offset / -p.
+    assert u[-1] == pytest.approx([-1e-4, -1.0], abs=1e-7)
+    # It never passes to the other side.
+    assert np.all(u[:, 0] < 0)
+    # Against the sense: up to the edge, the outer branch sqrt(p).
+    *_, last = continue_curve(
+        imperfect_pitchfork, (-0.7, 0.49), (0.0, 1.0), args=-1e-4, span=(-1, 1)
+    )
+    assert last.u[1] == pytest.approx(1.0, abs=ROUNDING) and last.end is End.LEFT_SPAN
+
+
+def test_ends():
+    *_, last = continue_curve(circle, (2.0, 0.0), (0.0, 1.0), args=2.0, max_points=7)
+    assert last.end is End.POINT_COUNT
+
+    *_, last = continue_curve(
+        circle, (2.0, 0.0), (0.0, 1.0), args=2.0, goes_on=lambda u: bool(u[1] < 1)
+    )
+    # The step is halved down to min_step before the curve is given up.
+    assert last.end is End.STOPPED and last.u[1] == pytest.approx(1, abs=1e-7) and last.u[1] < 1
+
+    def until_it_stops(u, _):
+        return jnp.array([u[1] - jnp.sqrt(1 - u[0])])
+
+    *_, last = continue_curve(until_it_stops, (0.0, 1.0), (1.0, 0.0))
+    # The square root's branch point ends the real curve.
+    assert last.end is End.STEP_TOO_SMALL and last.u == pytest.approx([1, 0], abs=1e-3)
+
+    assert list(continue_curve(until_it_stops, (3.0, 1.0), (1.0, 0.0))) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"start": (np.nan, 0.0)}, "start must be finite"),
+        ({"direction": (0.0, 0.0)}, "direction must be not zero"),
+        ({"direction": (0.0, 1.0, 0.0)}, "direction must be of shape"),
+        ({"step": 1.0}, "step must be such that 0 < min_step <= step <= max_step"),
+    ],
+)
+def test_impossible_arguments_are_named(arguments, message):
+    given = {"start": (2.0, 0.0), "direction": (0.0, 1.0), **arguments}
+    with pytest.raises(ValueError, match=message):
+        list(continue_curve(circle, given.pop("start"), given.pop("direction"), args=2.0, **given))
