@@ -23,6 +23,7 @@ unknowns of fixed-signature shooting (see `cycles`) the same equation is harmles
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -39,18 +40,18 @@ from .cycles import (
     Chain,
     Cycle,
     Ends,
+    Turn,
     admissible,
-    chain_of,
     cycle_of,
     follow,
     jacobian,
     last_turn,
     meshed,
-    multiplier_without_sticking,
     newton,
     residual,
     residual_and_blocks,
     trace_of,
+    turn_of,
 )
 from .equilibria import EquilibriumKind, equilibria
 from .modes import (
@@ -170,12 +171,16 @@ def refine(
     osc.check_scalars()
     osc.check()
     n = len(osc.belts)
-    belts = condition.belts if isinstance(condition, SlidingExchange) else ()
-    belts = (condition.belt,) if isinstance(condition, _BeltCondition) else belts
+    belts = condition.belts if isinstance(condition, SlidingExchange) else (0, 0)
+    belts = (condition.belt,) * 2 if isinstance(condition, _BeltCondition) else belts
     for belt in belts:
         require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
     size = SIZES[1] if max_arcs is None else max_arcs
-    return _refine(condition, osc, leaf_index(osc, where), size)
+    # The belts are data: one program is compiled for all of them.
+    solve = _SOLVERS.get(type(condition), _at_cycle)
+    wanted = np.float64(_SIDES.get(type(condition), 0.0))
+    point = _refine(solve, osc, leaf_index(osc, where), np.array(belts), wanted, size)
+    return replace(point, condition=condition)
 
 
 def leaf_index(osc: Oscillator, where: Callable[[Oscillator], Any]) -> int:
@@ -197,17 +202,11 @@ def vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
 
 
 @eqx.filter_jit
-def _refine(condition, osc: Oscillator, index: int, size: int) -> BifurcationPoint:
+def _refine(solve: Callable, osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoint:
     p0 = jax.tree.leaves(osc)[index][None]
     # Derivatives with respect to the varied parameter itself would be those of the guess.
     osc = vary(osc, index, lax.stop_gradient(p0))
-    if isinstance(condition, Hopf):
-        return _refine_hopf(condition, osc, index)
-    if isinstance(condition, SuddenSliding):
-        return _refine_sudden(condition, osc, index)
-    if isinstance(condition, SlidingExchange):
-        return _refine_exchange(condition, osc, index, size)
-    return _refine_touch(condition, osc, index, size)
+    return solve(osc, index, belts, wanted, size)
 
 
 # --- systems of a cycle and one condition ---------------------------------------------------------
@@ -218,21 +217,22 @@ def _refine(condition, osc: Oscillator, index: int, size: int) -> BifurcationPoi
 class _System(eqx.Module):
     """A fixed signature and a condition, for the parameter of that number.
 
-    The condition: two belts run at one velocity, or else, an arc is tangent to a boundary.
+    The condition: the two belts run at one velocity; if they are the same, an arc of the chain is
+    tangent to a boundary.
     """
 
     chain: Chain
+    belts: Array
     index: int = eqx.field(static=True)
-    equal: tuple[int, ...] = eqx.field(static=True)
 
-    def _difference(self, osc: Oscillator) -> Array:
-        i, j = self.equal
-        return osc.belts[i].velocity - osc.belts[j].velocity
+    def _condition(self, osc: Oscillator, miss: Array) -> Array:
+        difference = _velocity(osc, self.belts[0]) - _velocity(osc, self.belts[1])
+        return jnp.where(self.belts[0] != self.belts[1], difference, miss)
 
     def residual(self, osc: Oscillator, z: Array, p: Array) -> Array:
         osc = vary(osc, self.index, p)
         value, miss = residual(osc, self.chain, z)
-        return jnp.append(value.reshape(-1), self._difference(osc) if self.equal else miss)
+        return jnp.append(value.reshape(-1), self._condition(osc, miss))
 
     def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
         """The residual, and its Jacobian with respect to (z, p)."""
@@ -240,11 +240,10 @@ class _System(eqx.Module):
         def osc_of(p):
             return vary(osc, self.index, p)
 
-        value, g, blocks = residual_and_blocks(osc_of, self.chain, z, p)
-        row = jnp.append(blocks[:, 3, :3].reshape(-1), jnp.sum(blocks[:, 3, 3]))
-        if self.equal:
-            g, slope = jax.value_and_grad(lambda p: self._difference(osc_of(p)))(p)
-            row = jnp.zeros_like(row).at[-1].set(slope[0])
+        value, miss, blocks = residual_and_blocks(osc_of, self.chain, z, p)
+        g, g_p, g_miss = _value_and_slopes(lambda p, m: self._condition(osc_of(p), m), p[0], miss)
+        row = g_miss * jnp.append(blocks[:, 3, :3].reshape(-1), jnp.sum(blocks[:, 3, 3]))
+        row = row.at[-1].add(g_p)
         equations = jnp.concatenate(
             [jacobian(blocks[:, :3, :3]), blocks[:, :3, 3].reshape(-1, 1)], axis=1
         )
@@ -259,21 +258,28 @@ class _System(eqx.Module):
         return Chain(self.chain.codes, ends, self.chain.mesh)
 
 
+def _value_and_slopes(fn, p, miss):
+    value, (slope_p, slope_miss) = jax.value_and_grad(lambda p, m: fn(p[None], m), (0, 1))(p, miss)
+    return value, slope_p, slope_miss
+
+
 @eqx.filter_custom_jvp
 def _solve_system(osc, system, z0, p0):
+    """Unknowns, the parameter, the steps of Newton's method and the matrix of the last one."""
+
     def step(unknowns):
         value, matrix = system.linearized(osc, *unknowns)
         change = jnp.linalg.solve(matrix, -value)
-        return (change[:-1].reshape(z0.shape), change[-1:]), jnp.max(jnp.abs(value))
+        return (change[:-1].reshape(z0.shape), change[-1:]), jnp.max(jnp.abs(value)), matrix
 
     solved = newton(step, (z0, p0))
-    return (*solved.z, solved.lengths)
+    return (*solved.z, solved.lengths, solved.matrix)
 
 
 @_solve_system.def_jvp
 def _(primals, tangents):
     osc, system, z0, p0 = primals
-    z, p, steps = _solve_system(osc, system, z0, p0)
+    z, p, steps, matrix = _solve_system(osc, system, z0, p0)
     moved, fixed = eqx.partition(
         osc, jax.tree.map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
     )
@@ -282,35 +288,41 @@ def _(primals, tangents):
         (moved,),
         (tangents[0],),
     )
-    _, matrix = system.linearized(osc, z, p)
-    change = jnp.linalg.solve(matrix, -shift)
-    return (z, p, steps), (change[:-1].reshape(z.shape), change[-1:], None)
+    _, slopes = system.linearized(osc, z, p)
+    change = jnp.linalg.solve(slopes, -shift)
+    return (z, p, steps, matrix), (change[:-1].reshape(z.shape), change[-1:], None, None)
 
 
-def _error(osc: Oscillator, system: _System, z: Array, p: Array) -> Array:
-    """A bound on the error of p: what the residual with halved steps and rounding do to it."""
-    halved = jnp.repeat(0.5 * system.chain.mesh, 2, axis=1)
-    finer = eqx.tree_at(lambda s: s.chain.mesh, system, halved)
-    value = finer.residual(osc, z, p)
-    _, matrix = system.linearized(osc, z, p)
-    last = jnp.zeros(value.size).at[-1].set(1.0)
-    weights = jnp.linalg.solve(matrix.T, last)
+def _accuracy(osc: Oscillator, system: _System, z: Array, p: Array, matrix: Array):
+    """The residual, and a bound on the error of p: what the residual with halved steps and rounding
+    do to it."""
+    mesh = system.chain.mesh
+    # The steps as they are, and halved; padded by steps of length zero to one shape.
+    meshes = jnp.stack(
+        [jnp.concatenate([mesh, jnp.zeros_like(mesh)], axis=1), jnp.repeat(0.5 * mesh, 2, axis=1)]
+    )
+
+    def value(mesh):
+        return eqx.tree_at(lambda s: s.chain.mesh, system, mesh).residual(osc, z, p)
+
+    values = jax.vmap(value)(meshes)
+    weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
     rounding = 1e-15 * (1 + jnp.max(jnp.abs(z))) * jnp.sum(jnp.abs(weights))
-    return 2 * jnp.abs(jnp.sum(weights * value)) + rounding
+    return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
 
 
-def _solved_point(condition, osc, system, z0, p0, status, judge) -> BifurcationPoint:
-    """Solve; judge(osc, z, cycle) -> (status, multiplier) says whether it is what was meant."""
-    z, p, steps = _solve_system(osc, system, z0, p0)
+def _solved_point(osc, system, z0, p0, status, judge) -> BifurcationPoint:
+    """Solve; judge(osc, z, cycle, slope), slope the cycle's multiplier with stick phases left out,
+    gives the status and the multiplier to be told."""
+    z, p, steps, matrix = _solve_system(osc, system, z0, p0)
     iterations = jnp.sum(~jnp.isnan(steps))
     at_point = vary(osc, system.index, p)
-    cycle = cycle_of(at_point, system.ordinary, z, iterations, status)
-    error = _error(*lax.stop_gradient((osc, system, z, p)))
-    status, multiplier = judge(at_point, z, cycle)
-    size = jnp.max(jnp.abs(system.residual(osc, z, p)))
+    cycle, slope = cycle_of(at_point, system.ordinary, z, iterations, status)
+    size, error = _accuracy(*lax.stop_gradient((osc, system, z, p, matrix)))
+    status, multiplier = judge(at_point, z, cycle, slope)
     known = functools.partial(jnp.where, status == Status.OK)
     return BifurcationPoint(
-        condition=condition,
+        condition=AbstractCondition(),
         value=known(p[0], jnp.nan),
         residual=known(size, jnp.nan),
         iterations=iterations,
@@ -323,7 +335,7 @@ def _solved_point(condition, osc, system, z0, p0, status, judge) -> BifurcationP
     )
 
 
-# --- touching a boundary --------------------------------------------------------------------------
+# --- touching a boundary, and two boundaries that change places -----------------------------------
 
 
 def _velocity(osc: Oscillator, belt: int | Array) -> Array:
@@ -350,29 +362,22 @@ def before_onset(osc: Oscillator, belt: int | Array) -> Array:
     return jnp.stack([x1, v])
 
 
-def _refine_touch(condition, osc, index, size) -> BifurcationPoint:
-    point = touch(condition, osc, condition.belt, index, size)
-    is_fold = isinstance(condition, NonsmoothFold)
-    other = (point.status == Status.OK) & (is_fold != (point.multiplier > 1))
-    status = jnp.where(other, Status.OTHER_KIND.value, point.status)
-    known = functools.partial(jnp.where, status == Status.OK)
-    return eqx.tree_at(
-        lambda q: (q.value, q.residual, q.error, q.multiplier, q.oscillator, q.status),
-        point,
-        (
-            *(known(x, jnp.nan) for x in (point.value, point.residual, point.error)),
-            known(point.multiplier, jnp.nan),
-            vary(osc, index, known(point.value, jnp.nan)[None]),
-            status,
-        ),
-    )
-
-
 def touch(condition, osc: Oscillator, belt: int | Array, index: int, size: int) -> BifurcationPoint:
     """The point near an oscillator where a cycle is tangent to the boundary of a belt.
 
     Its multiplier m tells the kind: m > 1 a nonsmooth fold, m < 1 grazing.
     """
+    point = _at_cycle(osc, index, jnp.stack([jnp.asarray(belt)] * 2), jnp.zeros(()), size)
+    return replace(point, condition=condition)
+
+
+def _at_cycle(osc: Oscillator, index: int, belts: Array, wanted: Array, size: int):
+    """A cycle tangent to the boundary of a belt, given twice, or at the exchange of two belts.
+
+    wanted: 1 a fold, -1 grazing, 0 either.
+    """
+    belt, other = belts[0], belts[1]
+    exchange = belt != other
     n = len(osc.belts)
     names = Ends(n)
     still = lax.stop_gradient(osc)
@@ -392,43 +397,56 @@ def touch(condition, osc: Oscillator, belt: int | Array, index: int, size: int) 
     )
     orbit = jax.tree.map(lambda a, b: jnp.where(repeated, a, b), orbit, first_turn)
     _, count = last_turn(orbit)
-    chain, z = chain_of(still, orbit, size)
-    chain, z, row, found = _with_stick(still, chain, z, belt)
+    turn = turn_of(orbit, size, n)
+    sticks_to = [jnp.any(turn.used & (turn.codes[:, k] == 0)) for k in (belt, other)]
+    touching, row, found = _with_stick(still, turn, belt)
+    turn = jax.tree.map(lambda a, b: jnp.where(exchange, a, b), turn, touching)
+    chain, z = meshed(still, turn)
 
-    usable = (repeated | returns) & found
+    usable = jnp.where(exchange, repeated & (sticks_to[0] != sticks_to[1]), found)
+    usable = usable & (repeated | returns)
     status = jnp.where(usable, Status.OK.value, Status.NOT_TOUCHED.value)
-    fits = count < size
+    fits = count < jnp.where(exchange, size + 1, size)  # a tangency may need one arc more
     status = jnp.where(usable & ~fits, Status.TOO_MANY_ARCS.value, status)
     status = jnp.where(velocity == 0, Status.STUCK_FOREVER.value, status)
+    swap = jnp.arange(n).at[belt].set(other).at[other].set(belt)
 
-    def judge(osc, z, cycle):
+    def judge(osc, z, cycle, slope):
         chain = cycle.chain
         others = jnp.any(chain.codes == 0, axis=-1) & chain.used & (jnp.arange(size) != row)
-        slope = jnp.where(jnp.any(others), 0.0, multiplier_without_sticking(osc, chain, z))
-        return cycle.status, slope
+        slope = jnp.where(jnp.any(others), 0.0, slope)
+        swapped = Chain(chain.codes[:, swap], chain.ends, chain.mesh)
+        # An exchange needs the same cycle with the belts swapped; a tangency is of one kind.
+        fits = jnp.where(exchange, admissible(osc, swapped, z), wanted * (slope - 1) >= 0)
+        slope = jnp.where(exchange, jnp.nan, slope)
+        other_kind = (cycle.status == Status.OK) & ~fits
+        return jnp.where(other_kind, Status.OTHER_KIND.value, cycle.status), slope
 
     # The arc before the stick arc is the one that becomes tangent.
     before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
     tangent = chain.ends.at[before].set(names.tangent + belt)
-    system = _System(Chain(chain.codes, tangent, chain.mesh), index, ())
+    ends = jnp.where(exchange, chain.ends, tangent)
+    system = _System(Chain(chain.codes, ends, chain.mesh), belts, index)
     p0 = jax.tree.leaves(still)[index][None]
-    return _solved_point(condition, osc, system, z, p0, status, judge)
+    return _solved_point(osc, system, z, p0, status, judge)
 
 
-def _with_stick(osc: Oscillator, chain: Chain, z: Array, belt: int | Array):
-    """The chain with a stick arc on the belt: (chain, guess, its row, whether there is one).
+def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, Array]:
+    """A turn with a stick arc on the belt, its row, whether there is one.
 
     Its own shortest, or one of duration zero where x2 comes closest to the boundary from inside.
     """
     velocity = _velocity(osc, belt)
-    rows = jnp.arange(chain.ends.size)
-    own = chain.used & (chain.codes[:, belt] == 0)
-    shortest = jnp.argmin(jnp.where(own, z[:, 2], jnp.inf))
+    rows = jnp.arange(turn.ends.size)
+    own = turn.used & (turn.codes[:, belt] == 0)
+    shortest = jnp.argmin(jnp.where(own, turn.durations, jnp.inf))
 
-    count = jnp.sum(chain.used)
-    following = jnp.where((rows == count - 1)[:, None], z[0], jnp.roll(z, -1, axis=0))
-    turns = chain.used & (chain.ends == Ends(len(osc.belts)).turn_x2)
-    turns = turns & (chain.codes[:, belt] == jnp.sign(velocity))
+    count = jnp.sum(turn.used)
+    last = (rows == count - 1)[:, None]
+    following = jnp.where(last, turn.entries[0], jnp.roll(turn.entries, -1, axis=0))
+    names = Ends(len(osc.belts))
+    turns = turn.used & (turn.ends == names.turn_x2)
+    turns = turns & (turn.codes[:, belt] == jnp.sign(velocity))
     turns = turns & (following[:, 1] * jnp.sign(velocity) > 0)
     distance = jnp.abs(velocity - osc.omega * following[:, 1])
     at = jnp.argmin(jnp.where(turns, distance, jnp.inf))
@@ -438,44 +456,19 @@ def _with_stick(osc: Oscillator, chain: Chain, z: Array, belt: int | Array):
         after = (rows > at + 1).reshape(-1, *[1] * (array.ndim - 1))
         return jnp.where(after, shifted, array).at[at + 1].set(new)
 
-    x1 = following[at, 0]
-    stick = jnp.stack([x1, velocity / osc.omega, jnp.zeros(())])
-    names = Ends(len(osc.belts))
-    codes = inserted(chain.codes, chain.codes[at].at[belt].set(STUCK))
-    ends = inserted(chain.ends.at[at].set(belt), jnp.asarray(names.onset))
-    z_new = inserted(z, stick)
-    # Where the chain is full, the last row was shifted out; the caller knows.
+    # Where all rows are in use the last one is shifted out; the caller knows.
+    new = Turn(
+        codes=inserted(turn.codes, turn.codes[at].at[belt].set(STUCK)),
+        ends=inserted(turn.ends.at[at].set(belt), jnp.asarray(names.onset)),
+        entries=inserted(turn.entries, jnp.stack([following[at, 0], velocity / osc.omega])),
+        durations=inserted(turn.durations, jnp.zeros(())),
+    )
     has_own = jnp.any(own)
-    choose = functools.partial(jnp.where, has_own)
-    z = choose(z, z_new)
-    chain, z = meshed(osc, choose(chain.codes, codes), choose(chain.ends, ends), z[:, :2], z[:, 2])
-    return chain, z, choose(shortest, at + 1), has_own | jnp.any(turns)
+    turn = jax.tree.map(lambda a, b: jnp.where(has_own, a, b), turn, new)
+    return turn, jnp.where(has_own, shortest, at + 1), has_own | jnp.any(turns)
 
 
 # --- the other conditions -------------------------------------------------------------------------
-
-
-def _refine_exchange(condition, osc, index, size) -> BifurcationPoint:
-    i, j = condition.belts
-    still = lax.stop_gradient(osc)
-    orbit = follow(still, before_onset(still, i), HINT_BUDGET)
-    _, count = last_turn(orbit)
-    chain, z = chain_of(still, orbit, size)
-    on_i, on_j = (jnp.any(chain.used & (chain.codes[:, k] == 0)) for k in (i, j))
-    fits = (orbit.status == Status.OK) & (count <= size) & (on_i != on_j)
-    status = jnp.where(fits, Status.OK.value, Status.NOT_TOUCHED.value)
-    swap = np.arange(len(osc.belts))
-    swap[[i, j]] = j, i
-
-    def judge(osc, z, cycle):
-        chain = cycle.chain
-        swapped = Chain(chain.codes[:, swap], chain.ends, chain.mesh)
-        other = (cycle.status == Status.OK) & ~admissible(osc, swapped, z)
-        return jnp.where(other, Status.OTHER_KIND.value, cycle.status), jnp.asarray(jnp.nan)
-
-    system = _System(chain, index, (i, j))
-    p0 = jax.tree.leaves(still)[index][None]
-    return _solved_point(condition, osc, system, z, p0, status, judge)
 
 
 def _small_newton(equations, osc, unknowns):
@@ -487,7 +480,7 @@ def _small_newton(equations, osc, unknowns):
     def step(u):
         value = equations(lax.stop_gradient(osc), u)
         matrix = jax.jacfwd(lambda u: equations(lax.stop_gradient(osc), u))(u)
-        return jnp.linalg.solve(matrix, -value), jnp.max(jnp.abs(value))
+        return jnp.linalg.solve(matrix, -value), jnp.max(jnp.abs(value)), matrix
 
     solved = newton(step, lax.stop_gradient(unknowns))
     u = lax.stop_gradient(solved.z)
@@ -500,7 +493,7 @@ def _small_newton(equations, osc, unknowns):
     return u, solved.lengths, jnp.max(jnp.abs(value)), error
 
 
-def _point_without_cycle(condition, osc, index, p, steps, size, error, status, why):
+def _point_without_cycle(osc, index, p, steps, size, error, status, why):
     iterations = jnp.sum(~jnp.isnan(steps))
     known = functools.partial(jnp.where, status == Status.OK)
     at_point = vary(osc, index, known(p, jnp.nan)[None])
@@ -512,7 +505,7 @@ def _point_without_cycle(condition, osc, index, p, steps, size, error, status, w
     none = jnp.asarray(jnp.nan)
     cycle = Cycle(at_point, chain, nan, none, none, iterations, jnp.asarray(why.value))
     return BifurcationPoint(
-        condition=condition,
+        condition=AbstractCondition(),
         value=known(p, jnp.nan),
         residual=known(size, jnp.nan),
         iterations=iterations,
@@ -529,7 +522,6 @@ def unexplained_point(osc: Oscillator, index: int, value: float, width: float) -
     """A point where something changes, within an interval of that width, that nothing explains."""
     p, error, none = jnp.asarray(value), jnp.asarray(width), jnp.asarray(jnp.nan)
     point = _point_without_cycle(
-        Unexplained(),
         osc,
         index,
         p,
@@ -539,10 +531,11 @@ def unexplained_point(osc: Oscillator, index: int, value: float, width: float) -
         jnp.asarray(Status.OK.value),
         Status.UNEXPLAINED,
     )
-    return eqx.tree_at(lambda q: q.status, point, jnp.asarray(Status.UNEXPLAINED.value))
+    status = jnp.asarray(Status.UNEXPLAINED.value)
+    return replace(point, condition=Unexplained(), status=status)
 
 
-def _refine_hopf(condition, osc, index) -> BifurcationPoint:
+def _at_hopf(osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoint:
     rests = equilibria(lax.stop_gradient(osc))
     fixed = rests.kind == EquilibriumKind.FIXED_POINT
     row = jnp.argmin(jnp.where(fixed, jnp.abs(rests.rate), jnp.inf))
@@ -564,21 +557,18 @@ def _refine_hopf(condition, osc, index) -> BifurcationPoint:
     status = jnp.where(jnp.all(jnp.stack(inside) > 0), Status.OK.value, Status.NOT_ADMISSIBLE.value)
     status = jnp.where(size < 1e-9, status, Status.NO_CONVERGENCE.value)
     status = jnp.where(jnp.any(fixed), status, Status.NO_FIXED_POINT.value)
-    return _point_without_cycle(
-        condition, osc, index, u[1], steps, size, error, status, Status.EQUILIBRIUM
-    )
+    return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.EQUILIBRIUM)
 
 
-def _refine_sudden(condition, osc, index) -> BifurcationPoint:
-    belt = condition.belt
+def _at_rest(osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoint:
+    belt = belts[0]
     still = lax.stop_gradient(osc)
     # From a guess on the point itself there is no orbit to follow; its cycles lie beside it.
-    at_rest = still.belts[belt].velocity == 0
-    beside = eqx.tree_at(
-        lambda o: o.belts[belt].velocity,
-        still,
-        jnp.where(at_rest, 1e-2, still.belts[belt].velocity),
-    )
+    velocities = [
+        jnp.where((belt == i) & (one.velocity == 0), 1e-2, one.velocity)
+        for i, one in enumerate(still.belts)
+    ]
+    beside = eqx.tree_at(lambda o: [one.velocity for one in o.belts], still, velocities)
     start = before_onset(beside, belt)
     orbit = follow(beside, start, HINT_BUDGET)
     rows = jnp.arange(HINT_BUDGET)
@@ -590,14 +580,17 @@ def _refine_sudden(condition, osc, index) -> BifurcationPoint:
 
     def equations(osc, u):
         osc = vary(osc, index, u[1:])
-        nu = osc.belts[belt].velocity
-        limit = jnp.sign(beside.belts[belt].velocity) * capacity(osc, mode)
+        nu = _velocity(osc, belt)
+        limit = jnp.sign(_velocity(beside, belt)) * capacity(osc, mode)
         return jnp.stack([mode_acceleration(osc, mode, u[0], rest) + limit, nu])
 
     p0 = jax.tree.leaves(osc)[index]
     u, steps, size, error = _small_newton(equations, osc, jnp.stack([start[0], p0]))
     status = jnp.where(sticks, Status.OK.value, Status.NOT_TOUCHED.value)
     status = jnp.where(size < 1e-9, status, Status.NO_CONVERGENCE.value)
-    return _point_without_cycle(
-        condition, osc, index, u[1], steps, size, error, status, Status.STUCK_FOREVER
-    )
+    return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.STUCK_FOREVER)
+
+
+#: What solves for a condition, if not `_at_cycle`; and on which side of one the multiplier lies.
+_SOLVERS = {Hopf: _at_hopf, SuddenSliding: _at_rest}
+_SIDES = {NonsmoothFold: 1.0, GrazingSliding: -1.0}

@@ -33,6 +33,7 @@ from jaxtyping import Array, ArrayLike
 
 from .checks import as_array, check_finite, is_concrete, number, pick, require
 from .equilibria import EquilibriumKind, equilibria
+from .extrapolation import Scheme, increments, scheme
 from .modes import (
     Mode,
     boundary_guards,
@@ -71,50 +72,21 @@ LONGEST = 0.5
 # --- smooth arcs ----------------------------------------------------------------------------------
 
 
-def _extrapolation(*sizes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The midpoint rule with so many substeps each, extrapolated to substeps of length zero.
-
-    One row a substep: its length, whether it is the first of its rule, and, at the last, the weight
-    of that rule's result. Gragg's method: the error is even in the length.
-    """
-    rows = []
-    for n in sizes:
-        weight = np.prod([n**2 / (n**2 - m**2) for m in sizes if m != n])
-        rows += [(1 / n, float(k == 0), weight if k == n - 1 else 0.0) for k in range(n)]
-    return tuple(np.array(rows).T)
-
-
 # Of order 12 for the arcs, of order 8 for following an orbit, of order 4 for placing the steps.
-_FINE = _extrapolation(2, 4, 6, 8, 10, 12)
-_MEDIUM = _extrapolation(2, 4, 6, 8)
-_COARSE = _extrapolation(2, 4)
+_FINE = scheme((2, 4, 6, 8, 10, 12))
+_MEDIUM = scheme((2, 4, 6, 8))
+_COARSE = scheme((2, 4))
 
 
-def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme) -> Array:
-    """One step of size h of an extrapolated midpoint rule.
+def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -> Array:
+    """One step of size h, for states in one array."""
 
-    Not a Runge-Kutta scheme: unrolled, its stages take minutes to compile, and as an array they
-    make a batch of thousands of arcs several times slower than these three states, kept apart by
-    component.
-    """
-    start = tuple(y[i] for i in range(y.size))
+    def apart(state):
+        slopes = field(jnp.stack(state))
+        return tuple(slopes[i] for i in range(y.size))
 
-    def substep(carry, row):
-        before, now, total = carry
-        length, first, weight = row
-        now = tuple(jnp.where(first == 1, a, b) for a, b in zip(start, now, strict=True))
-        before = tuple(jnp.where(first == 1, a, b) for a, b in zip(start, before, strict=True))
-        slopes = field(jnp.stack(now))
-        stride = (2 - first) * length * h
-        new = tuple(a + stride * slopes[i] for i, a in enumerate(before))
-        moved = zip(total, new, start, strict=True)
-        total = tuple(sum_ + weight * (a - a0) for sum_, a, a0 in moved)
-        return (now, new, total), None
-
-    nothing = tuple(jnp.zeros_like(part) for part in start)
-    rows = tuple(map(jnp.asarray, scheme))
-    (_, _, total), _ = lax.scan(substep, (start, start, nothing), rows)
-    return y + jnp.stack(total)
+    (change,) = increments(apart, tuple(y[i] for i in range(y.size)), h, scheme)
+    return y + jnp.stack(change)
 
 
 def _mode(codes: Array) -> Mode:
@@ -301,17 +273,18 @@ def jacobian(blocks: Array) -> Array:
 
 
 class Newton(eqx.Module):
-    """State of a Newton iteration: unknowns, largest residual, steps made, and how long each was,
-    [NEWTON_STEPS], NaN where there was none."""
+    """State of a Newton iteration: unknowns, largest residual, steps made, how long each was,
+    [NEWTON_STEPS], NaN where there was none, and the matrix of the last one."""
 
     z: Any
     residual: Array
     iterations: Array
     lengths: Array
+    matrix: Array
 
 
-def newton(step: Callable[[Any], tuple[Any, Array]], start: Any) -> Newton:
-    """Newton's method: step(z) gives the correction and the residual at z.
+def newton(step: Callable[[Any], tuple[Any, Array, Array]], start: Any) -> Newton:
+    """Newton's method: step(z) gives the correction, the residual at z and the matrix.
 
     Steps longer than LONGEST are cut. Ends where steps are as small as rounding lets them be, and
     where they are not finite.
@@ -325,20 +298,24 @@ def newton(step: Callable[[Any], tuple[Any, Array]], start: Any) -> Newton:
         return going | (n.iterations == 0)
 
     def improve(n):
-        change, size = step(n.z)
+        change, size, matrix = step(n.z)
         length = jnp.max(jnp.stack([jnp.max(jnp.abs(c)) for c in jax.tree.leaves(change)]))
         shorter = jnp.minimum(1.0, LONGEST / length)
         z = jax.tree.map(lambda a, b: a + shorter * b, n.z, change)
-        return Newton(z, size, n.iterations + 1, n.lengths.at[n.iterations].set(length))
+        lengths = n.lengths.at[n.iterations].set(length)
+        return Newton(z, size, n.iterations + 1, lengths, matrix)
 
     none = jnp.full(NEWTON_STEPS, jnp.nan)
-    return lax.while_loop(unfinished, improve, Newton(start, jnp.zeros(()), jnp.asarray(0), none))
+    matrix = jnp.zeros(eqx.filter_eval_shape(step, start)[2].shape)
+    first = Newton(start, jnp.zeros(()), jnp.asarray(0), none, matrix)
+    return lax.while_loop(unfinished, improve, first)
 
 
 def _newton_step(osc, chain, z):
     value, _, blocks = residual_and_blocks(lambda _: osc, chain, z, jnp.zeros(0))
-    step = jnp.linalg.solve(jacobian(blocks[:, :3]), -value.reshape(-1))
-    return step.reshape(z.shape), jnp.max(jnp.abs(value))
+    matrix = jacobian(blocks[:, :3])
+    step = jnp.linalg.solve(matrix, -value.reshape(-1))
+    return step.reshape(z.shape), jnp.max(jnp.abs(value)), matrix
 
 
 @eqx.filter_custom_jvp
@@ -409,17 +386,15 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
         _, _, _, y_end, steps = state
         # A stuck lane has no slip arc to follow; it must not keep a batch waiting.
         going = (steps < 200) & ~mode.any_stuck & jnp.all(jnp.isfinite(y_end))
-        return jnp.all(guards(y_end) >= 0) & going
+        return ((steps == 0) | jnp.all(guards(y_end) >= 0)) & going
 
     def advance(state):
         t, _, h, y, steps = state
         h_new = 0.3 / density(osc, codes, y)
         return t + h, y, h_new, _step(field, y, h_new, _MEDIUM), steps + 1
 
-    # The first step is one of length zero, into which y itself is put.
-    t, y0, h, y1, steps = lax.while_loop(
-        inside, advance, advance((jnp.zeros(()), y, jnp.zeros(()), y, jnp.asarray(0)))
-    )
+    zero = jnp.zeros(())
+    t, y0, h, y1, steps = lax.while_loop(inside, advance, (zero, y, zero, y, jnp.asarray(0)))
     # The root on the step's cubic, then two Newton steps of the true state.
     d0, d1 = field(y0) * h, field(y1) * h
 
@@ -440,16 +415,17 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
     _, root = lax.fori_loop(0, 30, halve, (jnp.zeros(()), jnp.ones(())))
     fired = jnp.argmin(guards(cubic(root)))
 
-    def polish(_, h_root):
+    def polish(_, state):
+        h_root, *_ = state
         y_root = _step(field, y0, h_root, _MEDIUM)
         value, slope = jax.jvp(guards, (y_root,), (field(y_root),))
         slope = slope[fired]
         regular = jnp.abs(slope) > 1e-6
         shift = jnp.where(regular, value[fired] / jnp.where(regular, slope, 1.0), 0.0)
-        return jnp.clip(h_root - shift, 0.0, 1.01 * h)
+        return jnp.clip(h_root - shift, 0.0, 1.01 * h), h_root, y_root
 
-    h_root = lax.fori_loop(0, 2, polish, root * h)
-    return t + h_root, _step(field, y0, h_root, _MEDIUM), fired, steps >= 200
+    _, h_root, y_root = lax.fori_loop(0, 3, polish, (root * h, root * h, y0))
+    return t + h_root, y_root, fired, steps >= 200
 
 
 def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
@@ -535,7 +511,7 @@ def last_turn(orbit: Orbit) -> tuple[Array, Array]:
     """(first row, number of rows) of the turn that repeats; it begins at the end of a stick phase.
 
     That of the longest one, if there are several; if there is none, at the top. Rows are to be
-    taken modulo the number, see `chain_of`.
+    taken modulo the number, see `turn_of`.
     """
     rows = jnp.arange(orbit.durations.size)
     size = orbit.count - 1 - orbit.repeats
@@ -546,23 +522,37 @@ def last_turn(orbit: Orbit) -> tuple[Array, Array]:
     return shift, size
 
 
-def chain_of(osc: Oscillator, orbit: Orbit, size: int) -> tuple[Chain, Array]:
-    """The signature of the turn that repeats, padded to `size` arcs, and its unknowns."""
+class Turn(eqx.Module):
+    """One turn of an orbit, arc by arc, padded: a signature, and a guess of the unknowns."""
+
+    codes: Array
+    ends: Array
+    entries: Array
+    durations: Array
+
+    @property
+    def used(self) -> Array:
+        return self.ends != Ends(self.codes.shape[-1]).unused
+
+
+def turn_of(orbit: Orbit, size: int, n: int) -> Turn:
+    """The turn that repeats, padded to `size` arcs, of an oscillator with n belts."""
     shift, count = last_turn(orbit)
     rows = jnp.arange(size)
     used = rows < count
     source = orbit.repeats + 1 + jnp.where(used, shift + rows, shift) % jnp.maximum(count, 1)
-    ends = jnp.where(used, orbit.ends[source], Ends(len(osc.belts)).unused)
+    ends = jnp.where(used, orbit.ends[source], Ends(n).unused)
     durations = jnp.where(used, orbit.durations[source], 0.0)
-    return meshed(osc, orbit.codes[source], ends, orbit.entries[source], durations)
+    return Turn(orbit.codes[source], ends, orbit.entries[source], durations)
 
 
-def meshed(osc: Oscillator, codes, ends, entries, durations) -> tuple[Chain, Array]:
-    """A chain with its mesh, and its unknowns, from a guess."""
-    stuck = jnp.any(codes == 0, axis=-1)
-    mesh = jax.vmap(functools.partial(_mesh, osc))(codes, entries, jnp.where(stuck, 0.0, durations))
-    z = jnp.concatenate([entries, durations[:, None]], axis=1)
-    return lax.stop_gradient((Chain(codes, ends, mesh), z))
+def meshed(osc: Oscillator, turn: Turn) -> tuple[Chain, Array]:
+    """The chain of a turn with its mesh, and the guess of its unknowns."""
+    stuck = jnp.any(turn.codes == 0, axis=-1)
+    slip = jnp.where(stuck, 0.0, turn.durations)
+    mesh = jax.vmap(functools.partial(_mesh, osc))(turn.codes, turn.entries, slip)
+    z = jnp.concatenate([turn.entries, turn.durations[:, None]], axis=1)
+    return lax.stop_gradient((Chain(turn.codes, turn.ends, mesh), z))
 
 
 # --- the cycle ------------------------------------------------------------------------------------
@@ -699,30 +689,33 @@ def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     return slope[None]
 
 
-def multiplier_without_sticking(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """Determinant of the monodromy matrix, stick phases left out: exp of the mean divergence, and
-    at each crossing of a boundary the determinant of its saltation matrix, x2' after over before.
+def _closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
+    """The largest error in the shooting equations, and the determinant of the monodromy matrix with
+    stick phases left out: exp of the mean divergence, and at each crossing of a boundary the
+    determinant of its saltation matrix, x2' after over before.
 
     One multiplier of a planar cycle is 1, so this is the other one. Contact edges have determinant
     one: their saltation matrix is [[1, 0], [jump of x2' / x2, 1]].
     """
     n = len(osc.belts)
 
-    def one(codes, mesh, unknown, following, entry, end):
+    def one(codes, end, mesh, unknown, following, entry):
         after = flow(osc, codes, mesh, unknown[:2], unknown[2], trace_of)
+        guard = _guard(osc, codes, end, after[:2], unknown[2])
         before_crossing = mode_acceleration(osc, _mode(codes), after[0], after[1])
         after_crossing = mode_acceleration(osc, _mode(following), entry[0], entry[1])
         slips = jnp.all(codes != 0) & (unknown[2] != 0)
         crosses = (end < n) & jnp.all(following != 0)
         ratio = after_crossing / jnp.where(crosses, before_crossing, 1.0)
         growth = jnp.where(slips, jnp.exp(jnp.where(slips, after[2], 0.0)), 1.0)
-        return growth * jnp.where(crosses, ratio, 1.0)
+        error = jnp.maximum(jnp.max(jnp.abs(after[:2] - entry)), jnp.abs(guard))
+        return error, growth * jnp.where(crosses, ratio, 1.0)
 
-    following = following_codes(chain)
-    factors = jax.vmap(one)(
-        chain.codes, chain.mesh, z, following, jnp.roll(z[:, :2], -1, axis=0), chain.ends
+    entries = jnp.roll(z[:, :2], -1, axis=0)
+    errors, factors = jax.vmap(one)(
+        chain.codes, chain.ends, chain.mesh, z, following_codes(chain), entries
     )
-    return jnp.prod(factors)
+    return jnp.max(errors), jnp.prod(factors)
 
 
 def following_codes(chain: Chain) -> Array:
@@ -753,24 +746,26 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
     return jnp.all(each | ~chain.used)
 
 
-def cycle_of(osc: Oscillator, chain: Chain, z: Array, iterations: Array, status: Array) -> Cycle:
-    """The `Cycle` of a solution z; NaN with a status where it is none."""
-    error = jnp.max(jnp.abs(residual(osc, chain, z)[0]))
-    found = error < 1e-9
-    status = _first_failure(status, found, Status.NO_CONVERGENCE)
+def cycle_of(
+    osc: Oscillator, chain: Chain, z: Array, iterations: Array, status: Array
+) -> tuple[Cycle, Array]:
+    """The `Cycle` of a solution z, NaN with a status where it is none; and its multiplier with
+    stick phases left out."""
+    error, slope = _closure(osc, chain, z)
+    status = _first_failure(status, error < 1e-9, Status.NO_CONVERGENCE)
     status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
-    multiplier = jnp.where(sticks, 0.0, multiplier_without_sticking(osc, chain, z))
     known = functools.partial(jnp.where, status == Status.OK)
-    return Cycle(
+    cycle = Cycle(
         oscillator=osc,
         chain=chain,
         unknowns=known(z, jnp.nan),
-        multiplier=known(multiplier, jnp.nan),
+        multiplier=known(jnp.where(sticks, 0.0, slope), jnp.nan),
         residual=known(error, jnp.nan),
         iterations=iterations,
         status=status,
     )
+    return cycle, slope
 
 
 def _first_failure(status: Array, fine: Array, code: Status) -> Array:
@@ -787,9 +782,9 @@ def _polish(osc: Oscillator, orbit: Orbit, size: int) -> Cycle:
     _, count = last_turn(orbit)
     status = _first_failure(orbit.status, count <= size, Status.TOO_MANY_ARCS)
     # Where there is no cycle a turn of the orbit still gives finite numbers to calculate with.
-    chain, guess = chain_of(lax.stop_gradient(osc), orbit, size)
+    chain, guess = meshed(lax.stop_gradient(osc), turn_of(orbit, size, len(osc.belts)))
     z, iterations = _solve(osc, chain, guess)
-    return cycle_of(osc, chain, z, iterations, status)
+    return cycle_of(osc, chain, z, iterations, status)[0]
 
 
 def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Cycle:
@@ -874,18 +869,20 @@ def _unstable_cycle(osc: Oscillator, size: int) -> Cycle:
 
     def narrow(bracket, _):
         distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
-        _, inside = jax.vmap(turn)(distances)
+        orbits, inside = jax.vmap(turn)(distances)
         first = jnp.argmin(inside)
         bounded = ~inside[-1] & (first > 0)
         low, high = distances[jnp.maximum(first - 1, 0)], distances[first]
-        return jnp.where(bounded, jnp.stack([low, high]), bracket), inside[0] & ~jnp.all(inside)
+        bracket = jnp.where(bounded, jnp.stack([low, high]), bracket)
+        innermost = jax.tree.map(lambda leaf: leaf[jnp.maximum(first - 1, 0)], orbits)
+        return bracket, (inside[0] & ~jnp.all(inside), innermost)
 
-    bracket, found = lax.scan(narrow, jnp.array([1e-4, 10.0]), None, length=REFINEMENTS)
-    orbit, _ = turn(bracket[0])
-    chain, guess = chain_of(still, orbit, size)
+    bracket, (found, orbits) = lax.scan(narrow, jnp.array([1e-4, 10.0]), None, length=REFINEMENTS)
+    orbit = jax.tree.map(lambda leaf: leaf[-1], orbits)
+    chain, guess = meshed(still, turn_of(orbit, size, len(osc.belts)))
     z, iterations = _solve(osc, chain, guess)
     status = jnp.where(exists & found[0], Status.OK.value, Status.NO_UNSTABLE_CYCLE.value)
-    cycle = cycle_of(osc, chain, z, iterations, status)
+    cycle, _ = cycle_of(osc, chain, z, iterations, status)
     # A cycle that Newton found elsewhere, or shrunk to the equilibrium, is not the one meant.
     same = (jnp.abs(z[0, 0] - guess[0, 0]) < 0.1 * bracket[0]) & (cycle.multiplier > 1)
     missing = (cycle.status == Status.OK) & ~same | (cycle.status == Status.NOT_ADMISSIBLE)

@@ -26,6 +26,7 @@ LADDER = (
     "presets",
     "continuation",
     "derivatives",
+    "extrapolation",
     "smoothing",
     "simulate",
     "batch",
