@@ -27,6 +27,9 @@ class Status(enum.IntEnum):
     OTHER_KIND = 13
     NO_FIXED_POINT = 14
     UNEXPLAINED = 15
+    NOT_IDENTIFIED = 16
+    MISFIT = 17
+    UNREACHABLE = 18
 
 
 ADVICE = {
@@ -81,6 +84,19 @@ ADVICE = {
     Status.UNEXPLAINED: (
         "What the oscillator does changes here, and no condition known to the search explains how. "
         "Simulate on both sides."
+    ),
+    Status.NOT_IDENTIFIED: (
+        "The record does not tell all of the parameters: those with an infinite standard error may "
+        "have any value. Fit fewer of them, or measure a motion that feels them."
+    ),
+    Status.MISFIT: (
+        "The best fit leaves more than the given noise: the model, or the noise, is not that of "
+        "the record, or a better fit was not found. Look at the residuals; try a nearer guess or "
+        "more starts."
+    ),
+    Status.UNREACHABLE: (
+        "No choice of the parameters within their bounds reaches the targets along this way; what "
+        "comes nearest is given. Widen the bounds, free more parameters, or start elsewhere."
     ),
 }
 
