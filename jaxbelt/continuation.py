@@ -81,23 +81,23 @@ def continue_curve(
     `args`, any pytree of arrays. start: a guess of the first point. direction: [n + 1], the way to
     go from there, as its angle with the tangent tells. span: smallest and largest u, numbers or
     [n + 1]; the curve ends with a point on the first side that it meets. step, min_step, max_step:
-    lengths of the first, the shortest and the longest chord. goes_on: asked of every u; where it says no
-    the curve ends, with the last point for which it said yes. jacobian: gives the residual and its
-    matrix, [n, n + 1], where that is cheaper than by differentiation.
+    lengths of the first, the shortest and the longest chord. goes_on: asked of every u; where it
+    says no the curve ends, with the last point for which it said yes. jacobian: gives the residual
+    and its matrix, [n, n + 1], where that is cheaper than by differentiation.
 
     The last point says why it is the last. Where Newton's method fails at the start there is no
     point. `ValueError` names an impossible argument.
     """
-    start = as_array(start, "start", (None,))
-    check_finite(start, "start")
-    direction = as_array(direction, "direction", start.shape)
-    check_finite(direction, "direction")
-    require(np.any(np.asarray(direction) != 0), "direction", "not zero", direction)
+    u0 = as_array(start, "start", (None,))
+    check_finite(u0, "start")
+    way = as_array(direction, "direction", u0.shape)
+    check_finite(way, "direction")
+    require(np.any(np.asarray(way) != 0), "direction", "not zero", way)
     steps = (min_step, step, max_step)
     ordered = 0 < min_step <= step <= max_step
     require(ordered, "step", "such that 0 < min_step <= step <= max_step", steps)
     lower, upper = (-np.inf, np.inf) if span is None else span
-    limits = np.broadcast_to(lower, start.shape), np.broadcast_to(upper, start.shape)
+    limits = np.broadcast_to(lower, u0.shape), np.broadcast_to(upper, u0.shape)
 
     # A number that is no array would be a constant of the program, compiled anew for every value.
     args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, args)
@@ -107,7 +107,7 @@ def continue_curve(
             np.asarray, _correct(residual, jacobian, args, u, tangent, jnp.asarray(length))
         )
 
-    first = solve(start, direction / jnp.linalg.norm(direction), 0.0)
+    first = solve(u0, way / jnp.linalg.norm(way), 0.0)
     if not first.found:
         return
     point = _point(first, 0.0)

@@ -44,7 +44,7 @@ from .bifurcations import (
 )
 from .checks import as_array, check_finite, pick, require
 from .cycles import SIZES, Orbit, follow, last_turn
-from .equilibria import equilibria
+from .equilibria import Equilibria, equilibria
 from .oscillator import Oscillator
 from .results import EventKind, Status
 
@@ -79,7 +79,11 @@ def scan(
     UNEXPLAINED and the value where it happens, good to about 1e-9 of the span. A contact edge or an
     equilibrium meeting an edge are such changes. `ValueError` names an impossible argument.
     """
-    path = Path(osc, where, span)
+    return search(Path(osc, where, span), resolution)
+
+
+def search(path: "Path", resolution: int = 96) -> tuple[BifurcationPoint, ...]:
+    """Every bifurcation point on a path, in order; its labels are kept with it."""
     points = [point for at in path.breaks for point in _at_break(path, at)]
     ends = [path.first, *(v for at in path.breaks for v in path.beside(at)), path.last]
     width = (path.last - path.first) / resolution
@@ -111,12 +115,16 @@ def scan(
 # --- what the oscillator does at one value --------------------------------------------------------
 
 
+#: The events of one turn, (kind, belt) each.
+Signature = tuple[tuple[EventKind, int], ...]
+
+
 class Label(NamedTuple):
     """What there is at one value: (kind, stable) of the equilibria from left to right, and the
     signatures of the attracting cycles, each from the same place in the turn."""
 
     equilibria: tuple[tuple[int, bool], ...]
-    cycles: frozenset[tuple[tuple[EventKind, int], ...]]
+    cycles: frozenset[Signature]
 
     @property
     def sticks(self) -> Counter[int]:
@@ -147,6 +155,7 @@ class Path:
             self.at(value).check()
         self.length = self.last - self.first
         self.labels: dict[float, Label] = {}
+        self.starts: dict[float, dict[Signature, int]] = {}
         self.breaks = self._coincidences()
 
     def at(self, value: float) -> Oscillator:
@@ -180,7 +189,8 @@ class Path:
             filled = np.concatenate([batch, np.full(BATCH - batch.size, new[0])])
             seen = jax.tree.map(np.asarray, _look(self.osc, self.index, jnp.asarray(filled)))
             for lane, value in enumerate(batch):
-                self.labels[float(value)] = _label(jax.tree.map(lambda x, i=lane: x[i], seen))
+                at_value = jax.tree.map(lambda x, i=lane: x[i], seen)
+                self.labels[float(value)], self.starts[float(value)] = _label(at_value)
 
     def label(self, value: float) -> Label:
         """The label there, which `look` has found."""
@@ -204,17 +214,8 @@ def _look(osc: Oscillator, index: int, values: Array) -> _Seen:
 
 
 def _look_at(osc: Oscillator) -> _Seen:
-    rests = equilibria(osc)
-    exists = rests.kind > 0
-    repels = exists & ~rests.stable
-    row = jnp.where(jnp.any(repels), jnp.argmax(repels), jnp.maximum(jnp.sum(exists) - 1, 0))
-    centre = jnp.where(jnp.any(exists), rests.x1[row], 0.0)
-    onsets = [before_onset(osc, belt) for belt in range(len(osc.belts))]
-    others = [jnp.stack([centre + distance, jnp.zeros(())]) for distance in DISTANCES]
-
     def run(start):
-        orbit = follow(osc, start, FOLLOWED)
-        orbit, status = _approach(orbit, jnp.where(exists, rests.x1, jnp.inf))
+        orbit, status = approach(osc, rests, start)
         shift, count = last_turn(orbit)
         rows = jnp.arange(ROOM)
         source = orbit.repeats + 1 + (shift + rows) % jnp.maximum(count, 1)
@@ -222,24 +223,41 @@ def _look_at(osc: Oscillator) -> _Seen:
         status = jnp.where(count > ROOM, Status.TOO_MANY_ARCS.value, status)
         return status, codes.astype(jnp.int8), ends.astype(jnp.int8), count
 
-    status, codes, ends, count = jax.vmap(run)(jnp.stack([*onsets, *others]))
+    rests = equilibria(osc)
+    status, codes, ends, count = jax.vmap(run)(starts(osc, rests))
     return _Seen(rests.kind, rests.stable, status, codes, ends, count)
 
 
-def _approach(orbit: Orbit, rests: Array) -> tuple[Orbit, Array]:
-    """Tell what an orbit approaches that has not settled, from its last three tops.
+def starts(osc: Oscillator, rests: Equilibria) -> Array:
+    """Where the orbits start that find the cycles, [starts, 2].
 
-    Their differences form a geometric sequence, so its limit is known (Aitken). It is a cycle if
-    the limit is much nearer to the last top than that is to any equilibrium. It then counts as
-    settled, the last turn as the one that repeats.
+    Before slip onset on each belt, and at several distances from an equilibrium.
     """
+    exists = rests.kind > 0
+    repels = exists & ~rests.stable
+    row = jnp.where(jnp.any(repels), jnp.argmax(repels), jnp.maximum(jnp.sum(exists) - 1, 0))
+    centre = jnp.where(jnp.any(exists), rests.x1[row], 0.0)
+    onsets = [before_onset(osc, belt) for belt in range(len(osc.belts))]
+    others = [jnp.stack([centre + distance, jnp.zeros(())]) for distance in DISTANCES]
+    return jnp.stack([*onsets, *others])
+
+
+def approach(osc: Oscillator, rests: Equilibria, start: Array) -> tuple[Orbit, Array]:
+    """The orbit from a start until it settles, and a status: OK where that is a cycle.
+
+    If it has not settled, the last three tops tell what it approaches: their differences form a
+    geometric sequence, so its limit is known (Aitken). It is a cycle if the limit is much nearer to
+    the last top than that is to any equilibrium. The orbit then counts as settled, its last turn as
+    the one that repeats.
+    """
+    orbit = follow(osc, start, FOLLOWED)
     rows = jnp.arange(orbit.tops.size)
     last = jnp.sort(jnp.where(jnp.isnan(orbit.tops), -1, rows))[-3:]
     tops = orbit.tops[last]
     before, after = tops[1] - tops[0], tops[2] - tops[1]
     ratio = after / jnp.where(before == 0, 1.0, before)
     limit = tops[2] + after * ratio / (1 - ratio)
-    distance = jnp.min(jnp.abs(tops[2] - rests))
+    distance = jnp.min(jnp.where(rests.kind > 0, jnp.abs(tops[2] - rests.x1), jnp.inf))
     away = jnp.abs(limit - tops[2]) < 0.2 * distance
     pending = (orbit.status == Status.NOT_SETTLED) & (last[0] >= 0) & (before != 0)
     is_cycle = pending & (jnp.abs(ratio) < 1) & away
@@ -248,23 +266,23 @@ def _approach(orbit: Orbit, rests: Array) -> tuple[Orbit, Array]:
     return orbit, jnp.where(is_cycle, Status.OK.value, orbit.status)
 
 
-def _label(seen: _Seen) -> Label:
+def _label(seen: _Seen) -> tuple[Label, dict[Signature, int]]:
+    """The label, and from which start each of its cycles is reached."""
     exists = seen.kind > 0
     rests = tuple(zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), strict=True))
-    cycles = {
-        _signature(codes[:count], ends[:count])
-        for status, codes, ends, count in zip(
-            seen.status, seen.codes, seen.ends, seen.count, strict=True
-        )
-        if status == Status.OK
-    }
+    cycles: dict[Signature, int] = {}
+    for start, status in enumerate(seen.status):
+        if status == Status.OK:
+            count = seen.count[start]
+            turn = _signature(seen.codes[start, :count], seen.ends[start, :count])
+            cycles.setdefault(turn, start)
     if not cycles and not any(stable for _, stable in rests):
         # Nothing holds the orbits but a cycle that they approach slowly.
-        cycles = {()}
-    return Label(rests, frozenset(cycles))
+        cycles = {(): len(seen.status) - 1}
+    return Label(rests, frozenset(cycles)), cycles
 
 
-def _signature(codes: np.ndarray, ends: np.ndarray) -> tuple[tuple[EventKind, int], ...]:
+def _signature(codes: np.ndarray, ends: np.ndarray) -> Signature:
     """The events of a turn, from the one that makes the smallest sequence; slip goes unsaid."""
     n = codes.shape[-1]
     events = []
