@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from . import presets
 from .bifurcations import (
     BifurcationPoint,
+    FoldOfCycles,
     GrazingSliding,
     Hopf,
     NonsmoothFold,
@@ -57,6 +58,7 @@ __all__ = [
     "EquilibriumKind",
     "EventKind",
     "Events",
+    "FoldOfCycles",
     "GrazingSliding",
     "Hopf",
     "NonsmoothFold",

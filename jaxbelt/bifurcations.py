@@ -19,6 +19,9 @@ unknowns of fixed-signature shooting (see `cycles`) the same equation is harmles
   the boundary. No cycle can be an unknown here: as nu_k goes to zero the stick phase lasts ever
   longer, the slip arc takes ever longer to leave the equilibrium, and in the limit there is none.
 - `Hopf`: trace zero at a fixed point (its determinant is always one).
+- `FoldOfCycles`: the multiplier of a cycle that does not stick is one. There the equations of the
+  cycle alone are singular; with this one, and the parameter, they are not. (A cycle that sticks
+  has the multiplier zero and takes part in nonsmooth folds only.)
 """
 
 import functools
@@ -42,7 +45,9 @@ from .cycles import (
     Ends,
     Turn,
     admissible,
+    closure,
     cycle_of,
+    first_turn,
     follow,
     jacobian,
     last_turn,
@@ -92,6 +97,10 @@ class GrazingSliding(_BeltCondition):
 
 class SuddenSliding(_BeltCondition):
     """A belt comes to rest: the time that the mass sticks to it in each turn goes to infinity."""
+
+
+class FoldOfCycles(AbstractCondition):
+    """Two cycles that do not stick, a stable and an unstable one, meet and vanish."""
 
 
 class SlidingExchange(AbstractCondition):
@@ -155,10 +164,10 @@ def refine(
 ) -> BifurcationPoint:
     """The bifurcation point near an oscillator, by Newton's method with exact derivatives.
 
-    condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`, `SlidingExchange(belts)` or
-    `SuddenSliding(belt)`. osc: a rough guess, on either side of the point. where: selects the
-    parameter that is varied, such as `lambda osc: osc.belts[0].velocity`. max_arcs: room for the
-    arcs of one turn (default 16).
+    condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`, `SlidingExchange(belts)`,
+    `SuddenSliding(belt)` or `FoldOfCycles()`. osc: a rough guess, on either side of the point.
+    where: selects the parameter that is varied, such as `lambda osc: osc.belts[0].velocity`.
+    max_arcs: room for the arcs of one turn (default 16).
 
     Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`; `value` and
     `cycle` are differentiable with respect to the other parameters. A guess that leads to no such
@@ -177,7 +186,7 @@ def refine(
         require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
     size = SIZES[1] if max_arcs is None else max_arcs
     # The belts are data: one program is compiled for all of them.
-    solve = _SOLVERS.get(type(condition), _at_cycle)
+    solve = _SOLVERS.get(type(condition), at_cycle)
     wanted = np.float64(_SIDES.get(type(condition), 0.0))
     point = _refine(solve, osc, leaf_index(osc, where), np.array(belts), wanted, size)
     return replace(point, condition=condition)
@@ -194,16 +203,28 @@ def leaf_index(osc: Oscillator, where: Callable[[Oscillator], Any]) -> int:
     return index
 
 
-def vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
-    """The oscillator with the parameter of that number replaced by p, [1]."""
+def vary(osc: Oscillator, index: int | Array, p: Array) -> Oscillator:
+    """The oscillator with the parameter of that number replaced by p, [1].
+
+    Where the number is an array, one program serves all parameters.
+    """
     leaves, structure = jax.tree.flatten(osc)
-    leaves[index] = p[0]
+    if isinstance(index, int):
+        leaves[index] = p[0]
+    else:
+        leaves = [jnp.where(index == i, p[0], leaf) for i, leaf in enumerate(leaves)]
     return jax.tree.unflatten(structure, leaves)
 
 
+def parameter(osc: Oscillator, index: int | Array) -> Array:
+    """The parameter of that number."""
+    leaves = jax.tree.leaves(osc)
+    return leaves[index] if isinstance(index, int) else jnp.stack(leaves)[index]
+
+
 @eqx.filter_jit
-def _refine(solve: Callable, osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoint:
-    p0 = jax.tree.leaves(osc)[index][None]
+def _refine(solve: Callable, osc: Oscillator, index, belts, wanted, size) -> BifurcationPoint:
+    p0 = parameter(osc, index)[None]
     # Derivatives with respect to the varied parameter itself would be those of the guess.
     osc = vary(osc, index, lax.stop_gradient(p0))
     return solve(osc, index, belts, wanted, size)
@@ -223,7 +244,7 @@ class _System(eqx.Module):
 
     chain: Chain
     belts: Array
-    index: int = eqx.field(static=True)
+    index: int | Array
 
     def _condition(self, osc: Oscillator, miss: Array) -> Array:
         difference = _velocity(osc, self.belts[0]) - _velocity(osc, self.belts[1])
@@ -362,19 +383,10 @@ def before_onset(osc: Oscillator, belt: int | Array) -> Array:
     return jnp.stack([x1, v])
 
 
-def touch(condition, osc: Oscillator, belt: int | Array, index: int, size: int) -> BifurcationPoint:
-    """The point near an oscillator where a cycle is tangent to the boundary of a belt.
-
-    Its multiplier m tells the kind: m > 1 a nonsmooth fold, m < 1 grazing.
-    """
-    point = _at_cycle(osc, index, jnp.stack([jnp.asarray(belt)] * 2), jnp.zeros(()), size)
-    return replace(point, condition=condition)
-
-
-def _at_cycle(osc: Oscillator, index: int, belts: Array, wanted: Array, size: int):
+def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
     """A cycle tangent to the boundary of a belt, given twice, or at the exchange of two belts.
 
-    wanted: 1 a fold, -1 grazing, 0 either.
+    wanted: 1 a fold, -1 grazing, 0 either; its multiplier tells which it is.
     """
     belt, other = belts[0], belts[1]
     exchange = belt != other
@@ -427,7 +439,7 @@ def _at_cycle(osc: Oscillator, index: int, belts: Array, wanted: Array, size: in
     tangent = chain.ends.at[before].set(names.tangent + belt)
     ends = jnp.where(exchange, chain.ends, tangent)
     system = _System(Chain(chain.codes, ends, chain.mesh), belts, index)
-    p0 = jax.tree.leaves(still)[index][None]
+    p0 = parameter(still, index)[None]
     return _solved_point(osc, system, z, p0, status, judge)
 
 
@@ -468,7 +480,89 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
     return turn, jnp.where(has_own, shortest, at + 1), has_own | jnp.any(turns)
 
 
-# --- the other conditions -------------------------------------------------------------------------
+# --- the fold of cycles ---------------------------------------------------------------------------
+
+#: Starts of which the first turns are compared.
+STARTS = 48
+
+
+class _UnitMultiplier(eqx.Module):
+    """A cycle with its signature fixed, and multiplier one."""
+
+    chain: Chain
+    index: int = eqx.field(static=True)
+
+    def residual(self, osc: Oscillator, z: Array, p: Array) -> Array:
+        osc = vary(osc, self.index, p)
+        value, _ = residual(osc, self.chain, z)
+        return jnp.append(value.reshape(-1), closure(osc, self.chain, z)[1] - 1)
+
+    def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
+        """The residual, and its Jacobian with respect to (z, p)."""
+
+        def osc_of(p):
+            return vary(osc, self.index, p)
+
+        def slope(z, p):
+            return closure(osc_of(p), self.chain, z)[1]
+
+        value, _, blocks = residual_and_blocks(osc_of, self.chain, z, p)
+        m, row = jax.value_and_grad(slope, (0, 1))(z, p)
+        equations = jnp.concatenate(
+            [jacobian(blocks[:, :3, :3]), blocks[:, :3, 3].reshape(-1, 1)], axis=1
+        )
+        matrix = jnp.concatenate([equations, jnp.append(row[0].reshape(-1), row[1])[None]])
+        return jnp.append(value.reshape(-1), m - 1), matrix
+
+    @property
+    def ordinary(self) -> Chain:
+        return self.chain
+
+
+def _at_fold_of_cycles(osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoint:
+    """Two cycles meet where a turn neither grows nor shrinks, and neither do its neighbours.
+
+    So the guess is the first turn whose growth is extremal among its neighbours'; of several the
+    one that closes best.
+    """
+    still = lax.stop_gradient(osc)
+    rests = equilibria(still)
+    eligible = (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
+    x1 = jnp.where(jnp.any(eligible), rests.x1[jnp.argmax(eligible)], 0.0)
+
+    def turn(distance):
+        orbit, _, top = first_turn(still, x1, distance, size)
+        rows = jnp.arange(size) < orbit.count
+        sticks = jnp.any(rows & jnp.any(orbit.codes == 0, axis=-1))
+        return orbit, jnp.where(sticks, jnp.nan, jnp.log((top - x1) / distance))
+
+    def narrow(bracket, _):
+        distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
+        orbits, growth = jax.vmap(turn)(distances)
+        change = jnp.diff(growth)
+        extremal = change[1:] * change[:-1] < 0
+        at = 1 + jnp.argmin(jnp.where(extremal, jnp.abs(growth[1:-1]), jnp.inf))
+        found = jnp.any(extremal)
+        bracket = jnp.where(found, jnp.stack([distances[at - 1], distances[at + 1]]), bracket)
+        return bracket, (jax.tree.map(lambda leaf: leaf[at], orbits), found)
+
+    _, (orbits, found) = lax.scan(narrow, jnp.array([1e-3, 10.0]), None, length=2)
+    orbit, found = jax.tree.map(lambda leaf: leaf[-1], (orbits, found))
+    chain, z = meshed(still, turn_of(orbit, size, len(osc.belts)))
+    status = jnp.where(jnp.any(eligible) & found, Status.OK.value, Status.NO_FOLD.value)
+
+    def judge(osc, z_found, cycle, slope):
+        # A cycle that has shrunk to the equilibrium has multiplier one too: a Hopf point.
+        size = jnp.max(z[:, 0]) - jnp.min(z[:, 0])
+        shrunk = cycle.x1_max - cycle.x1_min < 0.2 * size
+        fails = (cycle.status == Status.OK) & (shrunk | ~(jnp.abs(slope - 1) < 1e-6))
+        return jnp.where(fails, Status.NO_FOLD.value, cycle.status), jnp.asarray(jnp.nan)
+
+    p0 = jax.tree.leaves(still)[index][None]
+    return _solved_point(osc, _UnitMultiplier(chain, index), z, p0, status, judge)
+
+
+# --- points without a cycle -----------------------------------------------------------------------
 
 
 def _small_newton(equations, osc, unknowns):
@@ -535,7 +629,8 @@ def unexplained_point(osc: Oscillator, index: int, value: float, width: float) -
     return replace(point, condition=Unexplained(), status=status)
 
 
-def _at_hopf(osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoint:
+def at_hopf(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
+    """A fixed point whose trace vanishes."""
     rests = equilibria(lax.stop_gradient(osc))
     fixed = rests.kind == EquilibriumKind.FIXED_POINT
     row = jnp.argmin(jnp.where(fixed, jnp.abs(rests.rate), jnp.inf))
@@ -549,7 +644,7 @@ def _at_hopf(osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoi
             mode_acceleration(osc, mode, u[0], rest)[None], trace_of(osc, mode, u[0], rest)
         )
 
-    p0 = jax.tree.leaves(osc)[index]
+    p0 = parameter(osc, index)
     x1 = jnp.where(fixed[row], rests.x1[row], 0.0)
     u, steps, size, error = _small_newton(equations, osc, jnp.stack([x1, p0]))
     at_point = vary(osc, index, u[1:])
@@ -560,7 +655,8 @@ def _at_hopf(osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoi
     return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.EQUILIBRIUM)
 
 
-def _at_rest(osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoint:
+def at_rest(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
+    """The first of the belts comes to rest, and a cycle sticks to it."""
     belt = belts[0]
     still = lax.stop_gradient(osc)
     # From a guess on the point itself there is no orbit to follow; its cycles lie beside it.
@@ -584,13 +680,13 @@ def _at_rest(osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoi
         limit = jnp.sign(_velocity(beside, belt)) * capacity(osc, mode)
         return jnp.stack([mode_acceleration(osc, mode, u[0], rest) + limit, nu])
 
-    p0 = jax.tree.leaves(osc)[index]
+    p0 = parameter(osc, index)
     u, steps, size, error = _small_newton(equations, osc, jnp.stack([start[0], p0]))
     status = jnp.where(sticks, Status.OK.value, Status.NOT_TOUCHED.value)
     status = jnp.where(size < 1e-9, status, Status.NO_CONVERGENCE.value)
     return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.STUCK_FOREVER)
 
 
-#: What solves for a condition, if not `_at_cycle`; and on which side of one the multiplier lies.
-_SOLVERS = {Hopf: _at_hopf, SuddenSliding: _at_rest}
+#: What solves for a condition, if not `at_cycle`; and on which side of one the multiplier lies.
+_SOLVERS = {Hopf: at_hopf, SuddenSliding: at_rest, FoldOfCycles: _at_fold_of_cycles}
 _SIDES = {NonsmoothFold: 1.0, GrazingSliding: -1.0}

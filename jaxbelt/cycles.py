@@ -689,7 +689,7 @@ def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     return slope[None]
 
 
-def _closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
+def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
     """The largest error in the shooting equations, and the determinant of the monodromy matrix with
     stick phases left out: exp of the mean divergence, and at each crossing of a boundary the
     determinant of its saltation matrix, x2' after over before.
@@ -751,7 +751,7 @@ def cycle_of(
 ) -> tuple[Cycle, Array]:
     """The `Cycle` of a solution z, NaN with a status where it is none; and its multiplier with
     stick phases left out."""
-    error, slope = _closure(osc, chain, z)
+    error, slope = closure(osc, chain, z)
     status = _first_failure(status, error < 1e-9, Status.NO_CONVERGENCE)
     status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
@@ -846,6 +846,20 @@ def unstable_cycle(osc: Oscillator, *, max_arcs: int | None = None) -> Cycle:
     return _unstable_cycle(osc, size)
 
 
+def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
+    """The orbit from (x1 + distance, 0) to its first maximum of x1, within `size` arcs.
+
+    Returns it as if that turn repeated, whether it meets a boundary, and x1 there (NaN: none).
+    """
+    orbit = follow(osc, jnp.stack([x1 + distance, jnp.zeros(())]), size)
+    is_top = ~jnp.isnan(orbit.tops)
+    row = jnp.where(jnp.any(is_top), jnp.argmax(is_top), size)
+    meets = jnp.any((jnp.arange(size) <= row) & (orbit.ends < len(osc.belts)))
+    top = jnp.where(row < size, orbit.tops[jnp.minimum(row, size - 1)], jnp.nan)
+    closed = (jnp.asarray(-1), row + 1)
+    return eqx.tree_at(lambda o: (o.repeats, o.count), orbit, closed), meets, top
+
+
 @eqx.filter_jit
 def _unstable_cycle(osc: Oscillator, size: int) -> Cycle:
     still = lax.stop_gradient(osc)
@@ -855,17 +869,10 @@ def _unstable_cycle(osc: Oscillator, size: int) -> Cycle:
     x1 = jnp.where(exists, rests.x1[jnp.argmax(eligible)], 0.0)
 
     def turn(distance):
-        orbit = follow(still, jnp.stack([x1 + distance, jnp.zeros(())]), size)
-        rows = jnp.arange(size)
-        is_top = ~jnp.isnan(orbit.tops)
-        top = jnp.where(jnp.any(is_top), jnp.argmax(is_top), size)
-        touches = jnp.any((rows <= top) & (orbit.ends < len(osc.belts)))
-        nearer = orbit.tops[jnp.minimum(top, size - 1)] - x1 < distance
+        orbit, touches, top = first_turn(still, x1, distance, size)
         captured = orbit.status == Status.PSEUDO_FOCUS
-        inside = ~touches & (captured & (top == size) | (top < size) & nearer)
-        return eqx.tree_at(
-            lambda o: (o.repeats, o.count), orbit, (jnp.asarray(-1), top + 1)
-        ), inside
+        inside = ~touches & jnp.where(jnp.isnan(top), captured, top - x1 < distance)
+        return orbit, inside
 
     def narrow(bracket, _):
         distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))

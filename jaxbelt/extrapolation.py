@@ -5,7 +5,7 @@ results, whose errors are even in the substep's length, are extrapolated to leng
 over substeps it compiles to one small kernel. A Runge-Kutta scheme of that order does not: its
 stages, written out, take minutes to compile, and as an array they make a step ten times as slow.
 
-Source: E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations I, section II.9.
+Source: E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations I, sec. II.9.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 State = tuple[Array, ...]
 #: One row a substep: its length, whether it is the first of its rule, and the weights of the rule's
@@ -38,7 +38,7 @@ def _weight(n: int, sizes: tuple[int, ...]) -> float:
 
 
 def increments(
-    field: Callable[[State], State], start: State, h: Array, scheme: Scheme
+    field: Callable[[State], State], start: State, h: ArrayLike, scheme: Scheme
 ) -> tuple[State, ...]:
     """What each result of the scheme adds to the state in one step of size h.
 

@@ -30,6 +30,7 @@ class Status(enum.IntEnum):
     NOT_IDENTIFIED = 16
     MISFIT = 17
     UNREACHABLE = 18
+    NO_FOLD = 19
 
 
 ADVICE = {
@@ -79,6 +80,10 @@ ADVICE = {
     Status.OTHER_KIND: (
         "The cycle does touch the boundary at a point near here, but the point is of another kind: "
         "a nonsmooth fold ends the cycle, at a grazing point it goes on to both sides."
+    ),
+    Status.NO_FOLD: (
+        "No turn of the orbits around the equilibrium is extremal in its growth, or none that is "
+        "closes nearby: no two cycles meet near here."
     ),
     Status.NO_FIXED_POINT: "There is no fixed point in a smooth field whose trace could vanish.",
     Status.UNEXPLAINED: (

@@ -726,7 +726,7 @@ def simulate(
 def _has_edges(osc: Oscillator) -> bool:
     """Whether a contact edge is finite, or not known to be infinite."""
     bounds = [(belt.lower, belt.upper) for belt in osc.belts]
-    return not is_concrete(bounds) or bool(np.any(np.isfinite(bounds)))
+    return not is_concrete(bounds) or bool(np.any(np.isfinite(np.asarray(bounds))))
 
 
 def _power_of_two(value: float, least: int) -> int:

@@ -28,7 +28,7 @@ from oracle import (
     start_mode,
     touches,
 )
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 
 
 @dataclass(frozen=True)
@@ -342,3 +342,24 @@ def grazing(make, bracket, belt, y0=(3.0, 0.0)):
     else:
         raise ValueError(f"the cycle sticks to belt {belt} at both ends of {bracket}")
     return _solve(lambda p: gap(make(p), onset_belt, belt), bracket)
+
+
+def fold_of_cycles(make, bracket, distances):
+    """Parameter at which two cycles that touch no boundary meet and vanish.
+
+    A turn from (focus + d, 0) grows by a factor; between the two cycles that is above one.
+    They meet where its largest value over the distances d is just one.
+    """
+
+    def largest(p):
+        osc = make(p)
+        ((focus, _),) = foci(osc)
+
+        def growth(d):
+            return -((one_turn(osc, focus + d).stopped_by.x1 - focus) / d - 1)
+
+        best = minimize_scalar(growth, bounds=distances, method="bounded", options={"xatol": 1e-7})
+        assert distances[0] + 1e-3 < best.x < distances[1] - 1e-3, "the largest value is at an end"
+        return -best.fun
+
+    return _solve(largest, bracket)

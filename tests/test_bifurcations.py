@@ -121,6 +121,40 @@ def test_a_guess_that_fits_no_such_point_is_told_so(condition, nu, status):
     assert jnp.isnan(point.value) and jb.describe(status) in repr(point)
 
 
+class Lorentz(jb.AbstractFriction):
+    """A law of the user's own, mu(r) = kinetic + (static - kinetic)/(1 + (r/velocity)^2)."""
+
+    static: jax.Array
+    kinetic: jax.Array
+    velocity: jax.Array
+
+    def mu(self, speed):
+        return self.kinetic + (self.static - self.kinetic) / (1 + (speed / self.velocity) ** 2)
+
+
+@pytest.mark.parametrize("nu", [0.483, 0.52])
+def test_fold_of_cycles(nu):
+    """Two cycles that do not stick meet; from guesses on either side, 0.015 and 0.02 away."""
+    law = Lorentz(jnp.asarray(1.0), jnp.asarray(0.6), jnp.asarray(0.4))
+    point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.4, (jb.Belt(nu, law),)), where=nu0)
+
+    def make(nu):
+        belt = oracle.Belt(nu, lambda r: 0.6 + 0.4 / (1 + (r / 0.4) ** 2), 1.0, 1.0)
+        return oracle.Oscillator(0.4, (belt,), 1.0)
+
+    expected = oracle_cycles.fold_of_cycles(make, (0.49, 0.503), (0.2, 0.8))
+    # The oracle's largest value is good to 1e-14, its slope by nu is about 4.
+    assert point.value == pytest.approx(expected, abs=1e-11)
+    assert point.residual < 1e-11 and point.iterations <= 8
+    assert point.cycle.multiplier == pytest.approx(1, abs=1e-10)
+    assert point.cycle.signature == ()
+
+
+def test_a_hopf_point_is_no_fold_of_cycles():
+    point = jb.refine(jb.FoldOfCycles(), class_b(0.27), where=nu0)
+    assert point.status == Status.NO_FOLD and jnp.isnan(point.value)
+
+
 def test_convergence_is_quadratic():
     """Each Newton step is about the square of the one before, until rounding ends it."""
     point = jb.refine(jb.NonsmoothFold(0), jb.presets.class_a(0.28), where=nu0)
