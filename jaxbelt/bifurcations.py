@@ -490,7 +490,7 @@ class _UnitMultiplier(eqx.Module):
     """A cycle with its signature fixed, and multiplier one."""
 
     chain: Chain
-    index: int = eqx.field(static=True)
+    index: int | Array
 
     def residual(self, osc: Oscillator, z: Array, p: Array) -> Array:
         osc = vary(osc, self.index, p)
@@ -519,7 +519,7 @@ class _UnitMultiplier(eqx.Module):
         return self.chain
 
 
-def _at_fold_of_cycles(osc: Oscillator, index: int, belts, wanted, size) -> BifurcationPoint:
+def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
     """Two cycles meet where a turn neither grows nor shrinks, and neither do its neighbours.
 
     So the guess is the first turn whose growth is extremal among its neighbours'; of several the
@@ -558,7 +558,7 @@ def _at_fold_of_cycles(osc: Oscillator, index: int, belts, wanted, size) -> Bifu
         fails = (cycle.status == Status.OK) & (shrunk | ~(jnp.abs(slope - 1) < 1e-6))
         return jnp.where(fails, Status.NO_FOLD.value, cycle.status), jnp.asarray(jnp.nan)
 
-    p0 = jax.tree.leaves(still)[index][None]
+    p0 = parameter(still, index)[None]
     return _solved_point(osc, _UnitMultiplier(chain, index), z, p0, status, judge)
 
 
@@ -688,5 +688,5 @@ def at_rest(osc: Oscillator, index: int | Array, belts, wanted, size) -> Bifurca
 
 
 #: What solves for a condition, if not `at_cycle`; and on which side of one the multiplier lies.
-_SOLVERS = {Hopf: at_hopf, SuddenSliding: at_rest, FoldOfCycles: _at_fold_of_cycles}
+_SOLVERS = {Hopf: at_hopf, SuddenSliding: at_rest, FoldOfCycles: at_fold_of_cycles}
 _SIDES = {NonsmoothFold: 1.0, GrazingSliding: -1.0}
