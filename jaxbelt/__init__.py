@@ -19,6 +19,7 @@ from .bifurcations import (
     refine,
 )
 from .cycles import Cycle, find_cycle, unstable_cycle
+from .detection import scan
 from .equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
 from .friction import AbstractFriction, Conti, Coulomb, Stribeck
 from .functionals import (
@@ -84,6 +85,7 @@ __all__ = [
     "plot_vector_field",
     "presets",
     "refine",
+    "scan",
     "simulate",
     "slip_duration",
     "stick_duration",

@@ -24,21 +24,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array
 
 from .bifurcations import (
     AbstractCondition,
     BifurcationPoint,
+    FoldOfCycles,
     GrazingSliding,
     Hopf,
     NonsmoothFold,
     SlidingExchange,
     SuddenSliding,
+    at_cycle,
+    at_fold_of_cycles,
+    at_hopf,
+    at_rest,
     before_onset,
     leaf_index,
-    refine,
-    touch,
     unexplained_point,
     vary,
 )
@@ -104,7 +106,7 @@ def search(path: "Path", resolution: int = 96) -> tuple[BifurcationPoint, ...]:
                 before, after = path.beside(float(point.value))
                 cut += [[a, max(a, before)], [min(b, after), b]]
             elif b - a <= 1e-9 * path.length:
-                points.append(unexplained_point(path.osc, path.index, 0.5 * (a + b), b - a))
+                points.append(unexplained_point(path.osc, int(path.index), 0.5 * (a + b), b - a))
             else:
                 cut.append(list(np.linspace(a, b, 3 if b - a <= NEAR * path.length else 9)))
         path.look([value for values in cut for value in values])
@@ -133,6 +135,11 @@ class Label(NamedTuple):
             belt for cycle in self.cycles for kind, belt in cycle if kind == EventKind.STICK
         )
 
+    @property
+    def smooth(self) -> int:
+        """How many cycles stick to no belt."""
+        return sum(all(kind != EventKind.STICK for kind, _ in cycle) for cycle in self.cycles)
+
 
 class Path:
     """A path in one parameter: its labels, each computed once."""
@@ -150,7 +157,8 @@ class Path:
         check_finite(span, "span")
         self.first, self.last = (float(end) for end in span)
         require(self.first < self.last, "span", "(first, last) with first < last", tuple(span))
-        self.osc, self.index = osc, leaf_index(osc, where)
+        # As an array: one program serves all parameters.
+        self.osc, self.index = osc, jnp.asarray(leaf_index(osc, where))
         for value in (self.first, self.last):
             self.at(value).check()
         self.length = self.last - self.first
@@ -167,16 +175,16 @@ class Path:
         return value - CLOSE * self.length, value + CLOSE * self.length
 
     @property
-    def belt(self) -> int | None:
-        """The belt whose velocity is varied, if it is one."""
+    def belt(self) -> int:
+        """The belt whose velocity is varied, or -1."""
         for belt in range(len(self.osc.belts)):
             if leaf_index(self.osc, lambda osc, belt=belt: osc.belts[belt].velocity) == self.index:
                 return belt
-        return None
+        return -1
 
     def _coincidences(self) -> list[float]:
         """Where the belt that is varied is at rest, or runs with another one."""
-        if self.belt is None:
+        if self.belt < 0:
             return []
         others = [float(b.velocity) for i, b in enumerate(self.osc.belts) if i != self.belt]
         inside = [v for v in {0.0, *others} if self.first <= v <= self.last]
@@ -209,7 +217,7 @@ class _Seen(NamedTuple):
 
 
 @eqx.filter_jit
-def _look(osc: Oscillator, index: int, values: Array) -> _Seen:
+def _look(osc: Oscillator, index: Array, values: Array) -> _Seen:
     return jax.vmap(lambda p: _look_at(vary(osc, index, p[None])))(values)
 
 
@@ -298,81 +306,88 @@ def _signature(codes: np.ndarray, ends: np.ndarray) -> Signature:
 # --- what makes the difference between two values -------------------------------------------------
 
 
+class _Guess(NamedTuple):
+    """A value near which a condition may hold, and the interval that it is to explain."""
+
+    interval: tuple[float, float]
+    value: float
+    condition: AbstractCondition
+
+
 def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoint | None]:
     """For every interval a bifurcation point inside it, or None."""
-    found: dict[tuple[float, float], BifurcationPoint | None] = dict.fromkeys(intervals)
-    guesses: list[tuple[tuple[float, float], float, int]] = []
+    guesses = []
     for a, b in intervals:
         before, after = path.label(a), path.label(b)
+        conditions: list[AbstractCondition] = []
         if before.equilibria != after.equilibria:
-            guesses += [((a, b), value, -1) for value in (a, b)]
+            conditions.append(Hopf())
         changed = (before.sticks - after.sticks) + (after.sticks - before.sticks)
-        guesses += [((a, b), value, belt) for belt in changed for value in (a, b)]
-    for kind in (True, False):
-        chosen = [guess for guess in guesses if (guess[2] < 0) == kind]
-        points = _refined(path, chosen)
-        for ((a, b), _, _), point in zip(chosen, points, strict=True):
-            inside = a <= point.value <= b
-            if point.status == Status.OK and inside and found[a, b] is None:
-                found[a, b] = point
+        # Whether a tangency is a fold or grazing is seen when it is found.
+        conditions += [GrazingSliding(belt) for belt in changed]
+        if before.smooth != after.smooth:
+            conditions.append(FoldOfCycles())
+        guesses += [_Guess((a, b), value, one) for one in conditions for value in (a, b)]
+    found: dict[tuple[float, float], BifurcationPoint | None] = dict.fromkeys(intervals)
+    for guess, point in _refined(path, guesses):
+        a, b = guess.interval
+        if point.status == Status.OK and a <= point.value <= b and found[a, b] is None:
+            found[a, b] = point
     return found
-
-
-def _refined(path: Path, guesses) -> list[BifurcationPoint]:
-    """Hopf points (belt -1) or tangencies to a belt from each guess, in batches."""
-    points = []
-    for batch in (guesses[i : i + GUESSES] for i in range(0, len(guesses), GUESSES)):
-        filled = [*batch, *[batch[0]] * (GUESSES - len(batch))]
-        values = jnp.asarray(np.array([value for _, value, _ in filled]))
-        if batch[0][2] < 0:
-            solved = _hopf_points(path.osc, path.index, values)
-        else:
-            belts = jnp.asarray(np.array([belt for _, _, belt in filled]))
-            solved = _touches(path.osc, path.index, values, belts)
-        for lane, (_, _, belt) in enumerate(batch):
-            point = pick(solved, lane)
-            if belt >= 0:
-                is_fold = float(point.multiplier) > 1
-                kind = NonsmoothFold(belt) if is_fold else GrazingSliding(belt)
-                point = replace(point, condition=kind)
-            points.append(point)
-    return points
-
-
-@eqx.filter_jit
-def _hopf_points(osc: Oscillator, index: int, values: Array) -> BifurcationPoint:
-    here = lambda o: jax.tree.leaves(o)[index]  # noqa: E731
-    return jax.vmap(lambda p: refine(Hopf(), vary(osc, index, p[None]), where=here))(values)
-
-
-@eqx.filter_jit
-def _touches(osc: Oscillator, index: int, values: Array, belts: Array) -> BifurcationPoint:
-    def one(p, belt):
-        at = vary(osc, index, lax.stop_gradient(p)[None])
-        return touch(AbstractCondition(), at, belt, index, SIZES[1])
-
-    return jax.vmap(one)(values, belts)
 
 
 def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
     """The points where the varied belt is at rest or runs with another one."""
     belt = path.belt
-    assert belt is not None
     conditions: list[AbstractCondition] = [SuddenSliding(belt)] if value == 0 else []
     for other, its in enumerate(path.osc.belts):
         if other != belt and float(its.velocity) == value:
             conditions.append(SlidingExchange((min(belt, other), max(belt, other))))
-    points = []
-    for condition in conditions:
-        for guess in (value + 1e-2, value - 1e-2):
-            point = refine(
-                condition, path.at(guess), where=lambda o: jax.tree.leaves(o)[path.index]
-            )
-            if point.status == Status.OK:
-                points.append(point)
-                break
-    path.look(path.beside(value))
-    before, after = map(path.label, path.beside(value))
-    if not points and before != after:
-        points.append(unexplained_point(path.osc, path.index, value, 0.0))
-    return points
+    interval = path.beside(value)
+    guesses = [
+        _Guess(interval, value + offset, one) for one in conditions for offset in (1e-2, -1e-2)
+    ]
+    found = {g.condition: p for g, p in _refined(path, guesses) if p.status == Status.OK}
+    path.look(interval)
+    before, after = map(path.label, interval)
+    if not found and before != after:
+        return [unexplained_point(path.osc, int(path.index), value, 0.0)]
+    return list(found.values())
+
+
+def _refined(path: Path, guesses: list[_Guess]) -> list[tuple[_Guess, BifurcationPoint]]:
+    """The guesses, those of one kind after those of another, with the points found from them."""
+    out = []
+    for solve in (at_hopf, at_cycle, at_rest, at_fold_of_cycles):
+        own = [guess for guess in guesses if _solver(guess.condition) == solve]
+        for batch in (own[i : i + GUESSES] for i in range(0, len(own), GUESSES)):
+            filled = [*batch, *[batch[0]] * (GUESSES - len(batch))]
+            values = jnp.asarray(np.array([guess.value for guess in filled]))
+            belts = jnp.asarray(np.array([_belts(guess.condition) for guess in filled]))
+            solved = _points(solve, path.osc, path.index, values, belts)
+            for lane, guess in enumerate(batch):
+                point, condition = pick(solved, lane), guess.condition
+                if isinstance(condition, GrazingSliding) and point.multiplier > 1:
+                    condition = NonsmoothFold(condition.belt)
+                out.append((guess, replace(point, condition=condition)))
+    return out
+
+
+def _solver(condition: AbstractCondition) -> Callable:
+    special = {Hopf: at_hopf, SuddenSliding: at_rest, FoldOfCycles: at_fold_of_cycles}
+    return special.get(type(condition), at_cycle)
+
+
+def _belts(condition: AbstractCondition) -> tuple[int, int]:
+    if isinstance(condition, SlidingExchange):
+        return condition.belts
+    belt = condition.belt if isinstance(condition, GrazingSliding | SuddenSliding) else 0
+    return belt, belt
+
+
+@eqx.filter_jit
+def _points(solve, osc: Oscillator, index: Array, values: Array, belts: Array) -> BifurcationPoint:
+    def one(p, pair):
+        return solve(vary(osc, index, p[None]), index, pair, jnp.zeros(()), SIZES[1])
+
+    return jax.vmap(one)(values, belts)

@@ -1,0 +1,137 @@
+"""The points that `scan` finds by itself, against the exact table, simulation and the oracle."""
+
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import EventKind, Status
+from jaxbelt.bifurcations import leaf_index, vary
+
+
+def nu0(osc):
+    return osc.belts[0].velocity
+
+
+# Class (b), nu1 = 0.35: the paper's seven points and the one that it misses, see test_bifurcations.
+POINTS = [
+    (jb.NonsmoothFold(1), -0.561302406210),
+    (jb.GrazingSliding(0), -0.455724862289),
+    (jb.Hopf(), -0.263654916039),
+    (jb.GrazingSliding(1), -0.078804734107),
+    (jb.SuddenSliding(0), 0.0),
+    (jb.Hopf(), 0.263654916039),
+    (jb.SlidingExchange((0, 1)), 0.35),
+    (jb.NonsmoothFold(1), 0.538734800481),
+]
+
+
+def test_the_papers_path():
+    """All of them, in order, nothing else; to the 1e-11 that they are known to."""
+    points = jb.scan(jb.presets.class_b(0.3, 0.35), nu0, (-1.0, 1.0))
+    assert [point.condition for point in points] == [condition for condition, _ in POINTS]
+    assert [point.value for point in points] == pytest.approx([v for _, v in POINTS], abs=2e-11)
+    for point in points:
+        assert point.status == Status.OK and point.error < 1e-10
+        assert (point.kind == "NonsmoothFold") == bool(point.multiplier > 1)
+
+
+def test_several_points_between_two_of_the_first_values():
+    """Asked at five values only, it still sees the fold and two grazing points in one interval."""
+    points = jb.scan(jb.presets.class_b(0.3, 0.45), nu0, (-1.0, 1.0), resolution=4)
+    fine = jb.scan(jb.presets.class_b(0.3, 0.45), nu0, (-1.0, 1.0))
+    assert [point.condition for point in points] == [point.condition for point in fine]
+    assert [point.value for point in points] == pytest.approx([p.value for p in fine], abs=1e-11)
+    inside = [point.condition for point in points if -0.55 < point.value < -0.3]
+    assert inside == [jb.NonsmoothFold(1), jb.GrazingSliding(0), jb.GrazingSliding(1)]
+    expected = oracle_cycles.grazing(lambda nu: oracle.class_b(nu, 0.45), (-0.35, -0.32), 1)
+    assert points[2].value == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_path_in_the_damping():
+    """No velocity is varied, and the answer was not known beforehand."""
+    points = jb.scan(jb.presets.class_b(-0.2, 0.35), lambda osc: osc.damping, (0.0, 1.5))
+    assert [point.condition for point in points] == [
+        jb.Hopf(),
+        jb.GrazingSliding(1),
+        jb.NonsmoothFold(0),
+    ]
+
+    def at(zeta):
+        return oracle.class_b(-0.2, 0.35, zeta=zeta)
+
+    # The trace vanishes where zeta is the sum of p3 (mus - p1) / (1 + p3 |nu|)^2, eq. (27).
+    assert points[0].value == pytest.approx(4 / 3**2 + 4 / 4.5**2, abs=1e-14)
+    grazing, fold = (float(point.value) for point in points[1:])
+    expected = oracle_cycles.grazing(at, (grazing - 0.01, grazing + 0.01), 1)
+    assert grazing == pytest.approx(expected, abs=1e-9)
+    expected = oracle_cycles.nonsmooth_fold(at, (fold - 0.01, fold + 0.01), 0)
+    assert fold == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_change_that_no_condition_explains_is_reported():
+    """The fixed point meets the edge beyond which belt 0 no longer drags it."""
+    belts = (
+        jb.Belt(0.8, jb.Conti(1.0, 0.6, 10.0), upper=2.0),
+        jb.Belt(0.9, jb.Conti(1.0, 0.6, 10.0)),
+    )
+    osc = jb.Oscillator(0.5, belts)
+    (point,) = jb.scan(osc, lambda osc: osc.belts[0].upper, (1.0, 1.5), resolution=8)
+    assert point.kind == "Unexplained" and point.status == Status.UNEXPLAINED
+    # There x1 is the friction of both, 2 p1 + (mus - p1) (1/9 + 1/10); known to 1e-9 of the span.
+    assert point.value == pytest.approx(1.2 + 0.4 * (1 / 9 + 1 / 10), abs=1e-9)
+    assert "Simulate on both sides" in repr(point)
+
+
+@pytest.mark.parametrize(
+    ("span", "message"),
+    [
+        ((1.0, -1.0), "span must be .first, last. with first < last"),
+        ((0.0, np.inf), "span must be finite"),
+        ((-1.0, 1.0), "load of belt 0 must be >= 0"),
+    ],
+)
+def test_impossible_spans_are_named(span, message):
+    with pytest.raises(ValueError, match=message):
+        jb.scan(jb.presets.class_b(0.3, 0.35), lambda osc: osc.belts[0].load, span)
+
+
+def brute_force(osc, where, values, starts):
+    """Belts that each start sticks to in the end, [values, starts, belts]; plain simulation."""
+    index, end = leaf_index(osc, where), 160.0
+
+    def sticks(value, start):
+        run = jb.simulate(
+            vary(osc, index, value[None]), start, end, rtol=1e-6, atol=1e-6, max_segments=512
+        )
+        late = (run.events.t > 0.75 * end) & (run.events.kind == EventKind.STICK)
+        return jnp.stack([jnp.any(late & (run.events.belt == k)) for k in range(len(osc.belts))])
+
+    lanes = jax.jit(jax.vmap(jax.vmap(sticks, (None, 0)), (0, None)))
+    return np.asarray(lanes(jnp.asarray(values), jnp.asarray(starts)))
+
+
+#: What is found where, belts stuck to in the stretches between the points, and "rest" is stable.
+STRETCHES = ["rest", "rest 1", "rest 01", "01", "0", "0", "rest 0", "rest 1", "rest"]
+
+
+@pytest.mark.slow
+def test_simulation_agrees_between_any_two_points():
+    values = [-1.0, *(value for _, value in POINTS), 1.0]
+    places = [np.linspace(a, b, 4)[1:-1] for a, b in pairwise(values)]
+    # Far out; at the fixed points, which all lie between -0.7 and 1.7; and on either side.
+    osc = jb.presets.class_b(0.3, 0.35)
+    starts = np.array([(3.0, 0.0), (0.0, 0.3), (-2.0, -0.5)])
+    found = brute_force(osc, nu0, np.concatenate(places), starts).reshape(len(places), 2, 3, 2)
+    for stretch, expected in zip(found, STRETCHES, strict=True):
+        belts = {int(belt) for belt in expected if belt.isdigit()}
+        for place in stretch:
+            seen = {tuple(np.flatnonzero(sticks)) for sticks in place}
+            allowed = {tuple(sorted(belts))} | ({()} if "rest" in expected else set())
+            # From far out everything comes to the sticking cycle where there is one.
+            assert tuple(np.flatnonzero(place[0])) == tuple(sorted(belts)) and seen <= allowed
