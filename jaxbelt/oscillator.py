@@ -72,7 +72,7 @@ class Belt(eqx.Module):
         self.friction.check(f"friction of {owner}")
         if is_concrete((self.lower, self.upper)):
             require(not np.isnan(self.lower), f"lower of {owner}", "a number", self.lower)
-            if not self.lower < self.upper:
+            if not np.asarray(self.lower) < np.asarray(self.upper):
                 require(False, f"lower of {owner}", f"< {self.upper}", self.lower)
 
     def __repr__(self) -> str:
