@@ -778,7 +778,8 @@ def _follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
 
 
 @eqx.filter_jit
-def _polish(osc: Oscillator, orbit: Orbit, size: int) -> Cycle:
+def polish(osc: Oscillator, orbit: Orbit, size: int) -> Cycle:
+    """The cycle whose turn an orbit repeats, by Newton's method, in so many arcs."""
     _, count = last_turn(orbit)
     status = _first_failure(orbit.status, count <= size, Status.TOO_MANY_ARCS)
     # Where there is no cycle a turn of the orbit still gives finite numbers to calculate with.
@@ -807,7 +808,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     orbit = _follow(osc, y0, BUDGET)
-    return _polish(osc, orbit, _room(orbit, max_arcs))
+    return polish(osc, orbit, _room(orbit, max_arcs))
 
 
 def _room(orbit: Orbit, max_arcs: int | None) -> int:
