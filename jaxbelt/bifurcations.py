@@ -24,6 +24,7 @@ unknowns of fixed-signature shooting (see `cycles`) the same equation is harmles
   has the multiplier zero and takes part in nonsmooth folds only.)
 """
 
+import abc
 import functools
 from collections.abc import Callable
 from dataclasses import replace
@@ -236,11 +237,28 @@ def _refine(solve: Callable, osc: Oscillator, index, belts, wanted, size) -> Bif
 
 
 class _System(eqx.Module):
-    """A fixed signature and a condition, for the parameter of that number.
+    """A fixed signature and a condition, for the parameter of that number."""
 
-    The condition: the two belts run at one velocity; if they are the same, an arc of the chain is
-    tangent to a boundary.
-    """
+    chain: eqx.AbstractVar[Chain]
+    index: eqx.AbstractVar[int | Array]
+
+    @abc.abstractmethod
+    def residual(self, osc: Oscillator, z: Array, p: Array) -> Array: ...
+
+    @abc.abstractmethod
+    def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
+        """The residual, and its Jacobian with respect to (z, p)."""
+
+    @property
+    def ordinary(self) -> Chain:
+        """The chain with every tangency as an ordinary arrival at the boundary."""
+        tangent = Ends(self.chain.codes.shape[-1]).tangent
+        ends = jnp.where(self.chain.ends >= tangent, self.chain.ends - tangent, self.chain.ends)
+        return Chain(self.chain.codes, ends, self.chain.mesh)
+
+
+class _Encounter(_System):
+    """Two belts run at one velocity; if they are the same, an arc is tangent to its boundary."""
 
     chain: Chain
     belts: Array
@@ -256,8 +274,6 @@ class _System(eqx.Module):
         return jnp.append(value.reshape(-1), self._condition(osc, miss))
 
     def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
-        """The residual, and its Jacobian with respect to (z, p)."""
-
         def osc_of(p):
             return vary(osc, self.index, p)
 
@@ -270,13 +286,6 @@ class _System(eqx.Module):
         )
         matrix = jnp.concatenate([equations, row[None]])
         return jnp.append(value.reshape(-1), g), matrix
-
-    @property
-    def ordinary(self) -> Chain:
-        """The chain with every tangency as an ordinary arrival at the boundary."""
-        tangent = Ends(self.chain.codes.shape[-1]).tangent
-        ends = jnp.where(self.chain.ends >= tangent, self.chain.ends - tangent, self.chain.ends)
-        return Chain(self.chain.codes, ends, self.chain.mesh)
 
 
 def _value_and_slopes(fn, p, miss):
@@ -438,7 +447,7 @@ def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, s
     before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
     tangent = chain.ends.at[before].set(names.tangent + belt)
     ends = jnp.where(exchange, chain.ends, tangent)
-    system = _System(Chain(chain.codes, ends, chain.mesh), belts, index)
+    system = _Encounter(Chain(chain.codes, ends, chain.mesh), belts, index)
     p0 = parameter(still, index)[None]
     return _solved_point(osc, system, z, p0, status, judge)
 
@@ -486,7 +495,7 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
 STARTS = 48
 
 
-class _UnitMultiplier(eqx.Module):
+class _UnitMultiplier(_System):
     """A cycle with its signature fixed, and multiplier one."""
 
     chain: Chain
@@ -498,8 +507,6 @@ class _UnitMultiplier(eqx.Module):
         return jnp.append(value.reshape(-1), closure(osc, self.chain, z)[1] - 1)
 
     def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
-        """The residual, and its Jacobian with respect to (z, p)."""
-
         def osc_of(p):
             return vary(osc, self.index, p)
 
@@ -513,10 +520,6 @@ class _UnitMultiplier(eqx.Module):
         )
         matrix = jnp.concatenate([equations, jnp.append(row[0].reshape(-1), row[1])[None]])
         return jnp.append(value.reshape(-1), m - 1), matrix
-
-    @property
-    def ordinary(self) -> Chain:
-        return self.chain
 
 
 def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:

@@ -264,6 +264,18 @@ def _divergence(osc, run):
     return total
 
 
+def integral_of_x1(run):
+    """Integral of x1 over the time of a run."""
+    total = 0.0
+    for arc in run.arcs:
+        starts = [t for t, _, _ in arc.steps] or [arc.t_start]
+        for a, b in zip(starts, [*starts[1:], arc.t_end]):
+            for node, weight in zip(_NODES, _WEIGHTS):
+                x1, _ = arc.at(0.5 * (a + b) + 0.5 * (b - a) * node)
+                total += 0.5 * (b - a) * weight * x1
+    return total
+
+
 # ---------------------------------------------------------------- nonstandard points
 
 

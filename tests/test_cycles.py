@@ -134,6 +134,74 @@ def test_derivatives_forward_and_reverse():
     assert jax.jacrev(functionals)(0.45) == pytest.approx(slopes, rel=1e-8)
 
 
+def test_derivatives_of_every_functional():
+    """Forward and reverse, against Richardson differences of the oracle, 1e-8 relative."""
+
+    def functionals(nu):
+        cycle = jb.find_cycle(jb.presets.class_a(nu), START)
+        beyond = jb.find_cycle(jb.presets.class_b(nu - 0.75, 0.35), START)  # sticks to belt 1 only
+        return jnp.stack(
+            [
+                jb.period(cycle),
+                jb.stick_duration(cycle, 0),
+                jb.slip_duration(cycle, 0),
+                jb.stick_fraction(cycle),
+                jb.amplitude(cycle),
+                jb.amplitude(cycle, "x2"),
+                jb.peak(cycle),
+                jb.peak(cycle, "x2"),
+                jb.energy_fed(cycle),
+                jb.energy_dissipated(cycle),
+                jb.gap(beyond, 0),
+            ]
+        )
+
+    def expected(nu):
+        cycle = oracle_cycles.sticking_cycle(oracle.class_a(nu))
+        beyond = oracle_cycles.sticking_cycle(oracle.class_b(nu - 0.75, 0.35))
+        stick = cycle.stick_durations[0]
+        # One belt: the work of its drive is nu times the mean friction, which is the spring's.
+        fed = nu * oracle_cycles.integral_of_x1(cycle.run)
+        return [
+            cycle.period,
+            stick,
+            cycle.period - stick,
+            stick / cycle.period,
+            (cycle.x1_max - cycle.x1_min) / 2,
+            (cycle.x2_max - cycle.x2_min) / 2,
+            max(cycle.x1_max, -cycle.x1_min),
+            max(cycle.x2_max, -cycle.x2_min),
+            fed,
+            fed,
+            beyond.x2_min - (nu - 0.75),
+        ]
+
+    nu = 0.24
+    assert functionals(nu) == pytest.approx(expected(nu), abs=1e-10)
+    slopes, _ = oracle.richardson(expected, nu, 8e-3, levels=4)
+    assert jax.jacfwd(functionals)(nu) == pytest.approx(slopes, rel=1e-8)
+    assert jax.jacrev(functionals)(nu) == pytest.approx(slopes, rel=1e-8)
+
+
+def test_square_root_law_near_the_hopf_point():
+    """The amplitude r of the unstable cycle: r^2 -> -(trace/2)/a with the Lyapunov coefficient a.
+
+    The next term of r^2 is relatively of the order of the distance, so two distances give the
+    limit by extrapolation, up to the square of the distance.
+    """
+    hopf = (np.sqrt(8) - 1) / 10
+    a = jb.lyapunov_coefficient(jb.presets.class_a(hopf))[0]
+
+    def ratio(distance):
+        osc = jb.presets.class_a(hopf + distance)
+        trace = jnp.trace(jb.equilibria(osc).jacobian[0])
+        return jb.amplitude(jb.unstable_cycle(osc)) ** 2 / (-(trace / 2) / a)
+
+    near, far = ratio(1e-4), ratio(2e-4)
+    assert near == pytest.approx(1, abs=0.02) and abs(near - 1) < 0.6 * abs(far - 1)
+    assert 2 * near - far == pytest.approx(1, abs=2e-4)
+
+
 def test_a_batch_of_cycles_is_each_of_them():
     nus = jnp.array([0.45, -0.3, 0.6])
     batch = jax.jit(jax.vmap(lambda nu: jb.find_cycle(jb.presets.class_b(nu, 0.35), START)))(nus)

@@ -43,7 +43,7 @@ def test_random_runs_agree_with_the_oracle(kind, seed, record_property):
     """25 runs a test: 100 of classes (a) and (b), 100 of (c), 100 of (d)."""
     kind = kind[seed % 2] if kind == "ab" else kind
     rng = np.random.default_rng([ord(kind), seed])
-    set_aside, foci, magnified, worst = 0, 0, 0, 0.0
+    set_aside, foci, worst = 0, 0, 0.0
     for _ in range(25):
         parameters, y0 = random_case(kind, rng)
         expected = oracle.simulate(getattr(oracle, f"class_{kind}")(*parameters), y0, SPAN)
@@ -58,18 +58,12 @@ def test_random_runs_agree_with_the_oracle(kind, seed, record_property):
         assert run.status in (Status.OK, Status.STUCK_FOREVER), (parameters, y0, run)
         assert kinds(run) == [(e.kind, e.belt) for e in expected.events], (parameters, y0)
         error = difference(run, expected)
-        if error > 1e-8:
-            # Many slow passages of an edge: the clock drifts in the oracle itself as far as here
-            # when it is given our tolerance.
-            there = getattr(oracle, f"class_{kind}")(*parameters)
-            rerun = oracle.simulate(there, y0, SPAN, rtol=1e-10, atol=1e-10)
-            magnified += 1
-            assert error < difference(rerun, expected), (parameters, y0, error)
+        assert error < 1e-8, (parameters, y0, error)
         worst = max(worst, error)
-    report = f"{set_aside} set aside, {foci} pseudo-foci, {magnified} above 1e-8, worst {worst:.1e}"
+    report = f"{set_aside} set aside, {foci} pseudo-foci, worst error {worst:.1e}"
     record_property("report", report)
     print(f"class {kind}, seed {seed}: {report}")
-    assert set_aside + magnified <= 5
+    assert set_aside <= 5
 
 
 def difference(run, expected):
