@@ -778,12 +778,16 @@ def _follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
 
 
 @eqx.filter_jit
-def polish(osc: Oscillator, orbit: Orbit, size: int) -> Cycle:
-    """The cycle whose turn an orbit repeats, by Newton's method, in so many arcs."""
+def _polish(osc: Oscillator, orbit: Orbit, size: int) -> Cycle:
     _, count = last_turn(orbit)
     status = _first_failure(orbit.status, count <= size, Status.TOO_MANY_ARCS)
     # Where there is no cycle a turn of the orbit still gives finite numbers to calculate with.
-    chain, guess = meshed(lax.stop_gradient(osc), turn_of(orbit, size, len(osc.belts)))
+    return polish(osc, turn_of(orbit, size, len(osc.belts)), status)
+
+
+def polish(osc: Oscillator, turn: Turn, status: Array) -> Cycle:
+    """The cycle that a turn nearly is, by Newton's method."""
+    chain, guess = meshed(lax.stop_gradient(osc), turn)
     z, iterations = _solve(osc, chain, guess)
     return cycle_of(osc, chain, z, iterations, status)[0]
 
@@ -808,7 +812,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     orbit = _follow(osc, y0, BUDGET)
-    return polish(osc, orbit, _room(orbit, max_arcs))
+    return _polish(osc, orbit, _room(orbit, max_arcs))
 
 
 def _room(orbit: Orbit, max_arcs: int | None) -> int:
