@@ -36,6 +36,7 @@ from .functionals import (
 from .oscillator import Belt, Oscillator
 from .results import EventKind, Status, describe
 from .simulate import Arcs, Events, Trajectory, simulate
+from .sweep import sweep
 
 if TYPE_CHECKING:
     from .plotting import (
@@ -90,6 +91,7 @@ __all__ = [
     "slip_duration",
     "stick_duration",
     "stick_fraction",
+    "sweep",
     "unstable_cycle",
 ]
 

@@ -1,0 +1,1140 @@
+"""The throughput kernel behind sweeps: many short runs at once, a lane each.
+
+One embedded Runge-Kutta step advances all lanes; each has its own time, step size and mode. A pass
+of the loop is
+
+- *refill*: lanes whose run has ended hand in their result and take the next run from the queue;
+- *events*: lanes that stand on a guard of their mode go on by the rules of `modes`, and stick
+  phases are passed in closed form;
+- *steps*: a few Runge-Kutta steps of the lanes that slip.
+
+A step is kept only if no guard vanishes in it. Within a step the velocity is known as a polynomial
+of degree four (its values and slopes at both ends, and its integral, the displacement). If that
+leaves the interval in which the mode holds, at the end or at an extremum on the way, the step is
+made again, shorter, so that it ends on the first root; what is then left of the way, less than
+`LANDING * sqrt(tolerance)`, is bridged by one Taylor step. So the states at events are as good as
+the integration, not as its interpolant, and excursions within one step are found. Where a contact
+edge may be met (or extrema are wanted), steps also end where x2 = 0: x1 is then monotone on each.
+
+The Runge-Kutta stages are written for x1' = x2 (Nystroem's form: the accelerations alone are kept),
+and each acceleration is one quotient, with the division last. That is for XLA on the CPU, which
+computes everything that it deems cheap again in each place where it is used; a division it keeps.
+
+Derivatives are forward mode (`jax.jvp` through the loop): step sizes carry none, the landing's
+Taylor step gives event times and states their exact ones, and so does the last step, t1 - t.
+"""
+
+import abc
+import functools
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from .modes import (
+    ABOVE,
+    BELOW,
+    Mode,
+    boundary_guards,
+    edge_guards,
+    first_of,
+    leave_slip,
+    leave_stick,
+    mode_acceleration,
+    mode_of_state,
+    select,
+    stick_phase,
+)
+from .oscillator import Oscillator
+from .results import EventKind, Status
+
+#: First step of a run and after each event, at a tolerance of 1e-8.
+FIRST_STEP = 0.05
+#: Longest step: well below half a turn, so that x2 has at most one extremum in it.
+MAX_STEP = 0.5
+#: The way that a Taylor step may bridge to a guard, over the square root of the tolerance.
+LANDING = 0.1
+#: Steps between two looks at the events, and events between two refills.
+STEPS, ROUNDS = 4, 8
+
+#: Steps that a run may take for each 100 units of time before it is given up.
+MAX_STEPS = 100_000
+#: Runs that the kernel is given at once.
+CHUNK = 2**14
+#: Lanes. On the CPU XLA runs programs on buffers of up to 512 bytes without its own threads, which
+#: cost more than they bring here.
+WIDTH = {"cpu": 64}
+
+IDLE, SHORTENED, REJECTED, KEPT, LANDED = range(5)
+
+_TABLEAU = diffrax.Tsit5.tableau
+
+
+def _nystroem() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The tableau for x'' = a: weights of the stages' accelerations in x2 and in x1.
+
+    A row a stage, the last one the solution, and the same of the error estimate.
+    """
+    n = _TABLEAU.b_sol.size
+    a = np.zeros((n, n))
+    for i, row in enumerate(_TABLEAU.a_lower):
+        a[i + 1, : row.size] = row
+    return a, a @ a, a.sum(axis=1), _TABLEAU.b_error, _TABLEAU.b_error @ a
+
+
+_A, _AA, _C, _E, _EA = _nystroem()
+
+
+# --- what is watched ------------------------------------------------------------------------------
+
+
+class Lanes(eqx.Module):
+    """The state of all lanes, arrays [lanes].
+
+    run: number of the run, -1 for none; begun: the pass in which it began; t, x1, x2, a: time,
+    state and x2'; h: next step size, cap: a shorter one that ends on a guard (inf: none); landed:
+    it stands on a guard; mode; events: their number; status; done. lower, upper: extrema of x2
+    since `memory` was cleared, where the observer tracks them. memory: the observer's own.
+    """
+
+    run: Array
+    begun: Array
+    t: Array
+    x1: Array
+    x2: Array
+    a: Array
+    h: Array
+    cap: Array
+    landed: Array
+    mode: Mode
+    events: Array
+    status: Array
+    done: Array
+    lower: Array
+    upper: Array
+    memory: Any
+
+
+class Passage(eqx.Module):
+    """What happened to the lanes in one look at the events, arrays [lanes].
+
+    landed: a step ended on a guard or where x2 = 0. fired: it was a guard, its number is `guard`,
+    and `mode` is what followed, at (t, x1, x2). stuck: there was a stick phase, of that duration;
+    released: it ended, by slip onset or at an edge.
+    """
+
+    landed: Array
+    fired: Array
+    guard: Array
+    before: Mode
+    mode: Mode
+    t: Array
+    x1: Array
+    x2: Array
+    captured: Array
+    stuck: Array
+    duration: Array
+    released: Array
+    slips: Array
+    forever: Array
+
+
+def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
+    """Lane by lane one of two trees of arrays [lanes, ...]."""
+
+    def pick(a, b):
+        return jnp.where(condition.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(pick, on_true, on_false)
+
+
+class Observer(eqx.Module):
+    """What a run hands in, and when it may end early: subclasses are static settings."""
+
+    #: Whether the extrema of a run are wanted: steps then end where x2 = 0.
+    extrema: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def start(self, osc: Oscillator, lanes: Lanes) -> Any:
+        """The memory of runs that begin, a tree of arrays [lanes]."""
+
+    @abc.abstractmethod
+    def watch(
+        self, osc: Oscillator, lanes: Lanes, passage: Passage, t1: Array, tol: Array
+    ) -> Lanes:
+        """The lanes after a look at the events; sets `memory`, and `done` to end a run."""
+
+    def rest(self, osc: Oscillator, lanes: Lanes) -> Lanes:
+        """The same at each refill, for what costs more."""
+        return lanes
+
+    @abc.abstractmethod
+    def finish(self, osc: Oscillator, lanes: Lanes) -> dict[str, Array]:
+        """The result of runs that ended, arrays [lanes] or [lanes, n]."""
+
+
+# --- one step -------------------------------------------------------------------------------------
+
+
+class _Window(eqx.Module):
+    """Where the mode of a lane holds: bounds of x1 and x2; and what its field needs."""
+
+    x1: tuple[Array, Array] | None
+    x2: tuple[Array, Array]
+    signs: tuple[Array, ...]
+    pulls: tuple[Array, ...]
+
+
+def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, turns: bool) -> _Window:
+    """The bounds of the current modes. With `turns` x2 is bounded by 0, too."""
+    mode, inf = lanes.mode, jnp.full_like(lanes.t, jnp.inf)
+    low, high = -inf, inf
+    for belt, code in zip(osc.belts, mode.codes, strict=True):
+        boundary = belt.velocity / osc.omega
+        high = jnp.where(code == 1, jnp.minimum(high, boundary), high)
+        low = jnp.where(code == -1, jnp.maximum(low, boundary), low)
+    if turns:
+        up = (lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0))
+        down = (lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0))
+        low, high = (
+            jnp.where(up, jnp.maximum(low, 0.0), low),
+            jnp.where(down, jnp.minimum(high, 0.0), high),
+        )
+    x1 = None
+    if edges:
+        left, right = -inf, inf
+        for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
+            left = jnp.where(touches, jnp.maximum(left, belt.lower), left)
+            left = jnp.where(code == ABOVE, jnp.maximum(left, belt.upper), left)
+            right = jnp.where(touches, jnp.minimum(right, belt.upper), right)
+            right = jnp.where(code == BELOW, jnp.minimum(right, belt.lower), right)
+        x1 = left, right
+    signs = mode.signs
+    pulls = tuple(belt.load * sign for belt, sign in zip(osc.belts, signs, strict=True))
+    return _Window(x1, (low, high), signs, pulls)
+
+
+def _acceleration(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array) -> Array:
+    """`oscillator.acceleration` as a single quotient; one: an array of ones that XLA cannot see
+    through, for laws that are no quotient themselves."""
+    numerator, denominator = -x1 - osc.damping * x2, one
+    for belt, sign, pull in zip(osc.belts, window.signs, window.pulls, strict=True):
+        top, bottom = belt.friction.fraction(sign * (belt.velocity - osc.omega * x2))
+        numerator = numerator * bottom + pull * top * denominator
+        denominator = denominator * bottom
+    return numerator / denominator
+
+
+def _combine(weights: np.ndarray, arrays: list[Array]) -> Array:
+    terms = [w * array for w, array in zip(weights.tolist(), arrays, strict=False) if w != 0]
+    return functools.reduce(jnp.add, terms)
+
+
+class _Attempt(eqx.Module):
+    """A step of size h, not yet accepted: state and x2' at its end, and its error over the
+    tolerance."""
+
+    h: Array
+    x1: Array
+    x2: Array
+    a: Array
+    error: Array
+
+
+def _attempt(osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol) -> _Attempt:
+    """One Runge-Kutta step of all lanes."""
+    x1, x2, stages = lanes.x1, lanes.x2, [lanes.a]
+    for row, row1, c in zip(_A[1:-1], _AA[1:-1], _C[1:-1].tolist(), strict=True):
+        drift = c * x2 + h * _combine(row1, stages) if np.any(row1) else c * x2
+        x2_stage = x2 + h * _combine(row, stages)
+        stages.append(_acceleration(osc, window, one, x1 + h * drift, x2_stage))
+    # The weights of the solution are those of the last stage, which is the next step's first.
+    y1 = (x1 + h * (x2 + h * _combine(_AA[-1], stages))) / one
+    y2 = (x2 + h * _combine(_A[-1], stages)) / one
+    stages.append(_acceleration(osc, window, one, y1, y2))
+    scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
+    scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
+    error1, error2 = jnp.abs(h * h * _combine(_EA, stages)), jnp.abs(h * _combine(_E, stages))
+    error = jnp.maximum(error1 * scale2, error2 * scale1) / (scale1 * scale2)
+    return _Attempt(h, y1, y2, stages[-1], lax.stop_gradient(error))
+
+
+class _Path(eqx.Module):
+    """x2 within a step, x2 + k1 theta + ... + k4 theta^4 for theta from 0 to 1, and its extremum.
+
+    turns: whether there is one inside, at theta = turn; extremum: x2 there, at the end if none.
+    """
+
+    k: tuple[Array, Array, Array, Array]
+    turns: Array
+    turn: Array
+    extremum: Array
+
+
+def _path(one: Array, lanes: Lanes, new: _Attempt) -> _Path:
+    """Hermite's cubic and the term that makes the integral of x2 the change of x1."""
+    h, x2, m0, m1 = new.h, lanes.x2, new.h * lanes.a, new.h * new.a
+    rise, mean = new.x2 - x2, 0.5 * (x2 + new.x2) + (m0 - m1) / 12
+    k4 = 30 * (new.x1 - lanes.x1 - h * mean) / jnp.where(h > 0, h, 1.0)
+    c2, c3 = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
+    k = (m0, c2 + k4, c3 - 2 * k4, k4)
+    # Where the cubic is extreme: of an error there only the square counts.
+    turns = lanes.a * new.a < 0
+    divisor = jnp.sign(m0) * jnp.sqrt(jnp.maximum(c2 * c2 - 3 * c3 * m0, 0.0)) - c2
+    safe = turns & (divisor != 0)
+    turn = lax.stop_gradient(jnp.where(safe, m0, 1.0) / jnp.where(safe, divisor, 1.0))
+    extremum = x2 + turn * (k[0] + turn * (k[1] + turn * (k[2] + turn * k[3])))
+    return _Path(k, turns, turn, jnp.where(turns, extremum, new.x2) / one)
+
+
+class _Landing(eqx.Module):
+    """What a step has to do with the bounds of its mode.
+
+    reached: it ends so near to one that the time `delta` is left to (x1, x2) on it; blocked: it
+    ends, or turns, beyond one; theta: the fraction of it that ends on the bound. on_edge: the bound
+    is a contact edge; resumes: it is x2 = 0, where nothing happens.
+    """
+
+    reached: Array
+    delta: Array
+    x1: Array
+    x2: Array
+    on_edge: Array
+    resumes: Array
+    blocked: Array
+    theta: Array
+
+
+def _landing(window: _Window, lanes: Lanes, new: _Attempt, path: _Path, rtol) -> _Landing:
+    low, high = window.x2
+    beyond_turn = path.turns & ((path.extremum > high) | (path.extremum < low))
+    peak = jnp.where(beyond_turn, path.extremum, new.x2)
+    reach = LANDING * jnp.sqrt(rtol)
+    bound = jnp.where(new.a > 0, high, low)
+    reached = ~beyond_turn & (jnp.abs(bound - new.x2) <= reach * jnp.abs(new.a))
+    delta = jnp.where(reached, bound - new.x2, 1e300) / jnp.where(reached, new.a, 1.0)
+    blocked = ((peak > high) | (peak < low)) & ~reached
+    target = jnp.where(peak > high, high, low)
+    k = lax.stop_gradient(path.k)
+    start, end, poly = lanes.x2, peak, (*k, jnp.zeros_like(peak))
+    on_edge, edge = jnp.zeros_like(reached), lanes.x1
+    if window.x1 is not None:
+        left, right = window.x1
+        edge = jnp.where(new.x2 > 0, right, left)
+        near = jnp.abs(edge - new.x1) <= reach * jnp.abs(new.x2)
+        delta1 = jnp.where(near, edge - new.x1, 1e300) / jnp.where(near, new.x2, 1.0)
+        on_edge = near & (delta1 < delta)
+        reached, delta = reached | near, jnp.minimum(delta, delta1)
+        # x1 over the step is the integral of x2; x2 keeps its sign, so x1 is monotone.
+        h = new.h
+        integral = (h * lanes.x2, h * k[0] / 2, h * k[1] / 3, h * k[2] / 4, h * k[3] / 5)
+        beyond = ((new.x1 > right) | (new.x1 < left)) & ~near
+        use = beyond & ~blocked
+        poly = lax.stop_gradient(select(use, integral, poly))
+        start, end = jnp.where(use, lanes.x1, start), jnp.where(use, new.x1, end)
+        target = jnp.where(use, jnp.where(new.x1 > right, right, left), target)
+        blocked = blocked | beyond
+    until = jnp.where(beyond_turn, path.turn, 1.0)
+    theta = _first_root(poly, start - target, until, end - target)
+    # An extremum that close to a bound is no matter for an interpolant: split the step there.
+    doubt = jnp.abs(path.k[3])
+    grazes = path.turns & ((path.extremum > high - doubt) | (path.extremum < low + doubt))
+    grazes = grazes & ~beyond_turn & (path.turn > 0.05) & (path.turn < 0.95)
+    return _Landing(
+        reached=reached,
+        delta=delta,
+        x1=edge,
+        x2=bound,
+        on_edge=on_edge,
+        resumes=~on_edge & (bound == 0),
+        blocked=blocked | grazes,
+        theta=jnp.where(blocked, theta, path.turn),
+    )
+
+
+def _step(
+    osc, window: _Window, one: Array, going: Array, lanes: Lanes, t1, rtol, atol, observer
+) -> Lanes:
+    """One step of the lanes that are going: kept, shortened to end on a bound, or rejected."""
+    left = t1 - lanes.t
+    h = jnp.minimum(jnp.minimum(lanes.h, lanes.cap), left)
+    new = _attempt(osc, window, one, lanes, h, rtol, atol)
+    path = _path(one, lanes, new)
+    at = _landing(window, lanes, new, path, rtol)
+
+    going = going & ~lanes.landed & ~lanes.done
+    accepted = going & (new.error <= 1)
+    last = h >= left
+    lands = accepted & ~at.blocked & at.reached & ~(last & (at.delta > 0))
+    # As a number, divided: what many results depend on is then computed once.
+    outcome = jnp.where(going, float(REJECTED), float(IDLE))
+    outcome = jnp.where(accepted, jnp.where(at.blocked, float(SHORTENED), float(KEPT)), outcome)
+    outcome = jnp.where(lands, float(LANDED), outcome) / one
+    going, shortened = outcome > IDLE, outcome == SHORTENED
+    kept, lands = outcome >= KEPT, outcome == LANDED
+
+    delta = jnp.where(lands, at.delta, 0.0) / one
+    x1 = new.x1 + delta * (new.x2 + 0.5 * delta * new.a)
+    x2 = new.x2 + delta * new.a
+    if window.x1 is not None:
+        x1 = jnp.where(lands & at.on_edge, at.x1, x1)
+        x2 = jnp.where(lands & ~at.on_edge, at.x2, x2)
+    else:
+        x2 = jnp.where(lands, at.x2, x2)
+    # NaN is a large error, too.
+    size = jnp.where(new.error < 1e3, jnp.maximum(new.error, 1e-3), 1e3)
+    proposed = jnp.minimum(h * (0.9 / jnp.sqrt(jnp.sqrt(size))), MAX_STEP)
+    # A step that was cut short says little about the next one; after an event the field is new.
+    proposed = jnp.where(kept & (h < lanes.h), jnp.maximum(proposed, lanes.h), proposed)
+    proposed = jnp.where(lands & ~at.resumes, _first_step(rtol), proposed)
+    cap = jnp.where(shortened, at.theta * h, jnp.where(kept, jnp.inf, lanes.cap))
+    ends = last & ~lands
+    lower, upper = lanes.lower, lanes.upper
+    if observer.extrema:
+        lower = jnp.where(kept, jnp.minimum(lower, jnp.minimum(x2, path.extremum)), lower)
+        upper = jnp.where(kept, jnp.maximum(upper, jnp.maximum(x2, path.extremum)), upper)
+    return replace(
+        lanes,
+        t=jnp.where(kept, jnp.where(ends, t1, lanes.t + h + delta), lanes.t),
+        x1=jnp.where(kept, x1, lanes.x1),
+        x2=jnp.where(kept, x2, lanes.x2),
+        a=jnp.where(kept, new.a, lanes.a),
+        h=lax.stop_gradient(jnp.where(going & ~shortened, proposed, lanes.h)),
+        cap=lax.stop_gradient(cap),
+        landed=lanes.landed | lands,
+        done=lanes.done | (kept & ends),
+        lower=lower,
+        upper=upper,
+    )
+
+
+def _first_step(rtol):
+    return FIRST_STEP * (1e8 * rtol) ** 0.2
+
+
+def _first_root(poly, g_start, end, g_end):
+    """Root in (0, end] of g_start + poly[0] theta + ... + poly[4] theta^5, by Newton's method."""
+    # On the boundary that the lane has just left g vanishes, too: that root is not the one.
+    ratio = jnp.abs(g_start) / (jnp.abs(g_start) + jnp.abs(g_end))
+    theta = jnp.where(jnp.abs(g_start) > 1e-3 * jnp.abs(g_end), ratio, 1.0) * end
+    k1, k2, k3, k4, k5 = poly
+    for _ in range(3):
+        value = g_start + theta * (k1 + theta * (k2 + theta * (k3 + theta * (k4 + theta * k5))))
+        slope = k1 + theta * (2 * k2 + theta * (3 * k3 + theta * (4 * k4 + theta * (5 * k5))))
+        theta = theta - value / jnp.where(slope == 0, 1.0, slope)
+    good = (theta > 0) & (theta <= end)
+    return lax.stop_gradient(jnp.where(good, theta, 0.5 * end))
+
+
+# --- events ---------------------------------------------------------------------------------------
+
+
+def _pass_events(osc: Oscillator, lanes: Lanes, t1: Array, *, edges: bool) -> tuple[Lanes, Passage]:
+    """Lanes that stand on a guard go on; stick phases are passed to their end, or to t1."""
+    guards = boundary_guards(osc, lanes.mode, lanes.x2)
+    if edges:
+        guards += edge_guards(osc, lanes.mode, lanes.x1)
+    lowest = functools.reduce(jnp.minimum, guards)
+    # A lane may also have landed where x2 = 0, which is no guard.
+    fired = lanes.landed & (lowest <= 1e-12)
+    number = first_of(
+        [g <= lowest for g in guards], [jnp.asarray(i) for i in range(len(guards))], jnp.asarray(0)
+    )
+    after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
+    captured = fired & after.captured
+    x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
+
+    stuck = after.mode.any_stuck & ~captured & ~lanes.done
+    phase = stick_phase(osc, after.mode, x1)
+    left = t1 - lanes.t
+    ends = phase.duration >= left
+    duration = jnp.where(stuck, jnp.where(ends, left, phase.duration), 0.0)
+    released = stuck & ~ends
+    mode = select(released, leave_stick(osc, after.mode, phase, x2), after.mode)
+    mode = select(captured, lanes.mode, mode)
+    new_x1 = jnp.where(stuck, jnp.where(ends, x1 + x2 * left, phase.x1), x1)
+    t = jnp.where(stuck & ends, t1, lanes.t + duration)
+
+    # Slip onset is tangent: x2' = 0 there, for a law without a jump, but for rounding.
+    a = mode_acceleration(osc, mode, new_x1, x2)
+    a = jnp.where(jnp.abs(a) < 1e-12 * (1 + jnp.abs(new_x1)), 0.0, a)
+    moved = lanes.landed | stuck
+    forever = stuck & jnp.isinf(phase.duration)
+    status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
+    status = jnp.where(forever, Status.STUCK_FOREVER.value, status)
+    passage = Passage(
+        landed=lanes.landed,
+        fired=fired,
+        guard=number,
+        before=lanes.mode,
+        mode=after.mode,
+        t=lanes.t,
+        x1=x1,
+        x2=x2,
+        captured=captured,
+        stuck=stuck,
+        duration=duration,
+        released=released,
+        slips=released & phase.slips,
+        forever=forever,
+    )
+    lanes = eqx.tree_at(
+        lambda n: (n.t, n.x1, n.x2, n.a, n.landed, n.mode, n.events, n.status, n.done),
+        lanes,
+        (
+            t,
+            new_x1,
+            x2,
+            jnp.where(moved, a, lanes.a),
+            jnp.zeros_like(lanes.landed),
+            mode,
+            lanes.events + jnp.where(fired, 1, 0) + jnp.where(released, 1, 0),
+            status,
+            lanes.done | captured | (stuck & ends),
+        ),
+    )
+    return lanes, passage
+
+
+# --- the loop -------------------------------------------------------------------------------------
+
+
+class Program(eqx.Module):
+    """What is fixed when the kernel is compiled."""
+
+    structure: Any = eqx.field(static=True)
+    mapped: tuple[bool, ...] = eqx.field(static=True)
+    observer: Observer = eqx.field(static=True)
+    edges: bool = eqx.field(static=True)
+
+
+def _oscillator(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator:
+    """The oscillators of the lanes: leaves that differ from run to run are arrays [lanes]."""
+    leaves, column = [], 2
+    others = iter(shared)
+    for is_mapped in program.mapped:
+        if is_mapped:
+            leaves.append(rows[column])
+            column += 1
+        else:
+            leaves.append(next(others))
+    return jax.tree.unflatten(program.structure, leaves)
+
+
+def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
+    """Lanes at the start of their runs."""
+    mode = mode_of_state(osc, x1, x2)
+    finite = jnp.isfinite(x1) & jnp.isfinite(x2)
+    for leaf in jax.tree.leaves(osc):
+        finite = finite & ~jnp.isnan(leaf)
+    zero, no = jnp.zeros_like(x1), jnp.zeros_like(finite)
+    lanes = Lanes(
+        run=run,
+        begun=jnp.full_like(run, passes),
+        t=zero,
+        x1=x1,
+        x2=x2,
+        a=mode_acceleration(osc, mode, x1, x2) + zero,
+        h=zero + _first_step(rtol),
+        cap=zero + jnp.inf,
+        landed=no,
+        mode=Mode(tuple(code + zero for code in mode.codes)),
+        events=jnp.zeros_like(run),
+        status=jnp.where(finite, Status.OK.value, Status.NOT_FINITE.value).astype(run.dtype),
+        done=~finite,
+        lower=x2,
+        upper=x2,
+        memory=None,
+    )
+    return replace(lanes, memory=program.observer.start(osc, lanes))
+
+
+class Stream(eqx.Module):
+    """The kernel between two calls: lanes, the rows of the queue that they work on, and passes."""
+
+    lanes: Lanes
+    rows: tuple[Array, ...]
+    passes: Array
+    one: Array
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2, 3))
+def _idle(program: Program, shared, width: int, columns: int) -> Stream:
+    """Lanes with nothing to do."""
+    rows = tuple(jnp.zeros(width) for _ in range(columns))
+    osc = _oscillator(program, shared, rows)
+    run = jnp.full(width, -1, dtype=jnp.int32)
+    lanes = _begin(program, osc, run, rows[0], rows[1], jnp.zeros((), jnp.int32), jnp.ones(()))
+    lanes = eqx.tree_at(lambda n: n.done, lanes, jnp.ones(width, dtype=bool))
+    return Stream(lanes, rows, jnp.zeros((), jnp.int32), jnp.ones(width))
+
+
+def _ordered(values: dict[str, Any]) -> list[str]:
+    return sorted(values)
+
+
+def _columns(values: dict[str, Array]) -> list[Array]:
+    """Arrays [lanes, ...] as columns [lanes] of floats."""
+    return [
+        column
+        for name in _ordered(values)
+        for column in values[name].astype(jnp.float64).reshape(values[name].shape[0], -1).T
+    ]
+
+
+def _advance(
+    program: Program, shared, t1, rtol, atol, limit, queue, first, count, stream: Stream, drain
+):
+    """Work through the queue; with `drain` until all lanes are idle.
+
+    queue: [runs, columns], the starts and the parameters that differ; the runs are numbered from
+    `first`, `count` of them are real. Returns the lanes, and, in order of completion, numbers
+    [runs + lanes] (-1 where there is none) and results [runs + lanes, columns].
+    """
+    observer = program.observer
+    width = stream.lanes.t.size
+    size = queue.shape[0] + width
+    one = stream.one
+
+    def busy(state):
+        stream, taken, *_ = state
+        at_work = (stream.lanes.run >= 0) | ~stream.lanes.done
+        return (taken < count) | (drain & jnp.any(at_work))
+
+    def refill(state):
+        stream, taken, written, numbers, results = state
+        lanes, rows = stream.lanes, stream.rows
+        osc = _oscillator(program, shared, rows)
+        lanes = observer.rest(osc, lanes)
+        lanes = _give_up(lanes, stream.passes, limit)
+        finished = lanes.done & (lanes.run >= 0)
+        at = jnp.where(finished, written + jnp.cumsum(finished.astype(jnp.int32)) - 1, size)
+        result = jnp.stack(_columns(observer.finish(osc, lanes)), axis=-1)
+        numbers = numbers.at[at].set(lanes.run, mode="drop")
+        results = results.at[at].set(result, mode="drop")
+        written = written + jnp.sum(finished, dtype=jnp.int32)
+
+        index = taken + jnp.cumsum(lanes.done.astype(jnp.int32)) - 1
+        takes = lanes.done & (index < count)
+        taken_rows = queue[jnp.where(takes, index, 0)]
+        rows = tuple(jnp.where(takes, taken_rows[:, i], row) for i, row in enumerate(rows))
+        osc = _oscillator(program, shared, rows)
+        fresh = _begin(program, osc, first + index, rows[0], rows[1], stream.passes, rtol)
+        gone = eqx.tree_at(lambda n: n.run, lanes, jnp.where(lanes.done, -1, lanes.run))
+        lanes = choose(takes, fresh, gone)
+        taken = taken + jnp.sum(takes, dtype=jnp.int32)
+        return Stream(lanes, rows, stream.passes + 1, one), taken, written, numbers, results
+
+    def round_(osc, _, lanes):
+        lanes, passage = _pass_events(osc, lanes, t1, edges=program.edges)
+        lanes = observer.watch(osc, lanes, passage, t1, rtol)
+        window = _window(osc, lanes, edges=program.edges, turns=program.edges or observer.extrema)
+        going = ~lanes.done & ~lanes.mode.any_stuck
+
+        def step(_, lanes):
+            return _step(osc, window, one, going, lanes, t1, rtol, atol, observer)
+
+        return lax.fori_loop(0, STEPS, step, lanes)
+
+    def one_pass(state):
+        stream, *rest = refill(state)
+        osc = _oscillator(program, shared, stream.rows)
+        lanes = lax.fori_loop(0, ROUNDS, functools.partial(round_, osc), stream.lanes)
+        return eqx.tree_at(lambda s: s.lanes, stream, lanes), *rest
+
+    shape = jax.eval_shape(
+        lambda: jnp.stack(
+            _columns(observer.finish(_oscillator(program, shared, stream.rows), stream.lanes)), -1
+        )
+    )
+    start = (
+        stream,
+        jnp.zeros((), jnp.int32),
+        jnp.zeros((), jnp.int32),
+        jnp.full(size, -1, dtype=jnp.int32),
+        jnp.full((size, shape.shape[1]), jnp.nan),
+    )
+    stream, _, _, numbers, results = lax.while_loop(busy, one_pass, start)
+    return stream, numbers, results
+
+
+def _give_up(lanes: Lanes, passes, limit) -> Lanes:
+    """End runs that took too many steps, or whose state is not finite."""
+    finite = jnp.isfinite(lanes.x1) & jnp.isfinite(lanes.x2) & jnp.isfinite(lanes.a)
+    lost = ~lanes.done & (~finite | (lanes.h < 1e-14) | (passes - lanes.begun > limit))
+    reason = jnp.where(finite, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
+    status = jnp.where(lost, reason.astype(lanes.status.dtype), lanes.status)
+    return eqx.tree_at(lambda n: (n.status, n.done), lanes, (status, lanes.done | lost))
+
+
+# --- runs in bulk ---------------------------------------------------------------------------------
+
+
+def _kernel(program: Program, derivatives: int) -> Callable:
+    """The compiled kernel of a program, one for all threads and all sweeps."""
+    return _compiled(program, derivatives > 0, _options())
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(program, derivatives, options):
+    advance = _advance_with_derivatives if derivatives else _advance
+    return jax.jit(functools.partial(advance, program), compiler_options=dict(options) or None)
+
+
+def _advance_with_derivatives(
+    program, shared, t1, rtol, atol, limit, queue, first, count, stream, drain
+):
+    """`_advance` to the end, with derivatives in the directions queue[1:] of the rows queue[0]."""
+
+    def of_rows(rows):
+        stream_out, numbers, results = _advance(
+            program, shared, t1, rtol, atol, limit, rows, first, count, stream, True
+        )
+        return results, (stream_out, numbers)
+
+    def column(direction):
+        return jax.jvp(of_rows, (queue[0],), (direction,), has_aux=True)
+
+    out = jax.vmap(column, out_axes=(None, 0, None))(queue[1:])
+    results, columns, (stream_out, numbers) = out
+    return stream_out, numbers, jnp.concatenate([results[None], columns])
+
+
+def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
+    """The results of a run in the order of their columns: the shape of each by name."""
+
+    def finish():
+        stream = _idle(program, shared, 1, 2 + sum(program.mapped))
+        osc = _oscillator(program, shared, stream.rows)
+        return program.observer.finish(osc, stream.lanes)
+
+    shapes = jax.eval_shape(finish)
+    return {name: shapes[name].shape[1:] for name in _ordered(shapes)}
+
+
+@functools.lru_cache(maxsize=1)
+def _options() -> tuple[tuple[str, Any], ...]:
+    """Compiler options of the kernel: wide vectors where the processor has them."""
+    if jax.default_backend() != "cpu":
+        return ()
+    try:
+        wide = "avx512f" in Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return ()
+    options = {"xla_cpu_prefer_vector_width": 512}
+    try:
+        if wide:
+            jax.jit(lambda: 0, compiler_options=options)()
+            return tuple(options.items())
+    except jax.errors.JaxRuntimeError:
+        pass  # a version of XLA that does not know the option
+    return ()
+
+
+def workers() -> int:
+    """Threads that run the kernel: one a core on the CPU, one a device elsewhere."""
+    if jax.default_backend() != "cpu":
+        return jax.local_device_count()
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run(
+    program: Program,
+    shared: list[Array],
+    rows_of: Callable[[int, int], np.ndarray],
+    runs: int,
+    put: Callable[[np.ndarray, np.ndarray], None],
+    *,
+    t1: float,
+    rtol: float,
+    atol: float,
+    derivatives: int = 0,
+) -> None:
+    """Do all runs: rows_of(first, last) gives rows [1 + derivatives, runs, columns] of the queue,
+    the starts and the parameters that vary, and their derivatives in so many directions;
+    put(numbers, results) takes results [1 + derivatives, runs, columns] in any order.
+
+    Every thread feeds chunks to one compiled kernel (which lets go of Python's lock) on its own
+    lanes. Long runs stay in their lanes while the next chunk is worked on.
+    """
+    limit = int(MAX_STEPS * max(1.0, t1 / 100)) // (STEPS * ROUNDS)
+    settings = (t1, rtol, atol, np.int32(limit))
+    kernel = functools.partial(_kernel(program, derivatives), shared, *settings)
+    columns = 2 + sum(program.mapped)
+    threads = workers()
+    # The queue is of one size, for one compiled program; short work is shared out all the same.
+    share = min(CHUNK, -(-runs // threads))
+    width = WIDTH.get(jax.default_backend(), 2**17)
+    chunks = iter([(i, min(i + share, runs)) for i in range(0, runs, share)])
+    lock = threading.Lock()
+
+    def take():
+        with lock:
+            return next(chunks, None)
+
+    def work(device) -> None:
+        with jax.default_device(device):
+            stream, todo = _idle(program, shared, width, columns), take()
+            while todo is not None:
+                (first, last), todo = todo, take()
+                rows = np.zeros((1 + derivatives, CHUNK, columns))
+                rows[:, : last - first] = rows_of(first, last)
+                rows = rows if derivatives else rows[0]
+                span = np.int32(first), np.int32(last - first)
+                stream, numbers, results = kernel(rows, *span, stream, todo is None)
+                numbers = np.asarray(numbers)
+                done = np.flatnonzero(numbers >= 0)
+                results = np.asarray(results).reshape(1 + derivatives, len(numbers), -1)
+                with lock:
+                    put(numbers[done], results[:, done])
+
+    devices = jax.local_devices()
+    if not runs:
+        return
+    # Compiled here, once, and not by each thread.
+    nothing = np.zeros((1 + derivatives, CHUNK, columns))
+    idle = _idle(program, shared, width, columns)
+    kernel(nothing if derivatives else nothing[0], np.int32(0), np.int32(0), idle, False)
+    with ThreadPoolExecutor(threads) as pool:
+        started = [pool.submit(work, devices[i % len(devices)]) for i in range(threads)]
+        for future in started:
+            future.result()
+
+
+# --- what repeats ---------------------------------------------------------------------------------
+
+
+class _Mark(eqx.Module):
+    """A state of a run that later ones are compared with, arrays [lanes].
+
+    When it is 1, 2, 4, ... states old, the next one takes its place (Brent's method), so a cycle of
+    any number of such states is found at their first repetition or soon after.
+    """
+
+    x1: Array
+    code: Array
+    t: Array
+    events: Array
+    age: Array
+    limit: Array
+
+
+def _no_mark(lanes: Lanes) -> _Mark:
+    zero, count = jnp.zeros_like(lanes.t), jnp.zeros_like(lanes.events)
+    return _Mark(zero + jnp.nan, zero, zero, count, count, count)
+
+
+def _renew(mark: _Mark, lanes: Lanes, at: Array) -> tuple[_Mark, Array]:
+    """The marks after the lanes `at` such a state, and which of them are new."""
+    age = mark.age + jnp.where(at, 1, 0)
+    new = at & (age >= mark.limit)
+    here = _Mark(
+        lanes.x1,
+        _code(lanes.mode),
+        lanes.t,
+        lanes.events,
+        jnp.zeros_like(age),
+        jnp.maximum(2 * mark.limit, 1),
+    )
+    return select(new, here, eqx.tree_at(lambda m: m.age, mark, age)), new
+
+
+def _code(mode: Mode) -> Array:
+    """A mode as one number."""
+    total = jnp.zeros(())
+    for i, code in enumerate(mode.codes):
+        total = total + (code + 2) * 5.0**i
+    return total
+
+
+# --- final states ---------------------------------------------------------------------------------
+
+
+class Final(Observer):
+    """The state at t1.
+
+    At the end of a stick phase the state is a function of the parameters alone. Where it repeats,
+    everything repeats, to the last bit; so the run then goes on a whole number of turns at once
+    (unless `skip` is false).
+    """
+
+    skip: bool = eqx.field(static=True, default=True)
+
+    def start(self, osc, lanes):
+        return _no_mark(lanes)
+
+    def watch(self, osc, lanes, passage, t1, tol):
+        if not self.skip:
+            return lanes
+        mark: _Mark = lanes.memory
+        released = passage.released & ~lanes.mode.any_stuck
+        period = lanes.t - mark.t
+        repeats = released & (lanes.x1 == mark.x1) & (_code(lanes.mode) == mark.code) & (period > 0)
+        turns = jnp.floor((t1 - lanes.t) / jnp.where(repeats, period, jnp.inf))
+        turns = lax.stop_gradient(jnp.maximum(turns, 0.0))
+        per_turn = lanes.events - mark.events
+        t = jnp.where(repeats, lanes.t + turns * period, lanes.t)
+        events = lanes.events + jnp.where(repeats, turns.astype(per_turn.dtype) * per_turn, 0)
+        lanes = eqx.tree_at(lambda n: (n.t, n.events), lanes, (t, events))
+        return eqx.tree_at(lambda n: n.memory, lanes, _renew(mark, lanes, released)[0])
+
+    def finish(self, osc, lanes):
+        return {
+            "x1_end": lanes.x1,
+            "x2_end": lanes.x2,
+            "mode_end": jnp.stack(lanes.mode.codes, axis=-1),
+            "n_events": lanes.events,
+            "status": lanes.status,
+        }
+
+
+# --- attractors -----------------------------------------------------------------------------------
+
+#: What a run leads to, in the order of their codes.
+KINDS = ("undecided", "equilibrium", "cycle", "stuck")
+UNDECIDED, EQUILIBRIUM, CYCLE, STUCK_FOR_EVER = range(4)
+#: Speeds, as fractions of the radius, at which an attracting disc is checked.
+DISC = np.array([s * j / 8 for j in range(1, 9) for s in (1, -1)])
+
+
+class _Turn(eqx.Module):
+    """The turn under way, since the last mark; arrays [lanes], sticks one a belt.
+
+    previous, change: the top before, and how far it was from the one before that; period and
+    transient are set when the attractor is found.
+    """
+
+    mark: _Mark
+    x1_min: Array
+    x1_max: Array
+    sticks: tuple[Array, ...]
+    previous: Array
+    change: Array
+    kind: Array
+    period: Array
+    transient: Array
+    turn_events: Array
+
+
+class Attractor(Observer):
+    """Where the run leads; it ends as soon as that is known.
+
+    - A cycle: a top (a maximum of x1, where x2 = 0) repeats. After a stick phase the orbit is a
+      function of the parameters alone, so a turn that sticks repeats to the last bits. One that
+      does not stick converges: it has repeated when what is left of the way to the limit, by the
+      ratio of its last two changes, is below `REPEATED` times the amplitude.
+    - An equilibrium: the orbit has entered a disc that is attracted by a fixed point. In a slip
+      mode x1'' = -(x1 - x1*) + f(x2) with f(0) = 0, so E = (x1 - x1*)^2 + x2^2 obeys
+      E' = 2 x2 f(x2). If v f(v) < 0 for all 0 < |v| <= r, and the disc of radius r lies within the
+      mode's boundaries and edges, E falls until the orbit is at rest. The sign is checked at 16
+      speeds; a law that wiggles on a scale below r/8 could deceive that. A pseudo-focus is
+      recognised by `modes.is_captured`.
+    - Stuck for ever: on a belt at rest.
+    """
+
+    REPEATED: ClassVar[float] = 1e-7
+    extrema: ClassVar[bool] = True
+
+    def start(self, osc, lanes):
+        zero = jnp.zeros_like(lanes.t)
+        count = jnp.zeros_like(lanes.events)
+        nothing = zero + jnp.nan
+        sticks = tuple(zero for _ in osc.belts)
+        return _Turn(
+            _no_mark(lanes),
+            lanes.x1,
+            lanes.x1,
+            sticks,
+            nothing,
+            nothing,
+            count,
+            nothing,
+            nothing,
+            count,
+        )
+
+    def watch(self, osc, lanes, passage, t1, tol):
+        turn: _Turn = lanes.memory
+        sticks = tuple(
+            total + jnp.where(stuck, passage.duration, 0.0)
+            for total, stuck in zip(turn.sticks, passage.mode.stuck, strict=True)
+        )
+        # x1 is extreme where x2 = 0, and a step ends there.
+        x1_min, x1_max = jnp.minimum(turn.x1_min, lanes.x1), jnp.maximum(turn.x1_max, lanes.x1)
+        top = passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done
+
+        mark, amplitude = turn.mark, x1_max - x1_min
+        change = lanes.x1 - turn.previous
+        ratio = jnp.abs(change / jnp.where(turn.change == 0, 1.0, turn.change))
+        left = jnp.where(ratio < 1, ratio / jnp.where(ratio < 1, 1 - ratio, 1.0), jnp.inf)
+        moved, close = jnp.abs(lanes.x1 - mark.x1), amplitude * self.REPEATED
+        sticking = functools.reduce(jnp.add, sticks) > 0
+        converged = (moved <= close) & ((moved * left <= close) | (moved < 30 * tol * amplitude))
+        repeats = jnp.where(sticking, moved <= 1e-9 * amplitude, converged)
+        repeats = top & repeats & (_code(lanes.mode) == mark.code)
+
+        kind = jnp.where(repeats, CYCLE, UNDECIDED)
+        kind = jnp.where(repeats & (amplitude < self.REPEATED), EQUILIBRIUM, kind)
+        kind = jnp.where(passage.captured, EQUILIBRIUM, kind)
+        kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind).astype(turn.kind.dtype)
+        found = (kind != UNDECIDED) & (turn.kind == UNDECIDED) & (lanes.run >= 0)
+        resting = found & (kind != CYCLE)
+        renewed, new = _renew(mark, lanes, top & ~found)
+        # An attractor at rest is a point; a new mark begins a new turn.
+        fresh = new | resting
+        memory = _Turn(
+            mark=renewed,
+            x1_min=jnp.where(fresh, lanes.x1, x1_min),
+            x1_max=jnp.where(fresh, lanes.x1, x1_max),
+            sticks=tuple(
+                jnp.where(found & passage.forever & stuck, jnp.inf, jnp.where(fresh, 0.0, total))
+                for total, stuck in zip(sticks, passage.mode.stuck, strict=True)
+            ),
+            previous=jnp.where(top, lanes.x1, turn.previous),
+            change=jnp.where(top, change, turn.change),
+            kind=jnp.where(found, kind, turn.kind),
+            period=jnp.where(repeats & found & ~resting, lanes.t - mark.t, turn.period),
+            transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), turn.transient),
+            turn_events=jnp.where(found & ~resting, lanes.events - mark.events, turn.turn_events),
+        )
+        return eqx.tree_at(
+            lambda n: (n.lower, n.upper, n.done, n.memory),
+            lanes,
+            (
+                jnp.where(fresh, lanes.x2, lanes.lower),
+                jnp.where(fresh, lanes.x2, lanes.upper),
+                lanes.done | found,
+                memory,
+            ),
+        )
+
+    def rest(self, osc, lanes):
+        turn: _Turn = lanes.memory
+        zero = jnp.zeros_like(lanes.t)
+        x1_rest = mode_acceleration(osc, lanes.mode, zero, zero)
+        radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), 1e-6)
+        falls = jnp.ones_like(lanes.done)
+        for fraction in DISC.tolist():
+            v = fraction * radius
+            falls = falls & (v * mode_acceleration(osc, lanes.mode, x1_rest, v) < 0)
+        for v in (radius, -radius):
+            for guard in boundary_guards(osc, lanes.mode, v):
+                falls = falls & (guard > 0)
+            for guard in edge_guards(osc, lanes.mode, x1_rest + v):
+                falls = falls & (guard > 0)
+        found = falls & ~lanes.mode.any_stuck & ~lanes.done
+        memory = eqx.tree_at(
+            lambda m: (m.kind, m.x1_min, m.x1_max, m.sticks, m.transient),
+            turn,
+            (
+                jnp.where(found, EQUILIBRIUM, turn.kind).astype(turn.kind.dtype),
+                jnp.where(found, x1_rest, turn.x1_min),
+                jnp.where(found, x1_rest, turn.x1_max),
+                tuple(jnp.where(found, 0.0, total) for total in turn.sticks),
+                jnp.where(found, lanes.t, turn.transient),
+            ),
+        )
+        return eqx.tree_at(
+            lambda n: (n.lower, n.upper, n.done, n.memory),
+            lanes,
+            (
+                jnp.where(found, 0.0, lanes.lower),
+                jnp.where(found, 0.0, lanes.upper),
+                lanes.done | found,
+                memory,
+            ),
+        )
+
+    def finish(self, osc, lanes):
+        turn: _Turn = lanes.memory
+        undecided = (turn.kind == UNDECIDED) & (lanes.status == Status.OK.value)
+        status = jnp.where(undecided, Status.NOT_SETTLED.value, lanes.status)
+        return {
+            "kind": turn.kind,
+            "sticks": jnp.stack([total > 0 for total in turn.sticks], axis=-1),
+            "period": turn.period,
+            "stick_duration": jnp.stack(turn.sticks, axis=-1),
+            "x1_min": turn.x1_min,
+            "x1_max": turn.x1_max,
+            "x2_min": lanes.lower,
+            "x2_max": lanes.upper,
+            "transient": turn.transient,
+            "n_events": jnp.where(turn.kind == CYCLE, turn.turn_events, lanes.events),
+            "status": status,
+        }
+
+
+# --- a reducer of the user's ----------------------------------------------------------------------
+
+
+class Event(eqx.Module):
+    """An event of a run, as a reducer sees it: scalars t, x1, x2, kind (`EventKind`) and belt."""
+
+    t: Array
+    x1: Array
+    x2: Array
+    kind: Array
+    belt: Array
+
+
+class End(eqx.Module):
+    """The end of a run, as a reducer sees it: scalars t, x1, x2 and status."""
+
+    t: Array
+    x1: Array
+    x2: Array
+    status: Array
+
+
+class Reduce(Observer):
+    """What a reducer of the user's makes of the events of a run; see `sweep.sweep`."""
+
+    reducer: Any = eqx.field(static=True)
+
+    def start(self, osc, lanes):
+        axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
+        return jax.vmap(self.reducer.init, in_axes=(axes, 0, 0))(osc, lanes.x1, lanes.x2)
+
+    def watch(self, osc, lanes, passage, t1, tol):
+        memory, busy, n = lanes.memory, lanes.run >= 0, len(osc.belts)
+        sticks = jnp.where(passage.mode.any_stuck, EventKind.STICK.value, EventKind.CROSS.value)
+        at_edge = passage.guard >= n
+        kind = jnp.where(at_edge, EventKind.EDGE.value, sticks)
+        belt = _belt(passage.before, passage.mode, at_edge)
+        event = Event(passage.t, passage.x1, passage.x2, kind, belt)
+        memory = self._update(memory, event, passage.fired & busy)
+
+        kind = jnp.where(passage.slips, EventKind.SLIP.value, EventKind.EDGE.value)
+        belt = _belt(passage.mode, lanes.mode, ~passage.slips)
+        event = Event(lanes.t, lanes.x1, lanes.x2, kind, belt)
+        memory = self._update(memory, event, passage.released & busy)
+        return replace(lanes, memory=memory)
+
+    def _update(self, memory, event, happened):
+        return choose(happened, jax.vmap(self.reducer.update)(memory, event), memory)
+
+    def finish(self, osc, lanes):
+        end = End(lanes.t, lanes.x1, lanes.x2, lanes.status)
+        return {**jax.vmap(self.reducer.finish)(lanes.memory, end), "status": lanes.status}
+
+
+def _belt(before: Mode, after: Mode, at_edge: Array) -> Array:
+    """The lowest belt whose contact changed, or, at an edge, that came or went."""
+    numbers = [jnp.asarray(i) for i in range(len(before.codes))]
+
+    def first_change(a, b):
+        return first_of([p != q for p, q in zip(a, b, strict=True)], numbers, jnp.asarray(-1))
+
+    came = first_change(before.touching, after.touching)
+    return jnp.where(at_edge, came, first_change(before.codes, after.codes))
