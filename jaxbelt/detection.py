@@ -45,7 +45,7 @@ from .bifurcations import (
     vary,
 )
 from .checks import as_array, check_finite, pick, require
-from .cycles import SIZES, Orbit, follow, last_turn
+from .cycles import SIZES, Orbit, Turn, follow, last_turn, turn_of
 from .equilibria import Equilibria, equilibria
 from .oscillator import Oscillator
 from .results import EventKind, Status
@@ -142,7 +142,7 @@ class Label(NamedTuple):
 
 
 class Path:
-    """A path in one parameter: its labels, each computed once."""
+    """A path in one parameter: its labels, each computed once, and turns of the cycles in them."""
 
     def __init__(self, osc, where, span):
         require(
@@ -162,8 +162,10 @@ class Path:
         for value in (self.first, self.last):
             self.at(value).check()
         self.length = self.last - self.first
+        paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(osc)]
+        self.name = jax.tree_util.keystr(paths[int(self.index)]).removeprefix(".")
         self.labels: dict[float, Label] = {}
-        self.starts: dict[float, dict[Signature, int]] = {}
+        self.turns: dict[float, dict[Signature, Turn]] = {}
         self.breaks = self._coincidences()
 
     def at(self, value: float) -> Oscillator:
@@ -198,7 +200,7 @@ class Path:
             seen = jax.tree.map(np.asarray, _look(self.osc, self.index, jnp.asarray(filled)))
             for lane, value in enumerate(batch):
                 at_value = jax.tree.map(lambda x, i=lane: x[i], seen)
-                self.labels[float(value)], self.starts[float(value)] = _label(at_value)
+                self.labels[float(value)], self.turns[float(value)] = _label(at_value)
 
     def label(self, value: float) -> Label:
         """The label there, which `look` has found."""
@@ -211,9 +213,7 @@ class _Seen(NamedTuple):
     kind: Any
     stable: Any
     status: Any
-    codes: Any
-    ends: Any
-    count: Any
+    turn: Any
 
 
 @eqx.filter_jit
@@ -222,18 +222,17 @@ def _look(osc: Oscillator, index: Array, values: Array) -> _Seen:
 
 
 def _look_at(osc: Oscillator) -> _Seen:
-    def run(start):
-        orbit, status = approach(osc, rests, start)
-        shift, count = last_turn(orbit)
-        rows = jnp.arange(ROOM)
-        source = orbit.repeats + 1 + (shift + rows) % jnp.maximum(count, 1)
-        codes, ends = orbit.codes[source], orbit.ends[source]
-        status = jnp.where(count > ROOM, Status.TOO_MANY_ARCS.value, status)
-        return status, codes.astype(jnp.int8), ends.astype(jnp.int8), count
-
     rests = equilibria(osc)
-    status, codes, ends, count = jax.vmap(run)(starts(osc, rests))
-    return _Seen(rests.kind, rests.stable, status, codes, ends, count)
+
+    def run(start):
+        orbit = approach(osc, rests, start)
+        _, count = last_turn(orbit)
+        fits = (orbit.status != Status.OK) | (count <= ROOM)
+        status = jnp.where(fits, orbit.status, Status.TOO_MANY_ARCS.value)
+        return status, turn_of(orbit, ROOM, len(osc.belts))
+
+    status, turn = jax.vmap(run)(starts(osc, rests))
+    return _Seen(rests.kind, rests.stable, status, turn)
 
 
 def starts(osc: Oscillator, rests: Equilibria) -> Array:
@@ -250,8 +249,8 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
     return jnp.stack([*onsets, *others])
 
 
-def approach(osc: Oscillator, rests: Equilibria, start: Array) -> tuple[Orbit, Array]:
-    """The orbit from a start until it settles, and a status: OK where that is a cycle.
+def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
+    """The orbit from a start until it settles, with the status OK where that is on a cycle.
 
     If it has not settled, the last three tops tell what it approaches: their differences form a
     geometric sequence, so its limit is known (Aitken). It is a cycle if the limit is much nearer to
@@ -269,32 +268,35 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> tuple[Orbit, A
     away = jnp.abs(limit - tops[2]) < 0.2 * distance
     pending = (orbit.status == Status.NOT_SETTLED) & (last[0] >= 0) & (before != 0)
     is_cycle = pending & (jnp.abs(ratio) < 1) & away
-    ended = eqx.tree_at(lambda o: (o.repeats, o.count), orbit, (last[1], last[2] + 1))
-    orbit = jax.tree.map(lambda a, b: jnp.where(is_cycle, a, b), ended, orbit)
-    return orbit, jnp.where(is_cycle, Status.OK.value, orbit.status)
+    ended = eqx.tree_at(
+        lambda o: (o.repeats, o.count, o.status),
+        orbit,
+        (last[1], last[2] + 1, jnp.asarray(Status.OK.value)),
+    )
+    return jax.tree.map(lambda a, b: jnp.where(is_cycle, a, b), ended, orbit)
 
 
-def _label(seen: _Seen) -> tuple[Label, dict[Signature, int]]:
-    """The label, and from which start each of its cycles is reached."""
+def _label(seen: _Seen) -> tuple[Label, dict[Signature, Turn]]:
+    """The label, and a turn of every cycle in it."""
     exists = seen.kind > 0
     rests = tuple(zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), strict=True))
-    cycles: dict[Signature, int] = {}
+    cycles: dict[Signature, Turn] = {}
     for start, status in enumerate(seen.status):
+        turn = jax.tree.map(lambda x, i=start: x[i], seen.turn)
         if status == Status.OK:
-            count = seen.count[start]
-            turn = _signature(seen.codes[start, :count], seen.ends[start, :count])
-            cycles.setdefault(turn, start)
-    if not cycles and not any(stable for _, stable in rests):
-        # Nothing holds the orbits but a cycle that they approach slowly.
-        cycles = {(): len(seen.status) - 1}
+            cycles.setdefault(_signature(turn), turn)
+        if start == len(seen.status) - 1 and not cycles and not any(stable for _, stable in rests):
+            # Nothing holds the orbits but a cycle that they approach slowly.
+            cycles[()] = turn
     return Label(rests, frozenset(cycles)), cycles
 
 
-def _signature(codes: np.ndarray, ends: np.ndarray) -> Signature:
+def _signature(turn: Turn) -> Signature:
     """The events of a turn, from the one that makes the smallest sequence; slip goes unsaid."""
-    n = codes.shape[-1]
+    n = turn.codes.shape[-1]
+    codes, ends = turn.codes[turn.used], turn.ends[turn.used].tolist()
     events = []
-    for i, end in enumerate(ends.tolist()):
+    for i, end in enumerate(ends):
         following = codes[(i + 1) % len(codes)]
         if end < n:
             events.append((EventKind.STICK if following[end] == 0 else EventKind.CROSS, end))

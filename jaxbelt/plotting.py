@@ -15,6 +15,7 @@ module that imports matplotlib, and `import jaxbelt` does not import this module
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -28,6 +29,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
+from .diagrams import BifurcationDiagram, Branch
 from .equilibria import Equilibria, EquilibriumKind
 from .equilibria import equilibria as find_equilibria
 from .friction import AbstractFriction
@@ -291,14 +293,7 @@ def _name_boundaries_outside(ax: Axes, names: list[tuple[float, int]]) -> None:
     line = 1.25 * matplotlib.rcParams["font.size"]
     names = sorted(names)
     at = np.array([(level - bottom) / (top - bottom) * height for level, _ in names])
-    wanted = at.copy()
-    for _ in range(50):
-        for i in range(1, len(names)):
-            gap = line - (at[i] - at[i - 1])
-            if gap > 1e-9:
-                at[i - 1] -= gap / 2
-                at[i] += gap / 2
-    for (level, belt), shift in zip(names, at - wanted, strict=True):
+    for (level, belt), shift in zip(names, _spread(at, line) - at, strict=True):
         _name_boundary(
             ax, belt, (1.0, level), (3, shift), "left", "center", ax.get_yaxis_transform()
         )
@@ -427,6 +422,180 @@ def plot_vector_field(
 def _field(osc, x1, x2):
     mode = mode_of_state(osc, x1, x2)
     return x2, jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
+
+
+# --- bifurcation diagrams -----------------------------------------------------------------------
+
+UNSTABLE_COLOUR = "0.6"
+#: Parameters by the end of their path in the oscillator; % is the number of the belt.
+SYMBOLS = {
+    "damping": r"\zeta",
+    "omega": r"\omega",
+    "velocity": r"\nu_%",
+    "load": r"u_{0,%}",
+    "lower": r"\mathrm{lower\ edge}_%",
+    "upper": r"\mathrm{upper\ edge}_%",
+    "static": r"\mu_{s,%}",
+    "residual": r"p_{1,%}",
+    "quadratic": r"p_{2,%}",
+    "steepness": r"p_{3,%}",
+}
+WORDS = {"damping": "damping", "velocity": "belt velocity", "load": "load"}
+#: What is said of a special point above it.
+POINT_NAMES = {
+    "Hopf": "Hopf",
+    "NonsmoothFold": "fold, belt {belt}",
+    "GrazingSliding": "grazing, belt {belt}",
+    "SlidingExchange": "sliding exchange",
+    "SuddenSliding": "belt {belt} at rest",
+    "FoldOfCycles": "fold of cycles",
+    "Unexplained": "unexplained",
+}
+
+
+def parameter_symbol(name: str) -> str:
+    """The paper's symbol of a parameter, by its path such as "belts[0].velocity"."""
+    *_, last = name.split(".")
+    belt = name.partition("[")[2].partition("]")[0]
+    return SYMBOLS[last].replace("%", belt) if last in SYMBOLS else rf"\mathrm{{{last}}}"
+
+
+def plot_diagram(
+    diagram: BifurcationDiagram, ax: Axes | None = None, *, quantity: str = "x2"
+) -> Axes:
+    """A bifurcation diagram in the manner of the paper's Figs. 3 and 7.
+
+    quantity: "x2": equilibria are drawn at x2 = 0, cycles that stick by the velocity of each belt
+    that they stick to, two of these joined by double arrows where they belong to one cycle, other
+    cycles by their largest x2. "x1": smallest and largest x1; "period". Stable is black, unstable
+    grey; unstable cycles are dashed. Dotted lines are the special points, the names of the regions
+    between them stand at the upper edge. Returns the axes.
+    """
+    known = ("x2", "x1", "period")
+    if quantity not in known:
+        raise ValueError(f"quantity must be one of {', '.join(known)}, got {quantity!r}")
+    ax = _new_axes() if ax is None else ax
+    for branch in diagram.branches:
+        for rows in _stretches_of(branch.stable):
+            _draw_rows(ax, branch, rows, quantity)
+    first, last = diagram.regions[0][0], diagram.regions[-1][1]
+    ax.set_xlim(first, last)
+    ax.margins(y=0.08)
+    ax.autoscale_view(scalex=False)
+    if quantity == "x2":
+        _join_stick_phases(ax, diagram)
+    _name_points(ax, diagram)
+    _name_regions(ax, diagram)
+    *_, last_part = diagram.name.split(".")
+    word = WORDS.get(last_part, "parameter")
+    ax.set_xlabel(f"{word} ${parameter_symbol(diagram.name)}$")
+    labels = {"x2": "velocity $x_2$", "x1": "displacement $x_1$", "period": "period"}
+    ax.set_ylabel(labels[quantity])
+    return ax
+
+
+def _stretches_of(flags: np.ndarray) -> list[slice]:
+    """The rows between changes of a flag; each includes the first of the next, to be joined."""
+    ends = [0, *(np.flatnonzero(flags[1:] != flags[:-1]) + 1), len(flags)]
+    return [slice(a, b) for a, b in pairwise(ends)]
+
+
+def _draw_rows(ax: Axes, branch: Branch, rows: slice, quantity: str) -> None:
+    stable, values = bool(branch.stable[rows][0]), branch.values[rows]
+    is_cycle = branch.kind == "cycle"
+    style: dict[str, Any] = {
+        "color": "black" if stable else UNSTABLE_COLOUR,
+        "linewidth": (2.0 if stable else 1.2) if is_cycle else 1.1,
+        "linestyle": (0, (4, 2)) if is_cycle and not stable else "-",
+        "solid_capstyle": "butt",
+        "zorder": 3 if stable else 2.5,
+        "label": f"{'' if stable else 'un'}stable {'cycle' if is_cycle else 'fixed point'}",
+    }
+    if quantity == "period":
+        curves = [branch.period[rows]] if is_cycle else []
+    elif quantity == "x1":
+        curves = [branch.x1_min[rows], branch.x1_max[rows]]
+    else:
+        stuck = ~np.isnan(branch.stick_velocities[rows])
+        any_stuck = np.any(stuck, axis=1)
+        curves = [
+            column for column in branch.stick_velocities[rows].T if not np.all(np.isnan(column))
+        ]
+        curves.append(np.where(any_stuck, np.nan, branch.x2_max[rows]))
+    for curve in curves:
+        if not np.all(np.isnan(curve)):
+            ax.plot(values, curve, **style)
+
+
+def _join_stick_phases(ax: Axes, diagram: BifurcationDiagram) -> None:
+    """Double arrows between the velocities that one cycle sticks at in turn."""
+    for first, last, _ in diagram.regions:
+        count = max(1, round(8 * (last - first) / (diagram.regions[-1][1] - diagram.regions[0][0])))
+        for at in first + (last - first) * (np.arange(count) + 0.5) / count:
+            for branch in diagram.branches:
+                inside = (branch.values > first) & (branch.values < last) & branch.stable
+                if not np.any(inside):
+                    continue
+                row = np.flatnonzero(inside)[np.argmin(np.abs(branch.values[inside] - at))]
+                levels = np.sort(branch.stick_velocities[row])
+                levels = levels[~np.isnan(levels)]
+                for low, high in pairwise(levels):
+                    arrow = {"arrowstyle": "<->", "color": "0.35", "linewidth": 0.7}
+                    style = {**arrow, "shrinkA": 1.5, "shrinkB": 1.5, "mutation_scale": 7}
+                    ax.annotate("", (at, high), (at, low), arrowprops=style, zorder=2)
+
+
+def _name_points(ax: Axes, diagram: BifurcationDiagram) -> None:
+    width = ax.get_window_extent().width * 72 / _figure_of(ax).dpi
+    first, last = ax.get_xlim()
+    values = np.array([float(point.value) for point in diagram.points])
+    at = (values - first) / (last - first) * width
+    shifts = _spread(at, matplotlib.rcParams["font.size"]) - at
+    for point, value, shift in zip(diagram.points, values, shifts, strict=True):
+        ax.axvline(value, color="0.45", linewidth=0.6, linestyle=":", zorder=1)
+        name = POINT_NAMES[point.kind].format(belt=getattr(point.condition, "belt", ""))
+        ax.annotate(
+            name,
+            (value, 1.0),
+            xycoords=ax.get_xaxis_transform(),
+            xytext=(shift, 9),
+            textcoords="offset points",
+            rotation=90,
+            ha="center",
+            va="bottom",
+            fontsize="x-small",
+            arrowprops={"arrowstyle": "-", "color": "0.45", "linewidth": 0.5, "shrinkB": 0},
+            annotation_clip=False,
+        )
+
+
+def _name_regions(ax: Axes, diagram: BifurcationDiagram) -> None:
+    bottom, top = ax.get_ylim()
+    ax.set_ylim(bottom, top + 0.09 * (top - bottom))
+    for first, last, name in diagram.regions:
+        ax.annotate(
+            name,
+            ((first + last) / 2, 1.0),
+            xycoords=ax.get_xaxis_transform(),
+            xytext=(0, -4),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
+            zorder=5,
+        )
+
+
+def _spread(wanted: np.ndarray, gap: float) -> np.ndarray:
+    """Positions as near to the wanted ones, in order, as a gap between them allows."""
+    at = wanted.copy()
+    for _ in range(200):
+        for i in range(1, len(at)):
+            lack = gap - (at[i] - at[i - 1])
+            if lack > 1e-9:
+                at[i - 1] -= lack / 2
+                at[i] += lack / 2
+    return at
 
 
 # --- the model ----------------------------------------------------------------------------------

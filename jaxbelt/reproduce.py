@@ -11,6 +11,7 @@ What is still missing beside the paper is named in `STILL_MISSING`.
 import json
 import operator
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ from .bifurcations import (
     refine,
 )
 from .cycles import Cycle, unstable_cycle
+from .diagrams import BifurcationDiagram, bifurcation_diagram
 from .equilibria import Equilibria, equilibria
 from .oscillator import Belt, Oscillator
 from .presets import (
@@ -57,9 +59,7 @@ MISSING_REGION = (
     "Just below nu0 = 0 the exact cycle sticks on belt 0 only, Fig. 11 (c), until belt 1 joins in "
     "a grazing point at -0.0788: a region between 3a and 4c that the paper does not list."
 )
-STILL_MISSING = (
-    "Still missing: the bifurcation diagrams, Figs. 3 and 7, and the region map, Fig. 6."
-)
+STILL_MISSING = "Still missing: the region map, Fig. 6."
 #: What is to be said beside the table.
 REMARKS = (MISPRINT, MISSING_REGION, STILL_MISSING)
 
@@ -286,10 +286,13 @@ def draw_portraits(
         )
         ax.set_title(panel.title, loc="left")
         ax.label_outer()
-    # Remarks are for the terminal too, where symbols are words.
-    note = portraits.note.replace("p3", "$p_3$").replace("nu0", r"$\nu_0$")
-    plotting.draw_key(figure, note=note)
+    plotting.draw_key(figure, note=_with_symbols(portraits.note))
     return figure
+
+
+def _with_symbols(remark: str) -> str:
+    """A remark as for the terminal, where symbols are words, in symbols."""
+    return remark.replace("p3", "$p_3$").replace("nu0", r"$\nu_0$")
 
 
 def _equilibria(osc: Oscillator) -> Equilibria:
@@ -391,10 +394,36 @@ def draw_formulations() -> plotting.Figure:
     return figure
 
 
+def draw_diagram_a() -> plotting.Figure:
+    """Fig. 3: equilibria and cycles of the oscillator with one belt, over its velocity."""
+    osc = _with_two_belts(class_a(0.2))
+    diagram = bifurcation_diagram(osc, lambda osc: osc.belts[0].velocity, (0.0, 0.4))
+    # One belt only: the paper gives these regions no letter.
+    regions = tuple((first, last, name[:1]) for first, last, name in diagram.regions)
+    figure = _draw_diagram(replace(diagram, regions=regions), note=MISPRINT)
+    return figure
+
+
+def draw_diagram_b() -> plotting.Figure:
+    """Fig. 7: the same with two belts, along nu1 = 0.35."""
+    osc = class_b(0.3, PUBLISHED_NU1)
+    diagram = bifurcation_diagram(osc, lambda osc: osc.belts[0].velocity, (-0.7, 0.7))
+    return _draw_diagram(diagram, note=MISSING_REGION)
+
+
+def _draw_diagram(diagram: BifurcationDiagram, note: str) -> plotting.Figure:
+    figure = plotting.journal_figure(7.2, 4.2)
+    plotting.plot_diagram(diagram, figure.subplots())
+    plotting.draw_key(figure, note=_with_symbols(note))
+    return figure
+
+
 #: Every figure of the paper that can be drawn, by the name of its file, and one of our own.
 FIGURES: dict[str, Callable[[], plotting.Figure] | Portraits] = {
     "fig01": draw_model,
     "fig02": draw_classes,
+    "fig03": draw_diagram_a,
+    "fig07": draw_diagram_b,
     "formulations": draw_formulations,
     "fig04": Portraits(
         "a",

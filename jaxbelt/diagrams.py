@@ -1,0 +1,349 @@
+"""Pictures of a whole parameter space as data: `bifurcation_diagram`.
+
+A bifurcation diagram is what `scan` leaves between its points, filled in. In the stretch between
+two neighbouring points nothing changes in kind, so every equilibrium and every cycle in it can be
+computed at as many values as are wanted, all at once: the attracting cycles from where the label
+of the stretch says that they are reached from, the unstable ones around stable equilibria. The
+values are denser towards the points, where branches go like square roots. At a point, what ends on
+one side goes on as what begins there at the same place: through a Hopf point with the other
+stability, through a grazing point or an exchange with another signature, and at a nonsmooth fold
+back on the same side, from stable to unstable.
+"""
+
+import importlib
+from collections.abc import Callable, Sequence
+from itertools import combinations, pairwise
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .bifurcations import BifurcationPoint, SuddenSliding, vary
+from .checks import require
+from .cycles import SIZES, Cycle, Turn, polish, unstable_cycle
+from .detection import Label, Path, search
+from .equilibria import Equilibria, equilibria
+from .oscillator import Oscillator
+from .results import EventKind, Status
+
+#: Cycles in one batch.
+BATCH = 32
+#: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
+SAME = 1e-2
+
+
+class Branch(eqx.Module):
+    """Equilibria or cycles along a path in one parameter: a struct of arrays, a row a value.
+
+    kind: "equilibrium" or "cycle". values: of the parameter, [rows]; they turn back at a fold.
+    stable: [rows]. x1_min, x1_max, x2_min, x2_max: the range of the motion, [rows]; of a segment of
+    pseudo-equilibria its ends. period, multiplier (the nontrivial one): of a cycle, else NaN.
+    stick_durations, stick_velocities: per turn, and of the belt over omega, [rows, belts]; NaN
+    where a cycle does not stick to that belt.
+    """
+
+    kind: str = eqx.field(static=True)
+    values: np.ndarray
+    stable: np.ndarray
+    x1_min: np.ndarray
+    x1_max: np.ndarray
+    x2_min: np.ndarray
+    x2_max: np.ndarray
+    period: np.ndarray
+    multiplier: np.ndarray
+    stick_durations: np.ndarray
+    stick_velocities: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __repr__(self) -> str:
+        ends = f"{self.values[0]:.6g} to {self.values[-1]:.6g}"
+        flips = int(np.sum(self.stable[1:] != self.stable[:-1]))
+        first = "stable" if self.stable[0] else "unstable"
+        return f"Branch({self.kind}, {len(self)} rows, {ends}, {first} first, {flips} changes)"
+
+
+class BifurcationDiagram(eqx.Module):
+    """What `bifurcation_diagram` returns.
+
+    points: the special points in order, as from `scan`; branches: of equilibria, then of cycles;
+    regions: (first, last, name) of every stretch between points, see `region_name`; oscillator:
+    the one that was given; name: of the parameter, as the path to it. `plot()` draws it.
+    """
+
+    points: tuple[BifurcationPoint, ...]
+    branches: tuple[Branch, ...]
+    regions: tuple[tuple[float, float, str], ...] = eqx.field(static=True)
+    oscillator: Oscillator
+    name: str = eqx.field(static=True)
+
+    def plot(self, ax: Any = None, *, quantity: str = "x2") -> Any:
+        """Draw it into the axes `ax` (None: new ones), which are returned.
+
+        quantity: "x2", the paper's Figs. 3 and 7: equilibria at x2 = 0, sticking cycles by the
+        velocity of the belt, others by their largest x2; or "x1" (smallest and largest), "period".
+        """
+        # By its name: the modules are a ladder, in which pictures come last.
+        plotting = importlib.import_module(".plotting", __package__)
+        return plotting.plot_diagram(self, ax, quantity=quantity)
+
+    def __repr__(self) -> str:
+        names = " | ".join(name for _, _, name in self.regions)
+        return (
+            f"BifurcationDiagram({self.name}, {len(self.points)} points, "
+            f"{len(self.branches)} branches, regions {names})"
+        )
+
+
+def bifurcation_diagram(
+    osc: Oscillator,
+    where: Callable[[Oscillator], Any],
+    span: tuple[float, float],
+    *,
+    rows: int = 160,
+    resolution: int = 96,
+) -> BifurcationDiagram:
+    """Equilibria and cycles, stable and unstable, along a path in one parameter.
+
+    osc, where, span, resolution: as for `scan`, which finds the special points. rows: about how
+    many values of the parameter are computed. `ValueError` names an impossible argument.
+    """
+    require(isinstance(rows, int) and rows > 0, "rows", "a positive integer", repr(rows))
+    path = Path(osc, where, span)
+    points = search(path, resolution)
+    # A point on an end of the span has one side only.
+    inner = [point for point in points if path.first < float(point.value) < path.last]
+    ends = [path.first, *(float(point.value) for point in inner), path.last]
+    stretches = list(pairwise(ends))
+    nodes = [_nodes(path, a, b, rows) for a, b in stretches]
+    path.look(np.concatenate(nodes))
+    middles = [float(values[len(values) // 2]) for values in nodes]
+    labels = [path.label(value) for value in middles]
+    pieces = [*_equilibrium_pieces(path, nodes), *_cycle_pieces(path, nodes, labels)]
+    names = [region_name(path.at(v), label) for v, label in zip(middles, labels, strict=True)]
+    return BifurcationDiagram(
+        points=points,
+        branches=tuple(_joined(pieces, inner)),
+        regions=tuple((a, b, name) for (a, b), name in zip(stretches, names, strict=True)),
+        oscillator=osc,
+        name=path.name,
+    )
+
+
+def _nodes(path: Path, a: float, b: float, rows: int) -> np.ndarray:
+    """Values from a to b, dense at both ends, which are left out where they are special."""
+    count = max(9, round(rows * (b - a) / path.length))
+    inner = 0.5 * (1 - np.cos(np.linspace(0, np.pi, count)))
+    first = path.beside(a)[1] if a in path.breaks or a != path.first else a
+    last = path.beside(b)[0] if b in path.breaks or b != path.last else b
+    return first + (last - first) * inner
+
+
+def region_name(osc: Oscillator, label: Label) -> str:
+    """The name of what a label tells, in the manner of the paper's Fig. 6.
+
+    A digit: 1 there is a stable equilibrium only; 2 a stable cycle, too; 3 a stable cycle only.
+    Where belts run in opposite directions these are 6, 5 and 4. With several belts a letter tells
+    what the cycle sticks to: a belt 0, b belt 1, c both (belts as binary digits, for more of them),
+    s none. Of several cycles each has its letter.
+    """
+    velocities = [float(belt.velocity) for belt in osc.belts]
+    opposite = min(velocities) < 0 < max(velocities)
+    rests = any(stable for _, stable in label.equilibria)
+    number = 2 if rests and label.cycles else 3 if label.cycles else 1
+    letters = []
+    for cycle in label.cycles:
+        belts = {belt for kind, belt in cycle if kind == EventKind.STICK}
+        code = sum(2**belt for belt in belts)
+        letters.append(chr(ord("a") + code - 1) if code else "s")
+    several = len(velocities) > 1
+    tail = "".join(sorted(letters)) if several else "s" * letters.count("s")
+    return f"{7 - number if opposite else number}{tail}"
+
+
+# --- pieces of branches ---------------------------------------------------------------------------
+
+
+class _Piece(NamedTuple):
+    """A branch within one stretch, rows from left to right, and the number of the stretch."""
+
+    branch: Branch
+    stretch: int
+
+
+def _equilibrium_pieces(path: Path, nodes: Sequence[np.ndarray]) -> list[_Piece]:
+    found = _in_batches(_rests, path, np.concatenate(nodes))
+    pieces = []
+    for stretch, rows in enumerate(_consecutive(nodes)):
+        values, here = nodes[stretch], jax.tree.map(lambda x, rows=rows: x[rows], found)
+        none = np.full(len(values), np.nan)
+        per_belt = np.full((len(values), len(path.osc.belts)), np.nan)
+        for row in range(int(np.max(np.sum(here.kind > 0, axis=1)))):
+            branch = Branch(
+                kind="equilibrium",
+                values=values,
+                stable=here.stable[:, row],
+                x1_min=here.x1_lower[:, row],
+                x1_max=here.x1_upper[:, row],
+                x2_min=np.zeros(len(values)),
+                x2_max=np.zeros(len(values)),
+                period=none,
+                multiplier=none,
+                stick_durations=per_belt,
+                stick_velocities=per_belt,
+            )
+            pieces.append(_Piece(branch, stretch))
+    return pieces
+
+
+def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Label]) -> list[_Piece]:
+    wanted: list[tuple[int, np.ndarray, list[Turn]]] = []
+    for stretch, label in enumerate(labels):
+        for signature in label.cycles:
+            at = [v for v in nodes[stretch] if signature in path.turns[float(v)]]
+            turns = [path.turns[float(v)][signature] for v in at]
+            wanted.append((stretch, np.array(at), turns))
+    pieces = []
+    if wanted:
+        turns = [turn for _, _, group in wanted for turn in group]
+        room = next(n for n in SIZES if n >= max(int(np.sum(turn.used)) for turn in turns))
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves)[:, :room], *turns)
+        groups = [values for _, values, _ in wanted]
+        cycles = _in_batches(_attracting, path, np.concatenate(groups), stacked)
+        pieces += _as_pieces(path, cycles, groups, [stretch for stretch, _, _ in wanted])
+    # An unstable cycle lies between an equilibrium and a cycle that both attract.
+    both = [
+        stretch
+        for stretch, label in enumerate(labels)
+        if label.cycles and any(stable for _, stable in label.equilibria)
+    ]
+    if both:
+        groups = [nodes[stretch] for stretch in both]
+        cycles = _in_batches(_repelling, path, np.concatenate(groups))
+        pieces += _as_pieces(path, cycles, groups, both)
+    return pieces
+
+
+def _as_pieces(path: Path, cycles: Cycle, groups, stretches) -> list[_Piece]:
+    pieces = []
+    for stretch, values, rows in zip(stretches, groups, _consecutive(groups), strict=True):
+        found = rows[cycles.status[rows] == Status.OK]
+        if not found.size:
+            continue
+        here = jax.tree.map(lambda x, found=found: x[found], cycles)
+        at = values[found - rows[0]]
+        sticks = np.asarray(here.stick_durations)
+        belts, omega = here.oscillator.belts, here.oscillator.omega
+        speeds = np.stack([belt.velocity / omega for belt in belts], axis=1)
+        stuck = np.any((here.chain.codes == 0) & here.chain.used[..., None], axis=1)
+        branch = Branch(
+            kind="cycle",
+            values=at,
+            stable=np.asarray(here.stable),
+            x1_min=np.asarray(here.x1_min),
+            x1_max=np.asarray(here.x1_max),
+            x2_min=np.asarray(here.x2_min),
+            x2_max=np.asarray(here.x2_max),
+            period=np.asarray(here.period),
+            multiplier=here.multiplier,
+            stick_durations=np.where(stuck, sticks, np.nan),
+            stick_velocities=np.where(stuck, speeds, np.nan),
+        )
+        pieces.append(_Piece(branch, stretch))
+    return pieces
+
+
+def _consecutive(groups: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The row numbers of each group, when all stand one after another."""
+    ends = np.cumsum([len(group) for group in groups])
+    return [np.arange(end - len(group), end) for group, end in zip(groups, ends, strict=True)]
+
+
+def _in_batches(program, path: Path, values: np.ndarray, more: Any = None) -> Any:
+    """What a program gives at all values (and for one more argument), as NumPy arrays."""
+    parts = []
+    for begin in range(0, len(values), BATCH):
+        rows = np.minimum(np.arange(begin, begin + BATCH), len(values) - 1)
+        given = jax.tree.map(lambda x, rows=rows: jnp.asarray(x[rows]), (values, more))
+        parts.append(jax.tree.map(np.asarray, program(path.osc, path.index, *given)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(values)], *parts)
+
+
+@eqx.filter_jit
+def _rests(osc: Oscillator, index: Array, values: Array, _: None) -> Equilibria:
+    return jax.vmap(lambda p: equilibria(vary(osc, index, p[None])))(values)
+
+
+@eqx.filter_jit
+def _attracting(osc: Oscillator, index: Array, values: Array, turns: Turn) -> Cycle:
+    ok = jnp.asarray(Status.OK.value)
+    return jax.vmap(lambda p, turn: polish(vary(osc, index, p[None]), turn, ok))(values, turns)
+
+
+@eqx.filter_jit
+def _repelling(osc: Oscillator, index: Array, values: Array, _: None) -> Cycle:
+    return jax.vmap(lambda p: unstable_cycle(vary(osc, index, p[None])))(values)
+
+
+# --- from pieces to branches ----------------------------------------------------------------------
+
+
+class _End(NamedTuple):
+    """An end of a piece (its number, and whether it is the right one), and where it is."""
+
+    piece: int
+    right: bool
+    place: tuple[str, float, float]
+
+
+def _joined(pieces: Sequence[_Piece], points: Sequence[BifurcationPoint]) -> list[Branch]:
+    """Branches through the points: two ends of pieces that are one place there belong together."""
+    partner: dict[tuple[int, bool], tuple[int, bool]] = {}
+    for at, point in enumerate(points):
+        if isinstance(point.condition, SuddenSliding):
+            continue
+        ends = [
+            _end(i, piece, right=piece.stretch == at)
+            for i, piece in enumerate(pieces)
+            if piece.stretch in (at, at + 1)
+        ]
+        pairs = sorted((_apart(a, b), i, j) for (i, a), (j, b) in combinations(enumerate(ends), 2))
+        taken: set[int] = set()
+        for distance, i, j in pairs:
+            if distance < SAME and not taken & {i, j}:
+                taken |= {i, j}
+                for a, b in ((ends[i], ends[j]), (ends[j], ends[i])):
+                    partner[a.piece, a.right] = (b.piece, b.right)
+    branches, left = [], set(range(len(pieces)))
+    while left:
+        # Begin at an end that has no partner; a closed branch may begin anywhere.
+        free = [(i, r) for i in sorted(left) for r in (False, True) if (i, r) not in partner]
+        at = (free or [(min(left), False)])[0]
+        chain = []
+        while at is not None and at[0] in left:
+            left.remove(at[0])
+            branch = pieces[at[0]].branch
+            chain.append(_reversed(branch) if at[1] else branch)
+            at = partner.get((at[0], not at[1]))
+        branches.append(jax.tree.map(lambda *leaves: np.concatenate(leaves), *chain))
+    return branches
+
+
+def _end(number: int, piece: _Piece, *, right: bool) -> _End:
+    branch, row = piece.branch, -1 if right else 0
+    return _End(number, right, (branch.kind, float(branch.x1_min[row]), float(branch.x1_max[row])))
+
+
+def _apart(a: _End, b: _End) -> float:
+    """How far apart two ends are, relative to the motion there."""
+    (kind, *x), (other, *y) = a.place, b.place
+    size = max(x[1] - x[0], y[1] - y[0], 0.1)
+    return max(abs(x[0] - y[0]), abs(x[1] - y[1])) / size if kind == other else np.inf
+
+
+def _reversed(branch: Branch) -> Branch:
+    return jax.tree.map(lambda leaf: leaf[::-1], branch)
