@@ -20,6 +20,7 @@ from .bifurcations import (
 )
 from .cycles import Cycle, find_cycle, unstable_cycle
 from .detection import scan
+from .diagrams import BifurcationDiagram, bifurcation_diagram
 from .equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
 from .friction import AbstractFriction, Conti, Coulomb, Stribeck
 from .functionals import (
@@ -52,6 +53,7 @@ __all__ = [
     "AbstractFriction",
     "Arcs",
     "Belt",
+    "BifurcationDiagram",
     "BifurcationPoint",
     "Conti",
     "Coulomb",
@@ -71,6 +73,7 @@ __all__ = [
     "SuddenSliding",
     "Trajectory",
     "amplitude",
+    "bifurcation_diagram",
     "describe",
     "energy_dissipated",
     "energy_fed",
