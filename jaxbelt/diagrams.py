@@ -23,7 +23,7 @@ from jaxtyping import Array
 
 from .bifurcations import BifurcationPoint, SuddenSliding, vary
 from .checks import require
-from .cycles import SIZES, Cycle, Turn, polish, unstable_cycle
+from .cycles import SIZES, Cycle, Ends, Turn, polish, unstable_cycle
 from .detection import Label, Path, search
 from .equilibria import Equilibria, equilibria
 from .oscillator import Oscillator
@@ -210,7 +210,9 @@ def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Labe
     pieces = []
     if wanted:
         turns = [turn for _, _, group in wanted for turn in group]
-        room = next(n for n in SIZES if n >= max(int(np.sum(turn.used)) for turn in turns))
+        unused = Ends(len(path.osc.belts)).unused
+        arcs = max(int(np.sum(turn.ends != unused)) for turn in turns)
+        room = next(size for size in SIZES if size >= arcs)
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves)[:, :room], *turns)
         groups = [values for _, values, _ in wanted]
         cycles = _in_batches(_attracting, path, np.concatenate(groups), stacked)
@@ -228,33 +230,48 @@ def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Labe
     return pieces
 
 
-def _as_pieces(path: Path, cycles: Cycle, groups, stretches) -> list[_Piece]:
+def _as_pieces(path: Path, found: "_Rows", groups, stretches) -> list[_Piece]:
     pieces = []
     for stretch, values, rows in zip(stretches, groups, _consecutive(groups), strict=True):
-        found = rows[cycles.status[rows] == Status.OK]
-        if not found.size:
-            continue
-        here = jax.tree.map(lambda x, found=found: x[found], cycles)
-        at = values[found - rows[0]]
-        sticks = np.asarray(here.stick_durations)
-        belts, omega = here.oscillator.belts, here.oscillator.omega
-        speeds = np.stack([belt.velocity / omega for belt in belts], axis=1)
-        stuck = np.any((here.chain.codes == 0) & here.chain.used[..., None], axis=1)
-        branch = Branch(
-            kind="cycle",
-            values=at,
-            stable=np.asarray(here.stable),
-            x1_min=np.asarray(here.x1_min),
-            x1_max=np.asarray(here.x1_max),
-            x2_min=np.asarray(here.x2_min),
-            x2_max=np.asarray(here.x2_max),
-            period=np.asarray(here.period),
-            multiplier=here.multiplier,
-            stick_durations=np.where(stuck, sticks, np.nan),
-            stick_velocities=np.where(stuck, speeds, np.nan),
-        )
-        pieces.append(_Piece(branch, stretch))
+        fine = found.status[rows] == Status.OK
+        if np.any(fine):
+            here = jax.tree.map(lambda x, rows=rows[fine]: x[rows], found)
+            fields = {name: value for name, value in here._asdict().items() if name != "status"}
+            pieces.append(_Piece(Branch(kind="cycle", values=values[fine], **fields), stretch))
     return pieces
+
+
+class _Rows(NamedTuple):
+    """The fields of a `Branch` of cycles, and the status of each."""
+
+    status: Any
+    stable: Any
+    x1_min: Any
+    x1_max: Any
+    x2_min: Any
+    x2_max: Any
+    period: Any
+    multiplier: Any
+    stick_durations: Any
+    stick_velocities: Any
+
+
+def _row(cycle: Cycle) -> _Rows:
+    osc, chain = cycle.oscillator, cycle.chain
+    stuck = jnp.any((chain.codes == 0) & chain.used[:, None], axis=0)
+    speeds = jnp.stack([belt.velocity / osc.omega for belt in osc.belts])
+    return _Rows(
+        status=cycle.status,
+        stable=cycle.stable,
+        x1_min=cycle.x1_min,
+        x1_max=cycle.x1_max,
+        x2_min=cycle.x2_min,
+        x2_max=cycle.x2_max,
+        period=cycle.period,
+        multiplier=cycle.multiplier,
+        stick_durations=jnp.where(stuck, cycle.stick_durations, jnp.nan),
+        stick_velocities=jnp.where(stuck, speeds, jnp.nan),
+    )
 
 
 def _consecutive(groups: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -279,14 +296,16 @@ def _rests(osc: Oscillator, index: Array, values: Array, _: None) -> Equilibria:
 
 
 @eqx.filter_jit
-def _attracting(osc: Oscillator, index: Array, values: Array, turns: Turn) -> Cycle:
+def _attracting(osc: Oscillator, index: Array, values: Array, turns: Turn) -> _Rows:
     ok = jnp.asarray(Status.OK.value)
-    return jax.vmap(lambda p, turn: polish(vary(osc, index, p[None]), turn, ok))(values, turns)
+    return jax.vmap(lambda p, turn: _row(polish(vary(osc, index, p[None]), turn, ok)))(
+        values, turns
+    )
 
 
 @eqx.filter_jit
-def _repelling(osc: Oscillator, index: Array, values: Array, _: None) -> Cycle:
-    return jax.vmap(lambda p: unstable_cycle(vary(osc, index, p[None])))(values)
+def _repelling(osc: Oscillator, index: Array, values: Array, _: None) -> _Rows:
+    return jax.vmap(lambda p: _row(unstable_cycle(vary(osc, index, p[None]))))(values)
 
 
 # --- from pieces to branches ----------------------------------------------------------------------

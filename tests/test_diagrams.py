@@ -1,0 +1,126 @@
+"""Bifurcation diagrams against closed forms and the oracle, and their pictures."""
+
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import EventKind
+from jaxbelt.detection import Label
+from jaxbelt.diagrams import region_name
+
+STICK, CROSS = EventKind.STICK, EventKind.CROSS
+
+
+def nu0(osc):
+    return osc.belts[0].velocity
+
+
+@pytest.fixture(scope="module")
+def diagram():
+    return jb.bifurcation_diagram(jb.presets.class_b(0.3, 0.35), nu0, (-0.7, 0.7))
+
+
+def test_regions_are_named_as_in_the_paper(diagram):
+    """With 4a, which the paper misses; 5b and 6 on the far side as it has them."""
+    names = [name for _, _, name in diagram.regions]
+    assert names == ["6", "5b", "5c", "4c", "4a", "3a", "2a", "2b", "1"]
+    values = [float(point.value) for point in diagram.points]
+    assert [last for _, last, _ in diagram.regions[:-1]] == values
+    assert "8 points, 4 branches, regions 6 | 5b" in repr(diagram)
+
+
+def test_equilibria_are_those_of_the_closed_form(diagram):
+    left, right = (branch for branch in diagram.branches if branch.kind == "equilibrium")
+    for branch in (left, right):
+        nu = branch.values
+        # Eq. (24) for two belts: both pull with mu, in the direction in which they run.
+        pull = np.sign(nu) * (0.6 + 0.4 / (1 + 10 * np.abs(nu))) + 0.6 + 0.4 / 4.5
+        assert np.allclose(branch.x1_min, pull, rtol=0, atol=1e-15)
+        slope = 4 / (1 + 10 * np.abs(nu)) ** 2 + 4 / 4.5**2  # eq. (27)
+        assert np.all(branch.stable == (slope < 0.5))
+        assert np.all(np.diff(nu) > 0) and np.sum(np.diff(branch.stable)) == 1
+
+
+def test_cycles_are_those_of_the_oracle(diagram):
+    cycles = [branch for branch in diagram.branches if branch.kind == "cycle"]
+    for branch in cycles:
+        for stable in (True, False):
+            row = np.flatnonzero(branch.stable == stable)[15]
+            osc = oracle.class_b(float(branch.values[row]), 0.35)
+            find = oracle_cycles.sticking_cycle if stable else oracle_cycles.unstable_cycle
+            expected = find(osc)
+            assert expected is not None
+            # The oracle integrates to 1e-13; unstable cycles are good to 1e-9 there.
+            assert branch.period[row] == pytest.approx(expected.period, rel=1e-8)
+            assert branch.x1_max[row] == pytest.approx(expected.x1_max, abs=1e-8)
+            assert branch.x1_min[row] == pytest.approx(expected.x1_min, abs=1e-8)
+            assert branch.multiplier[row] == pytest.approx(expected.multiplier, rel=1e-7)
+
+
+def test_branches_of_cycles_go_on_through_grazing_exchange_and_fold(diagram):
+    left, right = (branch for branch in diagram.branches if branch.kind == "cycle")
+    fold, _, hopf, grazing, _, _, exchange, other_fold = (float(p.value) for p in diagram.points)
+    for branch, turning in ((left, fold), (right, other_fold)):
+        # From where belt 0 rests to the fold, and back from there to the Hopf point.
+        turn = int(np.argmax(np.abs(branch.values)))
+        assert branch.values[turn] == pytest.approx(turning, abs=2e-6)
+        assert np.all(branch.stable[: turn + 1]) and not np.any(branch.stable[turn + 2 :])
+        assert abs(branch.values[-1]) == pytest.approx(-hopf, abs=2e-6)
+        # It shrinks to the equilibrium like a square root: to 1e-3 at 1.4e-6 from the Hopf point.
+        assert branch.x1_max[-1] - branch.x1_min[-1] < 3e-3
+        # Rows are dense enough for a picture, and no two ends are joined that do not belong.
+        assert np.max(np.abs(np.diff(branch.x1_max))) < 0.06
+    sticks = ~np.isnan(left.stick_velocities[left.stable])
+    values = left.values[left.stable]
+    assert np.all(sticks[:, 1] == (values < grazing)) and np.all(sticks[values > -0.45, 0])
+    sticks = ~np.isnan(right.stick_velocities[right.stable])
+    values = right.values[right.stable]
+    assert np.all(sticks[:, 0] == (values < exchange)) and np.all(sticks[:, 1] != sticks[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("velocities", "stable", "cycles", "name"),
+    [
+        ((0.3, 0.7), True, [], "1"),
+        ((0.3, -0.7), True, [], "6"),
+        ((0.3, 0.7), True, [((STICK, 0),)], "2a"),
+        ((-0.3, 0.7), True, [((CROSS, 0), (STICK, 0), (STICK, 1))], "5c"),
+        ((0.3, 0.7), False, [((STICK, 1),)], "3b"),
+        ((-0.3, 0.7), False, [()], "4s"),
+        ((0.3, 0.7), True, [((STICK, 0),), ((STICK, 1),)], "2ab"),
+        ((0.3,), False, [((STICK, 0),)], "3"),
+        ((0.3, 0.4, 0.5), False, [((STICK, 1), (STICK, 2))], "3f"),
+    ],
+)
+def test_names_of_regions(velocities, stable, cycles, name):
+    osc = jb.Oscillator(0.5, [jb.Belt(v, jb.Conti(1.0, 0.6, 10.0)) for v in velocities])
+    assert region_name(osc, Label(((1, stable),), frozenset(cycles))) == name
+
+
+def test_picture(diagram):
+    for quantity in ("x2", "x1", "period"):
+        ax = diagram.plot(quantity=quantity)
+        texts = {text.get_text() for text in ax.texts}
+        assert {"6", "4a", "2b", "fold, belt 1", "grazing, belt 0", "belt 0 at rest"} <= texts
+        assert ax.get_xlabel() == r"belt velocity $\nu_0$"
+    with pytest.raises(ValueError, match="quantity must be one of x2, x1, period, got 'x3'"):
+        diagram.plot(quantity="x3")
+
+
+def test_picture_shows_stick_velocities_and_dashes_what_is_unstable(diagram):
+    lines = diagram.plot().get_lines()
+    dashed = [line for line in lines if line.get_label() == "unstable cycle"]
+    assert len(dashed) == 2 and all(line.is_dashed() for line in dashed)
+    stable = [line for line in lines if line.get_label() == "stable cycle"]
+    heights = [line.get_ydata()[~np.isnan(line.get_ydata())] for line in stable]
+    # Sticks on belt 1 at x2 = nu1, or on belt 0 at x2 = nu0.
+    for line, height in zip(stable, heights, strict=True):
+        nu = line.get_xdata()[~np.isnan(line.get_ydata())]
+        assert np.allclose(height, 0.35) or np.allclose(height, nu)
+
+
+def test_impossible_rows_are_named():
+    with pytest.raises(ValueError, match="rows must be a positive integer, got 0"):
+        jb.bifurcation_diagram(jb.presets.class_b(0.3, 0.35), nu0, (-0.7, 0.7), rows=0)
