@@ -447,7 +447,7 @@ def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, s
     before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
     tangent = chain.ends.at[before].set(names.tangent + belt)
     ends = jnp.where(exchange, chain.ends, tangent)
-    system = _Encounter(Chain(chain.codes, ends, chain.mesh), belts, index)
+    system = _Encounter(chain=Chain(chain.codes, ends, chain.mesh), belts=belts, index=index)
     p0 = parameter(still, index)[None]
     return _solved_point(osc, system, z, p0, status, judge)
 
@@ -568,7 +568,7 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
 # --- points without a cycle -----------------------------------------------------------------------
 
 
-def _small_newton(equations, osc, unknowns):
+def small_newton(equations, osc, unknowns):
     """Newton's method for a few equations(osc, unknowns).
 
     Returns the solution, its steps, its residual and the error of the last unknown.
@@ -649,7 +649,7 @@ def at_hopf(osc: Oscillator, index: int | Array, belts, wanted, size) -> Bifurca
 
     p0 = parameter(osc, index)
     x1 = jnp.where(fixed[row], rests.x1[row], 0.0)
-    u, steps, size, error = _small_newton(equations, osc, jnp.stack([x1, p0]))
+    u, steps, size, error = small_newton(equations, osc, jnp.stack([x1, p0]))
     at_point = vary(osc, index, u[1:])
     inside = [*boundary_guards(at_point, mode, rest), *edge_guards(at_point, mode, u[0])]
     status = jnp.where(jnp.all(jnp.stack(inside) > 0), Status.OK.value, Status.NOT_ADMISSIBLE.value)
@@ -684,7 +684,7 @@ def at_rest(osc: Oscillator, index: int | Array, belts, wanted, size) -> Bifurca
         return jnp.stack([mode_acceleration(osc, mode, u[0], rest) + limit, nu])
 
     p0 = parameter(osc, index)
-    u, steps, size, error = _small_newton(equations, osc, jnp.stack([start[0], p0]))
+    u, steps, size, error = small_newton(equations, osc, jnp.stack([start[0], p0]))
     status = jnp.where(sticks, Status.OK.value, Status.NOT_TOUCHED.value)
     status = jnp.where(size < 1e-9, status, Status.NO_CONVERGENCE.value)
     return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.STUCK_FOREVER)

@@ -35,6 +35,7 @@ LADDER = (
     "functionals",
     "sweep",
     "bifurcations",
+    "switch_folds",
     "detection",
     "diagrams",
     "basins",
