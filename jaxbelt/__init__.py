@@ -8,6 +8,7 @@ import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 from . import presets
+from .basins import Basins, BasinStability, basin_stability, basins
 from .bifurcations import (
     BifurcationPoint,
     FoldOfCycles,
@@ -41,6 +42,7 @@ from .sweep import sweep
 
 if TYPE_CHECKING:
     from .plotting import (
+        plot_basins,
         plot_friction_law,
         plot_phase_portrait,
         plot_time_history,
@@ -52,6 +54,8 @@ __version__ = importlib.metadata.version("jaxbelt")
 __all__ = [
     "AbstractFriction",
     "Arcs",
+    "BasinStability",
+    "Basins",
     "Belt",
     "BifurcationDiagram",
     "BifurcationPoint",
@@ -73,6 +77,8 @@ __all__ = [
     "SuddenSliding",
     "Trajectory",
     "amplitude",
+    "basin_stability",
+    "basins",
     "bifurcation_diagram",
     "describe",
     "energy_dissipated",
@@ -83,6 +89,7 @@ __all__ = [
     "lyapunov_coefficient",
     "peak",
     "period",
+    "plot_basins",
     "plot_friction_law",
     "plot_phase_portrait",
     "plot_time_history",

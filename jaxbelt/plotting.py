@@ -29,6 +29,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
+from .basins import Basins
 from .diagrams import BifurcationDiagram, Branch
 from .equilibria import Equilibria, EquilibriumKind
 from .equilibria import equilibria as find_equilibria
@@ -725,12 +726,58 @@ def _draw_arrow(ax: Axes, start, end, color: str = "black") -> None:
     ax.annotate("", xy=end, xytext=start, arrowprops={**style, "mutation_scale": 8}, zorder=5)
 
 
+# --- basins of attraction -----------------------------------------------------------------------
+
+
+def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
+    """Which start leads where, with the cycles, and the unstable one between the basins dashed.
+
+    basins: from `basins`. Basins of cycles are pale blue and green, those of equilibria pale
+    orange, undecided starts white. Returns the axes.
+    """
+    ax = _new_axes() if ax is None else ax
+    labels = np.asarray(basins.label)
+    x1, x2 = np.asarray(basins.dataset["x1"]), np.asarray(basins.dataset["x2"])
+    colours = _basin_colours(basins.attractors)
+    palette = matplotlib.colors.ListedColormap(["white", *colours])
+    mesh = ax.pcolormesh(x1, x2, labels.T, cmap=palette, vmin=-1.5, vmax=len(colours) - 0.5)
+    mesh.set_rasterized(True)
+    ax.set(xlim=(x1[0], x1[-1]), ylim=(x2[0], x2[-1]))
+    for colour, name in zip(colours, basins.attractors, strict=True):
+        ax.add_patch(Rectangle((0, 0), 0, 0, facecolor=colour, edgecolor="0.4", label=f"to {name}"))
+    plot_phase_portrait(
+        basins.oscillator,
+        cycles=[c for c in (*basins.cycles, basins.boundary) if int(c.status) == 0],
+        xlim=(x1[0], x1[-1]),
+        ylim=(x2[0], x2[-1]),
+        ax=ax,
+    )
+    return ax
+
+
+def _basin_colours(attractors: Sequence[str]) -> list[str]:
+    """Pale, so that lines stay visible; light enough apart for print without colour."""
+    cycles, others = (
+        iter(["#B5D6EC", "#A9DCC8", "#D5E8F5"]),
+        iter(["#F6C98F", "#F3DCE8", "#F5E9A9"]),
+    )
+    return [next(cycles if name.startswith("cycle") else others, "#DDDDDD") for name in attractors]
+
+
 # --- figures ------------------------------------------------------------------------------------
 
 
 def journal_style():
     """A context in which figures are made, drawn and saved in the manner of a journal."""
     return matplotlib.rc_context(JOURNAL)
+
+
+def draw_basins(basins: Basins) -> Figure:
+    """Basins of attraction on a page, with a key."""
+    figure = journal_figure(4.6, 4.4)
+    plot_basins(basins, ax=figure.subplots())
+    draw_key(figure, ncols=2)
+    return figure
 
 
 def journal_figure(width: float, height: float) -> Figure:
@@ -751,18 +798,20 @@ def draw_overview(
     return figure
 
 
-def draw_key(figure: Figure, note: str = "") -> None:
-    """Below the axes of a figure a note, and one key for all that they label."""
+def draw_key(figure: Figure, note: str = "", *, ncols: int | None = None) -> None:
+    """Below the axes of a figure a note, and one key for all that they label, in so many columns
+    (None: in one line)."""
     by_label: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             by_label.setdefault(label, handle)
-    labels = [label for label in KEY_ORDER if label in by_label]
+    first = [label for label in by_label if label.startswith("to ")]
+    labels = [*first, *(label for label in KEY_ORDER if label in by_label)]
     figure.legend(
         [by_label[label] for label in labels],
         labels,
         loc="outside lower center",
-        ncols=len(labels),
+        ncols=ncols or len(labels),
         handlelength=1.8,
         columnspacing=1.4,
         title=note or None,

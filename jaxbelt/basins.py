@@ -1,0 +1,209 @@
+"""Basins of attraction: which starts lead where, as a picture and as a number.
+
+`basins` labels a grid of starts by the attractor that each leads to, and finds the unstable cycle
+that separates them, where there is one. `basin_stability` gives the fraction of a box of starts
+that leads to each kind of attractor, with its standard error (P. J. Menck, J. Heitzig, N. Marwan,
+J. Kurths, How basin stability complements the linear-stability paradigm, Nature Physics 9 (2013)
+89-92). Both run in the kernel behind `sweep`, where a run ends as soon as its attractor is known.
+"""
+
+import equinox as eqx
+import jax
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, ArrayLike
+
+from . import batch
+from .checks import as_array, check_finite, require
+from .cycles import Cycle, find_cycle, unstable_cycle
+from .equilibria import equilibria
+from .oscillator import Oscillator
+from .sweep import LONG_ENOUGH, sweep
+
+#: Attractors of one kind whose extrema differ by less than this are one.
+SAME = 1e-4
+
+
+class Basins(eqx.Module):
+    """What `basins` returns.
+
+    oscillator; dataset: `xarray.Dataset` over x1 and x2 with everything that
+    `sweep(..., observe="attractor")` tells of each start, and `label`, the number of its attractor,
+    from 0, the most frequent first (-1: undecided); attractors: a few words for each label; cycles:
+    those of the attractors that are cycles, in the same order; boundary: the unstable cycle, with
+    the status NO_UNSTABLE_CYCLE where there is none.
+    """
+
+    oscillator: Oscillator
+    dataset: xr.Dataset = eqx.field(static=True)
+    attractors: tuple[str, ...] = eqx.field(static=True)
+    cycles: tuple[Cycle, ...]
+    boundary: Cycle
+
+    @property
+    def label(self) -> xr.DataArray:
+        return self.dataset["label"]
+
+    def __repr__(self) -> str:
+        labels = np.asarray(self.label)
+        parts = [f"{np.mean(labels == i):.1%} {name}" for i, name in enumerate(self.attractors)]
+        if np.any(labels < 0):
+            parts.append(f"{np.mean(labels < 0):.1%} undecided")
+        return f"Basins({labels.shape[0]} x {labels.shape[1]} starts: {', '.join(parts)})"
+
+
+class BasinStability(eqx.Module):
+    """What `basin_stability` returns: fractions of the starts, and their standard errors.
+
+    fractions, standard_errors: dictionaries with the keys "equilibrium", "cycle", "stuck" and
+    "undecided". n: number of starts. The standard error of 0 and of 1 is 0; what was met by none of
+    the n starts has a fraction below 3/n, with a confidence of 95 per cent.
+    """
+
+    fractions: dict[str, float]
+    standard_errors: dict[str, float]
+    n: int
+
+    def __repr__(self) -> str:
+        parts = [
+            f"{kind} {fraction:.5f} +- {self.standard_errors[kind]:.5f}"
+            for kind, fraction in self.fractions.items()
+            if fraction > 0
+        ]
+        return f"BasinStability({', '.join(parts)}; {self.n} starts)"
+
+
+def basins(
+    oscillator: Oscillator,
+    *,
+    x1: ArrayLike,
+    x2: ArrayLike,
+    t1: float = LONG_ENOUGH,
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    progress: bool | None = None,
+) -> Basins:
+    """A grid of starts, labelled by where each leads, and the unstable cycle between them.
+
+    x1, x2: displacements and velocities of the starts, increasing, [n] and [m], dimensionless. t1:
+    when a run that reached no attractor is given up. rtol, atol: tolerances of a step. progress:
+    whether to show a bar, as in `sweep`. `ValueError` names an argument that is impossible.
+    """
+    require(isinstance(oscillator, Oscillator), "oscillator", "an Oscillator", oscillator)
+    oscillator.check_scalars()
+    oscillator.check()
+    axes = {"x1": np.asarray(as_array(x1, "x1", (None,))), "x2": as_array(x2, "x2", (None,))}
+    for name, values in axes.items():
+        check_finite(values, name)
+        require(np.all(np.diff(values) > 0), name, "increasing", values)
+    dataset = sweep(
+        lambda: oscillator,
+        axes,
+        t1=t1,
+        rtol=rtol,
+        atol=atol,
+        observe="attractor",
+        progress=progress,
+    )
+    labels, attractors = _labels(oscillator, dataset)
+    dataset["label"] = (
+        ("x1", "x2"),
+        labels,
+        {"long_name": "number of the attractor", "attractors": list(attractors)},
+    )
+    cycles = []
+    for i, name in enumerate(attractors):
+        if name.startswith("cycle"):
+            j, k = np.argwhere(labels == i)[0]
+            cycles.append(find_cycle(oscillator, (float(dataset.x1[j]), float(dataset.x2[k]))))
+    return Basins(oscillator, dataset, attractors, tuple(cycles), unstable_cycle(oscillator))
+
+
+def _labels(osc: Oscillator, dataset: xr.Dataset) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Numbers of the attractors, the most frequent first, and their names."""
+    kinds = np.asarray(dataset["kind"])
+    sticks = np.asarray(dataset["sticks"]).astype(bool)
+    low, high = np.asarray(dataset["x1_min"]), np.asarray(dataset["x1_max"])
+    resting = kinds == "equilibrium"
+    rest = _nearest_equilibrium(osc, 0.5 * (low + high))
+    low, high = np.where(resting, rest, low), np.where(resting, rest, high)
+    labels = np.full(kinds.shape, -1)
+    found: list[tuple[int, str, np.ndarray]] = []
+    left = kinds != "undecided"
+    while np.any(left):
+        first = np.unravel_index(np.argmax(left), left.shape)
+        same = left & (kinds == kinds[first]) & np.all(sticks == sticks[first], axis=-1)
+        # A mass that is stuck for ever may be so anywhere on a segment.
+        if kinds[first] != "stuck":
+            same &= (np.abs(low - low[first]) < SAME) & (np.abs(high - high[first]) < SAME)
+        left &= ~same
+        found.append((int(np.sum(same)), _name(kinds[first], sticks[first], low[first]), same))
+    found.sort(key=lambda item: -item[0])
+    for i, (_, _, same) in enumerate(found):
+        labels[same] = i
+    return labels, tuple(name for _, name, _ in found)
+
+
+def _nearest_equilibrium(osc: Oscillator, x1: np.ndarray) -> np.ndarray:
+    """The x1 of the stable equilibrium nearest to each: a run ends in its neighbourhood."""
+    found = equilibria(osc)
+    rests = np.asarray(found.x1)[np.asarray(found.stable)]
+    if rests.size == 0:
+        return x1
+    return rests[np.argmin(np.abs(x1[..., None] - rests), axis=-1)]
+
+
+def _name(kind: str, sticks: np.ndarray, x1: float) -> str:
+    belts = " and ".join(f"belt {i}" for i in np.flatnonzero(sticks))
+    if kind == "equilibrium":
+        return f"rest at {x1:.3f}"
+    if kind == "stuck":
+        return f"stuck to {belts}" if belts else "stuck"
+    return f"cycle that sticks to {belts}" if belts else "cycle that never sticks"
+
+
+def basin_stability(
+    oscillator: Oscillator,
+    *,
+    box: tuple[tuple[float, float], tuple[float, float]],
+    n: int = 10_000,
+    key: Array,
+    t1: float = LONG_ENOUGH,
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+) -> BasinStability:
+    """The fraction of a box of starts that leads to each kind of attractor.
+
+    box: ((x1 from, to), (x2 from, to)), dimensionless; n: number of starts, drawn uniformly; key:
+    from `jax.random.key`; t1, rtol, atol as in `basins`. The standard error of a fraction f is
+    sqrt(f (1 - f) / n). `ValueError` names an argument that is impossible.
+    """
+    require(isinstance(oscillator, Oscillator), "oscillator", "an Oscillator", oscillator)
+    oscillator.check_scalars()
+    oscillator.check()
+    corners = as_array(box, "box", (2, 2))
+    check_finite(corners, "box")
+    require(np.all(np.asarray(corners)[:, 0] < np.asarray(corners)[:, 1]), "box", "not empty", box)
+    require(isinstance(n, int) and n > 0, "n", "a positive integer", n)
+    starts = jax.random.uniform(key, (2, n), minval=corners[:, :1], maxval=corners[:, 1:])
+    kinds = _kinds(oscillator, np.asarray(starts).T, {"t1": t1, "rtol": rtol, "atol": atol})
+    fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(batch.KINDS)}
+    errors = {name: float(np.sqrt(f * (1 - f) / n)) for name, f in fractions.items()}
+    return BasinStability(fractions, errors, n)
+
+
+def _kinds(osc: Oscillator, starts: np.ndarray, numbers: dict[str, float]) -> np.ndarray:
+    """Numbers of `batch.KINDS` for starts [n, 2], in the order of the starts."""
+    leaves, structure = jax.tree.flatten(osc)
+    edges = bool(np.any([np.isfinite([belt.lower, belt.upper]) for belt in osc.belts]))
+    program = batch.Program(structure, (False,) * len(leaves), batch.Attractor(), edges)
+    layout = batch.layout(program, leaves)
+    names = list(layout)
+    column = sum(int(np.prod(layout[name])) for name in names[: names.index("kind")])
+    kinds = np.zeros(len(starts), int)
+
+    def put(runs: np.ndarray, results: np.ndarray) -> None:
+        kinds[runs] = results[0, :, column]
+
+    batch.run(program, leaves, lambda a, b: starts[None, a:b], len(starts), put, **numbers)
+    return kinds
