@@ -309,8 +309,8 @@ def _signature(turn: Turn) -> Signature:
 # --- what makes the difference between two values -------------------------------------------------
 
 
-class _Guess(NamedTuple):
-    """A value near which a condition may hold, and the interval that it is to explain."""
+class Guess(NamedTuple):
+    """A value near which a condition may hold, and the interval in which it is looked for."""
 
     interval: tuple[float, float]
     value: float
@@ -330,9 +330,9 @@ def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoin
         conditions += [GrazingSliding(belt) for belt in changed]
         if before.smooth != after.smooth:
             conditions.append(FoldOfCycles())
-        guesses += [_Guess((a, b), value, one) for one in conditions for value in (a, b)]
+        guesses += [Guess((a, b), value, one) for one in conditions for value in (a, b)]
     found: dict[tuple[float, float], BifurcationPoint | None] = dict.fromkeys(intervals)
-    for guess, point in _refined(path, guesses):
+    for guess, point in refined(path.osc, path.index, guesses):
         a, b = guess.interval
         if point.status == Status.OK and a <= point.value <= b and found[a, b] is None:
             found[a, b] = point
@@ -348,9 +348,10 @@ def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
             conditions.append(SlidingExchange((min(belt, other), max(belt, other))))
     interval = path.beside(value)
     guesses = [
-        _Guess(interval, value + offset, one) for one in conditions for offset in (1e-2, -1e-2)
+        Guess(interval, value + offset, one) for one in conditions for offset in (1e-2, -1e-2)
     ]
-    found = {g.condition: p for g, p in _refined(path, guesses) if p.status == Status.OK}
+    solved = refined(path.osc, path.index, guesses)
+    found = {guess.condition: point for guess, point in solved if point.status == Status.OK}
     path.look(interval)
     before, after = map(path.label, interval)
     if not found and before != after:
@@ -358,8 +359,13 @@ def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
     return list(found.values())
 
 
-def _refined(path: Path, guesses: list[_Guess]) -> list[tuple[_Guess, BifurcationPoint]]:
-    """The guesses, those of one kind after those of another, with the points found from them."""
+def refined(
+    osc: Oscillator, index: Array, guesses: Sequence[Guess]
+) -> list[tuple[Guess, BifurcationPoint]]:
+    """The guesses, those of one kind after those of another, with the points found from them.
+
+    A tangency is looked for as `GrazingSliding` and returned as what it is.
+    """
     out = []
     for solve in (at_hopf, at_cycle, at_rest, at_fold_of_cycles):
         own = [guess for guess in guesses if _solver(guess.condition) == solve]
@@ -367,7 +373,7 @@ def _refined(path: Path, guesses: list[_Guess]) -> list[tuple[_Guess, Bifurcatio
             filled = [*batch, *[batch[0]] * (GUESSES - len(batch))]
             values = jnp.asarray(np.array([guess.value for guess in filled]))
             belts = jnp.asarray(np.array([_belts(guess.condition) for guess in filled]))
-            solved = _points(solve, path.osc, path.index, values, belts)
+            solved = _points(solve, osc, index, values, belts)
             for lane, guess in enumerate(batch):
                 point, condition = pick(solved, lane), guess.condition
                 if isinstance(condition, GrazingSliding) and point.multiplier > 1:
