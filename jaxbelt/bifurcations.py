@@ -257,7 +257,7 @@ class _System(eqx.Module):
         return Chain(self.chain.codes, ends, self.chain.mesh)
 
 
-class _Encounter(_System):
+class Encounter(_System):
     """Two belts run at one velocity; if they are the same, an arc is tangent to its boundary."""
 
     chain: Chain
@@ -447,7 +447,7 @@ def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, s
     before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
     tangent = chain.ends.at[before].set(names.tangent + belt)
     ends = jnp.where(exchange, chain.ends, tangent)
-    system = _Encounter(chain=Chain(chain.codes, ends, chain.mesh), belts=belts, index=index)
+    system = Encounter(chain=Chain(chain.codes, ends, chain.mesh), belts=belts, index=index)
     p0 = parameter(still, index)[None]
     return _solved_point(osc, system, z, p0, status, judge)
 
@@ -495,7 +495,7 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
 STARTS = 48
 
 
-class _UnitMultiplier(_System):
+class UnitMultiplier(_System):
     """A cycle with its signature fixed, and multiplier one."""
 
     chain: Chain
@@ -562,7 +562,7 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
         return jnp.where(fails, Status.NO_FOLD.value, cycle.status), jnp.asarray(jnp.nan)
 
     p0 = parameter(still, index)[None]
-    return _solved_point(osc, _UnitMultiplier(chain, index), z, p0, status, judge)
+    return _solved_point(osc, UnitMultiplier(chain, index), z, p0, status, judge)
 
 
 # --- points without a cycle -----------------------------------------------------------------------
