@@ -35,6 +35,7 @@ from .functionals import (
     stick_duration,
     stick_fraction,
 )
+from .inverse import Design, Fit, design, distance_to, fit
 from .oscillator import Belt, Oscillator
 from .results import EventKind, Status, describe
 from .simulate import Arcs, Events, Trajectory, simulate
@@ -62,10 +63,12 @@ __all__ = [
     "Conti",
     "Coulomb",
     "Cycle",
+    "Design",
     "Equilibria",
     "EquilibriumKind",
     "EventKind",
     "Events",
+    "Fit",
     "FoldOfCycles",
     "GrazingSliding",
     "Hopf",
@@ -81,10 +84,13 @@ __all__ = [
     "basins",
     "bifurcation_diagram",
     "describe",
+    "design",
+    "distance_to",
     "energy_dissipated",
     "energy_fed",
     "equilibria",
     "find_cycle",
+    "fit",
     "gap",
     "lyapunov_coefficient",
     "peak",
