@@ -64,6 +64,26 @@ def _console() -> Console:
     return console if console.is_terminal else Console(width=200)
 
 
+# --- options that describe an oscillator --------------------------------------------------------
+
+Class = Annotated[str, typer.Option("--class", help="The paper's class of contact: a, b, c or d.")]
+Nu0 = Annotated[float | None, typer.Option(help="Velocity of belt 0.")]
+Nu1 = Annotated[float | None, typer.Option(help="Velocity of belt 1 (classes b, c, d).")]
+Sigma = Annotated[float | None, typer.Option(help="Edge between the belts (class c).")]
+Sigma0 = Annotated[float | None, typer.Option(help="Where belt 1 begins (class d).")]
+Sigma1 = Annotated[float | None, typer.Option(help="Where belt 0 ends (class d).")]
+Belts = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--belt",
+        help="A belt in full, instead of a class; give it once a belt. A velocity, then "
+        "name=value with commas between: load, lower, upper (its contact interval), law.",
+    ),
+]
+Damping = Annotated[float, typer.Option(help="zeta = c / sqrt(k m).")]
+Omega = Annotated[float, typer.Option(help="sqrt(k / m).")]
+
+
 # --- reproduce ----------------------------------------------------------------------------------
 
 
@@ -135,23 +155,15 @@ def _table_of(values) -> Table:
 
 @app.command()
 def simulate(
-    system: Annotated[
-        str, typer.Option("--class", help="The paper's class of contact: a, b, c or d.")
-    ] = "b",
-    nu0: Annotated[float | None, typer.Option(help="Velocity of belt 0.")] = None,
-    nu1: Annotated[float | None, typer.Option(help="Velocity of belt 1 (classes b, c, d).")] = None,
-    sigma: Annotated[float | None, typer.Option(help="Edge between the belts (class c).")] = None,
-    sigma0: Annotated[float | None, typer.Option(help="Where belt 1 begins (class d).")] = None,
-    sigma1: Annotated[float | None, typer.Option(help="Where belt 0 ends (class d).")] = None,
-    belt: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="A belt in full, instead of a class; give it once a belt. A velocity, then "
-            "name=value with commas between: load, lower, upper (its contact interval), law."
-        ),
-    ] = None,
-    damping: Annotated[float, typer.Option(help="zeta = c / sqrt(k m).")] = 0.5,
-    omega: Annotated[float, typer.Option(help="sqrt(k / m).")] = 1.0,
+    system: Class = "b",
+    nu0: Nu0 = None,
+    nu1: Nu1 = None,
+    sigma: Sigma = None,
+    sigma0: Sigma0 = None,
+    sigma1: Sigma1 = None,
+    belt: Belts = None,
+    damping: Damping = 0.5,
+    omega: Omega = 1.0,
     start: Annotated[
         tuple[float, float],
         typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0."),
@@ -210,12 +222,10 @@ def simulate(
 
     console = _console()
     with _plain_errors():
-        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
         if samples < 2:
             raise ValueError(f"samples must be at least 2, got {samples}")
-        given = {name: value for name, value in arguments.items() if value is not None}
-        belts = _belts_of_class(system, given) if not belt else _belts_in_full(belt, given)
-        osc = jb.Oscillator(damping, belts, omega)
+        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
+        osc = _oscillator(system, arguments, belt, damping, omega)
         with console.status("simulating (the first seconds are compilation)"):
             trajectory = jb.simulate(
                 osc,
@@ -240,6 +250,12 @@ def simulate(
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if int(trajectory.status) >= jb.Status.TOO_MANY_SEGMENTS:
         raise typer.Exit(1)
+
+
+def _oscillator(system, arguments, belt, damping, omega) -> jb.Oscillator:
+    given = {name: value for name, value in arguments.items() if value is not None}
+    belts = _belts_of_class(system, given) if not belt else _belts_in_full(belt, given)
+    return jb.Oscillator(damping, belts, omega)
 
 
 def _belts_of_class(system: str, given: dict[str, float]) -> tuple[jb.Belt, ...]:
@@ -310,3 +326,79 @@ def write_events(trajectory: jb.Trajectory, path: Path) -> None:
         kinds = [jb.EventKind(kind).name for kind in np.asarray(events.kind).tolist()]
         for t, y, kind, belt in zip(*columns, kinds, np.asarray(events.belt).tolist(), strict=True):
             writer.writerow([t, *y, kind, belt])
+
+
+# --- basins -------------------------------------------------------------------------------------
+
+
+@app.command()
+def basins(
+    system: Class = "b",
+    nu0: Nu0 = None,
+    nu1: Nu1 = None,
+    sigma: Sigma = None,
+    sigma0: Sigma0 = None,
+    sigma1: Sigma1 = None,
+    belt: Belts = None,
+    damping: Damping = 0.5,
+    omega: Omega = 1.0,
+    x1: Annotated[
+        tuple[float, float], typer.Option(metavar="FROM TO", help="Displacements of the starts.")
+    ] = (0.0, 3.0),
+    x2: Annotated[
+        tuple[float, float], typer.Option(metavar="FROM TO", help="Velocities of the starts.")
+    ] = (-1.0, 1.0),
+    points: Annotated[
+        int, typer.Option(help="Starts along each side of the grid; their square is run.")
+    ] = 201,
+    starts: Annotated[
+        int, typer.Option(help="Random starts for the basin stability of the window; 0: none.")
+    ] = 10_000,
+    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
+    out: Annotated[
+        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv.")
+    ] = Path("basins"),
+) -> None:
+    """Where each start leads: basins of attraction, and the unstable cycle between them.
+
+    - **OUT.png**: a window of the phase plane, coloured by the attractor that a start leads to,
+      with the stable cycles, and the unstable one dashed.
+
+    - **OUT.csv**: x1, x2 and label of every start of the grid.
+
+    Prints the fraction of the window that leads to each kind of attractor, with its standard error
+    (basin stability), from random starts. An oscillator is described as for **simulate**.
+
+    Examples:
+
+    - jaxbelt basins --nu0 0.45 --nu1 0.35 --x1 0.5 2.5 --x2 -0.8 0.8
+
+    - jaxbelt basins --belt 1.4,law=stribeck,static=1,kinetic=0.5,stribeck_velocity=0.5
+      --damping 0.1 --x1 -2 2 --x2 0 2
+    """
+    from . import plotting
+
+    console = _console()
+    with _plain_errors():
+        if points < 2:
+            raise ValueError(f"points must be at least 2, got {points}")
+        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
+        osc = _oscillator(system, arguments, belt, damping, omega)
+        grid = [np.linspace(*span, points) for span in (x1, x2)]
+        with console.status("following the starts (the first seconds are compilation)"):
+            found = jb.basins(osc, x1=grid[0], x2=grid[1], progress=False)
+            lines = [repr(found)]
+            if starts:
+                key = jax.random.key(seed)
+                lines.append(repr(jb.basin_stability(osc, box=(x1, x2), n=starts, key=key)))
+        out.parent.mkdir(parents=True, exist_ok=True)
+        written = [out.with_name(out.name + end) for end in (".png", ".csv")]
+        with plotting.journal_style():
+            plotting.save(plotting.draw_basins(found), written[0])
+        with written[1].open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["x1", "x2", "label"])
+            for (i, j), label in np.ndenumerate(np.asarray(found.label)):
+                writer.writerow([float(grid[0][i]), float(grid[1][j]), int(label)])
+    for line in (*lines, f"Written: {', '.join(map(str, written))}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)

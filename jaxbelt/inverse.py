@@ -761,7 +761,7 @@ def design(
         gain = 1 - np.linalg.norm(new_miss) / np.linalg.norm(miss)
         if gain > 0:
             u, (achieved, slopes, cycle), miss, wanted = new, trial, new_miss, new_wanted
-            damping, idle = max(damping / 10, 1e-12), idle + 1 if gain < 1e-5 else 0
+            damping, idle = max(damping / 4, 1e-12), idle + 1 if gain < 1e-5 else 0
             tell(f"step {iterations}: off by {np.max(np.abs(miss)):.1e}")
         else:
             damping *= 10
