@@ -37,6 +37,7 @@ LADDER = (
     "bifurcations",
     "switch_folds",
     "detection",
+    "curves",
     "diagrams",
     "basins",
     "inverse",
