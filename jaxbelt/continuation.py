@@ -15,6 +15,7 @@ the step has gone over to another branch, and is halved, too.
 """
 
 import enum
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -102,10 +103,7 @@ def continue_curve(
     # A number that is no array would be a constant of the program, compiled anew for every value.
     args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, args)
 
-    def solve(u, tangent, length):
-        return jax.tree.map(
-            np.asarray, _correct(residual, jacobian, args, u, tangent, jnp.asarray(length))
-        )
+    solve = functools.partial(corrected, residual, jacobian, args)
 
     first = solve(u0, way / jnp.linalg.norm(way), 0.0)
     if not first.found:
@@ -184,7 +182,9 @@ def _passes(origin: CurvePoint, before: CurvePoint, after: CurvePoint) -> bool:
     return 0 < along <= length and off < 0.5 * length and same_way
 
 
-class _Corrected(NamedTuple):
+class Corrected(NamedTuple):
+    """What Newton's method ends with, see `CurvePoint`; found: whether it converged."""
+
     u: Any
     tangent: Any
     iterations: Any
@@ -192,8 +192,14 @@ class _Corrected(NamedTuple):
     found: Any
 
 
+def corrected(residual, jacobian, args, u, tangent, length) -> Corrected:
+    """The point of the curve in the plane normal to the tangent, `length` ahead of u; in NumPy."""
+    given = (jnp.asarray(u), jnp.asarray(tangent), jnp.asarray(length))
+    return jax.tree.map(np.asarray, _correct(residual, jacobian, args, *given))
+
+
 @eqx.filter_jit
-def _correct(residual, jacobian, args, u: Array, tangent: Array, step: Array) -> _Corrected:
+def _correct(residual, jacobian, args, u: Array, tangent: Array, step: Array) -> Corrected:
     """Newton's method in the plane normal to the tangent, `step` ahead of u."""
 
     def linearized(v):
@@ -222,4 +228,4 @@ def _correct(residual, jacobian, args, u: Array, tangent: Array, step: Array) ->
     start = (u + step * tangent, tangent, jnp.asarray(0), one, one)
     v, kernel, count, sign, size = lax.while_loop(unfinished, improve, start)
     found = (size <= 1e3 * ROUNDING) & jnp.all(jnp.isfinite(kernel))
-    return _Corrected(v, kernel / jnp.linalg.norm(kernel), count, sign, found)
+    return Corrected(v, kernel / jnp.linalg.norm(kernel), count, sign, found)
