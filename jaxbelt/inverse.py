@@ -145,7 +145,8 @@ class Record(eqx.Module):
     times: since the start of the piece, the last one the start of the next, [pieces, samples + 1];
     values: x1 and x2, [pieces, samples, 2]; weights: 1/noise, 0 where there is no datum, the same;
     starts: states at the starts of the pieces as the record has them, [pieces, 2]; scale: of each
-    component, [2]. Where only velocities are known the x1 of the starts lack a common constant.
+    component, [2]; lacks: 1.0 where only velocities are known, so that the x1 of the starts lack a
+    common constant, else 0.0.
     """
 
     times: Array
@@ -153,7 +154,7 @@ class Record(eqx.Module):
     weights: Array
     starts: Array
     scale: Array
-    velocity_only: bool = eqx.field(static=True)
+    lacks: Array
 
 
 def _record_of(ts: np.ndarray, values: np.ndarray, noise: Sequence[float | None]) -> Record:
@@ -189,7 +190,7 @@ def _record_of(ts: np.ndarray, values: np.ndarray, noise: Sequence[float | None]
         weights=jnp.asarray(np.pad(weights, padding).reshape(pieces, size, 2)),
         starts=jnp.asarray(states[begin]),
         scale=jnp.asarray(np.std(states, axis=0)),
-        velocity_only=0 not in given,
+        lacks=jnp.asarray(float(0 not in given)),
     )
 
 
@@ -239,7 +240,7 @@ def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Recor
         new = ahead(slope, 1.0)
         return new, jnp.stack(new, axis=-1)
 
-    start = (record.starts[:, 0] + shift * float(record.velocity_only), record.starts[:, 1])
+    start = (record.starts[:, 0] + shift * record.lacks, record.starts[:, 1])
     _, path = lax.scan(advance, start, None, length=steps)
     path = jnp.concatenate([jnp.stack(start, axis=-1)[None], path])
     # To the times of the data: linear between steps is good enough here.
@@ -295,7 +296,7 @@ def _candidates(selection, u, osc, record: Record, starts: int):
         near = any(np.max(np.abs(ends[i] - ends[j])) < 0.1 for j in chosen)
         if np.isfinite(misfits[i]) and not near:
             chosen.append(int(i))
-    shift = np.array([1.0, 0.0]) * record.velocity_only
+    shift = np.array([float(record.lacks), 0.0])
     return [(ends[i], np.asarray(record.starts) + shifts[i] * shift, misfits[i]) for i in chosen]
 
 
@@ -695,7 +696,7 @@ def distance_to(
 
 def design(
     oscillator: Oscillator,
-    targets: Sequence[tuple[Callable[[Cycle], Array], float | tuple[float, float]]],
+    targets: Sequence[Any],
     *,
     where: Callable[[Oscillator], Any],
     bounds: Sequence[tuple[float, float] | None] | None = None,
@@ -724,16 +725,8 @@ def design(
     selection, u = _select(oscillator, where, bounds)
     tell = report or (lambda text: None)
 
-    @eqx.filter_jit
     def evaluate(u):
-        def achieved(u):
-            cycle = find_cycle(selection.put(oscillator, selection.values(u)), y0)
-            values = jnp.stack([functional(cycle) for functional in functionals])
-            values = jnp.where(cycle.status == Status.OK, values, jnp.nan)
-            return values, (values, cycle)
-
-        slopes, (values, cycle) = jax.jacfwd(achieved, has_aux=True)(u)
-        return values, slopes, cycle
+        return _achieved(functionals, selection, oscillator, y0, jnp.asarray(u))
 
     def off(achieved):
         wanted = np.clip(achieved, *intervals.T)
@@ -748,14 +741,14 @@ def design(
         step = -matrix.T @ np.linalg.solve(gram + damping * np.eye(len(miss)), miss)
         return u + step * min(1.0, LONGEST / max(np.max(np.abs(step)), 1e-300))
 
-    achieved, slopes, cycle = evaluate(jnp.asarray(u))
+    achieved, slopes, cycle = evaluate(u)
     miss, wanted = off(np.asarray(achieved))
     damping, iterations, idle = 1e-3, 0, 0
     while iterations < 2 * ITERATIONS and idle < 5:
         if not np.all(np.isfinite(miss)) or np.max(np.abs(miss)) < MET or damping > 1e8:
             break
         new = improved(np.asarray(slopes), miss, wanted, damping)
-        trial = evaluate(jnp.asarray(new))
+        trial = evaluate(new)
         new_miss, new_wanted = off(np.asarray(trial[0]))
         iterations += 1
         gain = 1 - np.linalg.norm(new_miss) / np.linalg.norm(miss)
@@ -780,6 +773,20 @@ def design(
     )
 
 
+@eqx.filter_jit
+def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
+    """The functionals of the cycle, NaN where there is none, their derivatives, and the cycle."""
+
+    def achieved(u):
+        cycle = find_cycle(selection.put(osc, selection.values(u)), y0)
+        values = jnp.stack([functional(cycle) for functional in functionals])
+        values = jnp.where(cycle.status == Status.OK, values, jnp.nan)
+        return values, (values, cycle)
+
+    slopes, (values, cycle) = jax.jacfwd(achieved, has_aux=True)(u)
+    return values, slopes, cycle
+
+
 def _checked_targets(targets):
     pairs = list(targets)
     require(len(pairs) > 0, "targets", "at least one pair (functional, value)", targets)
@@ -790,4 +797,4 @@ def _checked_targets(targets):
         lower, upper = pair[1] if isinstance(pair[1], tuple) else (pair[1], pair[1])
         require(float(lower) <= float(upper), "targets", "intervals (lower, upper)", repr(pair[1]))
         intervals.append((float(lower), float(upper)))
-    return [functional for functional, _ in pairs], np.array(intervals)
+    return tuple(functional for functional, _ in pairs), np.array(intervals)

@@ -1,0 +1,232 @@
+"""Fits of simulated records against truth and the oracle; designs against the oracle."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import Status
+from jaxbelt.inverse import Selection, _inverse, _local_cubics
+
+TS = np.arange(400) * 0.1
+START = (0.0, -2.0)
+TRUTH = np.array([1.0, 0.5, 0.35])
+NAMES = (
+    "belts[0].friction.static = belts[1].friction.static",
+    "damping",
+    "belts[1].velocity",
+)
+
+
+def where(osc):
+    """Static friction of both belts, damping, and the velocity of the belt that is stuck to."""
+    return tuple(b.friction.static for b in osc.belts), osc.damping, osc.belts[1].velocity
+
+
+def oscillator(values):
+    static, damping, velocity = values
+    friction = jb.Conti(static, 0.6, 10.0)
+    return jb.Oscillator(damping, (jb.Belt(0.45, friction), jb.Belt(velocity, friction)))
+
+
+def oracle_record(values):
+    static, damping, velocity = values
+    osc = oracle.class_b(0.45, velocity, mus=static, damping=damping)
+    run = oracle.simulate(osc, START, TS[-1], rtol=1e-12, atol=1e-12)
+    return np.array([run.at(t) for t in TS])
+
+
+@pytest.fixture(scope="module")
+def motion():
+    return oracle_record(TRUTH)
+
+
+def noisy(column, seed):
+    sigma = 0.01 * np.std(column)
+    return column + sigma * np.random.default_rng(seed).standard_normal(len(column)), sigma
+
+
+@pytest.fixture(scope="module")
+def fitted(motion):
+    """From 30 per cent off, and what was told on the way."""
+    x1, sigma = noisy(motion[:, 0], 0)
+    told = []
+    guess = oscillator(TRUTH * [1.3, 0.7, 1.3])
+    result = jb.fit(guess, TS, x1, where=where, noise=sigma, starts=4, report=told.append)
+    return result, told, x1, sigma
+
+
+def test_fit_recovers_what_made_the_record(fitted):
+    result, told, x1, sigma = fitted
+    assert result.status == Status.OK, result
+    assert result.names == NAMES
+    # Four standard errors: by chance once in 5,000 records of three parameters.
+    off = np.abs(np.asarray(result.estimates) - TRUTH)
+    assert np.all(off < 4 * np.asarray(result.standard_errors))
+    assert np.all(np.asarray(result.standard_errors) < 0.02 * TRUTH)
+    assert np.all(np.abs(result.y0 - np.array(START)) < 4 * result.y0_standard_errors)
+    # 395 degrees of freedom: standard deviation 0.071; of the autocorrelation 0.05.
+    assert result.reduced_chi_squared == pytest.approx(1, abs=4 * 0.071)
+    assert abs(result.autocorrelation) < 4 * 0.05 and result.plausibility > 1e-4
+    np.testing.assert_allclose(result.residuals[:, 0], x1 - result.ys[:, 0])
+    assert np.all(np.isnan(result.residuals[:, 1])) and result.noise[0] == pytest.approx(sigma)
+    tied = [belt.friction.static for belt in result.oscillator.belts]
+    assert tied[0] == tied[1] == result.estimates[0]
+    assert told[0].startswith("search: 4 starts") and any("1 windows" in text for text in told)
+    width = result.intervals()[:, 1] - result.intervals()[:, 0]
+    np.testing.assert_allclose(width, 2 * 1.959964 * result.standard_errors, rtol=1e-6)
+
+
+def test_standard_errors_are_those_of_the_oracles_derivatives(fitted):
+    """The Gauss-Newton matrix at the estimate, from Richardson differences of SciPy's motion."""
+    result, _, _, sigma = fitted
+    at = np.append(np.asarray(result.estimates), np.asarray(result.y0))
+
+    def record(values):
+        static, damping, velocity, x1, x2 = values
+        osc = oracle.class_b(0.45, velocity, mus=static, damping=damping)
+        run = oracle.simulate(osc, (x1, x2), TS[-1], rtol=1e-12, atol=1e-12)
+        return np.array([run.at(t)[0] for t in TS])
+
+    columns = []
+    for i in range(5):
+        moved = np.eye(5)[i]
+        derivative, _ = oracle.richardson(lambda h, e=moved: record(at + h * e), 0.0, 1e-5, 1)
+        columns.append(derivative / sigma)
+    jacobian = np.stack(columns, axis=1)
+    covariance = np.linalg.inv(jacobian.T @ jacobian)[:3, :3]
+    # Central differences: 1e-10 by the step, 1e-6 by the integrator's 1e-11 over it; corners of
+    # the motion between two samples cost a little more.
+    scale = np.sqrt(np.diag(covariance))
+    expected = covariance / scale[:, None] / scale
+    np.testing.assert_allclose(result.covariance / scale[:, None] / scale, expected, atol=2e-3)
+
+
+def test_velocities_with_gaps_and_unknown_noise(motion):
+    x2, sigma = noisy(motion[:, 1], 1)
+    x2[100:120] = np.nan
+    guess = oscillator(TRUTH * [0.8, 1.2, 0.9])
+    result = jb.fit(guess, TS, x2=x2, where=where, starts=4, report=None)
+    assert result.status == Status.OK, result
+    # 400 data scatter about the truth by 4 per cent; corners of the motion add to the estimate.
+    assert result.noise[1] == pytest.approx(sigma, rel=0.25)
+    off = np.abs(np.asarray(result.estimates) - TRUTH)
+    assert np.all(off < 5 * np.asarray(result.standard_errors))
+    assert np.sum(np.isnan(result.residuals[:, 1])) == 20
+
+
+def test_a_record_of_something_else_is_a_misfit(motion):
+    x1, sigma = noisy(motion[:, 0], 2)
+    shaken = x1 + 5 * sigma * np.sin(2.7 * TS)
+    result = jb.fit(oscillator(TRUTH), TS, shaken, where=where, noise=sigma, starts=1, report=None)
+    assert result.status == Status.MISFIT
+    assert result.reduced_chi_squared > 2 and result.autocorrelation > 0.3
+    assert "MISFIT" in repr(result)
+
+
+def test_bounded_values_and_back():
+    """lower, upper: (-inf, inf), (0, inf), (-inf, 1), (0.2, 0.9)."""
+    inf = np.inf
+    lower, upper = jnp.array([-inf, 0.0, -inf, 0.2]), jnp.array([inf, inf, 1.0, 0.9])
+    selection = Selection(((0,),) * 4, ("",) * 4, lower, upper, jnp.array([2.0, 1.0, 1.0, 1.0]))
+    values = jnp.array([-0.7, 3.0, -5.0, 0.3])
+    np.testing.assert_allclose(selection.values(selection.unbounded(values)), values, rtol=1e-13)
+    far = selection.values(jnp.array([30.0, -30.0, 30.0, 30.0]))
+    assert far[1] > 0 and far[2] < 1 and far[3] <= 0.9
+    slopes = jnp.diag(jax.jacfwd(selection.values)(selection.unbounded(values)))
+    # size; value - lower; upper - value; (value - lower)(upper - value)/(upper - lower)
+    np.testing.assert_allclose(slopes, [2.0, 3.0, 6.0, 0.1 * 0.6 / 0.7], rtol=1e-12)
+
+
+def test_what_a_record_does_not_tell_has_an_infinite_standard_error():
+    columns = np.random.default_rng(0).standard_normal((50, 4))
+    columns[:, 1] = 0.0  # no influence
+    alone = _inverse(columns.T @ columns)
+    assert np.isinf(alone[1, 1]) and np.all(np.isfinite(np.diag(alone)[[0, 2, 3]]))
+    kept = columns[:, [0, 2, 3]]
+    np.testing.assert_allclose(
+        alone[np.ix_([0, 2, 3], [0, 2, 3])], np.linalg.inv(kept.T @ kept), rtol=1e-10
+    )
+    columns[:, 1] = columns[:, 0]  # two that trade with each other
+    trading = np.diag(_inverse(columns.T @ columns))
+    assert np.all(np.isinf(trading[:2])) and np.all(np.isfinite(trading[2:]))
+
+
+def test_local_cubics_are_exact_for_cubics():
+    ts = np.sort(np.random.default_rng(1).uniform(0, 10, 200))
+    value, slope, noise = _local_cubics(ts, ts**3 - 2 * ts)
+    np.testing.assert_allclose(value, ts**3 - 2 * ts, rtol=1e-9, atol=1e-8)
+    np.testing.assert_allclose(slope, 3 * ts**2 - 2, rtol=1e-7, atol=1e-6)
+    assert noise < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"where": lambda o: o.belts}, "where must be a function that selects parameters"),
+        ({"where": lambda o: (o.damping, o.damping)}, "where must be free of repeats"),
+        ({"bounds": [(0.6, 0.7)]}, "damping must be inside of its bounds"),
+        ({"bounds": []}, "bounds must be 1 pairs"),
+        ({"noise": -1.0}, "noise must be > 0"),
+        ({"ts": TS[::-1]}, "ts must be increasing"),
+        ({"x1": np.zeros(3)}, "x1 must be of shape"),
+        ({"x1": None}, "x1 must be given"),
+        ({"starts": 0}, "starts must be a positive integer"),
+    ],
+)
+def test_impossible_arguments_are_named(change, message):
+    arguments = {"ts": TS, "x1": np.zeros(400), "where": lambda o: o.damping, "noise": 0.1}
+    with pytest.raises(ValueError, match=message):
+        jb.fit(oscillator(TRUTH), **{**arguments, **change})
+
+
+# --- design ---------------------------------------------------------------------------------------
+
+
+def stick(cycle):
+    return jb.stick_duration(cycle, 1)
+
+
+def nu0(osc):
+    return osc.belts[0].velocity
+
+
+def test_design_meets_a_stick_duration():
+    told = []
+    plan = jb.design(jb.presets.class_b(0.45, 0.35), [(stick, 0.5)], where=nu0, report=told.append)
+    assert plan.status == Status.OK and len(told) == plan.iterations
+    assert plan.achieved[0] == pytest.approx(0.5, abs=1e-9)
+    exact = oracle_cycles.sticking_cycle(oracle.class_b(float(plan.values[0]), 0.35))
+    # Asked for is 1e-6; the oracle and the cycle are good to 1e-10.
+    assert exact.stick_durations[1] == pytest.approx(0.5, abs=1e-8)
+
+
+def test_design_says_so_when_a_target_is_out_of_reach():
+    """Between the bounds the duration is largest at the lower one, 1.386."""
+    plan = jb.design(
+        jb.presets.class_b(0.45, 0.35),
+        [(stick, 3.0)],
+        where=nu0,
+        bounds=[(0.4, 0.5)],
+        report=None,
+    )
+    assert plan.status == Status.UNREACHABLE and "UNREACHABLE" in repr(plan)
+    assert plan.values[0] == pytest.approx(0.4, abs=1e-3)
+    nothing = jb.design(jb.presets.class_b(0.6, 0.35), [(stick, 0.5)], where=nu0, report=None)
+    assert nothing.status == Status.EQUILIBRIUM and np.isnan(nothing.achieved[0])
+
+
+@pytest.mark.parametrize(
+    ("targets", "message"),
+    [
+        ([], "targets must be at least one pair"),
+        ([(0.5, stick)], "targets must be pairs"),
+        ([(stick, (1.0, 0.5))], "targets must be intervals"),
+    ],
+)
+def test_impossible_targets_are_named(targets, message):
+    with pytest.raises(ValueError, match=message):
+        jb.design(jb.presets.class_b(0.45, 0.35), targets, where=nu0)
