@@ -26,6 +26,7 @@ Taylor step gives event times and states their exact ones, and so does the last 
 
 import abc
 import functools
+import math
 import os
 import threading
 from collections.abc import Callable
@@ -61,8 +62,8 @@ from .results import EventKind, Status
 
 #: First step of a run and after each event, at a tolerance of 1e-8.
 FIRST_STEP = 0.05
-#: Longest step: well below half a turn, so that x2 has at most one extremum in it.
-MAX_STEP = 0.5
+#: Longest step: a sixth of a turn, so that x2 has at most one extremum in it.
+MAX_STEP = 1.0
 #: The way that a Taylor step may bridge to a guard, over the square root of the tolerance.
 LANDING = 0.1
 #: Steps between two looks at the events, and events between two refills.
@@ -75,8 +76,6 @@ CHUNK = 2**14
 #: Lanes. On the CPU XLA runs programs on buffers of up to 512 bytes without its own threads, which
 #: cost more than they bring here.
 WIDTH = {"cpu": 64}
-
-IDLE, SHORTENED, REJECTED, KEPT, LANDED = range(5)
 
 _TABLEAU = diffrax.Tsit5.tableau
 
@@ -103,8 +102,8 @@ class Lanes(eqx.Module):
     """The state of all lanes, arrays [lanes].
 
     run: number of the run, -1 for none; begun: the pass in which it began; t, x1, x2, a: time,
-    state and x2'; h: next step size, cap: a shorter one that ends on a guard (inf: none); landed:
-    it stands on a guard; mode; events: their number; status; done. lower, upper: extrema of x2
+    state and x2'; h: next step size; negative where the lane has landed on a bound of its mode and
+    waits for what follows; mode; events: their number; status; done. lower, upper: extrema of x2
     since `memory` was cleared, where the observer tracks them. memory: the observer's own.
     """
 
@@ -115,8 +114,6 @@ class Lanes(eqx.Module):
     x2: Array
     a: Array
     h: Array
-    cap: Array
-    landed: Array
     mode: Mode
     events: Array
     status: Array
@@ -180,20 +177,21 @@ class Observer(eqx.Module):
         return lanes
 
     @abc.abstractmethod
-    def finish(self, osc: Oscillator, lanes: Lanes) -> dict[str, Array]:
-        """The result of runs that ended, arrays [lanes] or [lanes, n]."""
+    def finish(self, osc: Oscillator, lanes: Lanes) -> dict[str, Any]:
+        """The results of runs that ended, arrays [lanes, ...] or tuples of arrays [lanes]."""
 
 
 # --- one step -------------------------------------------------------------------------------------
 
 
 class _Window(eqx.Module):
-    """Where the mode of a lane holds: bounds of x1 and x2; and what its field needs."""
+    """Where the mode of a lane holds: bounds of x1 and x2; active: it slips; and for its field."""
 
     x1: tuple[Array, Array] | None
     x2: tuple[Array, Array]
     signs: tuple[Array, ...]
     pulls: tuple[Array, ...]
+    active: Array
 
 
 def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, turns: bool) -> _Window:
@@ -222,7 +220,7 @@ def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, turns: bool) -> _Wind
         x1 = left, right
     signs = mode.signs
     pulls = tuple(belt.load * sign for belt, sign in zip(osc.belts, signs, strict=True))
-    return _Window(x1, (low, high), signs, pulls)
+    return _Window(x1, (low, high), signs, pulls, ~lanes.done & ~mode.any_stuck)
 
 
 def _acceleration(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array) -> Array:
@@ -303,7 +301,7 @@ class _Landing(eqx.Module):
 
     reached: it ends so near to one that the time `delta` is left to (x1, x2) on it; blocked: it
     ends, or turns, beyond one; theta: the fraction of it that ends on the bound. on_edge: the bound
-    is a contact edge; resumes: it is x2 = 0, where nothing happens.
+    is a contact edge.
     """
 
     reached: Array
@@ -311,7 +309,6 @@ class _Landing(eqx.Module):
     x1: Array
     x2: Array
     on_edge: Array
-    resumes: Array
     blocked: Array
     theta: Array
 
@@ -357,63 +354,50 @@ def _landing(window: _Window, lanes: Lanes, new: _Attempt, path: _Path, rtol) ->
         x1=edge,
         x2=bound,
         on_edge=on_edge,
-        resumes=~on_edge & (bound == 0),
         blocked=blocked | grazes,
         theta=jnp.where(blocked, theta, path.turn),
     )
 
 
-def _step(
-    osc, window: _Window, one: Array, going: Array, lanes: Lanes, t1, rtol, atol, observer
-) -> Lanes:
-    """One step of the lanes that are going: kept, shortened to end on a bound, or rejected."""
+def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol, observer) -> Lanes:
+    """One step of the lanes that slip: kept, shortened to end on a bound, or rejected."""
     left = t1 - lanes.t
-    h = jnp.minimum(jnp.minimum(lanes.h, lanes.cap), left)
+    going = window.active & (lanes.h > 0) & (left > 0)
+    h = jnp.where(going, jnp.minimum(lanes.h, left), 0.0)
     new = _attempt(osc, window, one, lanes, h, rtol, atol)
     path = _path(one, lanes, new)
     at = _landing(window, lanes, new, path, rtol)
 
-    going = going & ~lanes.landed & ~lanes.done
-    accepted = going & (new.error <= 1)
     last = h >= left
+    accepted = going & (new.error <= 1)
     lands = accepted & ~at.blocked & at.reached & ~(last & (at.delta > 0))
     # As a number, divided: what many results depend on is then computed once.
-    outcome = jnp.where(going, float(REJECTED), float(IDLE))
-    outcome = jnp.where(accepted, jnp.where(at.blocked, float(SHORTENED), float(KEPT)), outcome)
-    outcome = jnp.where(lands, float(LANDED), outcome) / one
-    going, shortened = outcome > IDLE, outcome == SHORTENED
-    kept, lands = outcome >= KEPT, outcome == LANDED
-
+    outcome = jnp.where(accepted, jnp.where(at.blocked, -1.0, 1.0), 0.0)
+    outcome = jnp.where(lands, 2.0, outcome) / one
+    shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
     delta = jnp.where(lands, at.delta, 0.0) / one
+
+    # The Taylor step to the bound, if there is one.
     x1 = new.x1 + delta * (new.x2 + 0.5 * delta * new.a)
-    x2 = new.x2 + delta * new.a
+    x2 = jnp.where(lands & ~at.on_edge, at.x2, new.x2 + delta * new.a)
     if window.x1 is not None:
         x1 = jnp.where(lands & at.on_edge, at.x1, x1)
-        x2 = jnp.where(lands & ~at.on_edge, at.x2, x2)
-    else:
-        x2 = jnp.where(lands, at.x2, x2)
+    t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
     # NaN is a large error, too.
     size = jnp.where(new.error < 1e3, jnp.maximum(new.error, 1e-3), 1e3)
     proposed = jnp.minimum(h * (0.9 / jnp.sqrt(jnp.sqrt(size))), MAX_STEP)
-    # A step that was cut short says little about the next one; after an event the field is new.
-    proposed = jnp.where(kept & (h < lanes.h), jnp.maximum(proposed, lanes.h), proposed)
-    proposed = jnp.where(lands & ~at.resumes, _first_step(rtol), proposed)
-    cap = jnp.where(shortened, at.theta * h, jnp.where(kept, jnp.inf, lanes.cap))
-    ends = last & ~lands
+    proposed = jnp.where(shortened, at.theta * h, jnp.where(lands, -proposed, proposed))
     lower, upper = lanes.lower, lanes.upper
     if observer.extrema:
         lower = jnp.where(kept, jnp.minimum(lower, jnp.minimum(x2, path.extremum)), lower)
         upper = jnp.where(kept, jnp.maximum(upper, jnp.maximum(x2, path.extremum)), upper)
     return replace(
         lanes,
-        t=jnp.where(kept, jnp.where(ends, t1, lanes.t + h + delta), lanes.t),
+        t=jnp.where(kept, t, lanes.t),
         x1=jnp.where(kept, x1, lanes.x1),
         x2=jnp.where(kept, x2, lanes.x2),
         a=jnp.where(kept, new.a, lanes.a),
-        h=lax.stop_gradient(jnp.where(going & ~shortened, proposed, lanes.h)),
-        cap=lax.stop_gradient(cap),
-        landed=lanes.landed | lands,
-        done=lanes.done | (kept & ends),
+        h=lax.stop_gradient(jnp.where(going, proposed, lanes.h)),
         lower=lower,
         upper=upper,
     )
@@ -440,14 +424,17 @@ def _first_root(poly, g_start, end, g_end):
 # --- events ---------------------------------------------------------------------------------------
 
 
-def _pass_events(osc: Oscillator, lanes: Lanes, t1: Array, *, edges: bool) -> tuple[Lanes, Passage]:
+def _pass_events(
+    osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array, *, edges: bool
+) -> tuple[Lanes, Passage]:
     """Lanes that stand on a guard go on; stick phases are passed to their end, or to t1."""
     guards = boundary_guards(osc, lanes.mode, lanes.x2)
     if edges:
         guards += edge_guards(osc, lanes.mode, lanes.x1)
     lowest = functools.reduce(jnp.minimum, guards)
+    landed = (lanes.h < 0) & ~lanes.done
     # A lane may also have landed where x2 = 0, which is no guard.
-    fired = lanes.landed & (lowest <= 1e-12)
+    fired = landed & (lowest <= 1e-12)
     number = first_of(
         [g <= lowest for g in guards], [jnp.asarray(i) for i in range(len(guards))], jnp.asarray(0)
     )
@@ -469,12 +456,12 @@ def _pass_events(osc: Oscillator, lanes: Lanes, t1: Array, *, edges: bool) -> tu
     # Slip onset is tangent: x2' = 0 there, for a law without a jump, but for rounding.
     a = mode_acceleration(osc, mode, new_x1, x2)
     a = jnp.where(jnp.abs(a) < 1e-12 * (1 + jnp.abs(new_x1)), 0.0, a)
-    moved = lanes.landed | stuck
+    moved = landed | stuck
     forever = stuck & jnp.isinf(phase.duration)
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
     status = jnp.where(forever, Status.STUCK_FOREVER.value, status)
     passage = Passage(
-        landed=lanes.landed,
+        landed=landed,
         fired=fired,
         guard=number,
         before=lanes.mode,
@@ -490,18 +477,19 @@ def _pass_events(osc: Oscillator, lanes: Lanes, t1: Array, *, edges: bool) -> tu
         forever=forever,
     )
     lanes = eqx.tree_at(
-        lambda n: (n.t, n.x1, n.x2, n.a, n.landed, n.mode, n.events, n.status, n.done),
+        lambda n: (n.t, n.x1, n.x2, n.a, n.h, n.mode, n.events, n.status, n.done),
         lanes,
         (
             t,
             new_x1,
             x2,
             jnp.where(moved, a, lanes.a),
-            jnp.zeros_like(lanes.landed),
+            # The field is new after an event, and so is the step size.
+            jnp.where(fired, _first_step(rtol), jnp.abs(lanes.h)),
             mode,
             lanes.events + jnp.where(fired, 1, 0) + jnp.where(released, 1, 0),
             status,
-            lanes.done | captured | (stuck & ends),
+            lanes.done | captured | (t >= t1),
         ),
     )
     return lanes, passage
@@ -529,7 +517,15 @@ def _oscillator(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator
             column += 1
         else:
             leaves.append(next(others))
-    return jax.tree.unflatten(program.structure, leaves)
+    osc = jax.tree.unflatten(program.structure, leaves)
+    if program.edges:
+        return osc
+    # Known to be infinite while the kernel is compiled; see `modes.has_edges`.
+    lower, upper = np.float64(-np.inf), np.float64(np.inf)
+    belts = tuple(
+        eqx.tree_at(lambda b: (b.lower, b.upper), belt, (lower, upper)) for belt in osc.belts
+    )
+    return eqx.tree_at(lambda o: o.belts, osc, belts)
 
 
 def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
@@ -538,7 +534,7 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
     finite = jnp.isfinite(x1) & jnp.isfinite(x2)
     for leaf in jax.tree.leaves(osc):
         finite = finite & ~jnp.isnan(leaf)
-    zero, no = jnp.zeros_like(x1), jnp.zeros_like(finite)
+    zero = jnp.zeros_like(x1)
     lanes = Lanes(
         run=run,
         begun=jnp.full_like(run, passes),
@@ -547,8 +543,6 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
         x2=x2,
         a=mode_acceleration(osc, mode, x1, x2) + zero,
         h=zero + _first_step(rtol),
-        cap=zero + jnp.inf,
-        landed=no,
         mode=Mode(tuple(code + zero for code in mode.codes)),
         events=jnp.zeros_like(run),
         status=jnp.where(finite, Status.OK.value, Status.NOT_FINITE.value).astype(run.dtype),
@@ -584,13 +578,27 @@ def _ordered(values: dict[str, Any]) -> list[str]:
     return sorted(values)
 
 
-def _columns(values: dict[str, Array]) -> list[Array]:
-    """Arrays [lanes, ...] as columns [lanes] of floats."""
-    return [
-        column
-        for name in _ordered(values)
-        for column in values[name].astype(jnp.float64).reshape(values[name].shape[0], -1).T
-    ]
+def _columns(values: dict[str, Any]) -> list[Array]:
+    """Results as columns [lanes] of floats: what is a tuple has a column each."""
+    columns = []
+    for name in _ordered(values):
+        for value in jax.tree.leaves(values[name]):
+            value = value.astype(jnp.float64)
+            columns += [value] if value.ndim == 1 else list(value.reshape(value.shape[0], -1).T)
+    return columns
+
+
+class _Desk(eqx.Module):
+    """What lies ready for the lanes, and what they have handed in: no more than there are lanes.
+
+    begun: runs taken; filled: rows handed in, of numbers and of columns of results.
+    """
+
+    stream: Stream
+    begun: Array
+    filled: Array
+    numbers: Array
+    columns: list[Array]
 
 
 def _advance(
@@ -598,81 +606,110 @@ def _advance(
 ):
     """Work through the queue; with `drain` until all lanes are idle.
 
-    queue: [runs, columns], the starts and the parameters that differ; the runs are numbered from
-    `first`, `count` of them are real. Returns the lanes, and, in order of completion, numbers
-    [runs + lanes] (-1 where there is none) and results [runs + lanes, columns].
+    queue: columns [runs + lanes], the starts and the parameters that differ; the runs are numbered
+    from `first`, `count` of them are real. Returns the lanes, and, in order of completion, numbers
+    (-1 where there is none) and results [columns, runs + 3 lanes].
+
+    Two loops, because on the CPU XLA does the operations of a loop one after the other if all of
+    its arrays are small, and else by threads that cost more than they bring. The inner loop sees
+    small ones only: as many new runs, and as many results, as there are lanes.
     """
-    observer = program.observer
-    width = stream.lanes.t.size
-    size = queue.shape[0] + width
-    one = stream.one
+    observer, one = program.observer, stream.one
+    width = one.size
+    size = queue[0].size + 2 * width
+    slots = jnp.arange(width, dtype=jnp.int32)
 
-    def busy(state):
-        stream, taken, *_ = state
-        at_work = (stream.lanes.run >= 0) | ~stream.lanes.done
-        return (taken < count) | (drain & jnp.any(at_work))
-
-    def refill(state):
-        stream, taken, written, numbers, results = state
-        lanes, rows = stream.lanes, stream.rows
-        osc = _oscillator(program, shared, rows)
-        lanes = observer.rest(osc, lanes)
-        lanes = _give_up(lanes, stream.passes, limit)
+    def refill(desk: _Desk, block, taken, available) -> _Desk:
+        """Hand in what is done and take new runs."""
+        lanes, passes = desk.stream.lanes, desk.stream.passes
+        osc = _oscillator(program, shared, desk.stream.rows)
+        lanes = _give_up(observer.rest(osc, lanes), passes, limit)
         finished = lanes.done & (lanes.run >= 0)
-        at = jnp.where(finished, written + jnp.cumsum(finished.astype(jnp.int32)) - 1, size)
-        result = jnp.stack(_columns(observer.finish(osc, lanes)), axis=-1)
-        numbers = numbers.at[at].set(lanes.run, mode="drop")
-        results = results.at[at].set(result, mode="drop")
-        written = written + jnp.sum(finished, dtype=jnp.int32)
+        finished = finished & (_rank(finished) < width - desk.filled)
+        # The finished ones first, behind what is there; the rest is written over the next time.
+        source = jnp.argsort(~finished)[jnp.maximum(slots - desk.filled, 0)]
+        number = jnp.where(finished, lanes.run, -1)
+        new = [number, *_columns(observer.finish(osc, lanes))]
+        pairs = zip([desk.numbers, *desk.columns], new, strict=True)
+        handed = [jnp.where(slots < desk.filled, old, value[source]) for old, value in pairs]
 
-        index = taken + jnp.cumsum(lanes.done.astype(jnp.int32)) - 1
-        takes = lanes.done & (index < count)
-        taken_rows = queue[jnp.where(takes, index, 0)]
-        rows = tuple(jnp.where(takes, taken_rows[:, i], row) for i, row in enumerate(rows))
+        free = lanes.done & (finished | (lanes.run < 0))
+        place = desk.begun + _rank(free)
+        takes = free & (place < available)
+        place = jnp.where(takes, place, 0)
+        pairs = zip(block, desk.stream.rows, strict=True)
+        rows = tuple(jnp.where(takes, column[place], row) for column, row in pairs)
         osc = _oscillator(program, shared, rows)
-        fresh = _begin(program, osc, first + index, rows[0], rows[1], stream.passes, rtol)
-        gone = eqx.tree_at(lambda n: n.run, lanes, jnp.where(lanes.done, -1, lanes.run))
-        lanes = choose(takes, fresh, gone)
-        taken = taken + jnp.sum(takes, dtype=jnp.int32)
-        return Stream(lanes, rows, stream.passes + 1, one), taken, written, numbers, results
+        fresh = _begin(program, osc, first + taken + place, rows[0], rows[1], passes, rtol)
+        lanes = choose(takes, fresh, replace(lanes, run=jnp.where(free, -1, lanes.run)))
+        return _Desk(
+            Stream(lanes, rows, passes + 1, one),
+            desk.begun + jnp.sum(takes, dtype=jnp.int32),
+            desk.filled + jnp.sum(finished, dtype=jnp.int32),
+            handed[0],
+            handed[1:],
+        )
 
     def round_(osc, _, lanes):
-        lanes, passage = _pass_events(osc, lanes, t1, edges=program.edges)
+        lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
         lanes = observer.watch(osc, lanes, passage, t1, rtol)
         window = _window(osc, lanes, edges=program.edges, turns=program.edges or observer.extrema)
-        going = ~lanes.done & ~lanes.mode.any_stuck
 
         def step(_, lanes):
-            return _step(osc, window, one, going, lanes, t1, rtol, atol, observer)
+            return _step(osc, window, one, lanes, t1, rtol, atol, observer)
 
         return lax.fori_loop(0, STEPS, step, lanes)
 
-    def one_pass(state):
-        stream, *rest = refill(state)
-        osc = _oscillator(program, shared, stream.rows)
-        lanes = lax.fori_loop(0, ROUNDS, functools.partial(round_, osc), stream.lanes)
-        return eqx.tree_at(lambda s: s.lanes, stream, lanes), *rest
+    def at_work(stream):
+        return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
 
-    shape = jax.eval_shape(
-        lambda: jnp.stack(
-            _columns(observer.finish(_oscillator(program, shared, stream.rows), stream.lanes)), -1
-        )
-    )
-    start = (
-        stream,
-        jnp.zeros((), jnp.int32),
-        jnp.zeros((), jnp.int32),
-        jnp.full(size, -1, dtype=jnp.int32),
-        jnp.full((size, shape.shape[1]), jnp.nan),
-    )
-    stream, _, _, numbers, results = lax.while_loop(busy, one_pass, start)
-    return stream, numbers, results
+    def outer(state):
+        stream, taken, written, numbers, results = state
+        zero = jnp.zeros_like(taken)
+        block = tuple(lax.dynamic_slice(column, (taken,), (width,)) for column in queue)
+        available = jnp.minimum(count - taken, width)
+        last = drain & (taken + available >= count)
+
+        def going_on(desk):
+            left = (desk.begun < available) | (last & at_work(desk.stream))
+            return left & (desk.filled < width)
+
+        def inner(desk):
+            desk = refill(desk, block, taken, available)
+            osc = _oscillator(program, shared, desk.stream.rows)
+            lanes = lax.fori_loop(0, ROUNDS, functools.partial(round_, osc), desk.stream.lanes)
+            return replace(desk, stream=replace(desk.stream, lanes=lanes))
+
+        nothing = [jnp.zeros_like(one) for _ in results]
+        desk = _Desk(stream, zero, zero, jnp.full_like(slots, -1), nothing)
+        desk = lax.while_loop(going_on, inner, desk)
+        numbers = lax.dynamic_update_slice(numbers, desk.numbers, (written,))
+        pairs = zip(results, desk.columns, strict=True)
+        results = [lax.dynamic_update_slice(whole, part, (written,)) for whole, part in pairs]
+        return desk.stream, taken + desk.begun, written + desk.filled, numbers, results
+
+    def unfinished(state):
+        stream, taken, *_ = state
+        return (taken < count) | (drain & at_work(stream))
+
+    n_columns = sum(math.prod(shape) for shape in layout(program, shared).values())
+    none = jnp.zeros((), jnp.int32)
+    numbers = jnp.full(size, -1, dtype=jnp.int32)
+    results = [jnp.full(size, jnp.nan) for _ in range(n_columns)]
+    start = (stream, none, none, numbers, results)
+    stream, _, _, numbers, results = lax.while_loop(unfinished, outer, start)
+    return stream, numbers, jnp.stack(results)
+
+
+def _rank(flags: Array) -> Array:
+    """How many flags are set before each one."""
+    return jnp.cumsum(flags.astype(jnp.int32)) - 1
 
 
 def _give_up(lanes: Lanes, passes, limit) -> Lanes:
     """End runs that took too many steps, or whose state is not finite."""
     finite = jnp.isfinite(lanes.x1) & jnp.isfinite(lanes.x2) & jnp.isfinite(lanes.a)
-    lost = ~lanes.done & (~finite | (lanes.h < 1e-14) | (passes - lanes.begun > limit))
+    lost = ~lanes.done & (~finite | (jnp.abs(lanes.h) < 1e-14) | (passes - lanes.begun > limit))
     reason = jnp.where(finite, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
     status = jnp.where(lost, reason.astype(lanes.status.dtype), lanes.status)
     return eqx.tree_at(lambda n: (n.status, n.done), lanes, (status, lanes.done | lost))
@@ -719,8 +756,13 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
         osc = _oscillator(program, shared, stream.rows)
         return program.observer.finish(osc, stream.lanes)
 
-    shapes = jax.eval_shape(finish)
-    return {name: shapes[name].shape[1:] for name in _ordered(shapes)}
+    values = jax.eval_shape(finish)
+    shapes = {}
+    for name in _ordered(values):
+        value = values[name]
+        is_tuple = isinstance(value, tuple)
+        shapes[name] = (len(value),) if is_tuple else value.shape[1:]
+    return shapes
 
 
 @functools.lru_cache(maxsize=1)
@@ -761,9 +803,9 @@ def run(
     atol: float,
     derivatives: int = 0,
 ) -> None:
-    """Do all runs: rows_of(first, last) gives rows [1 + derivatives, runs, columns] of the queue,
+    """Do all runs: rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]:
     the starts and the parameters that vary, and their derivatives in so many directions;
-    put(numbers, results) takes results [1 + derivatives, runs, columns] in any order.
+    put(numbers, results) takes results [1 + derivatives, columns, runs] in any order.
 
     Every thread feeds chunks to one compiled kernel (which lets go of Python's lock) on its own
     lanes. Long runs stay in their lanes while the next chunk is worked on.
@@ -788,22 +830,22 @@ def run(
             stream, todo = _idle(program, shared, width, columns), take()
             while todo is not None:
                 (first, last), todo = todo, take()
-                rows = np.zeros((1 + derivatives, CHUNK, columns))
-                rows[:, : last - first] = rows_of(first, last)
+                rows = np.zeros((1 + derivatives, columns, CHUNK + width))
+                rows[:, :, : last - first] = rows_of(first, last)
                 rows = rows if derivatives else rows[0]
                 span = np.int32(first), np.int32(last - first)
                 stream, numbers, results = kernel(rows, *span, stream, todo is None)
                 numbers = np.asarray(numbers)
                 done = np.flatnonzero(numbers >= 0)
-                results = np.asarray(results).reshape(1 + derivatives, len(numbers), -1)
+                results = np.asarray(results).reshape(1 + derivatives, -1, len(numbers))
                 with lock:
-                    put(numbers[done], results[:, done])
+                    put(numbers[done], results[:, :, done])
 
     devices = jax.local_devices()
     if not runs:
         return
     # Compiled here, once, and not by each thread.
-    nothing = np.zeros((1 + derivatives, CHUNK, columns))
+    nothing = np.zeros((1 + derivatives, columns, CHUNK + width))
     idle = _idle(program, shared, width, columns)
     kernel(nothing if derivatives else nothing[0], np.int32(0), np.int32(0), idle, False)
     with ThreadPoolExecutor(threads) as pool:
@@ -893,7 +935,7 @@ class Final(Observer):
         return {
             "x1_end": lanes.x1,
             "x2_end": lanes.x2,
-            "mode_end": jnp.stack(lanes.mode.codes, axis=-1),
+            "mode_end": lanes.mode.codes,
             "n_events": lanes.events,
             "status": lanes.status,
         }
@@ -1062,9 +1104,9 @@ class Attractor(Observer):
         status = jnp.where(undecided, Status.NOT_SETTLED.value, lanes.status)
         return {
             "kind": turn.kind,
-            "sticks": jnp.stack([total > 0 for total in turn.sticks], axis=-1),
+            "sticks": tuple(total > 0 for total in turn.sticks),
             "period": turn.period,
-            "stick_duration": jnp.stack(turn.sticks, axis=-1),
+            "stick_duration": turn.sticks,
             "x1_min": turn.x1_min,
             "x1_max": turn.x1_max,
             "x2_min": lanes.lower,

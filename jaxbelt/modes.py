@@ -22,8 +22,10 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
+from .checks import is_concrete
 from .oscillator import Oscillator, acceleration
 
 Tree = TypeVar("Tree")
@@ -158,6 +160,14 @@ def edges(osc: Oscillator) -> list[Array]:
     return [belt.lower for belt in osc.belts] + [belt.upper for belt in osc.belts]
 
 
+def has_edges(osc: Oscillator) -> bool:
+    """Whether there may be a contact edge: one is finite, or not known to be infinite.
+
+    Known inside a trace, too, where the bounds are NumPy's. What edges need is then left out.
+    """
+    return not is_concrete(edges(osc)) or bool(np.any(np.isfinite(edges(osc))))
+
+
 # --- transitions ----------------------------------------------------------------------------------
 
 
@@ -262,6 +272,8 @@ def leave_stick(osc: Oscillator, mode: Mode, phase: StickPhase, x2: Array) -> Mo
             for code, stuck in zip(mode.codes, mode.stuck, strict=True)
         )
     )
+    if not has_edges(osc):
+        return slipping
     return select(phase.slips, slipping, pass_edge(osc, mode, phase.x1, x2, x2 > 0))
 
 
@@ -288,13 +300,17 @@ def leave_slip(osc: Oscillator, mode: Mode, fired: Array, x1: Array, x2: Array) 
     """
     n = len(osc.belts)
     at_boundary, at_edge = (fired >= 0) & (fired < n), (fired >= n) & (fired < 3 * n)
+    hit = [fired == i for i in range(n)]
+    after_boundary, x2_boundary = reach_boundary(osc, mode, hit, x1)
+    if not has_edges(osc):
+        x2 = jnp.where(at_boundary, x2_boundary, x2)
+        after_boundary = select(at_boundary, after_boundary, mode)
+        return Departure(after_boundary, x1, x2, at_boundary, at_edge, at_edge)
     edge_hit = [fired == n + i for i in range(2 * n)]
     edge = first_of(edge_hit, edges(osc), x1)
     flags = zip(edge_hit, bounds_rightward(mode), strict=True)
     rightward = any_of([hit & right for hit, right in flags])
     after_edge = pass_edge(osc, mode, edge, x2, rightward)
-    hit = [fired == i for i in range(n)]
-    after_boundary, x2_boundary = reach_boundary(osc, mode, hit, x1)
     left, right = select(rightward, (mode, after_edge), (after_edge, mode))
     return Departure(
         mode=select(at_boundary, after_boundary, select(at_edge, after_edge, mode)),

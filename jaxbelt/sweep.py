@@ -239,7 +239,7 @@ class _Grid:
         return batch.Program(self.structure, self.mapped, observer, bool(edges))
 
     def rows(self, runs: np.ndarray, derivatives: tuple[str, ...] = ()) -> np.ndarray:
-        """Starts and varying parameters of some runs, [1 + derivatives, runs, columns]."""
+        """Starts and varying parameters of some runs, [1 + derivatives, columns, runs]."""
         # Of one size, for one compiled program.
         padded = np.concatenate([runs, np.zeros(batch.CHUNK - len(runs), runs.dtype)])
         places = np.unravel_index(padded, self.shape)
@@ -248,7 +248,7 @@ class _Grid:
         }
         start = tuple(self.y0.items())
         table = _rows(self.make, tuple(self.names), self.mapped, start, derivatives, values)
-        return np.asarray(table)[:, : len(runs)]
+        return np.asarray(table)[:, :, : len(runs)]
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4))
@@ -258,10 +258,11 @@ def _rows(make, names, mapped, start, derivatives, values):
         varying = [leaf for leaf, varies in zip(leaves, mapped, strict=True) if varies]
         return jnp.stack([*(jnp.asarray(values.get(x, default)) for x, default in start), *varying])
 
-    tables = [jax.vmap(row)(values)]
+    rows = jax.vmap(row, out_axes=1)
+    tables = [rows(values)]
     for name in derivatives:
         direction = {n: jnp.full_like(v, float(n == name)) for n, v in values.items()}
-        tables.append(jax.jvp(jax.vmap(row), (values,), (direction,))[1])
+        tables.append(jax.jvp(rows, (values,), (direction,))[1])
     return jnp.stack(tables)
 
 
@@ -300,12 +301,13 @@ class _Table:
         return np.flatnonzero(self.arrays["status"] < 0)
 
     def put(self, runs: np.ndarray, results: np.ndarray) -> None:
-        """Store results of runs, [1 + derivatives, runs, columns]; the status last of all."""
+        """Store results of runs, [1 + derivatives, columns, runs]; the status last of all."""
         column = 0
         parts = {}
         for name, shape in self.layout.items():
             width = math.prod(shape)
-            parts[name] = results[:, :, column : column + width].reshape(*results.shape[:2], *shape)
+            part = np.moveaxis(results[:, column : column + width], 1, -1)
+            parts[name] = part.reshape(*part.shape[:2], *shape)
             column += width
         status = parts.pop("status")[0]
         for name, part in parts.items():
