@@ -58,7 +58,7 @@ FOLLOWED, ROOM = 96, SIZES[2]
 DISTANCES = (0.02, 0.3, 3.0)
 #: Intervals narrower than this fraction of the span are good guesses for Newton's method.
 NEAR = 1 / 400
-#: Nothing closer than this fraction of the span is told apart.
+#: Nothing closer than this, and this fraction of the span, is told apart.
 CLOSE = 1e-6
 
 
@@ -174,7 +174,9 @@ class Path:
 
     def beside(self, value: float) -> tuple[float, float]:
         """The values just below and just above."""
-        return value - CLOSE * self.length, value + CLOSE * self.length
+        # Not nearer in a short span: a turn counts as repeated when it does so to 1e-7.
+        distance = CLOSE * (1.0 + self.length)
+        return value - distance, value + distance
 
     @property
     def belt(self) -> int:
@@ -364,7 +366,7 @@ def refined(
 ) -> list[tuple[Guess, BifurcationPoint]]:
     """The guesses, those of one kind after those of another, with the points found from them.
 
-    A tangency is looked for as `GrazingSliding` and returned as what it is.
+    A tangency, of whichever kind it is looked for, is returned as what it is.
     """
     out = []
     for solve in (at_hopf, at_cycle, at_rest, at_fold_of_cycles):
@@ -376,8 +378,9 @@ def refined(
             solved = _points(solve, osc, index, values, belts)
             for lane, guess in enumerate(batch):
                 point, condition = pick(solved, lane), guess.condition
-                if isinstance(condition, GrazingSliding) and point.multiplier > 1:
-                    condition = NonsmoothFold(condition.belt)
+                if isinstance(condition, GrazingSliding | NonsmoothFold):
+                    is_fold = point.multiplier > 1
+                    condition = (NonsmoothFold if is_fold else GrazingSliding)(condition.belt)
                 out.append((guess, replace(point, condition=condition)))
     return out
 
@@ -390,7 +393,7 @@ def _solver(condition: AbstractCondition) -> Callable:
 def _belts(condition: AbstractCondition) -> tuple[int, int]:
     if isinstance(condition, SlidingExchange):
         return condition.belts
-    belt = condition.belt if isinstance(condition, GrazingSliding | SuddenSliding) else 0
+    belt = getattr(condition, "belt", 0)
     return belt, belt
 
 
