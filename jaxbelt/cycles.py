@@ -293,7 +293,8 @@ def newton(step: Callable[[Any], tuple[Any, Array, Array]], start: Any) -> Newto
     def unfinished(n):
         last = n.lengths[n.iterations - 1]
         before = n.lengths[jnp.maximum(n.iterations - 2, 0)]
-        settled = (last < 1e-13) | ((n.iterations > 1) & (before < 1e-9) & (last < 1e-9))
+        # The next step is shorter by the same factor at least: not worth making below rounding.
+        settled = last * jnp.minimum(last / before, 1.0) < 1e-13
         going = (n.iterations < NEWTON_STEPS) & ~settled & jnp.isfinite(last)
         return going | (n.iterations == 0)
 

@@ -9,8 +9,10 @@ What is still missing beside the paper is named in `STILL_MISSING`.
 """
 
 import json
+import math
 import operator
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,9 +30,10 @@ from .bifurcations import (
     NonsmoothFold,
     SlidingExchange,
     SuddenSliding,
-    refine,
+    leaf_index,
 )
 from .cycles import Cycle, unstable_cycle
+from .detection import Guess, refined
 from .diagrams import BifurcationDiagram, bifurcation_diagram
 from .equilibria import Equilibria, equilibria
 from .oscillator import Belt, Oscillator
@@ -102,22 +105,33 @@ class CriticalValue(NamedTuple):
 
 def critical_values() -> tuple[CriticalValue, ...]:
     """The table of section 3 of the paper, recomputed; NaN where Newton's method failed."""
-    values = []
-    for published in PUBLISHED:
-        guess = paper_oscillator(published.system, published.printed + AWAY)
-        condition = CONDITIONS[published.system, published.point]
-        point = refine(condition, guess, where=lambda osc: osc.belts[0].velocity)
-        has_cycle = int(point.cycle.status) == Status.OK and isinstance(condition, NonsmoothFold)
-        values.append(
-            CriticalValue(
-                *published,
-                computed=float(point.value),
+    values = {}
+    for system in ("a", "b"):
+        rows = [published for published in PUBLISHED if published.system == system]
+        osc = _with_two_belts(paper_oscillator(system, rows[0].printed))
+        wanted = {row: CONDITIONS[system, row.point] for row in rows}
+        guesses = []
+        for row in rows:
+            guess = row.printed + AWAY
+            guesses.append(Guess((row.printed - AWAY, guess), guess, wanted[row]))
+        points = dict(refined(osc, jnp.asarray(leaf_index(osc, _velocity)), guesses))
+        for row, guess in zip(rows, guesses, strict=True):
+            point = points[guess]
+            agrees = point.condition == wanted[row]
+            has_cycle = int(point.cycle.status) == Status.OK
+            is_fold = isinstance(point.condition, NonsmoothFold)
+            values[row] = CriticalValue(
+                *row,
+                computed=float(point.value) if agrees else math.nan,
                 residual=float(point.residual),
                 iterations=int(point.iterations),
-                cycle=point.cycle if has_cycle else None,
+                cycle=point.cycle if has_cycle and is_fold else None,
             )
-        )
-    return tuple(values)
+    return tuple(values[row] for row in PUBLISHED)
+
+
+def _velocity(osc: Oscillator) -> Any:
+    return osc.belts[0].velocity
 
 
 def as_json(values: Sequence[CriticalValue]) -> list[dict[str, Any]]:
@@ -257,8 +271,16 @@ def _transient(trajectory: Trajectory, cycle: SimulatedCycle | None) -> Trajecto
     return eqx.tree_at(lambda run: (run.ts, run.events.t), trajectory, shown)
 
 
+def find_unstable_cycles(panels: Sequence[Panel]) -> list[Cycle]:
+    """The unstable cycle of every panel, with the status of none where there is none."""
+    return [unstable_cycle(_with_two_belts(panel.oscillator)) for panel in panels]
+
+
 def draw_portraits(
-    portraits: Portraits, panels: Sequence[Panel], orbits: Sequence[Sequence[Trajectory]]
+    portraits: Portraits,
+    panels: Sequence[Panel],
+    orbits: Sequence[Sequence[Trajectory]],
+    unstable: Sequence[Cycle],
 ) -> plotting.Figure:
     """The portraits side by side: transients thin, the steady cycle thick, equilibria."""
     figure = plotting.journal_figure(7.2, 2.75 if len(panels) == 3 else 4.9)
@@ -266,11 +288,11 @@ def draw_portraits(
         axes = figure.subplots(1, 3, sharey=True)
     else:
         axes = figure.subplots(2, 2, sharex=True, sharey=True)
-    for ax, panel, trajectories in zip(axes.flat, panels, orbits, strict=True):
+    for ax, panel, trajectories, repelling in zip(axes.flat, panels, orbits, unstable, strict=True):
         steady = [cycle for cycle in map(steady_cycle, trajectories) if cycle is not None]
         cycle = steady[0] if steady else None
-        unstable = unstable_cycle(_with_two_belts(panel.oscillator))
-        cycles: list[plotting.ClosedOrbit] = [unstable] if int(unstable.status) == Status.OK else []
+        exists = int(repelling.status) == Status.OK
+        cycles: list[plotting.ClosedOrbit] = [repelling] if exists else []
         if panel.cycle is not None:
             cycles.append(panel.cycle)
         elif cycle is not None:
@@ -378,37 +400,51 @@ def formulation_errors(
     return errors, float(order)
 
 
-def draw_formulations() -> plotting.Figure:
-    """How the switch and the smooth formulation approach the exact motion."""
+class Study(NamedTuple):
+    """A formulation, what its band is called and its symbol, errors over widths, their order."""
+
+    formulation: str
+    symbol: str
+    errors: np.ndarray
+    order: float
+
+
+WIDTHS = np.logspace(-2, -5, 7)
+
+
+def study_formulations() -> list[Study]:
+    """How the switch and the smooth formulation approach the exact motion, over WIDTHS."""
+    return [
+        Study(formulation, symbol, *formulation_errors(formulation, width, WIDTHS))
+        for formulation, width, symbol in (
+            ("switch", "v_star", r"$v_\ast$"),
+            ("smooth", "eps", r"$\varepsilon$"),
+        )
+    ]
+
+
+def draw_formulations(studies: Sequence[Study]) -> plotting.Figure:
+    """The errors of both over the width of their band."""
     figure = plotting.journal_figure(4.2, 3.2)
-    axes = figure.subplots()
-    widths = np.logspace(-2, -5, 7)
-    curves = {}
-    for formulation, width, symbol in (
-        ("switch", "v_star", r"$v_\ast$"),
-        ("smooth", "eps", r"$\varepsilon$"),
-    ):
-        errors, order = formulation_errors(formulation, width, widths)
-        curves[f"{formulation}, {symbol}: order {order:.2f}"] = errors
-    plotting.plot_convergence(widths, curves, axes)
+    curves = {
+        f"{study.formulation}, {study.symbol}: order {study.order:.2f}": study.errors
+        for study in studies
+    }
+    plotting.plot_convergence(WIDTHS, curves, figure.subplots())
     return figure
 
 
-def draw_diagram_a() -> plotting.Figure:
-    """Fig. 3: equilibria and cycles of the oscillator with one belt, over its velocity."""
-    osc = _with_two_belts(class_a(0.2))
-    diagram = bifurcation_diagram(osc, lambda osc: osc.belts[0].velocity, (0.0, 0.4))
+def diagram_a() -> BifurcationDiagram:
+    """Of Fig. 3: equilibria and cycles of the oscillator with one belt, over its velocity."""
+    diagram = bifurcation_diagram(_with_two_belts(class_a(0.2)), _velocity, (0.0, 0.4))
     # One belt only: the paper gives these regions no letter.
     regions = tuple((first, last, name[:1]) for first, last, name in diagram.regions)
-    figure = _draw_diagram(replace(diagram, regions=regions), note=MISPRINT)
-    return figure
+    return replace(diagram, regions=regions)
 
 
-def draw_diagram_b() -> plotting.Figure:
-    """Fig. 7: the same with two belts, along nu1 = 0.35."""
-    osc = class_b(0.3, PUBLISHED_NU1)
-    diagram = bifurcation_diagram(osc, lambda osc: osc.belts[0].velocity, (-0.7, 0.7))
-    return _draw_diagram(diagram, note=MISSING_REGION)
+def diagram_b() -> BifurcationDiagram:
+    """Of Fig. 7: the same with two belts, along nu1 = 0.35."""
+    return bifurcation_diagram(class_b(0.3, PUBLISHED_NU1), _velocity, (-0.7, 0.7))
 
 
 def _draw_diagram(diagram: BifurcationDiagram, note: str) -> plotting.Figure:
@@ -418,13 +454,21 @@ def _draw_diagram(diagram: BifurcationDiagram, note: str) -> plotting.Figure:
     return figure
 
 
+class Computed(NamedTuple):
+    """What is computed for the figures other than the portraits."""
+
+    diagram_a: BifurcationDiagram
+    diagram_b: BifurcationDiagram
+    studies: list[Study]
+
+
 #: Every figure of the paper that can be drawn, by the name of its file, and one of our own.
-FIGURES: dict[str, Callable[[], plotting.Figure] | Portraits] = {
-    "fig01": draw_model,
-    "fig02": draw_classes,
-    "fig03": draw_diagram_a,
-    "fig07": draw_diagram_b,
-    "formulations": draw_formulations,
+FIGURES: dict[str, Callable[[Computed], plotting.Figure] | Portraits] = {
+    "fig01": lambda computed: draw_model(),
+    "fig02": lambda computed: draw_classes(),
+    "fig03": lambda computed: _draw_diagram(computed.diagram_a, MISPRINT),
+    "fig07": lambda computed: _draw_diagram(computed.diagram_b, MISSING_REGION),
+    "formulations": lambda computed: draw_formulations(computed.studies),
     "fig04": Portraits(
         "a",
         "nu_alpha",
@@ -505,7 +549,7 @@ FIGURES: dict[str, Callable[[], plotting.Figure] | Portraits] = {
 
 def steps() -> int:
     """How many times `reproduce` reports progress."""
-    return len(FIGURES) + 2
+    return len(FIGURES) + 3
 
 
 def reproduce(
@@ -516,25 +560,33 @@ def reproduce(
     folder: made where it is not there. progress: called `steps()` times, with what comes next.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    progress("critical values")
-    values = critical_values()
-    text = json.dumps(as_json(values), indent=2)
-    (folder / "critical_values.json").write_text(text + "\n", encoding="utf-8")
+    # From a cold start nearly all the time goes into compiling, so two threads use two cores.
+    with ThreadPoolExecutor(1) as beside:
+        studies = beside.submit(study_formulations)
+        progress("critical values")
+        values = critical_values()
+        text = json.dumps(as_json(values), indent=2)
+        (folder / "critical_values.json").write_text(text + "\n", encoding="utf-8")
 
-    progress("orbits of the phase portraits")
-    panels = {
-        name: figure.panels(values)
-        for name, figure in FIGURES.items()
-        if isinstance(figure, Portraits)
-    }
-    orbits = iter(simulate_panels([panel for group in panels.values() for panel in group]))
+        panels = {
+            name: figure.panels(values)
+            for name, figure in FIGURES.items()
+            if isinstance(figure, Portraits)
+        }
+        flat = [panel for group in panels.values() for panel in group]
+        orbits = beside.submit(simulate_panels, flat)
+        unstable = beside.submit(find_unstable_cycles, flat)
+        progress("bifurcation diagrams")
+        computed = Computed(diagram_a(), diagram_b(), studies.result())
+        progress("orbits of the phase portraits")
+        portraits = zip(orbits.result(), unstable.result(), strict=True)
     with plotting.journal_style():
         for name, figure in FIGURES.items():
             progress(name)
             if isinstance(figure, Portraits):
-                own = [next(orbits) for _ in panels[name]]
-                drawn = draw_portraits(figure, panels[name], own)
+                own, repelling = zip(*(next(portraits) for _ in panels[name]), strict=True)
+                drawn = draw_portraits(figure, panels[name], own, repelling)
             else:
-                drawn = figure()
+                drawn = figure(computed)
             plotting.save(drawn, folder / f"{name}.png")
     return values
