@@ -19,6 +19,7 @@ from .bifurcations import (
     SuddenSliding,
     refine,
 )
+from .curves import BifurcationCurve, SpecialPoint, bifurcation_curve
 from .cycles import Cycle, find_cycle, unstable_cycle
 from .detection import scan
 from .diagrams import BifurcationDiagram, bifurcation_diagram
@@ -58,6 +59,7 @@ __all__ = [
     "BasinStability",
     "Basins",
     "Belt",
+    "BifurcationCurve",
     "BifurcationDiagram",
     "BifurcationPoint",
     "Conti",
@@ -75,6 +77,7 @@ __all__ = [
     "NonsmoothFold",
     "Oscillator",
     "SlidingExchange",
+    "SpecialPoint",
     "Status",
     "Stribeck",
     "SuddenSliding",
@@ -82,6 +85,7 @@ __all__ = [
     "amplitude",
     "basin_stability",
     "basins",
+    "bifurcation_curve",
     "bifurcation_diagram",
     "describe",
     "design",

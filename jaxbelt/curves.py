@@ -1,0 +1,582 @@
+"""Curves of bifurcation points in two parameters: `bifurcation_curve`.
+
+A condition's own system of equations, regular at the point, stays regular along its curve, so with
+one unknown more, the second parameter, pseudo-arclength follows it (see `continuation`), turning
+points included. The signature is fixed while it lasts. Functions are watched that vanish where two
+conditions hold at once: the first Lyapunov coefficient on a Hopf curve; on a curve of tangencies
+the multiplier less one, the duration of each other stick phase and the distance of each other
+extremum of x2 from a boundary; on every curve the velocities and their differences. Where one
+changes its sign the curve is solved for its zero, a point of codimension two. There the signature
+may change; the condition is then refined anew just beyond, and the curve goes on from there with
+the signature that is found.
+"""
+
+import importlib
+from collections.abc import Callable
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.optimize import brentq
+
+from .bifurcations import (
+    AbstractCondition,
+    BifurcationPoint,
+    Encounter,
+    GrazingSliding,
+    Hopf,
+    NonsmoothFold,
+    SlidingExchange,
+    SuddenSliding,
+    leaf_index,
+    parameter,
+    vary,
+)
+from .checks import as_array, check_finite, require
+from .continuation import CurvePoint, End, continue_curve, corrected
+from .cycles import Chain, Ends, Turn, cycle_of, meshed, trace_of
+from .detection import Guess, refined
+from .equilibria import EquilibriumKind, equilibria
+from .modes import Mode, boundary_guards, edge_guards, mode_acceleration
+from .oscillator import Oscillator
+from .results import Status
+
+#: Unknowns of a cycle count this much in the length of a step, beside the two parameters; large
+#: ones less, for durations of stick phases go to infinity where a belt comes to rest.
+WEIGHT = 0.1
+#: After so many points the steps of integration are spread anew.
+REMESH = 10
+
+
+class SpecialPoint(NamedTuple):
+    """A point of codimension two on a curve.
+
+    kind: "DegenerateHopf" (first Lyapunov coefficient 0), "FoldGrazing" (multiplier 1: the fold
+    turns into a grazing point), "DoubleSliding" (the boundary of another belt is touched, too),
+    "BeltAtRest", "EqualVelocities"; belts: concerned; values: of the two parameters; residual: the
+    largest error in all equations.
+    """
+
+    kind: str
+    belts: tuple[int, ...]
+    values: tuple[float, float]
+    residual: float
+
+
+class BifurcationCurve(eqx.Module):
+    """A curve of bifurcation points in two parameters; what `bifurcation_curve` returns.
+
+    condition: that of the point it began with; values: of the parameters, [rows, 2]; kinds: name of
+    the condition that holds there, a row each; multiplier: of the cycle without the stick phase
+    that vanishes, [rows], NaN where there is none; residual: [rows]; special: points of codimension
+    two, in order; ends: why it ends at the first and the last row; names: of the parameters.
+    """
+
+    condition: AbstractCondition
+    values: np.ndarray
+    kinds: tuple[str, ...] = eqx.field(static=True)
+    multiplier: np.ndarray
+    residual: np.ndarray
+    special: tuple[SpecialPoint, ...] = eqx.field(static=True)
+    ends: tuple[End, End] = eqx.field(static=True)
+    names: tuple[str, str] = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw it into the axes `ax` (None: new ones), which are returned."""
+        plotting = importlib.import_module(".plotting", __package__)
+        return plotting.plot_curves([self], ax)
+
+    def __repr__(self) -> str:
+        first, last = (f"({p:.6g}, {q:.6g})" for p, q in self.values[[0, -1]])
+        special = ", ".join(point.kind for point in self.special) or "none"
+        return (
+            f"BifurcationCurve({self.condition!r}, {len(self)} rows, {first} to {last}, "
+            f"special: {special})"
+        )
+
+
+def bifurcation_curve(
+    point: BifurcationPoint,
+    where: tuple[Callable[[Oscillator], Any], Callable[[Oscillator], Any]],
+    span: tuple[tuple[float, float], tuple[float, float]],
+    *,
+    step: float = 0.01,
+    max_points: int = 1000,
+) -> BifurcationCurve:
+    """The curve of a bifurcation point in two parameters, to both sides of it.
+
+    point: from `refine` or `scan`, with status OK; where: selects the two parameters; span: first
+    and last value of each; step: length between neighbours; max_points: on each side.
+    `ValueError` names an impossible argument.
+    """
+    require(isinstance(point, BifurcationPoint), "point", "a BifurcationPoint", repr(point))
+    require(int(point.status) == Status.OK, "point", "one with status OK", repr(point))
+    require(len(where) == 2, "where", "two functions", repr(where))
+    osc = point.oscillator
+    indices = jnp.asarray([leaf_index(osc, one) for one in where])
+    require(indices[0] != indices[1], "where", "two different parameters", "one twice")
+    limits = np.stack([np.asarray(as_array(ends, "span", (2,))) for ends in span])
+    check_finite(limits, "span")
+    start = np.array([float(parameter(osc, index)) for index in indices])
+    inside = np.all((limits[:, 0] <= start) & (start <= limits[:, 1]))
+    require(inside, "span", f"around the point {start.tolist()}", limits.tolist())
+    problem = _Problem(point.condition, osc, indices, limits, step, max_points)
+    ahead, behind = (_follow(problem, point, sign) for sign in (1.0, -1.0))
+    rows = [*reversed(behind.rows[1:]), *ahead.rows]
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(osc)]
+    names = [jax.tree_util.keystr(paths[int(i)]).removeprefix(".") for i in indices]
+    return BifurcationCurve(
+        condition=point.condition,
+        values=np.array([row.values for row in rows]),
+        kinds=tuple(row.kind for row in rows),
+        multiplier=np.array([row.multiplier for row in rows]),
+        residual=np.array([row.residual for row in rows]),
+        special=(*reversed(behind.special), *ahead.special),
+        ends=(behind.end, ahead.end),
+        names=(names[0], names[1]),
+    )
+
+
+# --- going along ----------------------------------------------------------------------------------
+
+
+class _Problem(NamedTuple):
+    condition: AbstractCondition
+    osc: Oscillator
+    indices: Array
+    limits: np.ndarray
+    step: float
+    max_points: int
+
+
+class _Row(NamedTuple):
+    values: np.ndarray
+    kind: str
+    multiplier: float
+    residual: float
+
+
+class _Side(NamedTuple):
+    rows: list[_Row]
+    special: list[SpecialPoint]
+    end: End
+
+
+def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
+    """The curve to one side of a point: piece by piece, each with one signature and one mesh."""
+    system = _system_of(problem, point)
+    u = system.unknowns(point)
+    direction = sign * system.tangent(u)
+    rows: list[_Row] = []
+    special: list[SpecialPoint] = []
+    while True:
+        piece, end = [], End.STEP_TOO_SMALL
+        for at in _piece(problem, system, u, direction):
+            piece.append((at, system.look(at.u)))
+            if len(piece) > 1:
+                special += _between(problem, system, piece[-2], piece[-1])
+            if not piece[-1][1].valid:
+                break
+            end = at.end
+        beyond = piece.pop()[0] if piece and not piece[-1][1].valid else None
+        rows += [_row(problem, at, seen) for at, seen in piece[min(len(rows), 1) :]]
+        if len(rows) >= problem.max_points or not piece:
+            return _Side(rows, special, End.POINT_COUNT if piece else End.STEP_TOO_SMALL)
+        last = piece[-1][0]
+        if end is not End.LEFT_SPAN and (rest := _limit_at_rest(problem, rows)):
+            return _Side(rows, [*special, rest], End.STOPPED)
+        if beyond is None and end is not End.POINT_COUNT:
+            return _Side(rows, special, end or End.STOPPED)
+        if beyond is None:
+            # The same curve, its mesh spread anew.
+            system, u, direction = system.renewed(last.u, last.tangent)
+            continue
+        # The signature has changed between the last two points.
+        found = _beyond(problem, last.u[-2:], special[-1:] or [], beyond)
+        if found is None:
+            return _Side(rows, special, End.STOPPED)
+        system = _system_of(problem, found)
+        u = system.unknowns(found)
+        direction = system.tangent(u)
+        direction *= np.sign(direction[-2:] @ (u[-2:] - last.u[-2:]))
+        rows.append(_row(problem, beyond._replace(u=u), system.look(u)))
+
+
+def _piece(problem: _Problem, system: "_System", u: np.ndarray, direction: np.ndarray):
+    span = np.full((2, u.size), np.inf) * np.array([[-1.0], [1.0]])
+    span[:, -2:] = problem.limits.T
+    return continue_curve(
+        system.residual,
+        u,
+        direction,
+        args=system.args,
+        jacobian=system.jacobian,
+        span=(span[0], span[1]),
+        step=problem.step,
+        min_step=1e-2 * problem.step,
+        max_step=problem.step,
+        max_points=REMESH,
+    )
+
+
+def _row(problem: _Problem, at: CurvePoint, seen: "_Seen") -> _Row:
+    kind = type(problem.condition).__name__
+    if isinstance(problem.condition, NonsmoothFold | GrazingSliding):
+        kind = (NonsmoothFold if seen.multiplier > 1 else GrazingSliding).__name__
+    return _Row(at.u[-2:], kind, seen.multiplier, seen.residual)
+
+
+def _between(problem: _Problem, system: "_System", before, after) -> list[SpecialPoint]:
+    """The points of codimension two between two neighbours: where a watched function vanishes."""
+    (a, seen_a), (b, seen_b) = before, after
+    length = float((b.u - a.u) @ a.tangent)
+    found = []
+    for name, start in seen_a.tests.items():
+        end = seen_b.tests.get(name, np.nan)
+        if start * end >= 0 or np.isnan(start * end):
+            continue
+        solved: list[tuple[np.ndarray, float]] = []
+
+        def test(part, name=name, solved=solved):
+            at = corrected(*system.problem, a.u, a.tangent, part * length)
+            seen = system.look(at.u)
+            solved.append((at.u, max(seen.residual, abs(seen.tests[name]))))
+            return seen.tests[name]
+
+        root: Any = brentq(test, 0.0, 1.0, xtol=1e-14)
+        test(root)
+        u, residual = solved[-1]
+        if np.all((problem.limits[:, 0] <= u[-2:]) & (u[-2:] <= problem.limits[:, 1])):
+            values = (float(u[-2]), float(u[-1]))
+            found.append((root, SpecialPoint(name[0], name[1], values, residual)))
+    return [point for _, point in sorted(found, key=lambda item: item[0])]
+
+
+def _beyond(problem: _Problem, before: np.ndarray, special, beyond: CurvePoint):
+    """The point of the same condition just beyond a change of signature, or None.
+
+    The curve may have a corner there. So it is looked for all around the change, less where the
+    curve came from.
+    """
+    condition = _sought(problem.condition)
+    centre = np.array(special[-1].values) if special else 0.5 * (before + beyond.u[-2:])
+    came_from = (before - centre) / max(float(np.linalg.norm(before - centre)), 1e-12)
+    best: tuple[float, BifurcationPoint] | None = None
+    for free in (0, 1):
+        for side in (1.0, -1.0):
+            values = centre + side * 0.5 * problem.step * np.eye(2)[1 - free]
+            held = vary(problem.osc, problem.indices[1 - free], jnp.asarray(values[1 - free])[None])
+            guesses = [
+                Guess((-np.inf, np.inf), float(values[free]) + offset * problem.step, condition)
+                for offset in (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0)
+            ]
+            for _, point in refined(held, problem.indices[free], guesses):
+                at = [float(parameter(point.oscillator, index)) for index in problem.indices]
+                away = np.array(at) - centre
+                distance = float(np.linalg.norm(away))
+                fine = point.status == Status.OK and 0 < distance < 3 * problem.step
+                if fine and (away / distance) @ came_from < 0.7:
+                    if best is None or distance < best[0]:
+                        best = distance, point
+    return None if best is None else best[1]
+
+
+def _limit_at_rest(problem: _Problem, rows: list[_Row]) -> SpecialPoint | None:
+    """Where the curve ends at a belt at rest, if that is near.
+
+    There is no cycle in the limit, so the last rows are extrapolated; the residual is the
+    difference between doing so by two of them and by three.
+    """
+    if isinstance(problem.condition, Hopf | SuddenSliding) or len(rows) < 3:
+        return None
+    velocities = [
+        leaf_index(problem.osc, lambda osc, k=k: osc.belts[k].velocity)
+        for k in range(len(problem.osc.belts))
+    ]
+    last = np.array([row.values for row in rows[-3:]])
+    for held in (0, 1):
+        nu, free = last[:, held], last[:, 1 - held]
+        index = int(problem.indices[held])
+        falls = 0 < abs(nu[2]) < min(abs(nu[1]), 2 * problem.step)
+        if index not in velocities or not falls:
+            continue
+        linear = np.polyval(np.polyfit(nu[1:], free[1:], 1), 0.0)
+        limit = float(np.polyval(np.polyfit(nu, free, 2), 0.0))
+        pair = (limit, 0.0) if held else (0.0, limit)
+        belts = (velocities.index(index),)
+        return SpecialPoint("BeltAtRest", belts, pair, abs(limit - float(linear)))
+    return None
+
+
+def _sought(condition: AbstractCondition) -> AbstractCondition:
+    """A tangency may be of the other kind further on."""
+    is_fold = isinstance(condition, NonsmoothFold)
+    return GrazingSliding(condition.belt) if is_fold else condition
+
+
+# --- the systems ----------------------------------------------------------------------------------
+
+
+class _Seen(NamedTuple):
+    """What is watched at a point: functions by (name, belts), whether there is such a motion."""
+
+    tests: dict[tuple[str, tuple[int, ...]], float]
+    valid: bool
+    multiplier: float
+    residual: float
+
+
+class _System:
+    """Equations in u, whose last two entries are the parameters, and what is watched of them."""
+
+    residual: Callable[..., Array]
+    jacobian: Callable[..., tuple[Array, Array]] | None = None
+    args: Any
+
+    @property
+    def problem(self) -> tuple[Any, Any, Any]:
+        return self.residual, self.jacobian, self.args
+
+    def unknowns(self, point: BifurcationPoint) -> np.ndarray:
+        raise NotImplementedError
+
+    def look(self, u: np.ndarray) -> _Seen:
+        raise NotImplementedError
+
+    def renewed(self, u: np.ndarray, tangent: np.ndarray) -> "tuple[_System, Any, Any]":
+        """The system for what follows, and the point and the tangent in its unknowns."""
+        return self, u, tangent
+
+    def tangent(self, u: np.ndarray) -> np.ndarray:
+        """The direction of the curve at u, in one sense or the other."""
+        matrix = np.asarray(_matrix(*self.problem, jnp.asarray(u)))
+        return np.linalg.svd(matrix)[2][-1]
+
+
+@eqx.filter_jit
+def _matrix(residual, jacobian, args, u: Array) -> Array:
+    return jax.jacfwd(lambda v: residual(v, args))(u) if jacobian is None else jacobian(u, args)[1]
+
+
+def _system_of(problem: _Problem, point: BifurcationPoint) -> _System:
+    kind = type(point.condition)
+    if kind is Hopf:
+        return _HopfSystem(problem, point)
+    if kind is SuddenSliding:
+        return _RestSystem(problem, point)
+    if kind in (NonsmoothFold, GrazingSliding, SlidingExchange):
+        return _CycleSystem.begun(problem, point)
+    raise ValueError(f"point must be of a kind that has curves, got {point.condition!r}")
+
+
+def _with(osc: Oscillator, indices: Array, pair: Array) -> Oscillator:
+    return vary(vary(osc, indices[0], pair[:1]), indices[1], pair[1:])
+
+
+def _velocity_tests(osc: Oscillator) -> dict[tuple[str, tuple[int, ...]], Any]:
+    velocities = [belt.velocity for belt in osc.belts]
+    tests: dict[tuple[str, tuple[int, ...]], Any] = {}
+    for i, nu in enumerate(velocities):
+        tests["BeltAtRest", (i,)] = nu
+    for (i, a), (j, b) in combinations(enumerate(velocities), 2):
+        tests["EqualVelocities", (i, j)] = a - b
+    return tests
+
+
+class _HopfSystem(_System):
+    """Two equations in x1 and the parameters: rest, and a trace of zero."""
+
+    def __init__(self, problem: _Problem, point: BifurcationPoint):
+        self._indices = problem.indices
+        rests = equilibria(point.oscillator)
+        fixed = np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT
+        row = int(np.argmin(np.where(fixed, np.abs(np.asarray(rests.rate)), np.inf)))
+        self._x1 = float(rests.x1[row])
+        codes = jnp.asarray(rests.modes[row]).astype(float)
+        self.residual = _rest_equations
+        self.args = (point.oscillator, problem.indices, codes)
+
+    def unknowns(self, point):
+        pair = [float(parameter(point.oscillator, index)) for index in self._indices]
+        return np.array([self._x1, *pair])
+
+    def look(self, u):
+        tests, valid, residual = _look_at_rest(self.args, jnp.asarray(u))
+        tests = {name: float(value) for name, value in tests.items()}
+        return _Seen(tests, bool(valid), np.nan, float(residual))
+
+
+def _rest_equations(u: Array, args) -> Array:
+    osc, indices, codes = args
+    osc, mode = _with(osc, indices, u[-2:]), Mode(tuple(codes))
+    rest = jnp.zeros(())
+    return jnp.append(
+        mode_acceleration(osc, mode, u[0], rest)[None], trace_of(osc, mode, u[0], rest)
+    )
+
+
+@eqx.filter_jit
+def _look_at_rest(args, u: Array):
+    osc, indices, codes = args
+    osc, mode = _with(osc, indices, u[-2:]), Mode(tuple(codes))
+
+    def derivative(fn):
+        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
+
+    third = derivative(derivative(derivative(lambda x2: mode_acceleration(osc, mode, u[0], x2))))
+    tests = {**_velocity_tests(osc), ("DegenerateHopf", ()): third(jnp.zeros(()))}
+    rest = jnp.zeros(())
+    inside = [*boundary_guards(osc, mode, rest), *edge_guards(osc, mode, u[0])]
+    residual = jnp.max(jnp.abs(_rest_equations(u, args)))
+    return tests, jnp.all(jnp.stack(inside) > 0), residual
+
+
+class _RestSystem(_System):
+    """One equation in the parameters: the velocity of a belt is zero."""
+
+    def __init__(self, problem: _Problem, point: BifurcationPoint):
+        self.residual = _velocity_equation
+        belt = point.condition.belt if isinstance(point.condition, SuddenSliding) else 0
+        self.args = (point.oscillator, problem.indices, jnp.asarray(belt))
+        self._indices = problem.indices
+
+    def unknowns(self, point):
+        return np.array([float(parameter(point.oscillator, index)) for index in self._indices])
+
+    def look(self, u):
+        osc, indices, belt = self.args
+        tests = _velocity_tests(jax.tree.map(np.asarray, _with(osc, indices, jnp.asarray(u))))
+        tests = {name: float(v) for name, v in tests.items() if name[1] != (int(belt),)}
+        return _Seen(tests, True, np.nan, 0.0)
+
+
+def _velocity_equation(u: Array, args) -> Array:
+    osc, indices, belt = args
+    osc = _with(osc, indices, u)
+    return jnp.stack([one.velocity for one in osc.belts])[belt][None]
+
+
+class _CycleSystem(_System):
+    """3N + 1 equations in the unknowns of a cycle and the parameters, see `bifurcations`."""
+
+    def __init__(self, args):
+        self.residual, self.jacobian, self.args = _cycle_equations, _cycle_jacobian, args
+
+    @classmethod
+    def begun(cls, problem: _Problem, point: BifurcationPoint) -> "_CycleSystem":
+        chain, condition = point.cycle.chain, point.condition
+        codes, ends = np.asarray(chain.codes), np.array(chain.ends)
+        names = Ends(codes.shape[1])
+        row = -1
+        if isinstance(condition, SlidingExchange):
+            belts = condition.belts
+        else:
+            assert isinstance(condition, NonsmoothFold | GrazingSliding)
+            belts = (condition.belt, condition.belt)
+            # Its stick phase is the one of no duration; the arc before it is tangent.
+            own = (codes[:, condition.belt] == 0) & (ends != names.unused)
+            durations = np.abs(np.asarray(point.cycle.unknowns)[:, 2])
+            row = int(np.argmin(np.where(own, durations, np.inf)))
+            ends[(row - 1) % int(np.sum(ends != names.unused))] = names.tangent + condition.belt
+        system = Encounter(
+            Chain(chain.codes, jnp.asarray(ends), chain.mesh),
+            jnp.asarray(np.array(belts)),
+            problem.indices[0],
+        )
+        weights = _weights(np.asarray(point.cycle.unknowns))
+        return cls((point.oscillator, problem.indices, system, jnp.asarray(row), weights))
+
+    def unknowns(self, point):
+        pair = [float(parameter(point.oscillator, index)) for index in self.args[1]]
+        z = np.asarray(point.cycle.unknowns).reshape(-1)
+        return np.append(np.asarray(self.args[4]) * z, pair)
+
+    def look(self, u):
+        tests, valid, multiplier, residual = _look_at_cycle(self.args, jnp.asarray(u))
+        tests = {name: float(value) for name, value in tests.items()}
+        return _Seen(tests, bool(valid), float(multiplier), float(residual))
+
+    def renewed(self, u, tangent):
+        args = _meshed_anew(self.args, jnp.asarray(u))
+        scale = np.append(np.asarray(args[4]) / np.asarray(self.args[4]), [1.0, 1.0])
+        return _CycleSystem(args), scale * u, scale * tangent
+
+
+def _weights(z):
+    return jnp.asarray(WEIGHT / (1 + abs(z.reshape(-1))))
+
+
+def _parts(u: Array, args):
+    osc, indices, system, _, weights = args
+    return vary(osc, indices[1], u[-1:]), system, (u[:-2] / weights).reshape(-1, 3), u[-2:-1]
+
+
+def _cycle_equations(u: Array, args) -> Array:
+    osc, system, z, p = _parts(u, args)
+    return system.residual(osc, z, p)
+
+
+def _cycle_jacobian(u: Array, args) -> tuple[Array, Array]:
+    osc, system, z, p = _parts(u, args)
+    value, matrix = system.linearized(osc, z, p)
+    indices = args[1]
+
+    def of_second(q):
+        return system.residual(vary(osc, indices[1], q), z, p)
+
+    _, column = jax.jvp(of_second, (u[-1:],), (jnp.ones(1),))
+    matrix = matrix.at[:, :-1].divide(args[4][None])
+    return value, jnp.concatenate([matrix, column[:, None]], axis=1)
+
+
+@eqx.filter_jit
+def _look_at_cycle(args, u: Array):
+    osc, system, z, p = _parts(u, args)
+    row = args[3]
+    osc = vary(osc, args[1][0], p)
+    chain = system.ordinary
+    ok = jnp.asarray(Status.OK.value)
+    cycle, slope = cycle_of(osc, chain, z, jnp.asarray(0), ok)
+    n = len(osc.belts)
+    names = Ends(n)
+    rows = jnp.arange(chain.ends.size)
+    touches = row >= 0
+    others = chain.used & (rows != row)
+    sticks = others & jnp.any(chain.codes == 0, axis=-1)
+    slope = jnp.where(jnp.any(sticks), 0.0, slope)
+    tests = _velocity_tests(osc)
+    tests["FoldGrazing", ()] = jnp.where(touches & ~jnp.any(sticks), slope - 1, jnp.nan)
+    following = jnp.roll(z, -1, axis=0)
+    last = rows == jnp.sum(chain.used) - 1
+    following = jnp.where(last[:, None], z[0], following)
+    turns = chain.used & (system.chain.ends == names.turn_x2)
+    for belt in range(n):
+        own = sticks & (chain.codes[:, belt] == 0)
+        shortest = jnp.min(jnp.where(own, z[:, 2], jnp.inf))
+        r = osc.belts[belt].velocity - osc.omega * following[:, 1]
+        slips = turns & (jnp.abs(chain.codes[:, belt]) == 1)
+        gap = jnp.min(jnp.where(slips, chain.codes[:, belt] * r, jnp.inf))
+        nearest = jnp.where(jnp.any(own), shortest, gap)
+        # An exchange ends where the phase of sticking vanishes.
+        watched = (touches | jnp.any(own)) & jnp.isfinite(nearest)
+        pair = ("DoubleSliding", (belt,))
+        tests[pair] = jnp.where(watched, nearest, jnp.nan)
+    valid = cycle.status == Status.OK
+    residual = jnp.max(jnp.abs(_cycle_equations(u, args)))
+    return tests, valid, jnp.where(touches, slope, jnp.nan), residual
+
+
+@eqx.filter_jit
+def _meshed_anew(args, u: Array):
+    osc, system, z, p = _parts(u, args)
+    chain = system.chain
+    turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
+    fresh, _ = meshed(vary(osc, args[1][0], p), turn)
+    return (*args[:2], eqx.tree_at(lambda s: s.chain, system, fresh), args[3], _weights(z))

@@ -1,0 +1,131 @@
+"""Curves in the plane of both velocities: against refined points, closed forms and symmetry."""
+
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+
+import jaxbelt as jb
+from jaxbelt.bifurcations import leaf_index, vary
+from jaxbelt.continuation import End
+from jaxbelt.detection import Guess, refined
+
+
+def nu0(osc):
+    return osc.belts[0].velocity
+
+
+def nu1(osc):
+    return osc.belts[1].velocity
+
+
+PLANE = ((-0.7, 0.7), (-0.7, 0.7))
+
+
+@pytest.fixture(scope="module")
+def points():
+    """Those of class (b) along nu1 = 0.35, by their order."""
+    return jb.scan(jb.presets.class_b(0.3, 0.35), nu0, (-0.7, 0.7))
+
+
+@pytest.fixture(scope="module")
+def fold(points):
+    """The fold on belt 1 at nu0 = -0.5613 and what becomes of it."""
+    return jb.bifurcation_curve(points[0], (nu0, nu1), PLANE, step=0.02)
+
+
+def test_the_hopf_curve_is_that_of_the_closed_form(points):
+    curve = jb.bifurcation_curve(points[5], (nu0, nu1), PLANE, step=0.02)
+    a, b = curve.values.T
+    # The trace of two belts, eq. (27): 4 / (1 + 10 nu)^2 each; slopes up to 10 times rounding.
+    assert np.allclose(4 / (1 + 10 * a) ** 2 + 4 / (1 + 10 * b) ** 2, 0.5, rtol=0, atol=1e-14)
+    assert curve.ends == (End.LEFT_SPAN, End.LEFT_SPAN) and set(curve.kinds) == {"Hopf"}
+    assert np.all(np.max(np.abs(curve.values[[0, -1]]), axis=1) == pytest.approx(0.7, abs=1e-12))
+    (special,) = curve.special
+    assert special.kind == "EqualVelocities" and special.values == pytest.approx((0.3, 0.3))
+
+
+def test_every_row_is_what_refine_finds(fold):
+    """Refined over nu0 or nu1, whichever the curve crosses, in the neighbourhood of each row."""
+    condition = jb.GrazingSliding(1)
+    osc = jb.presets.class_b(-0.5, 0.35)
+    where = [jnp.asarray(leaf_index(osc, one)) for one in (nu0, nu1)]
+    rows = range(3, len(fold) - 3, len(fold) // 8)
+    for row in rows:
+        values, chord = fold.values[row], fold.values[row + 1] - fold.values[row - 1]
+        free = int(np.argmin(np.abs(chord)))
+        held = vary(osc, where[1 - free], jnp.asarray(values[1 - free])[None])
+        guesses = [
+            Guess((-1.0, 1.0), float(values[free]) + offset, condition) for offset in (-1e-3, 1e-3)
+        ]
+        found = [point for _, point in refined(held, where[free], guesses)]
+        # Both are exact up to the error of the integration, some 1e-12.
+        assert np.nanmin([abs(float(p.value) - values[free]) for p in found]) < 1e-9
+        assert fold.kinds[row] in {point.kind for point in found}
+    assert np.max(fold.residual) < 1e-12 and np.all(np.isfinite(fold.values))
+
+
+def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
+    """At nu0 = -nu1 by symmetry; there the fold of one belt goes over into the grazing point."""
+    double = fold.special[0]
+    assert double.kind == "DoubleSliding" and double.belts == (0,)
+    assert double.values[0] == pytest.approx(-double.values[1], abs=1e-9)
+    changes = [i for i in range(1, len(fold)) if fold.kinds[i] != fold.kinds[i - 1]]
+    assert len(changes) == 1 and {fold.kinds[0], fold.kinds[-1]} == {
+        "NonsmoothFold",
+        "GrazingSliding",
+    }
+    assert np.all((fold.multiplier > 1) == (np.array(fold.kinds) == "NonsmoothFold"))
+    # It runs through both points of the line nu1 = 0.35, and one that the oracle finds on another.
+    for value, nu in ((-0.561302406210, 0.35), (-0.078804734107, 0.35)):
+        gap = np.min(np.hypot(fold.values[:, 0] - value, fold.values[:, 1] - nu))
+        assert gap < 0.011  # half a step
+    expected = oracle_cycles.grazing(lambda nu: oracle.class_b(nu, 0.45), (-0.35, -0.32), 1)
+    near = np.argsort(np.abs(fold.values[:, 1] - 0.45) + 9 * (fold.values[:, 0] < -0.45))[:4]
+    order = near[np.argsort(fold.values[near, 1])]
+    found = np.polyval(np.polyfit(fold.values[order, 1], fold.values[order, 0], 3), 0.45)
+    # Interpolated by a cubic in steps of 0.02.
+    assert found == pytest.approx(expected, abs=1e-5)
+    assert fold.special[1].kind == "BeltAtRest" and End.STOPPED in fold.ends
+
+
+def test_curves_have_the_symmetries_of_the_plane(points, fold):
+    """The mirror image nu -> -nu, row by row; the belts exchanged, in the special points."""
+    mirrored = jb.scan(jb.presets.class_b(0.3, -0.35), nu0, (0.5, 0.6))
+    (start,) = mirrored
+    image = jb.bifurcation_curve(start, (nu0, nu1), PLANE, step=0.02)
+    assert len(image) == len(fold)
+    same = image.values if np.allclose(image.values[0], -fold.values[0]) else image.values[::-1]
+    assert np.allclose(same, -fold.values, rtol=0, atol=1e-9)
+
+    other = jb.bifurcation_curve(points[1], (nu0, nu1), PLANE, step=0.02)
+    assert points[1].condition == jb.GrazingSliding(0)
+    (double,) = (point for point in other.special if point.kind == "DoubleSliding")
+    assert double.belts == (1,)
+    assert double.values == pytest.approx(fold.special[0].values, abs=1e-9)
+
+
+def test_an_exchange_ends_where_the_cycle_does(points):
+    curve = jb.bifurcation_curve(points[6], (nu0, nu1), PLANE, step=0.05)
+    assert np.allclose(curve.values[:, 0], curve.values[:, 1], rtol=0, atol=1e-13)
+    rest, end = curve.special
+    assert rest.kind == "BeltAtRest" and end.kind == "DoubleSliding"
+    # Equal belts at one velocity are one belt of twice the load: the fold is the oracle's.
+    expected = oracle_cycles.nonsmooth_fold(
+        lambda nu: oracle.class_a(nu, load=2.0), (0.48, 0.50), 0
+    )
+    assert end.values[0] == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("where", "span", "message"),
+    [
+        ((nu0, nu0), PLANE, "where must be two different parameters"),
+        ((nu0, nu1), ((0.0, 0.7), (-0.7, 0.7)), "span must be around the point"),
+        ((nu0, nu1), ((-0.7, np.nan), (-0.7, 0.7)), "span must be finite"),
+    ],
+)
+def test_impossible_arguments_are_named(points, where, span, message):
+    with pytest.raises(ValueError, match=message):
+        jb.bifurcation_curve(points[0], where, span)
