@@ -7,6 +7,9 @@ J. Kurths, How basin stability complements the linear-stability paradigm, Nature
 89-92). Both run in the kernel behind `sweep`, where a run ends as soon as its attractor is known.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -76,8 +79,8 @@ class BasinStability(eqx.Module):
 def basins(
     oscillator: Oscillator,
     *,
-    x1: ArrayLike,
-    x2: ArrayLike,
+    x1: ArrayLike | Sequence[float],
+    x2: ArrayLike | Sequence[float],
     t1: float = LONG_ENOUGH,
     rtol: float = 1e-8,
     atol: float = 1e-8,
@@ -165,7 +168,7 @@ def _name(kind: str, sticks: np.ndarray, x1: float) -> str:
 def basin_stability(
     oscillator: Oscillator,
     *,
-    box: tuple[tuple[float, float], tuple[float, float]],
+    box: ArrayLike | Sequence[Any],
     n: int = 10_000,
     key: Array,
     t1: float = LONG_ENOUGH,
@@ -186,24 +189,28 @@ def basin_stability(
     require(np.all(np.asarray(corners)[:, 0] < np.asarray(corners)[:, 1]), "box", "not empty", box)
     require(isinstance(n, int) and n > 0, "n", "a positive integer", n)
     starts = jax.random.uniform(key, (2, n), minval=corners[:, :1], maxval=corners[:, 1:])
-    kinds = _kinds(oscillator, np.asarray(starts).T, {"t1": t1, "rtol": rtol, "atol": atol})
+    kinds = _kinds(oscillator, np.asarray(starts), t1, rtol, atol)
     fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(batch.KINDS)}
     errors = {name: float(np.sqrt(f * (1 - f) / n)) for name, f in fractions.items()}
     return BasinStability(fractions, errors, n)
 
 
-def _kinds(osc: Oscillator, starts: np.ndarray, numbers: dict[str, float]) -> np.ndarray:
-    """Numbers of `batch.KINDS` for starts [n, 2], in the order of the starts."""
+def _kinds(osc: Oscillator, starts: np.ndarray, t1, rtol, atol) -> np.ndarray:
+    """Numbers of `batch.KINDS` for starts [2, n], in the order of the starts."""
     leaves, structure = jax.tree.flatten(osc)
     edges = bool(np.any([np.isfinite([belt.lower, belt.upper]) for belt in osc.belts]))
     program = batch.Program(structure, (False,) * len(leaves), batch.Attractor(), edges)
     layout = batch.layout(program, leaves)
     names = list(layout)
     column = sum(int(np.prod(layout[name])) for name in names[: names.index("kind")])
-    kinds = np.zeros(len(starts), int)
+    kinds = np.zeros(starts.shape[1], int)
 
     def put(runs: np.ndarray, results: np.ndarray) -> None:
-        kinds[runs] = results[0, :, column]
+        kinds[runs] = results[0, column]
 
-    batch.run(program, leaves, lambda a, b: starts[None, a:b], len(starts), put, **numbers)
+    def rows_of(first: int, last: int) -> np.ndarray:
+        return starts[None, :, first:last]
+
+    n = starts.shape[1]
+    batch.run(program, leaves, rows_of, n, put, t1=t1, rtol=rtol, atol=atol)
     return kinds

@@ -1,0 +1,128 @@
+"""Basins against a published example, the oracle's unstable cycle, and what must come out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+from matplotlib.path import Path
+
+import jaxbelt as jb
+from jaxbelt import Status
+from jaxbelt.basins import _labels
+
+# One belt, zeta = 0.1, mu(r) = 0.5 (1 + exp(-r/0.5)); starts uniform in this box. Fraction of
+# them that comes to rest: bSTAB and pyBasin, from 5,000 starts each.
+BOX = ((-2.0, 2.0), (0.0, 2.0))
+PUBLISHED = {1.25: 0.0838, 1.4: 0.211, 1.5: 0.312}
+
+
+def belt_drive(velocity):
+    return jb.Oscillator(0.1, (jb.Belt(velocity, jb.Stribeck(1.0, 0.5, 0.5)),))
+
+
+def oracle_boundary(velocity):
+    """The unstable cycle as a polygon, [2000, 2], by SciPy backwards in time."""
+    osc = oracle.Oscillator(0.1, (oracle.Belt(velocity, *oracle.stribeck(1.0, 0.5, 0.5)),))
+    cycle = oracle_cycles.unstable_cycle(osc)
+    return np.array([cycle.run.at(t) for t in np.linspace(0, cycle.period, 2001)[:-1]])
+
+
+def area_above(polygon, level):
+    """Area of the part of a polygon where x2 > level (its edges cut, then the shoelace formula)."""
+    part = []
+    for p, q in zip(polygon, np.roll(polygon, -1, axis=0)):
+        if p[1] >= level:
+            part.append(p)
+        if (p[1] >= level) != (q[1] >= level):
+            part.append(p + (q - p) * (level - p[1]) / (q[1] - p[1]))
+    x, y = np.array(part).T
+    return 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+
+
+@pytest.mark.parametrize("velocity", PUBLISHED)
+def test_published_basin_stability_and_area_of_the_unstable_cycle(velocity):
+    n = 20_000
+    found = jb.basin_stability(belt_drive(velocity), box=BOX, n=n, key=jax.random.key(1))
+    fraction, error = found.fractions["equilibrium"], found.standard_errors["equilibrium"]
+    assert error == pytest.approx(np.sqrt(fraction * (1 - fraction) / n))
+    assert sum(found.fractions.values()) == pytest.approx(1) and found.fractions["undecided"] == 0
+    polygon = oracle_boundary(velocity)
+    assert np.all(np.abs(polygon[:, 0]) < 2) and np.max(polygon[:, 1]) < 2
+    # Sampling errors: once in 15,000 a right result is four of them off.
+    assert abs(fraction - area_above(polygon, 0.0) / 8) < 4 * error
+    theirs = PUBLISHED[velocity]
+    assert abs(fraction - theirs) < 4 * np.hypot(error, np.sqrt(theirs * (1 - theirs) / 5000))
+
+
+@pytest.mark.parametrize(("velocity", "exact"), [(1.0, 0.0), (1.9, 1.0)])
+def test_one_attractor_alone_is_exact(velocity, exact):
+    found = jb.basin_stability(belt_drive(velocity), box=BOX, n=2_000, key=jax.random.key(2))
+    assert found.fractions["equilibrium"] == exact
+    assert found.fractions["cycle"] == 1 - exact
+
+
+def test_grid_is_split_by_the_unstable_cycle():
+    x1, x2 = np.linspace(-1.0, 2.0, 41), np.linspace(-1.3, 1.7, 37)
+    found = jb.basins(belt_drive(1.4), x1=x1, x2=x2, progress=False)
+    assert found.boundary.status == Status.OK
+    # x1 = mu(1.4) at rest
+    assert found.attractors == (
+        "cycle that sticks to belt 0",
+        f"rest at {0.5 * (1 + np.exp(-2.8)):.3f}",
+    )
+    assert len(found.cycles) == 1 and found.cycles[0].stable
+    grid = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
+    polygon = Path(oracle_boundary(1.4))
+    # Starts nearer to the boundary than its polygon is to the curve are not asked.
+    inside, surely = polygon.contains_points(grid, radius=0.0), np.ones(len(grid), bool)
+    for radius in (-1e-4, 1e-4):
+        surely &= polygon.contains_points(grid, radius=radius) == inside
+    assert np.sum(~surely) <= 2
+    label = np.asarray(found.label).reshape(-1)
+    assert np.array_equal(label[surely] == 1, inside[surely])
+    assert "41 x 37 starts" in repr(found)
+
+
+def test_a_belt_at_rest_holds_what_comes_to_it():
+    osc = belt_drive(0.0)
+    found = jb.basin_stability(osc, box=BOX, n=200, key=jax.random.key(3))
+    assert found.fractions["stuck"] == 1.0
+
+
+def test_labels_tell_attractors_of_one_kind_apart():
+    """Cycles by what they stick to and by size; the most frequent first; undecided is -1."""
+    dataset = jb.sweep(lambda: belt_drive(1.4), {"x1": [0.0] * 5, "x2": [2.0]}, observe="attractor")
+    dataset = dataset.load()
+    dataset["kind"][:, 0] = ["cycle", "undecided", "cycle", "cycle", "cycle"]
+    dataset["x1_max"][:, 0] = [1.0, 1.0, 2.0, 2.0 + 1e-6, 2.0]
+    dataset["sticks"][:, 0, 0] = [True, True, True, True, False]
+    labels, names = _labels(belt_drive(1.4), dataset)
+    assert labels[:, 0].tolist() == [1, -1, 0, 0, 2]
+    assert names[2] == "cycle that never sticks"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"x1": [0.0, 0.0], "x2": [0.0]}, "x1 must be increasing"),
+        ({"x1": [0.0], "x2": [jnp.nan]}, "x2 must be finite"),
+    ],
+)
+def test_impossible_grids_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        jb.basins(belt_drive(1.4), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"box": ((0.0, 0.0), (0.0, 1.0))}, "box must be not empty"),
+        ({"box": (0.0, 1.0)}, "box must be of shape"),
+        ({"box": BOX, "n": 0}, "n must be a positive integer"),
+    ],
+)
+def test_impossible_boxes_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        jb.basin_stability(belt_drive(1.4), key=jax.random.key(0), **arguments)
