@@ -177,7 +177,7 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
     rows: list[_Row] = []
     special: list[SpecialPoint] = []
     while True:
-        piece, end = [], End.STEP_TOO_SMALL
+        piece, end, before = [], End.STEP_TOO_SMALL, len(special)
         for at in _piece(problem, system, u, direction):
             piece.append((at, system.look(at.u)))
             if len(piece) > 1:
@@ -199,13 +199,15 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
             system, u, direction = system.renewed(last.u, last.tangent)
             continue
         # The signature has changed between the last two points.
-        found = _beyond(problem, last.u[-2:], special[-1:] or [], beyond)
+        known = special[-1:] if len(special) > before else []
+        centre = np.array(known[0].values) if known else 0.5 * (last.u + beyond.u)[-2:]
+        found = _beyond(problem, last.u[-2:], centre)
         if found is None:
             return _Side(rows, special, End.STOPPED)
         system = _system_of(problem, found)
         u = system.unknowns(found)
         direction = system.tangent(u)
-        direction *= np.sign(direction[-2:] @ (u[-2:] - last.u[-2:]))
+        direction *= np.sign(direction[-2:] @ (u[-2:] - centre))
         rows.append(_row(problem, beyond._replace(u=u), system.look(u)))
 
 
@@ -259,14 +261,13 @@ def _between(problem: _Problem, system: "_System", before, after) -> list[Specia
     return [point for _, point in sorted(found, key=lambda item: item[0])]
 
 
-def _beyond(problem: _Problem, before: np.ndarray, special, beyond: CurvePoint):
+def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
     """The point of the same condition just beyond a change of signature, or None.
 
     The curve may have a corner there. So it is looked for all around the change, less where the
     curve came from.
     """
     condition = _sought(problem.condition)
-    centre = np.array(special[-1].values) if special else 0.5 * (before + beyond.u[-2:])
     came_from = (before - centre) / max(float(np.linalg.norm(before - centre)), 1e-12)
     best: tuple[float, BifurcationPoint] | None = None
     for free in (0, 1):

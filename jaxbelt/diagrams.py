@@ -1,4 +1,4 @@
-"""Pictures of a whole parameter space as data: `bifurcation_diagram`.
+"""Pictures of a whole parameter space as data: `bifurcation_diagram` and `region_map`.
 
 A bifurcation diagram is what `scan` leaves between its points, filled in. In the stretch between
 two neighbouring points nothing changes in kind, so every equilibrium and every cycle in it can be
@@ -8,10 +8,14 @@ values are denser towards the points, where branches go like square roots. At a 
 one side goes on as what begins there at the same place: through a Hopf point with the other
 stability, through a grazing point or an exchange with another signature, and at a nonsmooth fold
 back on the same side, from stable to unstable.
+
+A region map is a sweep over two parameters from several starts, each cell named by what its runs
+lead to and by the stability of its equilibria. What bounds the regions is not read off the cells:
+points are found by `scan` along a few lines across the map, and their curves are followed.
 """
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple
 
@@ -19,15 +23,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
+from scipy.ndimage import distance_transform_edt
 
-from .bifurcations import BifurcationPoint, SuddenSliding, vary
-from .checks import require
+from .bifurcations import (
+    AbstractCondition,
+    BifurcationPoint,
+    GrazingSliding,
+    NonsmoothFold,
+    SuddenSliding,
+    vary,
+)
+from .checks import as_array, require
+from .curves import BifurcationCurve, bifurcation_curve
 from .cycles import SIZES, Cycle, Ends, Turn, polish, unstable_cycle
 from .detection import Label, Path, search
 from .equilibria import Equilibria, equilibria
 from .oscillator import Oscillator
 from .results import EventKind, Status
+from .sweep import sweep
 
 #: Cycles in one batch.
 BATCH = 32
@@ -152,17 +166,201 @@ def region_name(osc: Oscillator, label: Label) -> str:
     s none. Of several cycles each has its letter.
     """
     velocities = [float(belt.velocity) for belt in osc.belts]
-    opposite = min(velocities) < 0 < max(velocities)
+    return region_of(min(velocities) < 0 < max(velocities), len(velocities), label)
+
+
+def region_of(opposite: bool, belts: int, label: Label) -> str:
+    """The same, where it is known whether belts run in opposite directions, and how many."""
     rests = any(stable for _, stable in label.equilibria)
     number = 2 if rests and label.cycles else 3 if label.cycles else 1
     letters = []
     for cycle in label.cycles:
-        belts = {belt for kind, belt in cycle if kind == EventKind.STICK}
-        code = sum(2**belt for belt in belts)
+        code = sum(2**belt for belt in {b for kind, b in cycle if kind == EventKind.STICK})
         letters.append(chr(ord("a") + code - 1) if code else "s")
-    several = len(velocities) > 1
-    tail = "".join(sorted(letters)) if several else "s" * letters.count("s")
+    tail = "".join(sorted(letters)) if belts > 1 else "s" * letters.count("s")
     return f"{7 - number if opposite else number}{tail}"
+
+
+class RegionMap(eqx.Module):
+    """What `region_map` returns.
+
+    names: of the two parameters, as arguments of `make`; values: of each, [n] and [m]; label: name
+    of the region, [n, m], as from `region_name`, "" where the runs were undecided; curves: what
+    bounds the regions, see `BifurcationCurve`; make: as given. `example(name)` is a cell well
+    inside a region; `plot()` draws the map, with a portrait of each region.
+    """
+
+    names: tuple[str, str] = eqx.field(static=True)
+    values: tuple[np.ndarray, np.ndarray]
+    label: np.ndarray
+    curves: tuple[BifurcationCurve, ...]
+    make: Callable[..., Oscillator] = eqx.field(static=True)
+
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """The names that occur, in order."""
+        return tuple(sorted(set(np.unique(self.label).tolist()) - {""}))
+
+    def example(self, name: str) -> tuple[float, float]:
+        """The values of the parameters in the cell of a region that is farthest from its bounds."""
+        require(name in self.regions, "name", f"one of {', '.join(self.regions)}", repr(name))
+        row, column = interior(self.label == name)
+        return float(self.values[0][row]), float(self.values[1][column])
+
+    def oscillator(self, name: str) -> Oscillator:
+        """The oscillator in that cell."""
+        return self.make(**dict(zip(self.names, self.example(name), strict=True)))
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the map into the axes `ax`, which are returned.
+
+        None: new ones, and a sketch of the phase portrait of each region in its example beside
+        them, as in the paper's Fig. 6.
+        """
+        plotting = importlib.import_module(".plotting", __package__)
+        return plotting.plot_region_map(self, ax)
+
+    def __repr__(self) -> str:
+        sizes = " x ".join(str(len(values)) for values in self.values)
+        return (
+            f"RegionMap({self.names[0]}, {self.names[1]}: {sizes} cells, "
+            f"regions {' '.join(self.regions)}, {len(self.curves)} curves)"
+        )
+
+
+def interior(inside: np.ndarray) -> tuple[int, int]:
+    """Row and column of the cell that is farthest from where a region ends, and from the rim."""
+    padded = np.pad(inside, 1)
+    depth = np.asarray(distance_transform_edt(padded))
+    row, column = np.unravel_index(np.argmax(depth), padded.shape)
+    return int(row) - 1, int(column) - 1
+
+
+def region_map(
+    make: Callable[..., Oscillator],
+    axes: Mapping[str, ArrayLike],
+    *,
+    starts: Sequence[tuple[float, float]] = ((3.0, 0.0), (0.0, 0.0), (-2.0, -0.5)),
+    step: float = 0.01,
+    lines: int = 4,
+) -> RegionMap:
+    """Which motions there are in each cell of a plane of two parameters, and what bounds them.
+
+    make: gives an `Oscillator`, such as `jb.presets.class_b`; axes: two of its arguments and their
+    values, increasing. starts: where each cell is run from; what attracts none of them is not seen.
+    step: between the points of the curves, in units of the larger side of the map / 1.4; lines: on
+    how many lines parallel to each axis curves are looked for, 0 for none. There are none either
+    where an argument of `make` is not one parameter of the oscillator. `ValueError` names an
+    impossible argument.
+    """
+    require(len(axes) == 2, "axes", "two arguments of make and their values", list(axes))
+    names = tuple(axes)
+    values = [np.asarray(as_array(axes[name], name, (None,))) for name in names]
+    for name, along in zip(names, values, strict=True):
+        increases = along.size > 1 and np.all(np.diff(along) > 0)
+        require(increases, name, "two values or more that increase", along)
+    runs = [sweep(make, dict(axes), y0=start, observe="attractor") for start in starts]
+    label = _cell_names(make, names, values, runs)
+    where = _leaves_of(make, names, values)
+    curves = _bounds(make, names, values, where, step, lines) if where and lines else ()
+    return RegionMap((names[0], names[1]), (values[0], values[1]), label, tuple(curves), make)
+
+
+def _cell_names(make, names, values, runs) -> np.ndarray:
+    grid = np.meshgrid(*values, indexing="ij")
+    rests, velocities = _at_cells(make, names, jnp.asarray(np.stack([g.ravel() for g in grid], 1)))
+    shape = grid[0].shape
+    stable = np.asarray(rests).reshape(shape)
+    velocities = np.asarray(velocities).reshape(*shape, -1)
+    n = velocities.shape[-1]
+    seen = np.zeros((*shape, len(runs)), dtype=int)  # 0 no cycle, else 1 + the belts stuck to
+    decided = np.ones(shape, dtype=bool)
+    for i, run in enumerate(runs):
+        kind = run.kind.transpose(*names).values
+        sticks = run.sticks.transpose(*names, "belt").values
+        seen[..., i] = np.where(kind == "cycle", 1 + sticks @ 2 ** np.arange(n), 0)
+        decided &= kind != "undecided"
+    opposite = (velocities.min(-1) < 0) & (velocities.max(-1) > 0)
+    facts = np.concatenate([stable[..., None], opposite[..., None], decided[..., None], seen], -1)
+    kinds, which = np.unique(facts.reshape(-1, facts.shape[-1]), axis=0, return_inverse=True)
+    found = []
+    for rest, against, known, *codes in kinds.tolist():
+        cycles = frozenset(
+            tuple((EventKind.STICK, b) for b in range(n) if (code - 1) >> b & 1)
+            for code in codes
+            if code
+        )
+        name = region_of(bool(against), n, Label(((1, bool(rest)),), cycles))
+        found.append(name if known and (rest or cycles) else "")
+    return np.array(found)[which.reshape(shape)]
+
+
+@eqx.filter_jit
+def _at_cells(make, names, cells: Array) -> tuple[Array, Array]:
+    def one(pair):
+        osc = make(**dict(zip(names, pair, strict=True)))
+        rests = equilibria(osc)
+        stable = jnp.any((rests.kind > 0) & rests.stable)
+        return stable, jnp.stack([belt.velocity for belt in osc.belts])
+
+    return jax.vmap(one)(cells)
+
+
+def _leaves_of(make, names, values):
+    """A function for each argument of `make` that selects the one parameter it sets, or None."""
+    base = [float(along[0]) for along in values]
+
+    def leaves(pair):
+        return [
+            float(leaf) for leaf in jax.tree.leaves(make(**dict(zip(names, pair, strict=True))))
+        ]
+
+    where = []
+    for i, along in enumerate(values):
+        other = [*base[:i], float(along[-1]), *base[i + 1 :]]
+        pairs = zip(leaves(base), leaves(other), strict=True)
+        changed = [index for index, (a, b) in enumerate(pairs) if a != b]
+        if len(changed) != 1 or leaves(other)[changed[0]] != float(along[-1]):
+            return None
+        where.append(lambda osc, index=changed[0]: jax.tree.leaves(osc)[index])
+    return where[0], where[1]
+
+
+def _bounds(make, names, values, where, step, lines) -> list[BifurcationCurve]:
+    """The curve of every point on a few lines, each curve once."""
+    span = tuple((float(along[0]), float(along[-1])) for along in values)
+    step = step * max(b - a for a, b in span) / 1.4
+    curves: list[BifurcationCurve] = []
+    for along in (0, 1):
+        a, b = span[1 - along]
+        for fixed in a + (b - a) * (np.arange(lines) + 0.37) / lines:
+            pair = {names[along]: span[along][0], names[1 - along]: float(fixed)}
+            for point in search(Path(make(**pair), where[along], span[along])):
+                at = np.empty(2)
+                at[along], at[1 - along] = float(point.value), fixed
+                if point.status == Status.OK and not any(
+                    _lies_on(point, at, curve, step) for curve in curves
+                ):
+                    curves.append(bifurcation_curve(point, where, (span[0], span[1]), step=step))
+    return curves
+
+
+def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, step: float) -> bool:
+    """Whether a point is on a curve that is known."""
+    if kind_of(point.condition) != kind_of(curve.condition):
+        return False
+    a, b = curve.values[:-1], curve.values[1:]
+    chord = b - a
+    along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
+    nearest = a + np.clip(along, 0, 1)[:, None] * chord
+    return bool(np.min(np.hypot(*(at - nearest).T)) < 0.3 * step)
+
+
+def kind_of(condition: AbstractCondition) -> tuple[str, Any]:
+    """What stays the same along a curve: a tangency to a belt is a fold here and grazing there."""
+    tangency = isinstance(condition, NonsmoothFold | GrazingSliding)
+    name = "tangency" if tangency else type(condition).__name__
+    return name, getattr(condition, "belt", getattr(condition, "belts", None))
 
 
 # --- pieces of branches ---------------------------------------------------------------------------
