@@ -88,6 +88,20 @@ class BifurcationCurve(eqx.Module):
     def __len__(self) -> int:
         return len(self.values)
 
+    @property
+    def path(self) -> np.ndarray:
+        """The values with those of the special points among them, [rows + special, 2]."""
+        path = self.values
+        for point in self.special:
+            at = np.array(point.values)
+            ends = [np.hypot(*(path[i] - at)) for i in (0, -1)]
+            gaps = np.hypot(*(path[1:] - path[:-1]).T)
+            detour = np.hypot(*(path[:-1] - at).T) + np.hypot(*(path[1:] - at).T) - gaps
+            # At an end where that is nearer than a way round by it between two rows.
+            longer = np.array([ends[0], *detour, ends[1]])
+            path = np.insert(path, int(np.argmin(longer)), at, axis=0)
+        return path
+
     def plot(self, ax: Any = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned."""
         plotting = importlib.import_module(".plotting", __package__)

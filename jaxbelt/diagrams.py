@@ -229,11 +229,13 @@ class RegionMap(eqx.Module):
 
 
 def interior(inside: np.ndarray) -> tuple[int, int]:
-    """Row and column of the cell that is farthest from where a region ends, and from the rim."""
-    padded = np.pad(inside, 1)
-    depth = np.asarray(distance_transform_edt(padded))
-    row, column = np.unravel_index(np.argmax(depth), padded.shape)
-    return int(row) - 1, int(column) - 1
+    """Row and column of the cell that is farthest from where a region ends, and from the rim.
+
+    Of several the last one: where the plane is symmetric, that with the larger parameters.
+    """
+    depth = np.asarray(distance_transform_edt(np.pad(inside, 1)))[1:-1, 1:-1]
+    row, column = np.argwhere(depth > np.max(depth) - 1e-9)[-1]
+    return int(row), int(column)
 
 
 def region_map(

@@ -28,14 +28,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
+from scipy import ndimage
 
 from .basins import Basins
-from .diagrams import BifurcationDiagram, Branch
+from .curves import BifurcationCurve
+from .cycles import find_cycle, unstable_cycle
+from .diagrams import BifurcationDiagram, Branch, RegionMap, interior
 from .equilibria import Equilibria, EquilibriumKind
 from .equilibria import equilibria as find_equilibria
 from .friction import AbstractFriction
 from .modes import mode_acceleration, mode_of_state
 from .oscillator import Oscillator
+from .results import Status
 from .simulate import Trajectory
 
 #: One colour a belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
@@ -597,6 +601,148 @@ def _spread(wanted: np.ndarray, gap: float) -> np.ndarray:
                 at[i - 1] -= lack / 2
                 at[i] += lack / 2
     return at
+
+
+# --- curves and region maps ---------------------------------------------------------------------
+
+#: How the curve of each kind of point is drawn.
+CURVE_STYLES: dict[str, dict[str, Any]] = {
+    "Hopf": {"color": "#009E73", "linestyle": (0, (5, 1.5)), "label": "Hopf"},
+    "NonsmoothFold": {"color": "black", "linestyle": "-", "label": "nonsmooth fold"},
+    "GrazingSliding": {"color": "#CC79A7", "linestyle": "-", "label": "grazing"},
+    "SlidingExchange": {"color": "black", "linestyle": (0, (3, 1, 1, 1)), "label": "exchange"},
+    "SuddenSliding": {"color": "black", "linestyle": (0, (1, 1.2)), "label": "belt at rest"},
+    "FoldOfCycles": {"color": "#E69F00", "linestyle": "-", "label": "fold of cycles"},
+}
+
+
+def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> Axes:
+    """Curves of bifurcation points in the plane of their parameters, special points as dots.
+
+    Each kind has its line; where a fold turns into a grazing point the line changes. Returns the
+    axes.
+    """
+    ax = _new_axes() if ax is None else ax
+    for curve in curves:
+        path = curve.path
+        # Rows and special points in order; a special point has the kind of the row before it.
+        kinds = _kinds_along(curve, path)
+        for rows in _stretches_of(kinds):
+            rows = slice(rows.start, min(rows.stop + 1, len(path)))
+            style = CURVE_STYLES[str(kinds[rows.start])]
+            ax.plot(*path[rows].T, linewidth=1.3, zorder=4, **style)
+        for point in curve.special:
+            if point.kind not in ("EqualVelocities", "BeltAtRest"):
+                dot = {"marker": "o", "markersize": 3.5, "color": "black", "zorder": 5}
+                ax.plot(*point.values, linestyle="none", label="double sliding", **dot)
+    if curves:
+        words = [WORDS.get(name.rpartition(".")[2], "parameter") for name in curves[0].names]
+        symbols = [parameter_symbol(name) for name in curves[0].names]
+        ax.set_xlabel(f"{words[0]} ${symbols[0]}$")
+        ax.set_ylabel(f"{words[1]} ${symbols[1]}$")
+    return ax
+
+
+def _kinds_along(curve: BifurcationCurve, path: np.ndarray) -> np.ndarray:
+    kinds, row = [], 0
+    for at in path:
+        is_row = row < len(curve) and bool(np.all(at == curve.values[row]))
+        kinds.append(curve.kinds[min(row, len(curve) - 1)] if is_row or not kinds else kinds[-1])
+        row += is_row
+    return np.array(kinds)
+
+
+def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
+    """The regions of a plane of two parameters by name, and the curves that bound them.
+
+    The colour tells what the stable cycle sticks to (that of the belt; both: violet; none: white),
+    paler where an equilibrium is stable, too. Without `ax` a figure is made that shows the portrait
+    of every region beside the map, as the paper's Fig. 6 does. Returns the axes of the map.
+    """
+    if ax is None:
+        figure = _new_figure()
+        figure.set_size_inches(7.2, 9.4)
+        return draw_region_map(regions, figure)
+    (x, y), label = regions.values, regions.label
+    known = sorted(set(np.unique(label).tolist()))
+    colours = np.array([_region_colour(name) for name in known])
+    image = colours[np.searchsorted(known, label)]
+    ax.pcolormesh(x, y, np.swapaxes(image, 0, 1), shading="nearest", rasterized=True, zorder=0)
+    plot_curves(regions.curves, ax)
+    for name in regions.regions:
+        parts: Any = ndimage.label(label == name)[0]  # type: ignore[index]
+        for part in range(1, int(np.max(parts)) + 1):
+            # Strips one cell wide, such as the line of equal velocities, are left unnamed.
+            inside = parts == part
+            if not np.any(ndimage.binary_erosion(inside)):
+                continue
+            row, column = interior(inside)
+            halo = [withStroke(linewidth=2.5, foreground="white")]
+            style = {"ha": "center", "va": "center", "path_effects": halo, "zorder": 6}
+            ax.text(x[row], y[column], name, **style)
+    ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+    if not regions.curves:
+        ax.set(xlabel=regions.names[0], ylabel=regions.names[1])
+    return ax
+
+
+def _region_colour(name: str) -> tuple[float, float, float]:
+    """Pale for cycles, paler where an equilibrium is stable beside them; white for no cycle."""
+    letters = {"a": BELT_COLOURS[0], "b": BELT_COLOURS[1], "c": "#7F5FA8"}
+    if not name or name[0] in "16":
+        return (1.0, 1.0, 1.0)
+    colour = np.array(matplotlib.colors.to_rgb(letters.get(name[1:2], "#555555")))
+    strength = 0.18 if name[0] in "25" else 0.38
+    red, green, blue = 1 - strength * (1 - colour)
+    return float(red), float(green), float(blue)
+
+
+def draw_region_map(regions: RegionMap, figure: Figure, note: str = "") -> Axes:
+    """The map above, below it a sketch of the phase portrait of each region, in its example."""
+    names = [name for name in regions.regions if _has_area(regions, name)]
+    columns = 5
+    rows = -(-len(names) // columns)
+    parts: Any = figure.subfigures(2, 1, height_ratios=(6, 1.25 * rows))
+    upper, lower = parts
+    ax = upper.subplots()
+    plot_region_map(regions, ax)
+    ax.set_aspect("equal")
+    handles, labels = ax.get_legend_handles_labels()
+    by_label = dict(zip(labels, handles, strict=True))
+    upper.legend(by_label.values(), by_label.keys(), loc="outside right center", handlelength=2.4)
+    axes = lower.subplots(rows, columns, squeeze=False)
+    for axis in axes.flat[len(names) :]:
+        axis.axis("off")
+    for axis, name in zip(axes.flat, names, strict=False):
+        _draw_sketch(axis, regions.oscillator(name), name)
+    if note:
+        lower.supxlabel(note, fontsize="small")
+    return ax
+
+
+def _has_area(regions: RegionMap, name: str) -> bool:
+    return bool(np.any(ndimage.binary_erosion(regions.label == name)))
+
+
+def _draw_sketch(ax: Axes, osc: Oscillator, name: str) -> None:
+    stable, unstable = find_cycle(osc, (3.0, 0.0)), unstable_cycle(osc)
+    cycles = [cycle for cycle in (stable, unstable) if int(cycle.status) == Status.OK]
+    loops = [np.asarray(cycle.sample(300)) for cycle in cycles]
+    rests = find_equilibria(osc)
+    x1 = float(rests.x1[0])
+    for i, belt in enumerate(osc.belts):
+        level = float(belt.velocity / osc.omega)
+        ax.axhline(level, color=_belt_colour(i), linewidth=0.9, zorder=1)
+    for cycle, loop in zip(cycles, loops, strict=True):
+        style: dict[str, Any] = {"linewidth": 1.4}
+        if not cycle.stable:
+            style = {"linewidth": 0.9, "linestyle": (0, (3, 2))}
+        ax.plot(*loop.T, color="black", zorder=3, **style)
+    for row in rests:
+        _draw_equilibrium(ax, row)
+    reach = max([0.5, *(1.2 * float(np.max(np.abs(loop[:, 0] - x1))) for loop in loops)])
+    ax.set(xlim=(x1 - reach, x1 + reach), ylim=(-0.85, 0.85), xticks=[], yticks=[])
+    ax.set_title(name, pad=2)
 
 
 # --- the model ----------------------------------------------------------------------------------
