@@ -1,4 +1,4 @@
-"""Every notebook runs from start to end."""
+"""Every notebook runs from start to end, in the small setting where it has one."""
 
 import json
 from pathlib import Path
@@ -17,5 +17,6 @@ def test_notebook_runs(path):
     namespace = {}
     for cell in cells:
         if cell["cell_type"] == "code":
-            exec(compile("".join(cell["source"]), path.name, "exec"), namespace)
+            source = "".join(cell["source"]).replace("\nFULL = True", "\nFULL = False")
+            exec(compile(source, path.name, "exec"), namespace)
     plt.close("all")

@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 
 import jaxbelt
@@ -119,6 +120,15 @@ def test_readme_reproduces_the_paper_in_one_line():
     assert readme_command("reproduce").endswith("&& .venv/bin/jaxbelt reproduce")
 
 
+@pytest.mark.slow
+def test_examples_of_the_readme_run():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    examples = re.findall(r"^```python\n(.+?)^```$", readme, re.MULTILINE | re.DOTALL)
+    assert examples
+    exec(compile("\n".join(examples), "README.md", "exec"), {})
+    plt.close("all")
+
+
 def test_ci_runs_the_test_command_of_the_readme():
     """The lines of .ci/run that read the command find it, and pytest is started nowhere else."""
     ci = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
@@ -134,3 +144,14 @@ def test_ci_runs_the_test_command_of_the_readme():
     assert run.stdout == readme_command("tests")
     assert ci.rstrip().endswith('bash -euo pipefail -c "$command"')
     assert "pytest" not in ci
+
+
+def test_every_public_name_has_its_place_in_the_reference():
+    pages = (ROOT / "docs" / "api").glob("*.md")
+    written = [page.read_text(encoding="utf-8") for page in pages]
+    named = {
+        name.rpartition(".")[2]
+        for text in written
+        for name in re.findall(r"^::: jaxbelt\.(\S+)$", text, re.MULTILINE)
+    }
+    assert set(jaxbelt.__all__) - named == {"presets"}
