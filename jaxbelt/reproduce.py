@@ -4,8 +4,6 @@
 in one batch, then draws. What a figure shows is said in one place, its line in `FIGURES`: either
 a function that draws it, or `Portraits`, the phase portraits before, at and after a critical
 value. The critical values come to all of them from one tuple, that of `critical_values`.
-
-What is still missing beside the paper is named in `STILL_MISSING`.
 """
 
 import json
@@ -34,7 +32,7 @@ from .bifurcations import (
 )
 from .cycles import Cycle, unstable_cycle
 from .detection import Guess, refined
-from .diagrams import BifurcationDiagram, bifurcation_diagram
+from .diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
 from .equilibria import Equilibria, equilibria
 from .oscillator import Belt, Oscillator
 from .presets import (
@@ -62,9 +60,8 @@ MISSING_REGION = (
     "Just below nu0 = 0 the exact cycle sticks on belt 0 only, Fig. 11 (c), until belt 1 joins in "
     "a grazing point at -0.0788: a region between 3a and 4c that the paper does not list."
 )
-STILL_MISSING = "Still missing: the region map, Fig. 6."
 #: What is to be said beside the table.
-REMARKS = (MISPRINT, MISSING_REGION, STILL_MISSING)
+REMARKS = (MISPRINT, MISSING_REGION)
 
 
 # --- the table ----------------------------------------------------------------------------------
@@ -447,6 +444,19 @@ def diagram_b() -> BifurcationDiagram:
     return bifurcation_diagram(class_b(0.3, PUBLISHED_NU1), _velocity, (-0.7, 0.7))
 
 
+def map_b() -> RegionMap:
+    """Of Fig. 6: the plane of both velocities. No cell lies on the lines nu0 = nu1 and nu = 0."""
+    nu0, nu1 = np.linspace(-0.7, 0.7, 120), np.linspace(-0.7, 0.7, 118)
+    return region_map(class_b, {"nu0": nu0, "nu1": nu1}, step=0.02, lines=2)
+
+
+def draw_map(regions: RegionMap) -> plotting.Figure:
+    """Fig. 6, with the regions that the paper does not list."""
+    figure = plotting.journal_figure(7.2, 9.0)
+    plotting.draw_region_map(regions, figure)
+    return figure
+
+
 def _draw_diagram(diagram: BifurcationDiagram, note: str) -> plotting.Figure:
     figure = plotting.journal_figure(7.2, 4.2)
     plotting.plot_diagram(diagram, figure.subplots())
@@ -459,6 +469,7 @@ class Computed(NamedTuple):
 
     diagram_a: BifurcationDiagram
     diagram_b: BifurcationDiagram
+    map_b: RegionMap
     studies: list[Study]
 
 
@@ -467,6 +478,7 @@ FIGURES: dict[str, Callable[[Computed], plotting.Figure] | Portraits] = {
     "fig01": lambda computed: draw_model(),
     "fig02": lambda computed: draw_classes(),
     "fig03": lambda computed: _draw_diagram(computed.diagram_a, MISPRINT),
+    "fig06": lambda computed: draw_map(computed.map_b),
     "fig07": lambda computed: _draw_diagram(computed.diagram_b, MISSING_REGION),
     "formulations": lambda computed: draw_formulations(computed.studies),
     "fig04": Portraits(
@@ -549,7 +561,7 @@ FIGURES: dict[str, Callable[[Computed], plotting.Figure] | Portraits] = {
 
 def steps() -> int:
     """How many times `reproduce` reports progress."""
-    return len(FIGURES) + 3
+    return len(FIGURES) + 4
 
 
 def reproduce(
@@ -577,7 +589,9 @@ def reproduce(
         orbits = beside.submit(simulate_panels, flat)
         unstable = beside.submit(find_unstable_cycles, flat)
         progress("bifurcation diagrams")
-        computed = Computed(diagram_a(), diagram_b(), studies.result())
+        diagrams = diagram_a(), diagram_b()
+        progress("region map")
+        computed = Computed(*diagrams, map_b(), studies.result())
         progress("orbits of the phase portraits")
         portraits = zip(orbits.result(), unstable.result(), strict=True)
     with plotting.journal_style():
