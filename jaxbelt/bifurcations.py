@@ -12,7 +12,9 @@ unknowns of fixed-signature shooting (see `cycles`) the same equation is harmles
   with that stick arc left out. The return map has slope 0 where the
   cycle sticks and slope m where it does not: for m > 1 both its fixed points lie on one side and
   vanish together (fold); for m < 1, one lies on either side, and the cycle goes on (grazing). A
-  cycle with another stick phase has m = 0.
+  cycle with another stick phase has m = 0. Where the law jumps, static > mu(0+), the stick phase
+  that begins at the tangency lasts, and without it the orbit is another one: the return map jumps,
+  m = inf, and the cycle ends there.
 - `SlidingExchange`: nu_i = nu_j, and a cycle that sticks to i or j. The friction of each mode keeps
   its sign, so the cycle with its signature fixed goes smoothly through the point.
 - `SuddenSliding`: nu_k = 0, with the mass at rest on the belt, x2' = x2 = 0: an equilibrium lies on
@@ -435,6 +437,7 @@ def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, s
     def judge(osc, z, cycle, slope):
         chain = cycle.chain
         others = jnp.any(chain.codes == 0, axis=-1) & chain.used & (jnp.arange(size) != row)
+        slope = jnp.where(z[row, 2] > 1e-6, jnp.inf, slope)  # a square root of rounding is no phase
         slope = jnp.where(jnp.any(others), 0.0, slope)
         swapped = Chain(chain.codes[:, swap], chain.ends, chain.mesh)
         # An exchange needs the same cycle with the belts swapped; a tangency is of one kind.

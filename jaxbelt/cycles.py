@@ -636,21 +636,7 @@ class Cycle(eqx.Module):
             "asked of one cycle outside of transformations",
             "a traced or batched cycle",
         )
-        codes, ends = np.asarray(self.chain.codes), np.asarray(self.chain.ends)
-        n = codes.shape[-1]
-        names = Ends(n)
-        count = int(np.sum(ends != names.unused))
-        events = []
-        for i in range(count if int(self.status) == Status.OK else 0):
-            end, following = int(ends[i]), codes[(i + 1) % count]
-            if end < n:
-                kind = EventKind.STICK if following[end] == 0 else EventKind.CROSS
-                events.append((kind, end))
-            elif end < 3 * n:
-                events.append((EventKind.EDGE, (end - n) % n))
-            elif end == names.onset:
-                events.append((EventKind.SLIP, int(np.argmax(codes[i] == 0))))
-        return tuple(events)
+        return turn_events(self.chain) if int(self.status) == Status.OK else ()
 
     def sample(self, n: int) -> Array:
         """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
@@ -668,6 +654,25 @@ class Cycle(eqx.Module):
             f"multiplier {number(self.multiplier)}, {'' if self.stable else 'un'}stable, "
             f"residual {float(self.residual):.1e})"
         )
+
+
+def turn_events(turn: Chain | Turn) -> tuple[tuple[EventKind, int], ...]:
+    """The events of one turn, (kind, belt) each; for EDGE the lowest belt that comes or goes."""
+    used = np.asarray(turn.used)
+    codes, ends = np.asarray(turn.codes)[used], np.asarray(turn.ends)[used].tolist()
+    n = codes.shape[-1]
+    names = Ends(n)
+    events = []
+    for end, before, after in zip(ends, codes, np.roll(codes, -1, axis=0), strict=True):
+        if end < n:
+            kind = EventKind.STICK if after[end] == 0 else EventKind.CROSS
+            events.append((kind, end))
+        elif end < 3 * n:
+            changes = (np.abs(before) < 2) != (np.abs(after) < 2)
+            events.append((EventKind.EDGE, int(np.argmax(changes))))
+        elif end == names.onset:
+            events.append((EventKind.SLIP, int(np.argmax(before == 0))))
+    return tuple(events)
 
 
 @eqx.filter_jit

@@ -45,7 +45,7 @@ from .bifurcations import (
     vary,
 )
 from .checks import as_array, check_finite, pick, require
-from .cycles import SIZES, Ends, Orbit, Turn, follow, last_turn, turn_of
+from .cycles import SIZES, Orbit, Turn, follow, last_turn, turn_events, turn_of
 from .equilibria import Equilibria, equilibria
 from .oscillator import Oscillator
 from .results import EventKind, Status
@@ -295,17 +295,8 @@ def _label(seen: _Seen) -> tuple[Label, dict[Signature, Turn]]:
 
 def _signature(turn: Turn) -> Signature:
     """The events of a turn, from the one that makes the smallest sequence; slip goes unsaid."""
-    n = turn.codes.shape[-1]
-    used = turn.ends != Ends(n).unused
-    codes, ends = turn.codes[used], turn.ends[used].tolist()
-    events = []
-    for i, end in enumerate(ends):
-        following = codes[(i + 1) % len(codes)]
-        if end < n:
-            events.append((EventKind.STICK if following[end] == 0 else EventKind.CROSS, end))
-        elif end < 3 * n:
-            events.append((EventKind.EDGE, (end - n) % n))
-    return min((tuple(events[i:] + events[:i]) for i in range(len(events))), default=())
+    events = tuple(event for event in turn_events(turn) if event[0] != EventKind.SLIP)
+    return min((events[i:] + events[:i] for i in range(len(events))), default=())
 
 
 # --- what makes the difference between two values -------------------------------------------------

@@ -105,6 +105,21 @@ def test_points_of_another_system():
     assert fold.value == pytest.approx(expected, abs=1e-9)
 
 
+def test_a_law_with_a_jump():
+    """The stick phase at the tangency has a duration; beyond, the cycle is gone."""
+
+    def make(nu):
+        return oracle.Oscillator(0.05, (oracle.Belt(nu, lambda r: 0.7, 1.0, 1.0),), 1.0)
+
+    osc = jb.Oscillator(0.05, (jb.Belt(0.45, jb.Coulomb(1.0, 0.7)),))
+    point = jb.refine(jb.NonsmoothFold(0), osc, where=nu0)
+    expected = oracle_cycles.nonsmooth_fold(make, (0.45, 0.55), 0)
+    assert point.value == pytest.approx(expected, abs=1e-10)
+    assert point.multiplier == jnp.inf and jb.stick_duration(point.cycle) > 0.5
+    assert oracle_cycles.sticking_cycle(make(expected - 1e-6)) is not None
+    assert oracle_cycles.sticking_cycle(make(expected + 1e-6)) is None
+
+
 @pytest.mark.parametrize(
     ("condition", "nu", "status"),
     [

@@ -195,8 +195,8 @@ def reproduced(tmp_path_factory):
 def test_reproduce_writes_the_table_and_every_figure(reproduced):
     folder, result = reproduced
     assert result.exit_code == 0, result.output
-    names = {f"fig{number:02}.png" for number in (1, 2, 4, 5, *range(8, 14))}
-    names |= {"formulations.png"}
+    names = {f"{name}.png" for name in reproduce.FIGURES}
+    assert names >= {f"fig{number:02}.png" for number in (*range(1, 6), *range(7, 14))}
     assert {path.name for path in folder.iterdir()} == names | {"critical_values.json"}
     for name in names:
         assert (folder / name).read_bytes().startswith(b"\x89PNG")

@@ -35,6 +35,32 @@ def test_sticking_cycle_is_that_of_the_oracle(nu):
 
 
 @pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        ("c", (0.08584, -0.21376, 0.01373)),  # stuck from edge to edge
+        ("c", (-0.11454, -0.36178, -0.72774)),
+        ("d", (0.05247, 0.52188, -0.99201, 1.448)),
+        ("d", (0.08584, -0.21376, 0.01373, 0.7829)),  # belts that change while the mass is stuck
+        ("d", (0.309, -0.003, 0.588, 1.357)),
+    ],
+)
+def test_cycle_that_passes_contact_edges_is_that_of_the_oracle(kind, parameters):
+    cycle = jb.find_cycle(getattr(jb.presets, f"class_{kind}")(*parameters), START)
+    expected = oracle_cycles.sticking_cycle(getattr(oracle, f"class_{kind}")(*parameters))
+    assert cycle.status == Status.OK and cycle.multiplier == 0
+    # The two begin their turn at different ends of a stick phase.
+    events = tuple((event.name, belt) for event, belt in cycle.signature)
+    assert ("EDGE", 0) in events or ("EDGE", 1) in events
+    assert expected.signature in {events[i:] + events[:i] for i in range(len(events))}
+    # An error in x1 where a stick phase begins is one of 1/nu as much in its duration.
+    exact = dict(rel=0, abs=1e-11 * (1 + 1 / np.min(np.abs(parameters[:2]))))
+    assert cycle.period == pytest.approx(expected.period, **exact)
+    assert cycle.stick_durations == pytest.approx(expected.stick_durations, **exact)
+    for name in EXTREMA:
+        assert getattr(cycle, name) == pytest.approx(getattr(expected, name), abs=1e-10)
+
+
+@pytest.mark.parametrize(
     ("name", "velocities"),
     [
         ("class_b", (0.28, 0.35)),
