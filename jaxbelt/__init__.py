@@ -22,7 +22,12 @@ from .bifurcations import (
 from .curves import BifurcationCurve, SpecialPoint, bifurcation_curve
 from .cycles import Cycle, find_cycle, unstable_cycle
 from .detection import scan
-from .diagrams import BifurcationDiagram, bifurcation_diagram
+from .diagrams import (
+    BifurcationDiagram,
+    RegionMap,
+    bifurcation_diagram,
+    region_map,
+)
 from .equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
 from .friction import AbstractFriction, Conti, Coulomb, Stribeck
 from .functionals import (
@@ -76,6 +81,7 @@ __all__ = [
     "Hopf",
     "NonsmoothFold",
     "Oscillator",
+    "RegionMap",
     "SlidingExchange",
     "SpecialPoint",
     "Status",
@@ -106,6 +112,7 @@ __all__ = [
     "plot_vector_field",
     "presets",
     "refine",
+    "region_map",
     "scan",
     "simulate",
     "slip_duration",

@@ -1,6 +1,7 @@
 """The command line, `jaxbelt reproduce` and `jaxbelt simulate`: words in, files out."""
 
 import csv
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -326,6 +327,214 @@ def write_events(trajectory: jb.Trajectory, path: Path) -> None:
         kinds = [jb.EventKind(kind).name for kind in np.asarray(events.kind).tolist()]
         for t, y, kind, belt in zip(*columns, kinds, np.asarray(events.belt).tolist(), strict=True):
             writer.writerow([t, *y, kind, belt])
+
+
+# --- diagram and map ----------------------------------------------------------------------------
+
+#: Short names of parameters that may be varied.
+PARAMETERS = {"nu0": "belts[0].velocity", "nu1": "belts[1].velocity", "zeta": "damping"}
+
+
+@app.command()
+def diagram(
+    system: Class = "b",
+    nu0: Nu0 = None,
+    nu1: Nu1 = None,
+    sigma: Sigma = None,
+    sigma0: Sigma0 = None,
+    sigma1: Sigma1 = None,
+    belt: Belts = None,
+    damping: Damping = 0.5,
+    omega: Omega = 1.0,
+    parameter: Annotated[
+        str,
+        typer.Option(
+            "--vary",
+            help="The parameter: nu0, nu1, zeta, or its path, such as belts[1].friction.steepness.",
+        ),
+    ] = "nu0",
+    span: Annotated[
+        tuple[float, float], typer.Option(metavar="FROM TO", help="Its first and last value.")
+    ] = (-0.7, 0.7),
+    rows: Annotated[int, typer.Option(help="About how many values are computed.")] = 160,
+    quantity: Annotated[str, typer.Option(help="What is drawn: x2, x1 or period.")] = "x2",
+    out: Annotated[
+        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
+    ] = Path("diagram"),
+) -> None:
+    """Equilibria and cycles along a parameter, and every bifurcation point, found by itself.
+
+    - **OUT.png**: the diagram in the manner of the paper's Figs. 3 and 7: stable black, unstable
+      grey, unstable cycles dashed; the regions between the points have the paper's names.
+
+    - **OUT.csv**: the branches: branch, kind, value, stable, x1_min, x1_max, x2_min, x2_max,
+      period, multiplier, stick_duration of each belt.
+
+    - **OUT_points.csv**: value, kind, belts, error (a bound), status of every bifurcation point.
+
+    An oscillator is described as for **simulate**; what is varied needs no value.
+
+    Examples:
+
+    - jaxbelt diagram --nu1 0.35
+
+    - jaxbelt diagram --nu0 -0.2 --nu1 0.35 --vary zeta --span 0 1.5 --quantity x1
+    """
+    from . import plotting
+
+    console = _console()
+    with _plain_errors():
+        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
+        osc = _oscillator(system, arguments, belt, damping, omega)
+        with console.status("looking along the parameter (the first minute is compilation)"):
+            found = jb.bifurcation_diagram(osc, _where(osc, parameter), span, rows=rows)
+        with plotting.journal_style():
+            figure = plotting.journal_figure(7.2, 4.2)
+            plotting.plot_diagram(found, figure.subplots(), quantity=quantity)
+            plotting.draw_key(figure)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            written = [out.with_name(out.name + end) for end in (".png", ".csv", "_points.csv")]
+            plotting.save(figure, written[0])
+        write_branches(found, written[1])
+        write_points(found.points, written[2])
+    lines = [repr(found), *map(repr, found.points)]
+    for line in (*lines, f"Written: {', '.join(map(str, written))}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _where(osc: jb.Oscillator, name: str) -> Any:
+    """What selects the parameter of that name or path."""
+    paths = [
+        jax.tree_util.keystr(path).removeprefix(".")
+        for path, _ in jax.tree_util.tree_leaves_with_path(osc)
+    ]
+    path = PARAMETERS.get(name, name)
+    if path not in paths:
+        raise ValueError(f"vary must be nu0, nu1, zeta or one of {', '.join(paths)}, got {name}")
+    return lambda osc: jax.tree.leaves(osc)[paths.index(path)]
+
+
+def _belts_of(condition: Any) -> str:
+    belts = getattr(condition, "belts", (condition.belt,) if hasattr(condition, "belt") else ())
+    return " ".join(map(str, belts))
+
+
+def write_points(points, path: Path) -> None:
+    """value, kind, belts, error and status, a row a bifurcation point."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["value", "kind", "belts", "error", "status"])
+        for point in points:
+            status = jb.Status(int(point.status)).name
+            row = [float(point.value), point.kind, _belts_of(point.condition), float(point.error)]
+            writer.writerow([*row, status])
+
+
+def write_branches(found: jb.BifurcationDiagram, path: Path) -> None:
+    """A row an equilibrium or cycle, see `jaxbelt diagram --help`."""
+    fields = ("values", "stable", "x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        belts = range(len(found.oscillator.belts))
+        names = [f"stick_duration{i}" for i in belts]
+        writer.writerow(["branch", "kind", "value", *fields[1:], *names])
+        for number, branch in enumerate(found.branches):
+            columns = [np.asarray(getattr(branch, name)).tolist() for name in fields]
+            sticks = np.asarray(branch.stick_durations).tolist()
+            for row, durations in zip(zip(*columns, strict=True), sticks, strict=True):
+                writer.writerow([number, branch.kind, *row, *durations])
+
+
+@app.command("map")
+def region_map(
+    system: Class = "b",
+    axes: Annotated[
+        tuple[str, str], typer.Option(metavar="P Q", help="The two arguments of the class.")
+    ] = ("nu0", "nu1"),
+    p: Annotated[
+        tuple[float, float], typer.Option(metavar="FROM TO", help="Values of the first one.")
+    ] = (-0.7, 0.7),
+    q: Annotated[
+        tuple[float, float], typer.Option(metavar="FROM TO", help="Values of the second one.")
+    ] = (-0.7, 0.7),
+    cells: Annotated[int, typer.Option(help="Cells along each side.")] = 200,
+    out: Annotated[
+        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
+    ] = Path("map"),
+) -> None:
+    """The regions of a plane of two parameters, and the curves that bound them: Fig. 6.
+
+    - **OUT.png**: the map, and a sketch of the phase portrait of each region.
+
+    - **OUT.csv**: both parameters and the region's name, a row a cell.
+
+    - **OUT_curves.csv**: curve, both parameters, kind, residual, a row a point of a curve.
+
+    - **OUT_special.csv**: curve, both parameters, kind, belts, residual, a row a point of
+      codimension two.
+
+    The other arguments of the class have the values that **simulate** takes for them.
+
+    Example: jaxbelt map --class b --cells 400
+    """
+    from . import plotting
+
+    console = _console()
+    with _plain_errors():
+        if system not in CLASSES:
+            raise ValueError(f"class must be a, b, c or d, got {system}")
+        for name in axes:
+            if name not in CLASSES[system]:
+                known = ", ".join(CLASSES[system])
+                raise ValueError(f"axes of class {system} must be among {known}, got {name}")
+        if cells < 2:
+            raise ValueError(f"cells must be at least 2, got {cells}")
+        fixed = {name: value for name, value in CLASSES[system].items() if name not in axes}
+        make = functools.partial(getattr(jb.presets, f"class_{system}"), **fixed)
+        # Other numbers of cells, lest cells lie on the line where both are the same.
+        values = {axes[0]: np.linspace(*p, cells), axes[1]: np.linspace(*q, cells + 1)}
+        with console.status("sweeping, then following curves (the first minutes are compilation)"):
+            found = jb.region_map(make, values)
+        with plotting.journal_style():
+            figure = plotting.journal_figure(7.2, 9.0)
+            plotting.draw_region_map(found, figure)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            ends = (".png", ".csv", "_curves.csv", "_special.csv")
+            written = [out.with_name(out.name + end) for end in ends]
+            plotting.save(figure, written[0])
+        write_cells(found, written[1])
+        write_curves(found.curves, written[2], written[3])
+    for line in (repr(found), f"Written: {', '.join(map(str, written))}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def write_cells(found: jb.RegionMap, path: Path) -> None:
+    """Both parameters and the name of the region, a row a cell."""
+    first, second = (np.asarray(values).tolist() for values in found.values)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([*found.names, "region"])
+        for (i, j), name in np.ndenumerate(found.label):
+            writer.writerow([first[i], second[j], name])
+
+
+def write_curves(curves, path: Path, special: Path) -> None:
+    """The points of curves, and in a file of their own those of codimension two."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["curve", "p", "q", "kind", "belts", "residual"])
+        for number, curve in enumerate(curves):
+            belts = _belts_of(curve.condition)
+            rows = zip(curve.values.tolist(), curve.kinds, curve.residual.tolist(), strict=True)
+            for (p, q), kind, residual in rows:
+                writer.writerow([number, p, q, kind, belts, residual])
+    with special.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["curve", "p", "q", "kind", "belts", "residual"])
+        for number, curve in enumerate(curves):
+            for point in curve.special:
+                belts = " ".join(map(str, point.belts))
+                writer.writerow([number, *point.values, point.kind, belts, point.residual])
 
 
 # --- basins -------------------------------------------------------------------------------------
