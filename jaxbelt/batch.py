@@ -194,22 +194,15 @@ class _Window(eqx.Module):
     active: Array
 
 
-def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, turns: bool) -> _Window:
-    """The bounds of the current modes. With `turns` x2 is bounded by 0, too."""
+def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: bool) -> _Window:
+    """The bounds of the current modes. Where x1 has to be monotone x2 is bounded by 0, too."""
     mode, inf = lanes.mode, jnp.full_like(lanes.t, jnp.inf)
     low, high = -inf, inf
     for belt, code in zip(osc.belts, mode.codes, strict=True):
         boundary = belt.velocity / osc.omega
         high = jnp.where(code == 1, jnp.minimum(high, boundary), high)
         low = jnp.where(code == -1, jnp.maximum(low, boundary), low)
-    if turns:
-        up = (lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0))
-        down = (lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0))
-        low, high = (
-            jnp.where(up, jnp.maximum(low, 0.0), low),
-            jnp.where(down, jnp.minimum(high, 0.0), high),
-        )
-    x1 = None
+    x1, turns = None, jnp.full_like(lanes.done, extrema)
     if edges:
         left, right = -inf, inf
         for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
@@ -218,6 +211,15 @@ def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, turns: bool) -> _Wind
             right = jnp.where(touches, jnp.minimum(right, belt.upper), right)
             right = jnp.where(code == BELOW, jnp.minimum(right, belt.lower), right)
         x1 = left, right
+        # Far from the edges, as measured by the motion, no turn matters. Without this a lane that
+        # comes to rest would turn for ever, with steps as small as rounding.
+        reach = 4 * (jnp.abs(lanes.x2) + jnp.abs(lanes.a))
+        turns = turns | (jnp.minimum(lanes.x1 - left, right - lanes.x1) <= reach)
+    if edges or extrema:
+        up = turns & ((lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0)))
+        down = turns & ((lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0)))
+        low = jnp.where(up, jnp.maximum(low, 0.0), low)
+        high = jnp.where(down, jnp.minimum(high, 0.0), high)
     signs = mode.signs
     pulls = tuple(belt.load * sign for belt, sign in zip(osc.belts, signs, strict=True))
     return _Window(x1, (low, high), signs, pulls, ~lanes.done & ~mode.any_stuck)
@@ -521,7 +523,8 @@ def _oscillator(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator
     if program.edges:
         return osc
     # Known to be infinite while the kernel is compiled; see `modes.has_edges`.
-    lower, upper = np.float64(-np.inf), np.float64(np.inf)
+    with jax.ensure_compile_time_eval():
+        lower, upper = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
     belts = tuple(
         eqx.tree_at(lambda b: (b.lower, b.upper), belt, (lower, upper)) for belt in osc.belts
     )
@@ -653,7 +656,7 @@ def _advance(
     def round_(osc, _, lanes):
         lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
         lanes = observer.watch(osc, lanes, passage, t1, rtol)
-        window = _window(osc, lanes, edges=program.edges, turns=program.edges or observer.extrema)
+        window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema)
 
         def step(_, lanes):
             return _step(osc, window, one, lanes, t1, rtol, atol, observer)
@@ -1050,6 +1053,8 @@ class Attractor(Observer):
             transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), turn.transient),
             turn_events=jnp.where(found & ~resting, lanes.events - mark.events, turn.turn_events),
         )
+        # Decided lanes may have to wait until their result is taken.
+        memory = select(turn.kind == UNDECIDED, memory, turn)
         return eqx.tree_at(
             lambda n: (n.lower, n.upper, n.done, n.memory),
             lanes,

@@ -163,7 +163,7 @@ def edges(osc: Oscillator) -> list[Array]:
 def has_edges(osc: Oscillator) -> bool:
     """Whether there may be a contact edge: one is finite, or not known to be infinite.
 
-    Known inside a trace, too, where the bounds are NumPy's. What edges need is then left out.
+    Known inside a trace, too, where the bounds are constants: what edges need is then left out.
     """
     return not is_concrete(edges(osc)) or bool(np.any(np.isfinite(edges(osc))))
 

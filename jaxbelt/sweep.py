@@ -69,12 +69,12 @@ LONG_ENOUGH = 3000.0
 
 def sweep(
     make: Callable[..., Oscillator],
-    axes: Mapping[str, ArrayLike],
+    axes: Mapping[str, Any],
     *,
     y0: ArrayLike | tuple = (3.0, 0.0),
-    t1: float | None = None,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
+    t1: ArrayLike | None = None,
+    rtol: ArrayLike = 1e-8,
+    atol: ArrayLike = 1e-8,
     observe: Any = "final",
     derivatives: Sequence[str] = (),
     store: str | Path | None = None,
@@ -177,7 +177,7 @@ class _Grid:
             name: np.asarray(as_array(v, f"axis {name}", (None,))) for name, v in axes.items()
         }
         for name, values in self.axes.items():
-            require(name not in ("belt", "run"), "axes", "without the name", name)
+            require(name != "belt", "axes", "without the name belt, a dimension of results", name)
             require(values.size > 0, f"axis {name}", "at least one value", "none")
         start = as_array(y0, "y0", (2,))
         check_finite(start, "y0")
@@ -311,7 +311,8 @@ class _Table:
             column += width
         status = parts.pop("status")[0]
         for name, part in parts.items():
-            self.arrays[name][runs] = part[0]
+            # Codes of runs that are not finite are not numbers: 0.
+            self.arrays[name][runs] = np.nan_to_num(part[0]) if name in TYPES else part[0]
             if name not in TYPES:
                 for by, derivative in zip(self.derivatives, part[1:], strict=True):
                     self.arrays[f"d_{name}_d_{by}"][runs] = derivative

@@ -1,0 +1,164 @@
+"""`sweep`: the dataset, derivatives, reducers, stores, and what it says about bad input."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import Status, batch
+
+NU0, NU1 = np.linspace(-0.6, 0.55, 4), np.array([0.35, -0.2])
+AXES = {"nu0": NU0, "nu1": NU1}
+SPAN = 40.0
+final = functools.partial(jb.sweep, jb.presets.class_b, t1=SPAN)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return final(AXES)
+
+
+def test_the_dataset_is_labelled(dataset):
+    assert dict(dataset.sizes) == {"nu0": 4, "nu1": 2, "belt": 2}
+    assert list(dataset) == ["x1_end", "x2_end", "mode_end", "n_events", "status"]
+    assert dataset.x1_end.dims == ("nu0", "nu1") and dataset.mode_end.dims == ("nu0", "nu1", "belt")
+    assert np.array_equal(dataset.nu0, NU0)
+    assert dataset.nu0.attrs == {"long_name": "velocity of belt 0", "units": "1"}
+    assert all(variable.attrs["long_name"] for variable in dataset.variables.values())
+    told = dataset.attrs
+    assert (told["t1"], told["rtol"], told["start"]) == (SPAN, 1e-8, "x1 = 3.0, x2 = 0.0")
+    assert f"jaxbelt {jb.__version__}" in told["versions"] and "Conti(" in told["oscillator"]
+    assert "velocity of belt 0" in str(dataset.nu0.attrs) and "x1_end" in repr(dataset)
+
+
+def test_axes_of_starts_and_of_functions_with_fixed_arguments(dataset):
+    make = functools.partial(jb.presets.class_b, nu1=0.35)
+    starts = jb.sweep(make, {"x1": [1.0, 3.0], "nu0": NU0}, t1=SPAN)
+    assert starts.x1_end.dims == ("x1", "nu0")
+    # Another compiled program, in which nu1 is one number for all: other roundings.
+    expected = dataset.x1_end.sel(nu1=0.35)
+    np.testing.assert_allclose(starts.x1_end.sel(x1=3.0), expected, atol=1e-9)
+
+
+def test_many_chunks_lose_no_run():
+    n = 2 * batch.CHUNK + 1000
+    many = jb.sweep(jb.presets.class_b, {"nu0": np.linspace(-0.7, 0.7, n), "nu1": [0.35]}, t1=2.0)
+    assert np.sum(many.status == Status.OK) == n
+    assert np.all(np.isfinite(many.x1_end))
+    some = np.arange(0, n, 5000)
+    alone = jb.sweep(jb.presets.class_b, {"nu0": many.nu0[some], "nu1": [0.35]}, t1=2.0)
+    assert np.array_equal(alone.x1_end, many.x1_end[some])
+
+
+@pytest.mark.slow
+def test_derivatives_equal_those_of_simulate():
+    options = dict(rtol=1e-12, atol=1e-12)
+    swept = final(AXES, derivatives=("nu0",), **options)
+
+    @jax.jit
+    @jax.vmap
+    def derivative(nu0, nu1):
+        def end(nu0):
+            osc, ts = jb.presets.class_b(nu0, nu1), jnp.array([SPAN])
+            return jb.simulate(osc, (3.0, 0.0), SPAN, ts=ts, max_segments=256, **options).ys[0]
+
+        return jax.jacfwd(end)(nu0)
+
+    grid = np.meshgrid(NU0, NU1, indexing="ij")
+    expected = derivative(*(jnp.asarray(part.ravel()) for part in grid)).reshape(4, 2, 2)
+    # Relative to their size, which is up to some hundreds: the clock of a sticking run shears.
+    size = 1 + np.max(np.abs(expected), axis=-1)
+    for i, name in enumerate(("d_x1_end_d_nu0", "d_x2_end_d_nu0")):
+        assert np.max(np.abs(swept[name].values - expected[..., i]) / size) < 1e-8
+
+
+def test_derivatives_of_a_cycle_equal_differences_of_the_oracle():
+    nu0, nu1 = 0.1, 0.35
+    swept = jb.sweep(
+        jb.presets.class_b,
+        {"nu0": [nu0], "nu1": [nu1]},
+        observe="attractor",
+        derivatives=("nu0",),
+        rtol=1e-11,
+        atol=1e-11,
+    ).squeeze()
+
+    def there(name):
+        def value(nu0):
+            return getattr(oracle_cycles.sticking_cycle(oracle.class_b(nu0, nu1)), name)
+
+        return oracle.richardson(value, nu0, 1e-2)[0]
+
+    for name in ("period", "x1_min", "x1_max", "x2_max"):
+        # The differences are good to 1e-9 or so; x2's extrema are interpolated, to 1e-8.
+        np.testing.assert_allclose(swept[f"d_{name}_d_nu0"], there(name), atol=1e-7)
+
+
+class Sticks:
+    """How often a run stuck to belt 1, and when something happened last."""
+
+    def init(self, osc, x1, x2):
+        return jnp.zeros(()), jnp.zeros(())
+
+    def update(self, state, event):
+        stick = (event.kind == jb.EventKind.STICK) & (event.belt == 1)
+        return state[0] + jnp.where(stick, 1.0, 0.0), event.t
+
+    def finish(self, state, end):
+        return {"sticks_to_1": state[0], "last": state[1], "end": jnp.stack([end.x1, end.x2])}
+
+
+def test_a_reducer_sees_every_event(dataset):
+    reduced = final(AXES, observe=Sticks())
+    for i, nu0 in enumerate(NU0.tolist()):
+        run = oracle.simulate(oracle.class_b(nu0, 0.35), (3.0, 0.0), SPAN)
+        sticks = [event for event in run.events if (event.kind, event.belt) == ("STICK", 1)]
+        assert reduced.sticks_to_1[i, 0] == len(sticks)
+        # Here at 1e-8, there at 1e-13.
+        np.testing.assert_allclose(reduced["last"][i, 0], run.events[-1].t, atol=1e-5)
+    # Not skipping turns changes nothing but the sum of the rounding of the clock.
+    np.testing.assert_allclose(reduced.end[..., 0], dataset.x1_end, atol=1e-9)
+
+
+def test_an_interrupted_sweep_goes_on_from_its_store(tmp_path, dataset):
+    store = tmp_path / "store"
+    first = final(AXES, store=store)
+    assert first.equals(dataset)
+    status = np.load(store / "status.npy", mmap_mode="r+")
+    status[3:] = -1  # as an interruption leaves it
+    np.load(store / "x1_end.npy", mmap_mode="r+")[:3] = 7.0
+    again = final(AXES, store=store)
+    assert again.x1_end.values.ravel()[:3].tolist() == [7.0] * 3
+    assert np.array_equal(again.x1_end.values.ravel()[3:], dataset.x1_end.values.ravel()[3:])
+    with pytest.raises(ValueError, match=r"store must be .* this very sweep"):
+        final(AXES, store=store, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (
+            dict(axes={"nu2": [1.0]}),
+            r"axes must be arguments of make \(nu0, nu1\), x1 or x2, got 'nu2'",
+        ),
+        (dict(axes={}), r"axes must be a dictionary of values, got \{\}"),
+        (dict(axes={"nu0": 0.3, "nu1": [0.2]}), r"axis nu0 must be of shape \(n\)"),
+        (dict(axes={"nu0": [], "nu1": [0.2]}), "axis nu0 must be at least one value"),
+        (dict(rtol=0.0), "rtol must be > 0"),
+        (dict(t1=-1.0), "t1 must be > 0"),
+        (dict(t1=None), "t1 must be given"),
+        (dict(y0=(np.nan, 0.0)), "y0 must be finite"),
+        (dict(observe="end"), 'observe must be "final", "attractor" or a reducer'),
+        (dict(derivatives=("mu",)), "derivatives must be names of axes, nu0, nu1, got 'mu'"),
+        (dict(make=lambda nu0, nu1: nu0), "make must be a function that returns an Oscillator"),
+    ],
+)
+def test_impossible_arguments_are_named(options, message):
+    arguments = {"make": jb.presets.class_b, "axes": AXES, "t1": 1.0, **options}
+    with pytest.raises(ValueError, match=message):
+        jb.sweep(arguments.pop("make"), arguments.pop("axes"), **arguments)
