@@ -7,10 +7,12 @@ import oracle
 import oracle_cycles
 import pytest
 from matplotlib.path import Path
+from typer.testing import CliRunner
 
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.basins import _labels
+from jaxbelt.cli import app
 
 # One belt, zeta = 0.1, mu(r) = 0.5 (1 + exp(-r/0.5)); starts uniform in this box. Fraction of
 # them that comes to rest: bSTAB and pyBasin, from 5,000 starts each.
@@ -126,3 +128,17 @@ def test_impossible_grids_are_named(arguments, message):
 def test_impossible_boxes_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         jb.basin_stability(belt_drive(1.4), key=jax.random.key(0), **arguments)
+
+
+def test_command_writes_a_picture_and_a_table(tmp_path):
+    belt = "1.4,law=stribeck,static=1,kinetic=0.5,stribeck_velocity=0.5"
+    words = f"basins --belt {belt} --damping 0.1 --x1 -1 2 --x2 0 1 --points 5 --starts 50"
+    run = CliRunner().invoke(app, [*words.split(), "--out", str(tmp_path / "here")])
+    assert run.exit_code == 0, run.output
+    assert "Basins(5 x 5 starts" in run.output and "BasinStability(" in run.output
+    assert (tmp_path / "here.png").stat().st_size > 10_000
+    rows = (tmp_path / "here.csv").read_text(encoding="utf-8").splitlines()
+    # The start (0.5, 0.25) is near the equilibrium at 0.530, the other basin.
+    assert rows[0] == "x1,x2,label" and len(rows) == 26 and "0.5,0.25,1" in rows
+    run = CliRunner().invoke(app, [*words.replace("--points 5", "--points 1").split()])
+    assert run.exit_code == 2 and "points must be at least 2, got 1" in run.output
