@@ -52,6 +52,11 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
     Python numbers and integer arrays are converted; a 32-bit float is refused, because the digits
     that it lacks are not there to be restored.
     """
+    return jnp.asarray(as_numbers(value, field, shape), dtype=jnp.float64)
+
+
+def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array | np.ndarray:
+    """The same, but left in NumPy if it is known: for what goes into a compiled function anyway."""
     require_float64()
     dtype = getattr(value, "dtype", None)
     if dtype is None:
@@ -73,7 +78,8 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
             f"{field} must be float64, got {dtype}"
             + (f"; {TURN_ON_FLOAT64} turns float64 on" if dtype == jnp.float32 else "")
         )
-    array = jnp.asarray(value, dtype=jnp.float64)
+    array = value if isinstance(value, jax.Array) else np.asarray(value)
+    array = array.astype(np.float64)
     fits = len(array.shape) == len(shape) and all(
         want is None or have == want for have, want in zip(array.shape, shape, strict=True)
     )
@@ -88,23 +94,23 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
 
 
 def check_finite(value: Any, field: str) -> None:
-    """Raise unless every known number of `value` is finite."""
-    if is_concrete(value):
-        require(np.all(np.isfinite(value)), field, "finite", value)
+    """Raise unless every known number of the array `value` is finite."""
+    if not isinstance(value, Tracer):
+        require(np.isfinite(value).all(), field, "finite", value)
 
 
 def check_nonnegative(value: Any, field: str) -> None:
     """Raise unless every known number of `value` is finite and >= 0."""
     check_finite(value, field)
-    if is_concrete(value):
-        require(np.all(np.asarray(value) >= 0), field, ">= 0", value)
+    if not isinstance(value, Tracer):
+        require((np.asarray(value) >= 0).all(), field, ">= 0", value)
 
 
 def check_positive(value: Any, field: str) -> None:
     """Raise unless every known number of `value` is finite and > 0."""
     check_finite(value, field)
-    if is_concrete(value):
-        require(np.all(np.asarray(value) > 0), field, "> 0", value)
+    if not isinstance(value, Tracer):
+        require((np.asarray(value) > 0).all(), field, "> 0", value)
 
 
 def number(value: Any) -> str:

@@ -30,7 +30,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .checks import as_array, check_finite, check_positive, is_concrete, pick, require
+from .checks import as_numbers, check_finite, check_positive, is_concrete, pick, require
 from .derivatives import forward_jacobian
 from .extrapolation import increments, scheme
 from .modes import (
@@ -667,18 +667,18 @@ def simulate(
     )
     osc.check_scalars()
     osc.check()
-    y0 = as_array(y0, "y0", (2,))
+    y0 = as_numbers(y0, "y0", (2,))
     check_finite(y0, "y0")
-    t0, t1 = as_array(t0, "t0"), as_array(t1, "t1")
+    t0, t1 = as_numbers(t0, "t0"), as_numbers(t1, "t1")
     check_finite(t0, "t0")
     check_finite(t1, "t1")
     if is_concrete((t0, t1)) and not t1 > t0:
         require(False, "t1", f"> t0 = {t0}", t1)
-    rtol, atol = as_array(rtol, "rtol"), as_array(atol, "atol")
+    rtol, atol = as_numbers(rtol, "rtol"), as_numbers(atol, "atol")
     check_positive(rtol, "rtol")
     check_positive(atol, "atol")
     if ts is not None:
-        ts = as_array(ts, "ts", (None,))
+        ts = as_numbers(ts, "ts", (None,))
         check_finite(ts, "ts")
         if is_concrete((ts, t0, t1)):
             if np.any(np.asarray(ts) < t0) or np.any(np.asarray(ts) > t1):
@@ -694,7 +694,7 @@ def simulate(
     resolution = _power_of_two(10 * span, 512)
     if formulation != "filippov":
         name = "v_star" if formulation == "switch" else "eps"
-        width = as_array(v_star if formulation == "switch" else eps, name)
+        width = as_numbers(v_star if formulation == "switch" else eps, name)
         check_positive(width, name)
         return _smoothed(
             osc,
