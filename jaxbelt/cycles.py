@@ -658,10 +658,11 @@ class Cycle(eqx.Module):
 
 def turn_events(turn: Chain | Turn) -> tuple[tuple[EventKind, int], ...]:
     """The events of one turn, (kind, belt) each; for EDGE the lowest belt that comes or goes."""
-    used = np.asarray(turn.used)
-    codes, ends = np.asarray(turn.codes)[used], np.asarray(turn.ends)[used].tolist()
+    codes, ends = np.asarray(turn.codes), np.asarray(turn.ends)
     n = codes.shape[-1]
     names = Ends(n)
+    used = ends != names.unused  # not `turn.used`: what is looked at here may be NumPy's
+    codes, ends = codes[used], ends[used].tolist()
     events = []
     for end, before, after in zip(ends, codes, np.roll(codes, -1, axis=0), strict=True):
         if end < n:
