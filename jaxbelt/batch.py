@@ -391,8 +391,9 @@ def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol, observ
     proposed = jnp.where(shortened, at.theta * h, jnp.where(lands, -proposed, proposed))
     lower, upper = lanes.lower, lanes.upper
     if observer.extrema:
-        lower = jnp.where(kept, jnp.minimum(lower, jnp.minimum(x2, path.extremum)), lower)
-        upper = jnp.where(kept, jnp.maximum(upper, jnp.maximum(x2, path.extremum)), upper)
+        extremum = jnp.where(path.turns, path.extremum, x2)
+        lower = jnp.where(kept, jnp.minimum(lower, jnp.minimum(x2, extremum)), lower)
+        upper = jnp.where(kept, jnp.maximum(upper, jnp.maximum(x2, extremum)), upper)
     return replace(
         lanes,
         t=jnp.where(kept, t, lanes.t),

@@ -14,6 +14,7 @@ The colours are those of Okabe and Ito, which colour-blind readers can tell apar
 module that imports matplotlib, and `import jaxbelt` does not import this module.
 """
 
+import itertools
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -24,13 +25,15 @@ import jax.numpy as jnp
 import matplotlib
 import matplotlib.colors
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from scipy import ndimage
 
 from .basins import Basins
+from .checks import require
 from .curves import BifurcationCurve
 from .cycles import find_cycle, unstable_cycle
 from .diagrams import BifurcationDiagram, Branch, RegionMap, interior
@@ -44,6 +47,8 @@ from .simulate import Trajectory
 
 #: One colour a belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
 BELT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
+#: Attractors of a sweep, those with the shortest names first (Okabe and Ito).
+ATTRACTOR_COLOURS = ("#F0F0F0", "#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#999999")
 #: A second mark of the belts, for print without colour.
 BELT_HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\")
 ORBIT_COLOUR = "0.55"
@@ -916,6 +921,64 @@ def _basin_colours(attractors: Sequence[str]) -> list[str]:
 def journal_style():
     """A context in which figures are made, drawn and saved in the manner of a journal."""
     return matplotlib.rc_context(JOURNAL)
+
+
+def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Axes:
+    """A variable of a sweep over its two axes longer than one, or along its one.
+
+    dataset: what `sweep` returned; variable: a name in it. "kind" shows equilibria, and cycles by
+    the belts that they stick to, as the letters of the paper's Fig. 6. `ValueError` if the axes of
+    the sweep are not one or two.
+    """
+    ax = _new_axes() if ax is None else ax
+    values = _attractors(dataset) if variable == "kind" else dataset[variable].squeeze(drop=True)
+    require(values.ndim in (1, 2), "dataset", "a sweep with one or two axes", f"{values.ndim}")
+    names = [f"{dataset[name].long_name}  {_math_name(name)}" for name in map(str, values.dims)]
+    if values.ndim == 1:
+        ax.plot(dataset[values.dims[0]], values, color="black", linewidth=0.8)
+        ax.set(xlabel=names[0], ylabel=dataset[variable].long_name)
+        return ax
+    x, y = (dataset[name].values for name in values.dims)
+    if variable != "kind":
+        mesh = ax.pcolormesh(x, y, values.T, cmap="viridis", rasterized=True)
+        _figure_of(ax).colorbar(mesh, ax=ax, label=dataset[variable].long_name)
+    else:
+        present, codes = np.unique(values.values.astype(str), return_inverse=True)
+        order = sorted(range(len(present)), key=lambda i: (len(present[i]), present[i]))
+        colours = [ATTRACTOR_COLOURS[rank % len(ATTRACTOR_COLOURS)] for rank in range(len(order))]
+        rank = np.argsort(order)
+        shades = matplotlib.colors.ListedColormap(colours)
+        codes = rank[codes].reshape(values.shape)
+        limits = dict(vmin=-0.5, vmax=len(order) - 0.5)
+        ax.pcolormesh(x, y, codes.T, cmap=shades, rasterized=True, **limits)
+        keys = [Patch(color=colour) for colour in colours]
+        _figure_of(ax).legend(
+            keys, [present[i] for i in order], loc="outside lower center", ncols=2, fontsize="small"
+        )
+    ax.set(xlabel=names[0], ylabel=names[1])
+    return ax
+
+
+def _math_name(name: str) -> str:
+    """An argument of a class such as nu0 as a formula."""
+    letters, digits = name.rstrip("0123456789"), name[len(name.rstrip("0123456789")) :]
+    greek = {"nu": r"\nu", "sigma": r"\sigma"}
+    return (
+        f"${greek.get(letters, letters)}_{{{digits}}}$" if digits else f"${greek.get(name, name)}$"
+    )
+
+
+def _attractors(dataset: xr.Dataset) -> xr.DataArray:
+    """What each run leads to, in words."""
+    words = dataset.kind.astype(object)
+    for belts in itertools.product((False, True), repeat=dataset.sizes["belt"]):
+        stuck = [str(i) for i, sticks in enumerate(belts) if sticks]
+        where = (
+            f"cycle, sticks to belt {' and '.join(stuck)}" if stuck else "cycle without sticking"
+        )
+        same = (dataset.sticks == np.array(belts)).all("belt") & (dataset.kind == "cycle")
+        words = words.where(~same, where)
+    return words.squeeze(drop=True)
 
 
 def draw_basins(basins: Basins) -> Figure:

@@ -8,9 +8,12 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+import xarray as xr
+from typer.testing import CliRunner
 
 import jaxbelt as jb
 from jaxbelt import Status, batch
+from jaxbelt.cli import app
 
 NU0, NU1 = np.linspace(-0.6, 0.55, 4), np.array([0.35, -0.2])
 AXES = {"nu0": NU0, "nu1": NU1}
@@ -162,3 +165,17 @@ def test_impossible_arguments_are_named(options, message):
     arguments = {"make": jb.presets.class_b, "axes": AXES, "t1": 1.0, **options}
     with pytest.raises(ValueError, match=message):
         jb.sweep(arguments.pop("make"), arguments.pop("axes"), **arguments)
+
+
+def test_the_command_writes_data_and_a_picture(tmp_path):
+    runner, out = CliRunner(), tmp_path / "plane.nc"
+    axes = ["nu0=-0.5:0.5:2", "nu1=0.35:0.4:2"]
+    done = runner.invoke(app, ["sweep", *axes, "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    written = xr.open_dataset(out, engine="scipy")
+    assert written.kind.dims == ("nu0", "nu1") and set(written.kind.values.ravel()) == {"cycle"}
+    done = runner.invoke(app, ["sweep", "nu0=0.1:0.2", "--out", str(out)])
+    assert (
+        done.exit_code == 2 and "NAME=FROM:TO:COUNT or NAME=VALUE, got 'nu0=0.1:0.2'" in done.output
+    )
