@@ -467,8 +467,8 @@ def fit(
     x2: ArrayLike | None = None,
     *,
     where: Callable[[Oscillator], Any],
-    noise: float | tuple[float | None, float | None] | None = None,
-    bounds: Sequence[tuple[float, float] | None] | None = None,
+    noise: ArrayLike | tuple[ArrayLike | None, ArrayLike | None] | None = None,
+    bounds: Sequence[Any] | None = None,
     starts: int = 8,
     report: Callable[[str], None] | None = print,
 ) -> Fit:
@@ -552,8 +552,9 @@ def _checked_record(ts, x1, x2, noise):
         require(not both or noise is None, "noise", "a pair, for x1 and x2", noise)
         sigmas = (noise, noise)
     require(len(sigmas) == 2, "noise", "a number or a pair", noise)
+    sigmas = [None if sigma is None else float(as_array(sigma, "noise")) for sigma in sigmas]
     for sigma in sigmas:
-        require(sigma is None or 0 < float(sigma) < np.inf, "noise", "> 0", sigma)
+        require(sigma is None or 0 < sigma < np.inf, "noise", "> 0", sigma)
     return times, np.stack(columns, axis=1), sigmas
 
 
@@ -699,7 +700,7 @@ def design(
     targets: Sequence[Any],
     *,
     where: Callable[[Oscillator], Any],
-    bounds: Sequence[tuple[float, float] | None] | None = None,
+    bounds: Sequence[Any] | None = None,
     y0: ArrayLike | tuple = (3.0, 0.0),
     report: Callable[[str], None] | None = print,
 ) -> Design:
