@@ -1,4 +1,4 @@
-"""The command line, `jaxbelt reproduce` and `jaxbelt simulate`: words in, files out."""
+"""The command line, `jaxbelt reproduce`, `jaxbelt simulate` and the rest: words in, files out."""
 
 import csv
 import functools
@@ -628,11 +628,10 @@ def parse_axis(text: str) -> tuple[str, np.ndarray]:
     name, equals, words = text.partition("=")
     parts = words.split(":")
     try:
-        numbers = [float(part) for part in parts[:2]]
         if equals and len(parts) == 1:
-            return name, np.array(numbers)
+            return name, np.array([float(words)])
         if equals and len(parts) == 3 and int(parts[2]) > 0:
-            return name, np.linspace(*numbers, int(parts[2]))
+            return name, np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
     except ValueError:
         pass
     raise ValueError(f"an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got {text!r}")

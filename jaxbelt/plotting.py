@@ -949,8 +949,8 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
         rank = np.argsort(order)
         shades = matplotlib.colors.ListedColormap(colours)
         codes = rank[codes].reshape(values.shape)
-        limits = dict(vmin=-0.5, vmax=len(order) - 0.5)
-        ax.pcolormesh(x, y, codes.T, cmap=shades, rasterized=True, **limits)
+        top = len(order) - 0.5
+        ax.pcolormesh(x, y, codes.T, cmap=shades, rasterized=True, vmin=-0.5, vmax=top)
         keys = [Patch(color=colour) for colour in colours]
         _figure_of(ax).legend(
             keys, [present[i] for i in order], loc="outside lower center", ncols=2, fontsize="small"

@@ -118,7 +118,7 @@ def sweep(
     if t1 is None:
         require(observe == "attractor", "t1", "given", "None")
         t1 = LONG_ENOUGH
-    numbers = {"t1": t1, "rtol": rtol, "atol": atol}
+    numbers: dict[str, Any] = {"t1": t1, "rtol": rtol, "atol": atol}
     for name, value in numbers.items():
         numbers[name] = float(as_array(value, name))
         check_positive(numbers[name], name)
