@@ -24,6 +24,7 @@ from jaxtyping import Array
 from scipy.optimize import brentq
 
 from .bifurcations import (
+    HINT_BUDGET,
     AbstractCondition,
     BifurcationPoint,
     Encounter,
@@ -32,13 +33,14 @@ from .bifurcations import (
     NonsmoothFold,
     SlidingExchange,
     SuddenSliding,
+    before_onset,
     leaf_index,
     parameter,
     vary,
 )
 from .checks import as_array, check_finite, require
 from .continuation import CurvePoint, End, continue_curve, corrected
-from .cycles import Chain, Ends, Turn, cycle_of, meshed, trace_of
+from .cycles import Chain, Ends, Turn, cycle_of, follow, meshed, trace_of
 from .detection import Guess, refined
 from .equilibria import EquilibriumKind, equilibria
 from .modes import Mode, boundary_guards, edge_guards, mode_acceleration
@@ -304,30 +306,78 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
 
 
 def _limit_at_rest(problem: _Problem, rows: list[_Row]) -> SpecialPoint | None:
-    """Where the curve ends at a belt at rest, if that is near.
+    """Where the curve of a tangency ends at a belt at rest, if that is near.
 
-    There is no cycle in the limit, so the last rows are extrapolated; the residual is the
-    difference between doing so by two of them and by three.
+    No cycle exists in the limit: the orbit takes ever longer to leave the equilibrium, more and
+    more along its stronger direction. So points are found ever nearer, as zeros of the distance by
+    which the orbit from slip onset on that belt stays short of the touched boundary. Their errors
+    are a geometric sequence, whose limit is known (Aitken); the residual is a tenth of what that
+    adds.
     """
-    if isinstance(problem.condition, Hopf | SuddenSliding) or len(rows) < 3:
-        return None
+    condition = problem.condition
     velocities = [
         leaf_index(problem.osc, lambda osc, k=k: osc.belts[k].velocity)
         for k in range(len(problem.osc.belts))
     ]
     last = np.array([row.values for row in rows[-3:]])
     for held in (0, 1):
-        nu, free = last[:, held], last[:, 1 - held]
         index = int(problem.indices[held])
-        falls = 0 < abs(nu[2]) < min(abs(nu[1]), 2 * problem.step)
-        if index not in velocities or not falls:
+        if index not in velocities or len(last) < 3:
             continue
-        linear = np.polyval(np.polyfit(nu[1:], free[1:], 1), 0.0)
-        limit = float(np.polyval(np.polyfit(nu, free, 2), 0.0))
-        pair = (limit, 0.0) if held else (0.0, limit)
-        belts = (velocities.index(index),)
-        return SpecialPoint("BeltAtRest", belts, pair, abs(limit - float(linear)))
+        nu, free, resting = last[:, held], last[:, 1 - held], velocities.index(index)
+        if not 0 < abs(nu[2]) < min(abs(nu[1]), 2 * problem.step):
+            continue
+        if isinstance(condition, SlidingExchange):
+            return SpecialPoint("BeltAtRest", condition.belts, (0.0, 0.0), 0.0)
+        if not isinstance(condition, NonsmoothFold | GrazingSliding):
+            return None
+        pair = problem.indices if held == 0 else problem.indices[::-1]
+        belts = (jnp.asarray(resting), jnp.asarray(condition.belt))
+        guess = float(np.polyval(np.polyfit(nu, free, 2), 0.0))
+        found, reach = [], 3 * problem.step
+        for speed in (1e-5, 1e-6, 1e-7):
+            given = (problem.osc, pair, belts, float(np.copysign(speed, nu[2])))
+            value = _where_gap_closes(*given, (guess - reach, guess + reach))
+            if value is None:
+                return None
+            found.append(value)
+        before, after = found[1] - found[0], found[2] - found[1]
+        limit = found[2] + after**2 / (before - after)
+        values = (limit, 0.0) if held else (0.0, limit)
+        return SpecialPoint("BeltAtRest", (resting,), values, 0.1 * abs(limit - found[2]))
     return None
+
+
+def _where_gap_closes(osc, indices, belts, velocity: float, ends) -> float | None:
+    def gap(value):
+        return float(_gap(osc, indices, belts, jnp.asarray([velocity, value])))
+
+    if not gap(ends[0]) * gap(ends[1]) < 0:
+        return None
+    root: Any = brentq(gap, *ends, xtol=1e-13)
+    return float(root)
+
+
+@eqx.filter_jit
+def _gap(osc: Oscillator, indices, belts, pair: Array) -> Array:
+    """By how much the orbit from slip onset on the first belt stays short of the second's boundary.
+
+    Negative where it reaches it, or nan where it does not come near.
+    """
+    osc = _with(osc, indices, pair)
+    onset, touched = belts
+    orbit = follow(osc, before_onset(osc, onset), HINT_BUDGET)
+    rows = jnp.arange(HINT_BUDGET)
+    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
+    nu = jnp.stack([belt.velocity for belt in osc.belts])[touched]
+    names = Ends(len(osc.belts))
+    inside = (rows > 0) & (rows < orbit.count)
+    turns = inside & (orbit.ends == names.turn_x2) & (exits[:, 1] * jnp.sign(nu) > 0)
+    hits = inside & (orbit.ends == touched)
+    turn = jnp.where(jnp.any(turns), jnp.argmax(turns), HINT_BUDGET)
+    hit = jnp.where(jnp.any(hits), jnp.argmax(hits), HINT_BUDGET)
+    gap = jnp.abs(nu) - osc.omega * jnp.abs(exits[jnp.minimum(turn, HINT_BUDGET - 1), 1])
+    return jnp.where(hit < turn, -1e-2, jnp.where(turn < HINT_BUDGET, gap, jnp.nan))
 
 
 def _sought(condition: AbstractCondition) -> AbstractCondition:

@@ -5,6 +5,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from scipy.optimize import brentq
 
 import jaxbelt as jb
 from jaxbelt.bifurcations import leaf_index, vary
@@ -87,7 +88,13 @@ def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     found = np.polyval(np.polyfit(fold.values[order, 1], fold.values[order, 0], 3), 0.45)
     # Interpolated by a cubic in steps of 0.02.
     assert found == pytest.approx(expected, abs=1e-5)
-    assert fold.special[1].kind == "BeltAtRest" and End.STOPPED in fold.ends
+    rest = fold.special[1]
+    assert (rest.kind, rest.belts) == ("BeltAtRest", (0,)) and End.STOPPED in fold.ends
+    # Just beside the end, where the error goes like the velocity to the power 0.9: some 6e-5.
+    beside = brentq(
+        lambda nu: oracle_cycles.gap(oracle.class_b(-1e-5, nu), 0, 1), 0.281, 0.287, xtol=1e-9
+    )
+    assert rest.values == pytest.approx((0.0, beside), abs=1e-4) and rest.residual < 1e-6
 
 
 def test_curves_have_the_symmetries_of_the_plane(points, fold):
