@@ -447,7 +447,7 @@ def diagram_b() -> BifurcationDiagram:
 def map_b() -> RegionMap:
     """Of Fig. 6: the plane of both velocities. No cell lies on the lines nu0 = nu1 and nu = 0."""
     nu0, nu1 = np.linspace(-0.7, 0.7, 120), np.linspace(-0.7, 0.7, 118)
-    return region_map(class_b, {"nu0": nu0, "nu1": nu1}, step=0.02, lines=2)
+    return region_map(class_b, {"nu0": nu0, "nu1": nu1}, step=0.02, lines=4)
 
 
 def draw_map(regions: RegionMap) -> plotting.Figure:
