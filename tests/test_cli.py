@@ -191,7 +191,6 @@ def reproduced(tmp_path_factory):
     return folder, runner.invoke(app, ["reproduce", "--out", str(folder)])
 
 
-@pytest.mark.slow
 def test_reproduce_writes_the_table_and_every_figure(reproduced):
     folder, result = reproduced
     assert result.exit_code == 0, result.output
@@ -202,7 +201,6 @@ def test_reproduce_writes_the_table_and_every_figure(reproduced):
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
 def test_critical_values_json(reproduced):
     folder, _ = reproduced
     rows = json.loads((folder / "critical_values.json").read_text(encoding="utf-8"))
@@ -225,7 +223,6 @@ def test_critical_values_json(reproduced):
         assert row["computed"] == pytest.approx(row["printed"], abs=1e-3)
 
 
-@pytest.mark.slow
 def test_reproduce_says_what_is_missing_and_what_the_paper_misprints(reproduced):
     _, result = reproduced
     text = " ".join(result.output.split())
@@ -244,7 +241,6 @@ def test_reproduce_tells_in_one_sentence_where_it_cannot_write(tmp_path):
     assert result.stderr.count("\n") == 1
 
 
-@pytest.mark.slow
 def test_portraits_show_what_the_paper_says_of_the_regions():
     """Which panels have a steady cycle, and on which belts it sticks."""
     values = reproduce.critical_values()
