@@ -11,7 +11,7 @@ def on_files(files, config):
     """Adds them to what mkdocs found in docs/."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     # What is not a page is reached where the project lies.
-    readme = readme.replace("](CITATION.cff)", "](files/CITATION.cff)")
+    readme = readme.replace("](CITATION.cff)", "](files/CITATION.cff)").replace("](docs/", "](")
     files.append(File.generated(config, "index.md", content=readme))
     files.append(File.generated(config, "files/CITATION.cff", abs_src_path=ROOT / "CITATION.cff"))
     for notebook in sorted((ROOT / "notebooks").glob("*.ipynb")):
