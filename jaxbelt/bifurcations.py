@@ -40,6 +40,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .checks import is_concrete, number, require
+from .compiling import jit
 from .cycles import (
     NEWTON_STEPS,
     SIZES,
@@ -225,7 +226,7 @@ def parameter(osc: Oscillator, index: int | Array) -> Array:
     return leaves[index] if isinstance(index, int) else jnp.stack(leaves)[index]
 
 
-@eqx.filter_jit
+@jit
 def _refine(solve: Callable, osc: Oscillator, index, belts, wanted, size) -> BifurcationPoint:
     p0 = parameter(osc, index)[None]
     # Derivatives with respect to the varied parameter itself would be those of the guess.

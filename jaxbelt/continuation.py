@@ -19,7 +19,6 @@ import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +26,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from .checks import as_array, check_finite, require
+from .compiling import jit
 
 #: Newton's method may take so many steps; half of it is quick.
 NEWTON_STEPS = 8
@@ -198,7 +198,7 @@ def corrected(residual, jacobian, args, u, tangent, length) -> Corrected:
     return jax.tree.map(np.asarray, _correct(residual, jacobian, args, *given))
 
 
-@eqx.filter_jit
+@jit
 def _correct(residual, jacobian, args, u: Array, tangent: Array, step: Array) -> Corrected:
     """Newton's method in the plane normal to the tangent, `step` ahead of u."""
 

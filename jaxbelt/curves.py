@@ -39,6 +39,7 @@ from .bifurcations import (
     vary,
 )
 from .checks import as_array, check_finite, require
+from .compiling import jit
 from .continuation import CurvePoint, End, continue_curve, corrected
 from .cycles import Chain, Ends, Turn, cycle_of, follow, meshed, trace_of
 from .detection import Guess, refined
@@ -358,7 +359,7 @@ def _where_gap_closes(osc, indices, belts, velocity: float, ends) -> float | Non
     return float(root)
 
 
-@eqx.filter_jit
+@jit
 def _gap(osc: Oscillator, indices, belts, pair: Array) -> Array:
     """By how much the orbit from slip onset on the first belt stays short of the second's boundary.
 
@@ -425,7 +426,7 @@ class _System:
         return np.linalg.svd(matrix)[2][-1]
 
 
-@eqx.filter_jit
+@jit
 def _matrix(residual, jacobian, args, u: Array) -> Array:
     return jax.jacfwd(lambda v: residual(v, args))(u) if jacobian is None else jacobian(u, args)[1]
 
@@ -487,7 +488,7 @@ def _rest_equations(u: Array, args) -> Array:
     )
 
 
-@eqx.filter_jit
+@jit
 def _look_at_rest(args, u: Array):
     osc, indices, codes = args
     osc, mode = _with(osc, indices, u[-2:]), Mode(tuple(codes))
@@ -601,7 +602,7 @@ def _cycle_jacobian(u: Array, args) -> tuple[Array, Array]:
     return value, jnp.concatenate([matrix, column[:, None]], axis=1)
 
 
-@eqx.filter_jit
+@jit
 def _look_at_cycle(args, u: Array):
     osc, system, z, p = _parts(u, args)
     row = args[3]
@@ -638,7 +639,7 @@ def _look_at_cycle(args, u: Array):
     return tests, valid, jnp.where(touches, slope, jnp.nan), residual
 
 
-@eqx.filter_jit
+@jit
 def _meshed_anew(args, u: Array):
     osc, system, z, p = _parts(u, args)
     chain = system.chain

@@ -32,6 +32,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from .checks import as_array, check_finite, is_concrete, number, pick, require
+from .compiling import jit
 from .equilibria import EquilibriumKind, equilibria
 from .extrapolation import Scheme, increments, scheme
 from .modes import (
@@ -676,7 +677,7 @@ def turn_events(turn: Chain | Turn) -> tuple[tuple[EventKind, int], ...]:
     return tuple(events)
 
 
-@eqx.filter_jit
+@jit
 def _sample(cycle: Cycle, n: int) -> Array:
     durations = cycle.unknowns[:, 2]
     ends = jnp.cumsum(durations)
@@ -779,12 +780,12 @@ def _first_failure(status: Array, fine: Array, code: Status) -> Array:
     return jnp.where((status == Status.OK) & ~fine, code.value, status)
 
 
-@eqx.filter_jit
+@jit
 def _follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
     return follow(osc, y0, budget)
 
 
-@eqx.filter_jit
+@jit
 def _polish(osc: Oscillator, orbit: Orbit, size: int) -> Cycle:
     _, count = last_turn(orbit)
     status = _first_failure(orbit.status, count <= size, Status.TOO_MANY_ARCS)
@@ -872,7 +873,7 @@ def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
     return eqx.tree_at(lambda o: (o.repeats, o.count), orbit, closed), meets, top
 
 
-@eqx.filter_jit
+@jit
 def _unstable_cycle(osc: Oscillator, size: int) -> Cycle:
     still = lax.stop_gradient(osc)
     rests = equilibria(still)

@@ -45,6 +45,7 @@ from .bifurcations import (
     vary,
 )
 from .checks import as_array, check_finite, pick, require
+from .compiling import jit
 from .cycles import SIZES, Orbit, Turn, follow, last_turn, turn_events, turn_of
 from .equilibria import Equilibria, equilibria
 from .oscillator import Oscillator
@@ -218,7 +219,7 @@ class _Seen(NamedTuple):
     turn: Any
 
 
-@eqx.filter_jit
+@jit
 def _look(osc: Oscillator, index: Array, values: Array) -> _Seen:
     return jax.vmap(lambda p: _look_at(vary(osc, index, p[None])))(values)
 
@@ -388,7 +389,7 @@ def _belts(condition: AbstractCondition) -> tuple[int, int]:
     return belt, belt
 
 
-@eqx.filter_jit
+@jit
 def _points(solve, osc: Oscillator, index: Array, values: Array, belts: Array) -> BifurcationPoint:
     def one(p, pair):
         return solve(vary(osc, index, p[None]), index, pair, jnp.zeros(()), SIZES[1])

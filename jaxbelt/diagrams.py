@@ -35,6 +35,7 @@ from .bifurcations import (
     vary,
 )
 from .checks import as_array, require
+from .compiling import jit
 from .curves import BifurcationCurve, bifurcation_curve
 from .cycles import SIZES, Cycle, Ends, Turn, polish, unstable_cycle
 from .detection import Label, Path, search
@@ -297,7 +298,7 @@ def _cell_names(make, names, values, runs) -> np.ndarray:
     return np.array(found)[which.reshape(shape)]
 
 
-@eqx.filter_jit
+@jit
 def _at_cells(make, names, cells: Array) -> tuple[Array, Array]:
     def one(pair):
         osc = make(**dict(zip(names, pair, strict=True)))
@@ -490,12 +491,12 @@ def _in_batches(program, path: Path, values: np.ndarray, more: Any = None) -> An
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(values)], *parts)
 
 
-@eqx.filter_jit
+@jit
 def _rests(osc: Oscillator, index: Array, values: Array, _: None) -> Equilibria:
     return jax.vmap(lambda p: equilibria(vary(osc, index, p[None])))(values)
 
 
-@eqx.filter_jit
+@jit
 def _attracting(osc: Oscillator, index: Array, values: Array, turns: Turn) -> _Rows:
     ok = jnp.asarray(Status.OK.value)
     return jax.vmap(lambda p, turn: _row(polish(vary(osc, index, p[None]), turn, ok)))(
@@ -503,7 +504,7 @@ def _attracting(osc: Oscillator, index: Array, values: Array, turns: Turn) -> _R
     )
 
 
-@eqx.filter_jit
+@jit
 def _repelling(osc: Oscillator, index: Array, values: Array, _: None) -> _Rows:
     return jax.vmap(lambda p: _row(unstable_cycle(vary(osc, index, p[None]))))(values)
 

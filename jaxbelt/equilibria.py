@@ -22,6 +22,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .checks import is_concrete, number, pick, require
+from .compiling import jit
 from .modes import (
     ABOVE,
     BELOW,
@@ -135,7 +136,7 @@ def _trim(rows, found: Equilibria):
     return pick(rows, slice(int(np.sum(np.asarray(found.kind) > 0))))
 
 
-@eqx.filter_jit
+@jit
 def _equilibria(osc: Oscillator) -> Equilibria:
     """All candidates, one a zone and one an edge, sorted; those that are none come last as NaN."""
     positions = jnp.sort(jnp.stack(edges(osc)))
@@ -281,7 +282,7 @@ def lyapunov_coefficient(osc: Oscillator) -> Array:
     return _trim(coefficients, found)
 
 
-@eqx.filter_jit
+@jit
 def _lyapunov_coefficients(osc: Oscillator) -> tuple[Equilibria, Array]:
     found = _equilibria(osc)
     mode = Mode(tuple(codes.astype(found.x1.dtype) for codes in jnp.moveaxis(found.modes, -1, 0)))

@@ -5,12 +5,12 @@ parameters, forward and reverse, and works on batches under `jax.vmap`. All quan
 dimensionless: times in units of 1/omega, energies in units of k L^2 where L is the unit of length.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .checks import require
+from .compiling import jit
 from .cycles import Chain, Cycle, flow
 from .modes import Mode, mode_acceleration
 from .oscillator import Oscillator
@@ -102,7 +102,7 @@ def _values(cycle: Cycle, coordinate: str) -> Array:
     return cycle.unknowns[..., _COORDINATES[coordinate]]
 
 
-@eqx.filter_jit
+@jit
 def _energies(cycle: Cycle) -> Array:
     """[fed, dissipated] in one turn, each the integral of a power over every arc."""
     return _energies_of(cycle.oscillator, cycle.chain, cycle.unknowns)

@@ -36,6 +36,7 @@ from jaxtyping import Array, ArrayLike
 
 from .bifurcations import AbstractCondition, refine
 from .checks import as_array, check_finite, require
+from .compiling import jit
 from .cycles import Cycle, find_cycle
 from .oscillator import Oscillator
 from .results import Status, describe
@@ -255,7 +256,7 @@ def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Recor
     return jnp.mean(jnp.sqrt(1 + off**2) - 1)
 
 
-@eqx.filter_jit
+@jit
 def _search(starts, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
     """Adam from many starts, (u [starts, p], shift [starts]): where each ends, and its misfit."""
     optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, SEARCH_STEPS))
@@ -303,7 +304,7 @@ def _candidates(selection, u, osc, record: Record, starts: int):
 # --- 2 and 3: windows of the exact motion ---------------------------------------------------------
 
 
-@eqx.filter_jit
+@jit
 def _linearized(selection: Selection, osc: Oscillator, record: Record, u, starts, fresh):
     """The motion at the times of the record, [pieces, samples, 2], and Gauss-Newton blocks.
 
@@ -774,7 +775,7 @@ def design(
     )
 
 
-@eqx.filter_jit
+@jit
 def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
     """The functionals of the cycle, NaN where there is none, their derivatives, and the cycle."""
 

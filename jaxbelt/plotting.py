@@ -20,7 +20,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-import equinox as eqx
 import jax.numpy as jnp
 import matplotlib
 import matplotlib.colors
@@ -34,6 +33,7 @@ from scipy import ndimage
 
 from .basins import Basins
 from .checks import require
+from .compiling import jit
 from .curves import BifurcationCurve
 from .cycles import find_cycle, unstable_cycle
 from .diagrams import BifurcationDiagram, Branch, RegionMap, interior
@@ -267,7 +267,7 @@ def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
     return ax
 
 
-@eqx.filter_jit
+@jit
 def _sliding_set(osc, x1, x2, belt):
     return jnp.stack(mode_of_state(osc, x1, x2).stuck)[belt]
 
@@ -428,7 +428,7 @@ def plot_vector_field(
     return ax
 
 
-@eqx.filter_jit
+@jit
 def _field(osc, x1, x2):
     mode = mode_of_state(osc, x1, x2)
     return x2, jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))

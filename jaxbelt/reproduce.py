@@ -30,6 +30,7 @@ from .bifurcations import (
     SuddenSliding,
     leaf_index,
 )
+from .compiling import jit
 from .cycles import Cycle, unstable_cycle
 from .detection import Guess, refined
 from .diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
@@ -219,7 +220,7 @@ def simulate_panels(panels: Sequence[Panel]) -> list[list[Trajectory]]:
     return [[next(trajectories) for _ in panel.starts] for panel in panels]
 
 
-@jax.jit
+@jit
 @jax.vmap
 def _run(osc: Oscillator, start: jax.Array) -> Trajectory:
     times = np.linspace(0.0, TIME_SPAN, SAMPLES)

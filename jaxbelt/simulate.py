@@ -31,6 +31,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from .checks import as_numbers, check_finite, check_positive, is_concrete, pick, require
+from .compiling import jit
 from .derivatives import forward_jacobian
 from .extrapolation import increments, scheme
 from .modes import (
@@ -518,7 +519,7 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
         finite = finite & jnp.all(~jnp.isnan(leaf))
     status = jnp.where(finite, Status.OK.value, Status.NOT_FINITE.value)
     start = _State(t0, y, mode, _turn_signs(osc, mode, y), status, ~finite)
-    blank = jax.tree.map(_blank, eqx.filter_eval_shape(_segment, osc, start, t1, rtol, atol)[1])
+    blank = _unused(len(osc.belts))
 
     def segment(state, _):
         def advance():
@@ -546,9 +547,11 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
     return eqx.tree_at(lambda s: s.status, final, unfinished), records
 
 
-def _blank(leaf):
-    value = jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0
-    return jnp.full(leaf.shape, value, leaf.dtype)
+def _unused(belts: int) -> _Record:
+    """The record of a segment that is not needed."""
+    nan, pair, none = jnp.full((), jnp.nan), jnp.full(2, jnp.nan), jnp.zeros((), int)
+    mode = jnp.zeros(belts, jnp.int8)
+    return _Record(nan, pair, mode, nan, none, none, event_t=nan, event_y=pair)
 
 
 def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
@@ -574,7 +577,7 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     return jax.vmap(at)(ts)
 
 
-@eqx.filter_jit
+@jit
 def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution) -> Trajectory:
     """A trajectory of the switch or the smooth formulation: samples without events or arcs."""
     if ts is None:
@@ -601,7 +604,7 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
     )
 
 
-@eqx.filter_jit
+@jit
 def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> Trajectory:
     final, records = _run(osc, y0, t0, t1, rtol, atol, max_segments)
     # Events first, in a stable order; the rest is padding.

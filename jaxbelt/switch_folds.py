@@ -28,6 +28,7 @@ from jaxtyping import Array, ArrayLike
 
 from .bifurcations import BifurcationPoint, NonsmoothFold, leaf_index, small_newton, vary
 from .checks import as_array, check_positive, require
+from .compiling import jit
 from .cycles import flow
 from .modes import Mode, capacity, mode_acceleration
 from .oscillator import Oscillator
@@ -89,7 +90,7 @@ def _check(point):
     )
 
 
-@eqx.filter_jit
+@jit
 def _fold(point, index, v_star):
     # From a narrow band, where the asymptotic solution is good, by equal factors to the wanted one.
     bands = FIRST * (v_star / FIRST) ** jnp.linspace(0.0, 1.0, STAGES)
@@ -106,7 +107,7 @@ def _fold(point, index, v_star):
     return _known(u[3], v_star, residual)
 
 
-@eqx.filter_jit
+@jit
 def _band(point, index, value):
     start = jnp.append(jnp.array([1.0, 1.0, 1.0]), jnp.log(TYPICAL))
     u, _, residual, _ = small_newton(

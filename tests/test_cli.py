@@ -223,7 +223,7 @@ def test_critical_values_json(reproduced):
         assert row["computed"] == pytest.approx(row["printed"], abs=1e-3)
 
 
-def test_reproduce_says_what_is_missing_and_what_the_paper_misprints(reproduced):
+def test_reproduce_says_what_the_paper_misprints_and_lacks(reproduced):
     _, result = reproduced
     text = " ".join(result.output.split())
     for remark in reproduce.REMARKS:

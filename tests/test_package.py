@@ -21,6 +21,7 @@ PACKAGE = ROOT / "jaxbelt"
 LADDER = (
     "results",
     "checks",
+    "compiling",
     "friction",
     "oscillator",
     "modes",
