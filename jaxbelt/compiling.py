@@ -1,4 +1,4 @@
-"""How functions are compiled: `jit`, with options that spare the user's time."""
+"""How functions are compiled so that nobody waits long: `jit`, `traced_once` and `each`."""
 
 import functools
 from collections.abc import Callable
@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+from jax import lax
 
 from .checks import is_concrete
 
@@ -37,11 +38,12 @@ def jit(function: Callable) -> Any:
 
     Inside of another trace, where JAX takes no options, without them.
     """
-    plain = eqx.filter_jit(function)
+    filter_jit: Any = eqx.filter_jit
+    plain = filter_jit(function)
 
     @functools.cache
     def quick():
-        return eqx.filter_jit(function, compiler_options=known(QUICK))
+        return filter_jit(function, compiler_options=known(QUICK))
 
     @functools.wraps(function)
     def call(*args, **kwargs):
@@ -49,3 +51,20 @@ def jit(function: Callable) -> Any:
         return (quick() if outermost else plain)(*args, **kwargs)
 
     return call
+
+
+def traced_once(function: Callable) -> Any:
+    """The function itself, for functions that stand in many places: its trace is kept."""
+    filter_jit: Any = eqx.filter_jit
+    return filter_jit(function, inline=True)
+
+
+def each(function: Callable) -> Callable:
+    """`jax.vmap` of a function of arrays; on the CPU one row after another.
+
+    There a loop over some dozen rows takes as long as they do together, and compiles in half the
+    time.
+    """
+    if jax.default_backend() != "cpu":
+        return jax.vmap(function)
+    return lambda *rows: lax.map(lambda row: function(*row), rows)

@@ -45,7 +45,7 @@ from .bifurcations import (
     vary,
 )
 from .checks import as_array, check_finite, pick, require
-from .compiling import jit
+from .compiling import each, jit
 from .cycles import SIZES, Orbit, Turn, follow, last_turn, turn_events, turn_of
 from .equilibria import Equilibria, equilibria
 from .oscillator import Oscillator
@@ -221,7 +221,7 @@ class _Seen(NamedTuple):
 
 @jit
 def _look(osc: Oscillator, index: Array, values: Array) -> _Seen:
-    return jax.vmap(lambda p: _look_at(vary(osc, index, p[None])))(values)
+    return each(lambda p: _look_at(vary(osc, index, p[None])))(values)
 
 
 def _look_at(osc: Oscillator) -> _Seen:
@@ -234,7 +234,7 @@ def _look_at(osc: Oscillator) -> _Seen:
         status = jnp.where(fits, orbit.status, Status.TOO_MANY_ARCS.value)
         return status, turn_of(orbit, ROOM, len(osc.belts))
 
-    status, turn = jax.vmap(run)(starts(osc, rests))
+    status, turn = each(run)(starts(osc, rests))
     return _Seen(rests.kind, rests.stable, status, turn)
 
 
@@ -313,24 +313,35 @@ class Guess(NamedTuple):
 
 def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoint | None]:
     """For every interval a bifurcation point inside it, or None."""
-    guesses = []
-    for a, b in intervals:
-        before, after = path.label(a), path.label(b)
-        conditions: list[AbstractCondition] = []
-        if before.equilibria != after.equilibria:
-            conditions.append(Hopf())
-        changed = (before.sticks - after.sticks) + (after.sticks - before.sticks)
-        # Whether a tangency is a fold or grazing is seen when it is found.
-        conditions += [GrazingSliding(belt) for belt in changed]
-        if before.smooth != after.smooth:
-            conditions.append(FoldOfCycles())
-        guesses += [Guess((a, b), value, one) for one in conditions for value in (a, b)]
     found: dict[tuple[float, float], BifurcationPoint | None] = dict.fromkeys(intervals)
-    for guess, point in refined(path.osc, path.index, guesses):
-        a, b = guess.interval
-        if point.status == Status.OK and a <= point.value <= b and found[a, b] is None:
-            found[a, b] = point
+    # A fold is looked for last: most intervals in which smooth cycles come or go have another
+    # point, and its program takes longest to compile.
+    for conditions_of in (_local_conditions, _fold_conditions):
+        guesses = [
+            Guess((a, b), value, condition)
+            for (a, b), point in found.items()
+            if point is None
+            for condition in conditions_of(path.label(a), path.label(b))
+            for value in (a, b)
+        ]
+        for guess, point in refined(path.osc, path.index, guesses):
+            a, b = guess.interval
+            if point.status == Status.OK and a <= point.value <= b and found[a, b] is None:
+                found[a, b] = point
     return found
+
+
+def _local_conditions(before: Label, after: Label) -> list[AbstractCondition]:
+    conditions: list[AbstractCondition] = []
+    if before.equilibria != after.equilibria:
+        conditions.append(Hopf())
+    changed = (before.sticks - after.sticks) + (after.sticks - before.sticks)
+    # Whether a tangency is a fold or grazing is seen when it is found.
+    return conditions + [GrazingSliding(belt) for belt in changed]
+
+
+def _fold_conditions(before: Label, after: Label) -> list[AbstractCondition]:
+    return [FoldOfCycles()] if before.smooth != after.smooth else []
 
 
 def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
@@ -394,4 +405,4 @@ def _points(solve, osc: Oscillator, index: Array, values: Array, belts: Array) -
     def one(p, pair):
         return solve(vary(osc, index, p[None]), index, pair, jnp.zeros(()), SIZES[1])
 
-    return jax.vmap(one)(values, belts)
+    return each(one)(values, belts)

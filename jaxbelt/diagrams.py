@@ -16,6 +16,7 @@ points are found by `scan` along a few lines across the map, and their curves ar
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple
 
@@ -35,7 +36,7 @@ from .bifurcations import (
     vary,
 )
 from .checks import as_array, require
-from .compiling import jit
+from .compiling import each, jit
 from .curves import BifurcationCurve, bifurcation_curve
 from .cycles import SIZES, Cycle, Ends, Turn, polish, unstable_cycle
 from .detection import Label, Path, search
@@ -262,14 +263,17 @@ def region_map(
     for name, along in zip(names, values, strict=True):
         increases = along.size > 1 and np.all(np.diff(along) > 0)
         require(increases, name, "two values or more that increase", along)
-    runs = [sweep(make, dict(axes), y0=start, observe="attractor") for start in starts]
-    label = _cell_names(make, names, values, runs)
     where = _leaves_of(make, names, values)
-    curves = _bounds(make, names, values, where, step, lines) if where and lines else ()
+    # Two things that know nothing of each other, most of the first time compiling.
+    with ThreadPoolExecutor(1) as beside:
+        label = beside.submit(_cell_names, make, names, values, dict(axes), starts)
+        curves = _bounds(make, names, values, where, step, lines) if where and lines else ()
+        label = label.result()
     return RegionMap((names[0], names[1]), (values[0], values[1]), label, tuple(curves), make)
 
 
-def _cell_names(make, names, values, runs) -> np.ndarray:
+def _cell_names(make, names, values, axes, starts) -> np.ndarray:
+    runs = [sweep(make, axes, y0=start, observe="attractor") for start in starts]
     grid = np.meshgrid(*values, indexing="ij")
     rests, velocities = _at_cells(make, names, jnp.asarray(np.stack([g.ravel() for g in grid], 1)))
     shape = grid[0].shape
@@ -426,7 +430,7 @@ def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Labe
     ]
     if both:
         groups = [nodes[stretch] for stretch in both]
-        cycles = _in_batches(_repelling, path, np.concatenate(groups))
+        cycles = _repelling(path, np.concatenate(groups))
         pieces += _as_pieces(path, cycles, groups, both)
     return pieces
 
@@ -499,14 +503,19 @@ def _rests(osc: Oscillator, index: Array, values: Array, _: None) -> Equilibria:
 @jit
 def _attracting(osc: Oscillator, index: Array, values: Array, turns: Turn) -> _Rows:
     ok = jnp.asarray(Status.OK.value)
-    return jax.vmap(lambda p, turn: _row(polish(vary(osc, index, p[None]), turn, ok)))(
-        values, turns
-    )
+    return each(lambda p, turn: _row(polish(vary(osc, index, p[None]), turn, ok)))(values, turns)
+
+
+def _repelling(path: Path, values: np.ndarray) -> _Rows:
+    # One by one: the program is the one that everybody has compiled.
+    cycles = [unstable_cycle(path.at(value)) for value in values]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *cycles)
+    return jax.tree.map(np.asarray, _as_rows(stacked))
 
 
 @jit
-def _repelling(osc: Oscillator, index: Array, values: Array, _: None) -> _Rows:
-    return jax.vmap(lambda p: _row(unstable_cycle(vary(osc, index, p[None]))))(values)
+def _as_rows(cycles: Cycle) -> _Rows:
+    return jax.vmap(_row)(cycles)
 
 
 # --- from pieces to branches ----------------------------------------------------------------------

@@ -19,7 +19,6 @@ with the relative velocity r_i = nu_i - omega x2 of belt i. The paper's symbols,
 What happens where the field is not smooth is told in `modes`.
 """
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -37,6 +36,7 @@ from .checks import (
     number,
     require,
 )
+from .compiling import traced_once
 from .friction import AbstractFriction
 
 
@@ -123,7 +123,7 @@ class Oscillator(eqx.Module):
         return f"Oscillator(damping={damping}, belts=({belts},), omega={omega})"
 
 
-@functools.partial(eqx.filter_jit, inline=True)  # traced once, though it stands in many places
+@traced_once
 def acceleration(osc: Oscillator, signs: tuple[Array, ...], x1: Array, x2: Array) -> Array:
     """x2' where belt i slips with the fixed sign signs[i] = +1 or -1 of r_i, or does not count (0).
 

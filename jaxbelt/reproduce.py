@@ -1,16 +1,14 @@
 """The paper's table of critical velocities and its figures, recomputed: `jaxbelt reproduce`.
 
-`reproduce(folder)` finds the critical values, then simulates every start of every phase portrait
-in one batch, then draws. What a figure shows is said in one place, its line in `FIGURES`: either
-a function that draws it, or `Portraits`, the phase portraits before, at and after a critical
-value. The critical values come to all of them from one tuple, that of `critical_values`.
+`reproduce(folder)` finds the critical values, computes what the figures show, and draws them. What
+the phase portraits before, at and after a critical value show is said in one place, their line in
+`PORTRAITS`. The critical values come to all of them from one tuple, that of `critical_values`.
 """
 
 import json
 import math
-import operator
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +28,6 @@ from .bifurcations import (
     SuddenSliding,
     leaf_index,
 )
-from .compiling import jit
 from .cycles import Cycle, unstable_cycle
 from .detection import Guess, refined
 from .diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
@@ -50,6 +47,8 @@ from .simulate import Trajectory, simulate
 
 #: Every portrait runs over this time (dimensionless), sampled at so many times.
 TIME_SPAN, SAMPLES = 60.0, 2401
+#: Room for the arcs of every run here: one program serves all.
+BUDGET = 512
 #: Transients that do not join a cycle are drawn until this time.
 TRANSIENT = 25.0
 
@@ -192,7 +191,7 @@ class Portraits(NamedTuple):
         panels = []
         for letter, (nu0, relation, cycle) in zip("abcd", relations, strict=False):
             osc = paper_oscillator(self.system, nu0)
-            centre = float(equilibria(osc).x1[0])
+            centre = float(equilibria(_with_two_belts(osc)).x1[0])
             starts = tuple((centre + x1, x2) for x1, x2 in self.starts)
             panels.append(Panel(f"({letter}) ${relation}$", osc, starts, cycle))
         return panels
@@ -209,22 +208,17 @@ class SimulatedCycle(NamedTuple):
 
 
 def simulate_panels(panels: Sequence[Panel]) -> list[list[Trajectory]]:
-    """The orbits of every panel, all in one batch, so that one program is compiled."""
-    lanes = [
-        (_with_two_belts(panel.oscillator), start) for panel in panels for start in panel.starts
+    """The orbits of every panel, sampled at the same times."""
+    return [
+        [_orbit(_with_two_belts(panel.oscillator), start) for start in panel.starts]
+        for panel in panels
     ]
-    oscillators = jax.tree.map(lambda *leaves: np.stack(leaves), *(osc for osc, _ in lanes))
-    starts = np.array([start for _, start in lanes])
-    batch = jax.tree.map(np.asarray, _run(oscillators, starts))
-    trajectories = (jax.tree.map(operator.itemgetter(lane), batch) for lane in range(len(lanes)))
-    return [[next(trajectories) for _ in panel.starts] for panel in panels]
 
 
-@jit
-@jax.vmap
-def _run(osc: Oscillator, start: jax.Array) -> Trajectory:
+def _orbit(osc: Oscillator, start: tuple[float, float]) -> Trajectory:
     times = np.linspace(0.0, TIME_SPAN, SAMPLES)
-    return simulate(osc, start, TIME_SPAN, ts=times, rtol=1e-7, atol=1e-7)
+    run = simulate(osc, start, TIME_SPAN, ts=times, rtol=1e-7, atol=1e-7, max_segments=BUDGET)
+    return jax.tree.map(np.asarray, run)
 
 
 def _with_two_belts(osc: Oscillator) -> Oscillator:
@@ -277,7 +271,7 @@ def find_unstable_cycles(panels: Sequence[Panel]) -> list[Cycle]:
 def draw_portraits(
     portraits: Portraits,
     panels: Sequence[Panel],
-    orbits: Sequence[Sequence[Trajectory]],
+    orbits: Future[list[list[Trajectory]]],
     unstable: Sequence[Cycle],
 ) -> plotting.Figure:
     """The portraits side by side: transients thin, the steady cycle thick, equilibria."""
@@ -286,7 +280,9 @@ def draw_portraits(
         axes = figure.subplots(1, 3, sharey=True)
     else:
         axes = figure.subplots(2, 2, sharex=True, sharey=True)
-    for ax, panel, trajectories, repelling in zip(axes.flat, panels, orbits, unstable, strict=True):
+    for ax, panel, trajectories, repelling in zip(
+        axes.flat, panels, orbits.result(), unstable, strict=True
+    ):
         steady = [cycle for cycle in map(steady_cycle, trajectories) if cycle is not None]
         cycle = steady[0] if steady else None
         exists = int(repelling.status) == Status.OK
@@ -317,7 +313,7 @@ def _with_symbols(remark: str) -> str:
 
 def _equilibria(osc: Oscillator) -> Equilibria:
     """Where the mass can rest. A subcritical Hopf point repels, whatever rounding says of it."""
-    found = equilibria(osc)
+    found = equilibria(_with_two_belts(osc))
     attracts = found.stable & ~(jnp.abs(found.rate) < 1e-9)
     return eqx.tree_at(lambda rows: rows.stable, found, attracts)
 
@@ -386,12 +382,13 @@ def formulation_errors(
     Class (b) with nu0 = -0.2, nu1 = 0.35 from (2, 0): four stick phases, both belts. The order is
     the slope over the three smallest widths.
     """
-    osc, y0, span, ts = class_b(-0.2, PUBLISHED_NU1), (2.0, 0.0), 15.0, jnp.linspace(0.0, 15.0, 31)
-    exact = simulate(osc, y0, span, ts=ts).ys
+    osc, y0, span = class_b(-0.2, PUBLISHED_NU1), (2.0, 0.0), 15.0
+    ts = np.linspace(0.0, span, SAMPLES)
+    exact = simulate(osc, y0, span, ts=ts, max_segments=BUDGET).ys
 
     def error(value):
         run = simulate(osc, y0, span, ts=ts, formulation=formulation, **{width: value})
-        return float(jnp.max(jnp.abs(run.ys - exact)))
+        return float(np.max(np.abs(np.asarray(run.ys) - np.asarray(exact))))
 
     errors = np.array([error(value) for value in widths])
     order = np.polyfit(np.log(widths[-3:]), np.log(errors[-3:]), 1)[0]
@@ -458,30 +455,16 @@ def draw_map(regions: RegionMap) -> plotting.Figure:
     return figure
 
 
-def _draw_diagram(diagram: BifurcationDiagram, note: str) -> plotting.Figure:
+def draw_diagram(diagram: BifurcationDiagram, note: str) -> plotting.Figure:
+    """Fig. 3 or 7."""
     figure = plotting.journal_figure(7.2, 4.2)
     plotting.plot_diagram(diagram, figure.subplots())
     plotting.draw_key(figure, note=_with_symbols(note))
     return figure
 
 
-class Computed(NamedTuple):
-    """What is computed for the figures other than the portraits."""
-
-    diagram_a: BifurcationDiagram
-    diagram_b: BifurcationDiagram
-    map_b: RegionMap
-    studies: list[Study]
-
-
-#: Every figure of the paper that can be drawn, by the name of its file, and one of our own.
-FIGURES: dict[str, Callable[[Computed], plotting.Figure] | Portraits] = {
-    "fig01": lambda computed: draw_model(),
-    "fig02": lambda computed: draw_classes(),
-    "fig03": lambda computed: _draw_diagram(computed.diagram_a, MISPRINT),
-    "fig06": lambda computed: draw_map(computed.map_b),
-    "fig07": lambda computed: _draw_diagram(computed.diagram_b, MISSING_REGION),
-    "formulations": lambda computed: draw_formulations(computed.studies),
+#: The phase portraits of the paper, by the name of the file.
+PORTRAITS: dict[str, Portraits] = {
     "fig04": Portraits(
         "a",
         "nu_alpha",
@@ -560,9 +543,13 @@ FIGURES: dict[str, Callable[[Computed], plotting.Figure] | Portraits] = {
 }
 
 
+#: Every figure, by the name of its file: those of the paper that can be drawn, and one of our own.
+FIGURES = sorted([*PORTRAITS, "fig01", "fig02", "fig03", "fig06", "fig07", "formulations"])
+
+
 def steps() -> int:
     """How many times `reproduce` reports progress."""
-    return len(FIGURES) + 4
+    return len(FIGURES) + 3
 
 
 def reproduce(
@@ -573,35 +560,38 @@ def reproduce(
     folder: made where it is not there. progress: called `steps()` times, with what comes next.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    # From a cold start nearly all the time goes into compiling, so two threads use two cores.
+    # From a cold start nearly all the time goes into compiling. Two threads use two cores: this one
+    # finds bifurcations, with programs that follow from one another, and the other one does the
+    # rest, and all the drawing.
     with ThreadPoolExecutor(1) as beside:
-        studies = beside.submit(study_formulations)
+        drawings: list[Future] = []
+
+        def draw(name: str, figure: Callable[..., plotting.Figure], *given: Any) -> None:
+            def drawn():
+                progress(name)
+                with plotting.journal_style():
+                    plotting.save(figure(*given), folder / f"{name}.png")
+
+            drawings.append(beside.submit(drawn))
+
         progress("critical values")
+        draw("formulations", lambda: draw_formulations(study_formulations()))
+        draw("fig01", draw_model)
+        draw("fig02", draw_classes)
         values = critical_values()
         text = json.dumps(as_json(values), indent=2)
         (folder / "critical_values.json").write_text(text + "\n", encoding="utf-8")
 
-        panels = {
-            name: figure.panels(values)
-            for name, figure in FIGURES.items()
-            if isinstance(figure, Portraits)
-        }
-        flat = [panel for group in panels.values() for panel in group]
-        orbits = beside.submit(simulate_panels, flat)
-        unstable = beside.submit(find_unstable_cycles, flat)
         progress("bifurcation diagrams")
-        diagrams = diagram_a(), diagram_b()
+        panels = {name: figure.panels(values) for name, figure in PORTRAITS.items()}
+        orbits = {name: beside.submit(simulate_panels, own) for name, own in panels.items()}
+        draw("fig03", draw_diagram, diagram_a(), MISPRINT)
+        draw("fig07", draw_diagram, diagram_b(), MISSING_REGION)
+        for name, own in panels.items():
+            repelling = find_unstable_cycles(own)
+            draw(name, draw_portraits, PORTRAITS[name], own, orbits[name], repelling)
         progress("region map")
-        computed = Computed(*diagrams, map_b(), studies.result())
-        progress("orbits of the phase portraits")
-        portraits = zip(orbits.result(), unstable.result(), strict=True)
-    with plotting.journal_style():
-        for name, figure in FIGURES.items():
-            progress(name)
-            if isinstance(figure, Portraits):
-                own, repelling = zip(*(next(portraits) for _ in panels[name]), strict=True)
-                drawn = draw_portraits(figure, panels[name], own, repelling)
-            else:
-                drawn = figure(computed)
-            plotting.save(drawn, folder / f"{name}.png")
+        draw("fig06", draw_map, map_b())
+        for drawing in drawings:
+            drawing.result()
     return values

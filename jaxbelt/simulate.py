@@ -694,7 +694,7 @@ def simulate(
         repr(formulation),
     )
     span = float(t1 - t0) if is_concrete((t0, t1)) else 100.0
-    resolution = _power_of_two(10 * span, 512)
+    resolution = 0 if ts is not None else _power_of_two(10 * span, 512)
     if formulation != "filippov":
         name = "v_star" if formulation == "switch" else "eps"
         width = as_numbers(v_star if formulation == "switch" else eps, name)

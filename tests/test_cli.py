@@ -244,12 +244,7 @@ def test_reproduce_tells_in_one_sentence_where_it_cannot_write(tmp_path):
 def test_portraits_show_what_the_paper_says_of_the_regions():
     """Which panels have a steady cycle, and on which belts it sticks."""
     values = reproduce.critical_values()
-    figures = {
-        name: figure
-        for name, figure in reproduce.FIGURES.items()
-        if isinstance(figure, reproduce.Portraits)
-    }
-    panels = {name: figure.panels(values) for name, figure in figures.items()}
+    panels = {name: figure.panels(values) for name, figure in reproduce.PORTRAITS.items()}
     orbits = iter(
         reproduce.simulate_panels([panel for group in panels.values() for panel in group])
     )
