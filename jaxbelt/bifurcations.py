@@ -213,8 +213,8 @@ def vary(osc: Oscillator, index: int | Array, p: Array) -> Oscillator:
     Where the number is an array, one program serves all parameters.
     """
     leaves, structure = jax.tree.flatten(osc)
-    if isinstance(index, int):
-        leaves[index] = p[0]
+    if is_concrete(index) and (isinstance(index, int) or is_concrete((osc, p))):
+        leaves[int(index)] = p[0]
     else:
         leaves = [jnp.where(index == i, p[0], leaf) for i, leaf in enumerate(leaves)]
     return jax.tree.unflatten(structure, leaves)
@@ -223,7 +223,7 @@ def vary(osc: Oscillator, index: int | Array, p: Array) -> Oscillator:
 def parameter(osc: Oscillator, index: int | Array) -> Array:
     """The parameter of that number."""
     leaves = jax.tree.leaves(osc)
-    return leaves[index] if isinstance(index, int) else jnp.stack(leaves)[index]
+    return leaves[int(index)] if is_concrete(index) else jnp.stack(leaves)[index]
 
 
 @jit

@@ -137,7 +137,7 @@ def bifurcation_curve(
     require(int(point.status) == Status.OK, "point", "one with status OK", repr(point))
     require(len(where) == 2, "where", "two functions", repr(where))
     osc = point.oscillator
-    indices = jnp.asarray([leaf_index(osc, one) for one in where])
+    indices = jnp.asarray(np.array([leaf_index(osc, one) for one in where]))
     require(indices[0] != indices[1], "where", "two different parameters", "one twice")
     limits = np.stack([np.asarray(as_array(ends, "span", (2,))) for ends in span])
     check_finite(limits, "span")
@@ -299,7 +299,7 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
                 at = [float(parameter(point.oscillator, index)) for index in problem.indices]
                 away = np.array(at) - centre
                 distance = float(np.linalg.norm(away))
-                fine = point.status == Status.OK and 0 < distance < 3 * problem.step
+                fine = 0 < distance < 3 * problem.step
                 if fine and (away / distance) @ came_from < 0.7:
                     if best is None or distance < best[0]:
                         best = distance, point

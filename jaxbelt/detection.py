@@ -159,7 +159,7 @@ class Path:
         self.first, self.last = (float(end) for end in span)
         require(self.first < self.last, "span", "(first, last) with first < last", tuple(span))
         # As an array: one program serves all parameters.
-        self.osc, self.index = osc, jnp.asarray(leaf_index(osc, where))
+        self.osc, self.index = osc, jnp.asarray(np.array(leaf_index(osc, where)))
         for value in (self.first, self.last):
             self.at(value).check()
         self.length = self.last - self.first
@@ -326,7 +326,7 @@ def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoin
         ]
         for guess, point in refined(path.osc, path.index, guesses):
             a, b = guess.interval
-            if point.status == Status.OK and a <= point.value <= b and found[a, b] is None:
+            if a <= point.value <= b and found[a, b] is None:
                 found[a, b] = point
     return found
 
@@ -356,7 +356,7 @@ def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
         Guess(interval, value + offset, one) for one in conditions for offset in (1e-2, -1e-2)
     ]
     solved = refined(path.osc, path.index, guesses)
-    found = {guess.condition: point for guess, point in solved if point.status == Status.OK}
+    found = {guess.condition: point for guess, point in solved}
     path.look(interval)
     before, after = map(path.label, interval)
     if not found and before != after:
@@ -367,7 +367,7 @@ def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
 def refined(
     osc: Oscillator, index: Array, guesses: Sequence[Guess]
 ) -> list[tuple[Guess, BifurcationPoint]]:
-    """The guesses, those of one kind after those of another, with the points found from them.
+    """The guesses from which a point was found, those of one kind after those of another, with it.
 
     A tangency, of whichever kind it is looked for, is returned as what it is.
     """
@@ -378,8 +378,10 @@ def refined(
             filled = [*batch, *[batch[0]] * (GUESSES - len(batch))]
             values = jnp.asarray(np.array([guess.value for guess in filled]))
             belts = jnp.asarray(np.array([_belts(guess.condition) for guess in filled]))
-            solved = _points(solve, osc, index, values, belts)
+            solved = jax.tree.map(np.asarray, _points(solve, osc, index, values, belts))
             for lane, guess in enumerate(batch):
+                if solved.status[lane] != Status.OK:
+                    continue
                 point, condition = pick(solved, lane), guess.condition
                 if isinstance(condition, GrazingSliding | NonsmoothFold):
                     is_fold = point.multiplier > 1

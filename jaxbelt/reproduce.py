@@ -111,18 +111,18 @@ def critical_values() -> tuple[CriticalValue, ...]:
         for row in rows:
             guess = row.printed + AWAY
             guesses.append(Guess((row.printed - AWAY, guess), guess, wanted[row]))
-        points = dict(refined(osc, jnp.asarray(leaf_index(osc, _velocity)), guesses))
+        points = dict(refined(osc, jnp.asarray(np.array(leaf_index(osc, _velocity))), guesses))
         for row, guess in zip(rows, guesses, strict=True):
-            point = points[guess]
-            agrees = point.condition == wanted[row]
-            has_cycle = int(point.cycle.status) == Status.OK
-            is_fold = isinstance(point.condition, NonsmoothFold)
+            point = points.get(guess)
+            if point is None or point.condition != wanted[row]:
+                values[row] = CriticalValue(*row, math.nan, math.nan, 0, None)
+                continue
             values[row] = CriticalValue(
                 *row,
-                computed=float(point.value) if agrees else math.nan,
+                computed=float(point.value),
                 residual=float(point.residual),
                 iterations=int(point.iterations),
-                cycle=point.cycle if has_cycle and is_fold else None,
+                cycle=point.cycle if isinstance(point.condition, NonsmoothFold) else None,
             )
     return tuple(values[row] for row in PUBLISHED)
 
