@@ -308,7 +308,8 @@ def newton(step: Callable[[Any], tuple[Any, Array, Array]], start: Any) -> Newto
         return Newton(z, size, n.iterations + 1, lengths, matrix)
 
     none = jnp.full(NEWTON_STEPS, jnp.nan)
-    matrix = jnp.zeros(eqx.filter_eval_shape(step, start)[2].shape)
+    size = sum(leaf.size for leaf in jax.tree.leaves(start))
+    matrix = jnp.zeros((size, size))
     first = Newton(start, jnp.zeros(()), jnp.asarray(0), none, matrix)
     return lax.while_loop(unfinished, improve, first)
 

@@ -199,7 +199,7 @@ class Path:
         """Find the labels there, in batches."""
         new = np.array(sorted({float(v) for v in values} - self.labels.keys()))
         for batch in (new[i : i + BATCH] for i in range(0, new.size, BATCH)):
-            filled = np.concatenate([batch, np.full(BATCH - batch.size, new[0])])
+            filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
             seen = jax.tree.map(np.asarray, _look(self.osc, self.index, jnp.asarray(filled)))
             for lane, value in enumerate(batch):
                 at_value = jax.tree.map(lambda x, i=lane: x[i], seen)
@@ -375,9 +375,10 @@ def refined(
     for solve in (at_hopf, at_cycle, at_rest, at_fold_of_cycles):
         own = [guess for guess in guesses if _solver(guess.condition) == solve]
         for batch in (own[i : i + GUESSES] for i in range(0, len(own), GUESSES)):
-            filled = [*batch, *[batch[0]] * (GUESSES - len(batch))]
-            values = jnp.asarray(np.array([guess.value for guess in filled]))
-            belts = jnp.asarray(np.array([_belts(guess.condition) for guess in filled]))
+            # Rows that are not needed are NaN, which ends at once.
+            unused = GUESSES - len(batch)
+            values = jnp.asarray(np.array([g.value for g in batch] + [np.nan] * unused))
+            belts = jnp.asarray(np.array([_belts(g.condition) for g in batch] + [(0, 0)] * unused))
             solved = jax.tree.map(np.asarray, _points(solve, osc, index, values, belts))
             for lane, guess in enumerate(batch):
                 if solved.status[lane] != Status.OK:
