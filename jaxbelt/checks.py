@@ -24,7 +24,8 @@ def is_concrete(value: Any) -> bool:
 def pick(tree: Any, index: Any) -> Any:
     """The tree with every array indexed; where it is known in NumPy, which compiles nothing."""
     if is_concrete((tree, index)):
-        return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[index]), tree)
+        # Put there as they are: jnp.asarray compiles a program for every shape.
+        return jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree))
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
