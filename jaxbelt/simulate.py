@@ -54,6 +54,8 @@ from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
 #: Longest step, in units of 1/(angular frequency of the spring): well below half a turn.
 MAX_STEP = 0.5
+#: First step of an arc.
+FIRST_STEP = 0.2
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
 #: because near-grazing events amplify them.
 SAFETY = 0.03
@@ -61,6 +63,9 @@ SAFETY = 0.03
 MAX_ARC = 1.0
 #: Segments are run in blocks of so many; the budget is rounded up to whole blocks.
 BLOCK = 32
+#: Samples computed at once: on the CPU XLA uses threads of its own for more than 512 bytes, which
+#: cost more than they bring here.
+SAMPLED = 64
 #: Steps that one segment may take before it is given up.
 MAX_STEPS = 100_000
 
@@ -293,7 +298,7 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
         _RememberStart(_SOLVER),
         t0=zero,
         t1=span,
-        dt0=None,
+        dt0=jnp.full_like(span, FIRST_STEP),
         y0=(y, (zero, *y)),
         saveat=diffrax.SaveAt(t1=True),
         stepsize_controller=_controller(SAFETY * rtol, SAFETY * atol),
@@ -354,7 +359,7 @@ def _flow(osc, mode, y, duration, rtol, atol):
         _SOLVER,
         t0=jnp.zeros_like(duration),
         t1=duration,
-        dt0=None,
+        dt0=jnp.full_like(duration, FIRST_STEP),
         y0=y,
         saveat=diffrax.SaveAt(t1=True),
         stepsize_controller=_controller(rtol, atol),
@@ -560,21 +565,28 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     # Past the end of the last arc the run either rests, with a reason, or is unknown.
     rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
 
-    def at(t):
-        i = jnp.maximum(jnp.searchsorted(entries, t, side="right") - 1, 0)
-        arc = jax.tree.map(lambda leaf: leaf[i], records)
-        mode = Mode(tuple(arc.mode[j].astype(float) for j in range(len(osc.belts))))
-        beyond = t > final.t
-        since = jnp.where(beyond, 0.0, t - arc.t)
-        y = (arc.y[0], arc.y[1])
-        flown = _flow(osc, mode, y, jnp.where(mode.any_stuck, 0.0, since), rtol, atol)
-        v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
-        x1 = jnp.where(mode.any_stuck, y[0] + v * since, flown[0])
-        x2 = jnp.where(mode.any_stuck, v, flown[1])
-        afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
-        return jnp.where(beyond, afterwards, jnp.stack([x1, x2])), arc.mode
+    numbers = jnp.maximum(jnp.searchsorted(entries, ts, side="right") - 1, 0)
+    arcs = jax.tree.map(lambda leaf: leaf[numbers], records)
+    beyond = ts > final.t
+    since = jnp.where(beyond, 0.0, ts - arcs.t)
+    stuck = jnp.any(arcs.mode == 0, axis=1)
 
-    return jax.vmap(at)(ts)
+    def at(arc, since, stuck):
+        mode = Mode(tuple(arc.mode[j].astype(float) for j in range(len(osc.belts))))
+        flown = _flow(osc, mode, (arc.y[0], arc.y[1]), jnp.where(stuck, 0.0, since), rtol, atol)
+        v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
+        carried = arc.y[0] + v * since, v
+        return jnp.stack(select(stuck, carried, flown))
+
+    # A few at a time, and those together that are as far from where their arc begins.
+    order = jnp.argsort(lax.stop_gradient(jnp.where(stuck, 0.0, since)))
+    filled = jnp.concatenate([order, jnp.zeros(-ts.size % SAMPLED, order.dtype)])
+    rows = jax.tree.map(
+        lambda leaf: leaf[filled].reshape(-1, SAMPLED, *leaf.shape[1:]), (arcs, since, stuck)
+    )
+    ys = lax.map(lambda row: jax.vmap(at)(*row), rows).reshape(-1, 2)[jnp.argsort(order)]
+    afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
+    return jnp.where(beyond[:, None], afterwards, ys), arcs.mode
 
 
 @jit
