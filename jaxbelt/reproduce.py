@@ -268,21 +268,15 @@ def find_unstable_cycles(panels: Sequence[Panel]) -> list[Cycle]:
     return [unstable_cycle(_with_two_belts(panel.oscillator)) for panel in panels]
 
 
-def draw_portraits(
-    portraits: Portraits,
-    panels: Sequence[Panel],
-    orbits: Future[list[list[Trajectory]]],
-    unstable: Sequence[Cycle],
-) -> plotting.Figure:
+def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> plotting.Figure:
     """The portraits side by side: transients thin, the steady cycle thick, equilibria."""
+    orbits, unstable = simulate_panels(panels), find_unstable_cycles(panels)
     figure = plotting.journal_figure(7.2, 2.75 if len(panels) == 3 else 4.9)
     if len(panels) == 3:
         axes = figure.subplots(1, 3, sharey=True)
     else:
         axes = figure.subplots(2, 2, sharex=True, sharey=True)
-    for ax, panel, trajectories, repelling in zip(
-        axes.flat, panels, orbits.result(), unstable, strict=True
-    ):
+    for ax, panel, trajectories, repelling in zip(axes.flat, panels, orbits, unstable, strict=True):
         steady = [cycle for cycle in map(steady_cycle, trajectories) if cycle is not None]
         cycle = steady[0] if steady else None
         exists = int(repelling.status) == Status.OK
@@ -584,12 +578,10 @@ def reproduce(
 
         progress("bifurcation diagrams")
         panels = {name: figure.panels(values) for name, figure in PORTRAITS.items()}
-        orbits = {name: beside.submit(simulate_panels, own) for name, own in panels.items()}
+        for name, own in panels.items():
+            draw(name, draw_portraits, PORTRAITS[name], own)
         draw("fig03", draw_diagram, diagram_a(), MISPRINT)
         draw("fig07", draw_diagram, diagram_b(), MISSING_REGION)
-        for name, own in panels.items():
-            repelling = find_unstable_cycles(own)
-            draw(name, draw_portraits, PORTRAITS[name], own, orbits[name], repelling)
         progress("region map")
         draw("fig06", draw_map, map_b())
         for drawing in drawings:
