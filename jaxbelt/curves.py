@@ -11,6 +11,7 @@ may change; the condition is then refined anew just beyond, and the curve goes o
 the signature that is found.
 """
 
+import functools
 import importlib
 from collections.abc import Callable
 from itertools import combinations
@@ -33,14 +34,24 @@ from .bifurcations import (
     NonsmoothFold,
     SlidingExchange,
     SuddenSliding,
-    before_onset,
     leaf_index,
     parameter,
     vary,
 )
 from .checks import as_array, check_finite, require
 from .continuation import CurvePoint, End, continue_curve, corrected
-from .cycles import Chain, Ends, Turn, cycle_of, follow, meshed, trace_of
+from .cycles import (
+    SIZES,
+    Chain,
+    Ends,
+    Turn,
+    admissible,
+    cycle_of,
+    follow,
+    meshed,
+    newton,
+    trace_of,
+)
 from .detection import Guess, refined
 from .equilibria import EquilibriumKind, equilibria
 from .modes import Mode, boundary_guards, edge_guards, mode_acceleration
@@ -52,6 +63,11 @@ from .results import Status
 WEIGHT = 0.1
 #: After so many points the steps of integration are spread anew.
 REMESH = 10
+#: How far from an equilibrium its unstable manifold begins to be followed: the error is some third
+#: power of it over the velocity at which the friction law bends, 1/p3 for Conti's law.
+DEPARTURE = 1e-5
+#: Integration steps for each arc of that orbit; it takes long to leave.
+STEPS = 48
 
 
 class SpecialPoint(NamedTuple):
@@ -206,7 +222,7 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
         if len(rows) >= problem.max_points or not piece:
             return _Side(rows, special, End.POINT_COUNT if piece else End.STEP_TOO_SMALL)
         last = piece[-1][0]
-        if end is not End.LEFT_SPAN and (rest := _limit_at_rest(problem, rows)):
+        if end is not End.LEFT_SPAN and (rest := _limit_at_rest(problem, system, rows)):
             return _Side(rows, [*special, rest], End.STOPPED)
         if beyond is None and end is not End.POINT_COUNT:
             return _Side(rows, special, end or End.STOPPED)
@@ -305,14 +321,13 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
     return None if best is None else best[1]
 
 
-def _limit_at_rest(problem: _Problem, rows: list[_Row]) -> SpecialPoint | None:
+def _limit_at_rest(problem: _Problem, system, rows: list[_Row]) -> SpecialPoint | None:
     """Where the curve of a tangency ends at a belt at rest, if that is near.
 
-    No cycle exists in the limit: the orbit takes ever longer to leave the equilibrium, more and
-    more along its stronger direction. So points are found ever nearer, as zeros of the distance by
-    which the orbit from slip onset on that belt stays short of the touched boundary. Their errors
-    are a geometric sequence, whose limit is known (Aitken); the residual is a tenth of what that
-    adds.
+    No cycle exists in the limit: slip onset on the belt meets an equilibrium, which the orbit takes
+    ever longer to leave. Of its two unstable directions the stronger one wins, by the power
+    1 - weak/strong of the velocity. So in the limit the orbit along that direction is tangent to
+    the boundary, which is a regular problem.
     """
     condition = problem.condition
     velocities = [
@@ -331,53 +346,85 @@ def _limit_at_rest(problem: _Problem, rows: list[_Row]) -> SpecialPoint | None:
             return SpecialPoint("BeltAtRest", condition.belts, (0.0, 0.0), 0.0)
         if not isinstance(condition, NonsmoothFold | GrazingSliding):
             return None
-        pair = problem.indices if held == 0 else problem.indices[::-1]
+        guess = np.polyval(np.polyfit(nu, free, 2), 0.0)
+        still = vary(problem.osc, problem.indices[held], jnp.zeros(1))
         belts = (jnp.asarray(resting), jnp.asarray(condition.belt))
-        guess = float(np.polyval(np.polyfit(nu, free, 2), 0.0))
-        found, reach = [], 3 * problem.step
-        for speed in (1e-5, 1e-6, 1e-7):
-            given = (problem.osc, pair, belts, float(np.copysign(speed, nu[2])))
-            value = _where_gap_closes(*given, (guess - reach, guess + reach))
-            if value is None:
-                return None
-            found.append(value)
-        before, after = found[1] - found[0], found[2] - found[1]
-        limit = found[2] + after**2 / (before - after)
-        values = (limit, 0.0) if held else (0.0, limit)
-        return SpecialPoint("BeltAtRest", (resting,), values, 0.1 * abs(limit - found[2]))
+        # A cycle begins at the end of its longest stick phase, which is the one on that belt.
+        codes = system.args[2].chain.codes[0]
+        value, residual = _tangent_departure(
+            still, problem.indices[1 - held], codes, *belts, jnp.full(1, guess)
+        )
+        if not (residual < 1e-9 and abs(value - guess) < 3 * problem.step):
+            return None
+        values = (float(value), 0.0) if held else (0.0, float(value))
+        return SpecialPoint("BeltAtRest", (resting,), values, float(residual))
     return None
 
 
-def _where_gap_closes(osc, indices, belts, velocity: float, ends) -> float | None:
-    def gap(value):
-        return float(_gap(osc, indices, belts, jnp.asarray([velocity, value])))
-
-    if not gap(ends[0]) * gap(ends[1]) < 0:
-        return None
-    root: Any = brentq(gap, *ends, xtol=1e-13)
-    return float(root)
-
-
 @eqx.filter_jit
-def _gap(osc: Oscillator, indices, belts, pair: Array) -> Array:
-    """By how much the orbit from slip onset on the first belt stays short of the second's boundary.
+def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: Array):
+    """Value of a parameter for which the orbit from `_departure` is tangent to another boundary.
 
-    Negative where it reaches it, or nan where it does not come near.
+    The 3N + 1 equations of an `Encounter`, but that the orbit is not closed: it begins on the
+    unstable manifold. Returns the residual, too, with every integration step halved; nan where
+    there is no such orbit.
     """
-    osc = _with(osc, indices, pair)
-    onset, touched = belts
-    orbit = follow(osc, before_onset(osc, onset), HINT_BUDGET)
-    rows = jnp.arange(HINT_BUDGET)
-    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
-    nu = jnp.stack([belt.velocity for belt in osc.belts])[touched]
+    osc_at = functools.partial(vary, osc, index)
+    start = _departure(osc_at(guess), codes, resting)
+    orbit = follow(osc_at(guess), start, HINT_BUDGET)
     names = Ends(len(osc.belts))
-    inside = (rows > 0) & (rows < orbit.count)
-    turns = inside & (orbit.ends == names.turn_x2) & (exits[:, 1] * jnp.sign(nu) > 0)
-    hits = inside & (orbit.ends == touched)
-    turn = jnp.where(jnp.any(turns), jnp.argmax(turns), HINT_BUDGET)
-    hit = jnp.where(jnp.any(hits), jnp.argmax(hits), HINT_BUDGET)
-    gap = jnp.abs(nu) - osc.omega * jnp.abs(exits[jnp.minimum(turn, HINT_BUDGET - 1), 1])
-    return jnp.where(hit < turn, -1e-2, jnp.where(turn < HINT_BUDGET, gap, jnp.nan))
+    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
+    side = jnp.sign(jnp.stack([belt.velocity for belt in osc.belts])[touched])
+    turns = (orbit.ends == names.turn_x2) & (exits[:, 1] * side > 0)
+    meets = (turns | (orbit.ends == touched)) & (jnp.arange(HINT_BUDGET) < orbit.count)
+    last = jnp.argmax(meets)
+
+    rows = jnp.arange(SIZES[1])
+    ends = jnp.where(rows < last, orbit.ends[rows], names.unused)
+    ends = ends.at[last].set(names.tangent + touched)
+    durations = jnp.where(rows <= last, orbit.durations[rows], 0.0)
+    z = jnp.concatenate([orbit.entries[rows], durations[:, None]], axis=1)
+
+    def system(steps):
+        chain = Chain(orbit.codes[rows], ends, jnp.full((rows.size, steps), 1 / steps))
+        return Encounter(chain, jnp.stack([touched, touched]), index)
+
+    closing = 3 * rows[-1] + jnp.arange(2)  # replaced by where the orbit begins
+
+    def begins(z, p):
+        return z[0, :2] - _departure(osc_at(p), codes, resting)
+
+    def step(unknowns):
+        z, p = unknowns
+        value, matrix = system(STEPS).linearized(osc, z, p)
+        _, slope = jax.jvp(lambda p: begins(z, p), (p,), (jnp.ones(1),))
+        row = jnp.zeros((2, value.size)).at[:, :2].set(jnp.eye(2)).at[:, -1].set(slope)
+        value, matrix = value.at[closing].set(begins(z, p)), matrix.at[closing].set(row)
+        change = jnp.linalg.solve(matrix, -value)
+        return (change[:-1].reshape(z.shape), change[-1:]), jnp.max(jnp.abs(value)), matrix
+
+    z, p = newton(step, (z, guess)).z
+    value = system(2 * STEPS).residual(osc, z, p).at[closing].set(begins(z, p))
+    exists = jnp.any(meets) & (last < SIZES[1]) & admissible(osc_at(p), system(1).ordinary, z)
+    return p[0], jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)
+
+
+def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
+    """A state on the strong unstable manifold of the equilibrium of a mode, on a belt at rest.
+
+    With x2' = -(x1 - rest) + trace x2 + bend x2^2 and eigenvalues strong > weak, whose product is
+    one, x1 - rest = weak x2 - weak bend / (2 strong - weak) x2^2 is invariant to third order. NaN
+    where the eigenvalues are complex: then the orbit turns back to the belt at once, on a small
+    cycle that touches nothing else, and no curve of tangencies ends here.
+    """
+    mode, zero = Mode(tuple(codes[i] for i in range(len(osc.belts)))), jnp.zeros(())
+    rest = mode_acceleration(osc, mode, zero, zero)
+    trace, twice_bend = jax.jvp(lambda x2: trace_of(osc, mode, rest, x2)[0], (zero,), (zero + 1,))
+    strong = 0.5 * trace + jnp.sqrt(0.25 * trace**2 - 1)
+    weak = 1 / strong
+    x2 = -codes[belt] * DEPARTURE
+    x1 = rest + weak * x2 - 0.5 * weak * twice_bend / (2 * strong - weak) * x2**2
+    return jnp.where(strong > 0, jnp.stack([x1, x2]), jnp.nan)
 
 
 def _sought(condition: AbstractCondition) -> AbstractCondition:

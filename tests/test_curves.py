@@ -90,11 +90,14 @@ def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     assert found == pytest.approx(expected, abs=1e-5)
     rest = fold.special[1]
     assert (rest.kind, rest.belts) == ("BeltAtRest", (0,)) and End.STOPPED in fold.ends
-    # Just beside the end, where the error goes like the velocity to the power 0.9: some 6e-5.
-    beside = brentq(
-        lambda nu: oracle_cycles.gap(oracle.class_b(-1e-5, nu), 0, 1), 0.281, 0.287, xtol=1e-9
+    expected = brentq(
+        lambda nu: oracle_cycles.gap_from_rest(oracle.class_b(0.0, nu), 0, -1, 1),
+        0.28,
+        0.29,
+        xtol=1e-13,
     )
-    assert rest.values == pytest.approx((0.0, beside), abs=1e-4) and rest.residual < 1e-6
+    # The oracle's start is good to 1e-11.
+    assert rest.values == pytest.approx((0.0, expected), abs=1e-10) and rest.residual < 1e-12
 
 
 def test_curves_have_the_symmetries_of_the_plane(points, fold):
