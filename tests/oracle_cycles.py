@@ -335,19 +335,31 @@ def gap_from_rest(osc, resting, sign, belt, slack=0.02):
 
 
 def _gap_from(osc, y, mode, belts, slack):
-    belt = belts[-1]
-    level = osc.speed(belt)
+    run = _to_extremum(osc, y, mode, belts, slack)
+    if run.status == "overshot":
+        return -slack - abs(acceleration(osc, run.mode_end)(*run.y_end))
+    if run.status != "stopped":
+        raise ValueError(f"the orbit from the onset on belt {belts[0]} does not come back")
+    return abs(osc.speed(belts[-1])) - abs(run.stopped_by.x2)
+
+
+def _to_extremum(osc, y, mode, belts, slack):
+    """The run to the first extremum of x2 on the side of the last belt's boundary."""
+    level = osc.speed(belts[-1])
 
     def until(item):
         return isinstance(item, Turn) and item.axis == 1 and item.x2 * level > 0
 
     within = dict.fromkeys(belts, slack)
-    run = advance(osc, y, mode, 100.0, until=until, slack=within, focus_speed=0.0)
-    if run.status == "overshot":
-        return -slack - abs(acceleration(osc, run.mode_end)(*run.y_end))
-    if run.status != "stopped":
-        raise ValueError(f"the orbit from the onset on belt {belts[0]} does not come back")
-    return abs(level) - abs(run.stopped_by.x2)
+    return advance(osc, y, mode, 100.0, until=until, slack=within, focus_speed=0.0)
+
+
+def growth_from_tangency(osc, belt):
+    """Logarithm of the multiplier of a cycle that is tangent to a belt's boundary where slip onset
+    on it is, and touches no other boundary: the integral of the trace."""
+    run = _to_extremum(osc, *slip_onset(osc, belt), (belt,), 0.02)
+    assert run.status == "stopped"
+    return _divergence(osc, run)
 
 
 def nonsmooth_fold(make, bracket, belt):
