@@ -97,6 +97,7 @@ class BifurcationCurve(eqx.Module):
     the condition that holds there, a row each; multiplier: of the cycle without the stick phase
     that vanishes, [rows], NaN where there is none; residual: [rows]; special: points of codimension
     two, in order; ends: why it ends at the first and the last row; names: of the parameters.
+    `path`, `table()` and `plot()` have rows and special points together.
     """
 
     condition: AbstractCondition
@@ -114,16 +115,49 @@ class BifurcationCurve(eqx.Module):
     @property
     def path(self) -> np.ndarray:
         """The values with those of the special points among them, [rows + special, 2]."""
-        path = self.values
+        at = (i.values if isinstance(i, SpecialPoint) else self.values[i] for i in self._order())
+        return np.array(list(at))
+
+    def table(self, names: tuple[str, str] | None = None) -> list[dict[str, Any]]:
+        """The rows and special points in order, as dictionaries.
+
+        condition, belts: what holds there; the two parameters, under `names` (None: those of the
+        curve); multiplier, residual: as above; special: kind and belts of a special point, else "".
+        """
+        belts = getattr(self.condition, "belts", (getattr(self.condition, "belt", ""),))
+        rows, kind = [], self.kinds[0]
+        for item in self._order():
+            if isinstance(item, SpecialPoint):
+                values, multiplier, residual = item.values, np.nan, item.residual
+                special = " ".join(map(str, (item.kind, *item.belts)))
+            else:
+                kind, values, special = self.kinds[item], self.values[item].tolist(), ""
+                multiplier, residual = float(self.multiplier[item]), float(self.residual[item])
+            rows.append(
+                {
+                    "condition": kind,
+                    "belts": " ".join(map(str, belts)),
+                    **dict(zip(names or self.names, values, strict=True)),
+                    "multiplier": multiplier,
+                    "residual": residual,
+                    "special": special,
+                }
+            )
+        return rows
+
+    def _order(self) -> list[int | SpecialPoint]:
+        """The numbers of the rows, and the special points at their places among them."""
+        path, order = self.values, list[int | SpecialPoint](range(len(self)))
         for point in self.special:
             at = np.array(point.values)
             ends = [np.hypot(*(path[i] - at)) for i in (0, -1)]
             gaps = np.hypot(*(path[1:] - path[:-1]).T)
             detour = np.hypot(*(path[:-1] - at).T) + np.hypot(*(path[1:] - at).T) - gaps
             # At an end where that is nearer than a way round by it between two rows.
-            longer = np.array([ends[0], *detour, ends[1]])
-            path = np.insert(path, int(np.argmin(longer)), at, axis=0)
-        return path
+            place = int(np.argmin([ends[0], *detour, ends[1]]))
+            path = np.insert(path, place, at, axis=0)
+            order.insert(place, point)
+        return order
 
     def plot(self, ax: Any = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned."""

@@ -220,6 +220,20 @@ def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     assert rest.values == pytest.approx((0.0, expected), abs=1e-10) and rest.residual < 1e-12
 
 
+def test_a_table_has_rows_and_special_points_in_order(fold):
+    table = fold.table(("nu0", "nu1"))
+    assert " ".join(table[0]) == "condition belts nu0 nu1 multiplier residual special"
+    values = np.array([(row["nu0"], row["nu1"]) for row in table])
+    assert np.array_equal(values, fold.path) and len(table) == len(fold) + 2
+    named = [row["special"] for row in table if row["special"]]
+    assert named == ["DoubleSliding 0", "BeltAtRest 0"]
+    # They stand where they belong: no step is longer than one between rows, 0.02, but the last.
+    assert np.max(np.hypot(*np.diff(values[:-1], axis=0).T)) < 0.0201
+    assert {row["belts"] for row in table} == {"1"}
+    assert [row["condition"] for row in table if not row["special"]] == list(fold.kinds)
+    assert "belts[0].velocity" in fold.table()[0]
+
+
 def test_curves_have_the_symmetries_of_the_plane(points, fold):
     """The mirror image nu -> -nu, row by row; the belts exchanged, in the special points."""
     mirrored = jb.scan(jb.presets.class_b(0.3, -0.35), nu0, (0.5, 0.6))
