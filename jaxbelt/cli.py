@@ -468,10 +468,9 @@ def region_map(
 
     - **OUT.csv**: both parameters and the region's name, a row a cell.
 
-    - **OUT_curves.csv**: curve, both parameters, kind, residual, a row a point of a curve.
-
-    - **OUT_special.csv**: curve, both parameters, kind, belts, residual, a row a point of
-      codimension two.
+    - **OUT_curves.csv**: curve, condition, belts, both parameters, multiplier of the cycle without
+      the stick phase that vanishes, residual, special, a row a point of a curve. Points of
+      codimension two stand at their places, named in the last column.
 
     The other arguments of the class have the values that **simulate** takes for them.
 
@@ -499,11 +498,11 @@ def region_map(
             figure = plotting.journal_figure(7.2, 9.0)
             plotting.draw_region_map(found, figure)
             out.parent.mkdir(parents=True, exist_ok=True)
-            ends = (".png", ".csv", "_curves.csv", "_special.csv")
+            ends = (".png", ".csv", "_curves.csv")
             written = [out.with_name(out.name + end) for end in ends]
             plotting.save(figure, written[0])
         write_cells(found, written[1])
-        write_curves(found.curves, written[2], written[3])
+        write_rows(found.table(), written[2])
     for line in (repr(found), f"Written: {', '.join(map(str, written))}"):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
@@ -518,23 +517,12 @@ def write_cells(found: jb.RegionMap, path: Path) -> None:
             writer.writerow([first[i], second[j], name])
 
 
-def write_curves(curves, path: Path, special: Path) -> None:
-    """The points of curves, and in a file of their own those of codimension two."""
+def write_rows(rows: list[dict[str, Any]], path: Path) -> None:
+    """Dictionaries that have the same keys, a row each."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["curve", "p", "q", "kind", "belts", "residual"])
-        for number, curve in enumerate(curves):
-            belts = _belts_of(curve.condition)
-            rows = zip(curve.values.tolist(), curve.kinds, curve.residual.tolist(), strict=True)
-            for (p, q), kind, residual in rows:
-                writer.writerow([number, p, q, kind, belts, residual])
-    with special.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["curve", "p", "q", "kind", "belts", "residual"])
-        for number, curve in enumerate(curves):
-            for point in curve.special:
-                belts = " ".join(map(str, point.belts))
-                writer.writerow([number, *point.values, point.kind, belts, point.residual])
+        writer = csv.DictWriter(file, list(rows[0]) if rows else [])
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 # --- sweep --------------------------------------------------------------------------------------

@@ -5,12 +5,14 @@ one unknown more, the second parameter, pseudo-arclength follows it (see `contin
 points included. The signature is fixed while it lasts. Functions are watched that vanish where two
 conditions hold at once: the first Lyapunov coefficient on a Hopf curve; on a curve of tangencies
 the multiplier less one, the duration of each other stick phase and the distance of each other
-extremum of x2 from a boundary; on every curve the velocities and their differences. Where one
+extremum of x2 from a boundary, as on a curve of folds of cycles, where the cycle's size is watched,
+too; on every curve the velocities and their differences. Where one
 changes its sign the curve is solved for its zero, a point of codimension two. There the signature
 may change; the condition is then refined anew just beyond, and the curve goes on from there with
 the signature that is found.
 """
 
+import functools
 import importlib
 from collections.abc import Callable
 from itertools import combinations
@@ -28,20 +30,33 @@ from .bifurcations import (
     AbstractCondition,
     BifurcationPoint,
     Encounter,
+    FoldOfCycles,
     GrazingSliding,
     Hopf,
     NonsmoothFold,
     SlidingExchange,
     SuddenSliding,
-    before_onset,
+    UnitMultiplier,
     leaf_index,
     parameter,
+    small_newton,
     vary,
 )
 from .checks import as_array, check_finite, require
 from .compiling import jit
 from .continuation import CurvePoint, End, continue_curve, corrected
-from .cycles import Chain, Ends, Turn, cycle_of, follow, meshed, trace_of
+from .cycles import (
+    SIZES,
+    Chain,
+    Ends,
+    Turn,
+    admissible,
+    cycle_of,
+    follow,
+    meshed,
+    newton,
+    trace_of,
+)
 from .detection import Guess, refined
 from .equilibria import EquilibriumKind, equilibria
 from .modes import Mode, boundary_guards, edge_guards, mode_acceleration
@@ -53,15 +68,21 @@ from .results import Status
 WEIGHT = 0.1
 #: After so many points the steps of integration are spread anew.
 REMESH = 10
+#: How far from an equilibrium its unstable manifold begins to be followed: the error is some third
+#: power of it over the velocity at which the friction law bends, 1/p3 for Conti's law.
+DEPARTURE = 1e-5
+#: Integration steps for each arc of that orbit; it takes long to leave.
+STEPS = 48
 
 
 class SpecialPoint(NamedTuple):
     """A point of codimension two on a curve.
 
-    kind: "DegenerateHopf" (first Lyapunov coefficient 0), "FoldGrazing" (multiplier 1: the fold
-    turns into a grazing point), "DoubleSliding" (the boundary of another belt is touched, too),
-    "BeltAtRest", "EqualVelocities"; belts: concerned; values: of the two parameters; residual: the
-    largest error in all equations.
+    kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
+    "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
+    point, and a fold of cycles ends), "DoubleSliding" (the boundary of another belt is touched,
+    too), "BeltAtRest", "EqualVelocities"; belts: concerned; values: of the two parameters;
+    residual: the largest error in all equations.
     """
 
     kind: str
@@ -77,6 +98,7 @@ class BifurcationCurve(eqx.Module):
     the condition that holds there, a row each; multiplier: of the cycle without the stick phase
     that vanishes, [rows], NaN where there is none; residual: [rows]; special: points of codimension
     two, in order; ends: why it ends at the first and the last row; names: of the parameters.
+    `path`, `table()` and `plot()` have rows and special points together.
     """
 
     condition: AbstractCondition
@@ -94,16 +116,49 @@ class BifurcationCurve(eqx.Module):
     @property
     def path(self) -> np.ndarray:
         """The values with those of the special points among them, [rows + special, 2]."""
-        path = self.values
+        at = (i.values if isinstance(i, SpecialPoint) else self.values[i] for i in self._order())
+        return np.array(list(at))
+
+    def table(self, names: tuple[str, str] | None = None) -> list[dict[str, Any]]:
+        """The rows and special points in order, as dictionaries.
+
+        condition, belts: what holds there; the two parameters, under `names` (None: those of the
+        curve); multiplier, residual: as above; special: kind and belts of a special point, else "".
+        """
+        belts = getattr(self.condition, "belts", (getattr(self.condition, "belt", ""),))
+        rows, kind = [], self.kinds[0]
+        for item in self._order():
+            if isinstance(item, SpecialPoint):
+                values, multiplier, residual = item.values, np.nan, item.residual
+                special = " ".join(map(str, (item.kind, *item.belts)))
+            else:
+                kind, values, special = self.kinds[item], self.values[item].tolist(), ""
+                multiplier, residual = float(self.multiplier[item]), float(self.residual[item])
+            rows.append(
+                {
+                    "condition": kind,
+                    "belts": " ".join(map(str, belts)),
+                    **dict(zip(names or self.names, values, strict=True)),
+                    "multiplier": multiplier,
+                    "residual": residual,
+                    "special": special,
+                }
+            )
+        return rows
+
+    def _order(self) -> list[int | SpecialPoint]:
+        """The numbers of the rows, and the special points at their places among them."""
+        path, order = self.values, list[int | SpecialPoint](range(len(self)))
         for point in self.special:
             at = np.array(point.values)
             ends = [np.hypot(*(path[i] - at)) for i in (0, -1)]
             gaps = np.hypot(*(path[1:] - path[:-1]).T)
             detour = np.hypot(*(path[:-1] - at).T) + np.hypot(*(path[1:] - at).T) - gaps
             # At an end where that is nearer than a way round by it between two rows.
-            longer = np.array([ends[0], *detour, ends[1]])
-            path = np.insert(path, int(np.argmin(longer)), at, axis=0)
-        return path
+            place = int(np.argmin([ends[0], *detour, ends[1]]))
+            path = np.insert(path, place, at, axis=0)
+            order.insert(place, point)
+        return order
 
     def plot(self, ax: Any = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned."""
@@ -145,7 +200,9 @@ def bifurcation_curve(
     inside = np.all((limits[:, 0] <= start) & (start <= limits[:, 1]))
     require(inside, "span", f"around the point {start.tolist()}", limits.tolist())
     problem = _Problem(point.condition, osc, indices, limits, step, max_points)
-    ahead, behind = (_follow(problem, point, sign) for sign in (1.0, -1.0))
+    ahead = _follow(problem, point, 1.0)
+    closed = ahead.end is End.CLOSED
+    behind = _Side(ahead.rows[:1], [], End.CLOSED) if closed else _follow(problem, point, -1.0)
     rows = [*reversed(behind.rows[1:]), *ahead.rows]
     paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(osc)]
     names = [jax.tree_util.keystr(paths[int(i)]).removeprefix(".") for i in indices]
@@ -190,45 +247,78 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
     """The curve to one side of a point: piece by piece, each with one signature and one mesh."""
     system = _system_of(problem, point)
     u = system.unknowns(point)
-    direction = sign * system.tangent(u)
+    origin, direction = u[-2:], sign * system.tangent(u)
     rows: list[_Row] = []
     special: list[SpecialPoint] = []
     while True:
-        piece, end, before = [], End.STEP_TOO_SMALL, len(special)
-        for at in _piece(problem, system, u, direction):
-            piece.append((at, system.look(at.u)))
-            if len(piece) > 1:
-                special += _between(problem, system, piece[-2], piece[-1])
-            if not piece[-1][1].valid:
-                break
-            end = at.end
-        beyond = piece.pop()[0] if piece and not piece[-1][1].valid else None
-        rows += [_row(problem, at, seen) for at, seen in piece[min(len(rows), 1) :]]
-        if len(rows) >= problem.max_points or not piece:
-            return _Side(rows, special, End.POINT_COUNT if piece else End.STEP_TOO_SMALL)
-        last = piece[-1][0]
-        if end is not End.LEFT_SPAN and (rest := _limit_at_rest(problem, rows)):
-            return _Side(rows, [*special, rest], End.STOPPED)
+        points, found, beyond, end = _piece(problem, system, u, direction, origin)
+        rows += [_row(problem, at, seen) for at, seen in points[min(len(rows), 1) :]]
+        special += found
+        last = points[-1][0].u if points else u
+        if end is not End.LEFT_SPAN and (limit := _limit(problem, system, rows, last, end)):
+            return _Side(rows, [*special, limit], End.STOPPED)
+        if len(rows) >= problem.max_points or not points:
+            return _Side(rows, special, End.POINT_COUNT if points else End.STEP_TOO_SMALL)
         if beyond is None and end is not End.POINT_COUNT:
-            return _Side(rows, special, end or End.STOPPED)
+            return _Side(rows, special, end)
         if beyond is None:
             # The same curve, its mesh spread anew.
-            system, u, direction = system.renewed(last.u, last.tangent)
+            system, u, direction = system.renewed(last, points[-1][0].tangent)
             continue
         # The signature has changed between the last two points.
-        known = special[-1:] if len(special) > before else []
-        centre = np.array(known[0].values) if known else 0.5 * (last.u + beyond.u)[-2:]
-        found = _beyond(problem, last.u[-2:], centre)
-        if found is None:
+        centre = np.array(found[-1].values) if found else 0.5 * (last + beyond.u)[-2:]
+        is_end = bool(found) and isinstance(problem.condition, FoldOfCycles)
+        further = None if is_end else _beyond(problem, last[-2:], centre)
+        if further is None:
             return _Side(rows, special, End.STOPPED)
-        system = _system_of(problem, found)
-        u = system.unknowns(found)
+        system = _system_of(problem, further)
+        u = system.unknowns(further)
         direction = system.tangent(u)
-        direction *= np.sign(direction[-2:] @ (u[-2:] - centre))
+        direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
         rows.append(_row(problem, beyond._replace(u=u), system.look(u)))
 
 
-def _piece(problem: _Problem, system: "_System", u: np.ndarray, direction: np.ndarray):
+class _Piece(NamedTuple):
+    """Points with what is seen there, where there is such a motion; the next one, where there is
+    none; the points of codimension two between them."""
+
+    points: list[tuple[CurvePoint, "_Seen"]]
+    special: list[SpecialPoint]
+    beyond: CurvePoint | None
+    end: End
+
+
+def _piece(problem: _Problem, system: "_System", u, direction, origin) -> _Piece:
+    points, special = [], []
+    for at in _steps(problem, system, u, direction):
+        if points:
+            at = _closing(system, points[-1][0], at, origin) or at
+        points.append((at, system.look(at.u)))
+        if len(points) > 1:
+            special += _between(problem, system, points[-2], points[-1])
+        if not points[-1][1].valid:
+            beyond, _ = points.pop()
+            return _Piece(points, special, beyond, End.STOPPED)
+        if at.end is not None:
+            return _Piece(points, special, None, at.end)
+    return _Piece(points, special, None, End.STEP_TOO_SMALL)
+
+
+def _closing(system: "_System", before: CurvePoint, after: CurvePoint, origin) -> CurvePoint | None:
+    """The point where the curve began, if the step from one point to the next passes it."""
+    chord = (after.u - before.u)[-2:]
+    part = (origin - before.u[-2:]) @ chord / (chord @ chord)
+    if not 1e-9 < part <= 1:
+        return None
+    guess = before.u + part * (after.u - before.u)
+    normal = np.append(np.zeros(guess.size - 2), chord)
+    at = corrected(*system.problem, guess, normal / np.linalg.norm(chord), 0.0)
+    if not at.found or np.linalg.norm(at.u[-2:] - origin) > 1e-6 * np.linalg.norm(chord):
+        return None
+    return after._replace(u=at.u, tangent=at.tangent, end=End.CLOSED)
+
+
+def _steps(problem: _Problem, system: "_System", u: np.ndarray, direction: np.ndarray):
     span = np.full((2, u.size), np.inf) * np.array([[-1.0], [1.0]])
     span[:, -2:] = problem.limits.T
     return continue_curve(
@@ -306,14 +396,34 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
     return None if best is None else best[1]
 
 
-def _limit_at_rest(problem: _Problem, rows: list[_Row]) -> SpecialPoint | None:
+def _limit(problem: _Problem, system, rows: list[_Row], u, end: End) -> SpecialPoint | None:
+    """What the curve of a cycle ends in where there is no cycle, if that is near its point u."""
+    if isinstance(problem.condition, FoldOfCycles):
+        return _limit_at_hopf(problem, system, u) if end is not End.POINT_COUNT else None
+    return _limit_at_rest(problem, system, rows)
+
+
+def _limit_at_hopf(problem: _Problem, system, u: np.ndarray) -> SpecialPoint | None:
+    """Where the cycle of a fold has shrunk to an equilibrium.
+
+    The fold's own equations are singular there, those of the equilibrium are not.
+    """
+    osc, indices, codes = problem.osc, problem.indices, system.args[2].chain.codes[0]
+    guess = jnp.asarray([u[0] / float(system.args[4][0]), *u[-2:]])
+    found, residual = _degenerate_hopf((osc, indices, codes), guess)
+    values = np.asarray(found[1:])
+    if not (residual < 1e-9 and np.linalg.norm(values - u[-2:]) < 2 * problem.step):
+        return None
+    return SpecialPoint("DegenerateHopf", (), (float(values[0]), float(values[1])), float(residual))
+
+
+def _limit_at_rest(problem: _Problem, system, rows: list[_Row]) -> SpecialPoint | None:
     """Where the curve of a tangency ends at a belt at rest, if that is near.
 
-    No cycle exists in the limit: the orbit takes ever longer to leave the equilibrium, more and
-    more along its stronger direction. So points are found ever nearer, as zeros of the distance by
-    which the orbit from slip onset on that belt stays short of the touched boundary. Their errors
-    are a geometric sequence, whose limit is known (Aitken); the residual is a tenth of what that
-    adds.
+    No cycle exists in the limit: slip onset on the belt meets an equilibrium, which the orbit takes
+    ever longer to leave. Of its two unstable directions the stronger one wins, by the power
+    1 - weak/strong of the velocity. So in the limit the orbit along that direction is tangent to
+    the boundary, which is a regular problem.
     """
     condition = problem.condition
     velocities = [
@@ -332,53 +442,85 @@ def _limit_at_rest(problem: _Problem, rows: list[_Row]) -> SpecialPoint | None:
             return SpecialPoint("BeltAtRest", condition.belts, (0.0, 0.0), 0.0)
         if not isinstance(condition, NonsmoothFold | GrazingSliding):
             return None
-        pair = problem.indices if held == 0 else problem.indices[::-1]
+        guess = np.polyval(np.polyfit(nu, free, 2), 0.0)
+        still = vary(problem.osc, problem.indices[held], jnp.zeros(1))
         belts = (jnp.asarray(resting), jnp.asarray(condition.belt))
-        guess = float(np.polyval(np.polyfit(nu, free, 2), 0.0))
-        found, reach = [], 3 * problem.step
-        for speed in (1e-5, 1e-6, 1e-7):
-            given = (problem.osc, pair, belts, float(np.copysign(speed, nu[2])))
-            value = _where_gap_closes(*given, (guess - reach, guess + reach))
-            if value is None:
-                return None
-            found.append(value)
-        before, after = found[1] - found[0], found[2] - found[1]
-        limit = found[2] + after**2 / (before - after)
-        values = (limit, 0.0) if held else (0.0, limit)
-        return SpecialPoint("BeltAtRest", (resting,), values, 0.1 * abs(limit - found[2]))
+        # A cycle begins at the end of its longest stick phase, which is the one on that belt.
+        codes = system.args[2].chain.codes[0]
+        value, residual = _tangent_departure(
+            still, problem.indices[1 - held], codes, *belts, jnp.full(1, guess)
+        )
+        if not (residual < 1e-9 and abs(value - guess) < 3 * problem.step):
+            return None
+        values = (float(value), 0.0) if held else (0.0, float(value))
+        return SpecialPoint("BeltAtRest", (resting,), values, float(residual))
     return None
 
 
-def _where_gap_closes(osc, indices, belts, velocity: float, ends) -> float | None:
-    def gap(value):
-        return float(_gap(osc, indices, belts, jnp.asarray([velocity, value])))
-
-    if not gap(ends[0]) * gap(ends[1]) < 0:
-        return None
-    root: Any = brentq(gap, *ends, xtol=1e-13)
-    return float(root)
-
-
 @jit
-def _gap(osc: Oscillator, indices, belts, pair: Array) -> Array:
-    """By how much the orbit from slip onset on the first belt stays short of the second's boundary.
+def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: Array):
+    """Value of a parameter for which the orbit from `_departure` is tangent to another boundary.
 
-    Negative where it reaches it, or nan where it does not come near.
+    The 3N + 1 equations of an `Encounter`, but that the orbit is not closed: it begins on the
+    unstable manifold. Returns the residual, too, with every integration step halved; nan where
+    there is no such orbit.
     """
-    osc = _with(osc, indices, pair)
-    onset, touched = belts
-    orbit = follow(osc, before_onset(osc, onset), HINT_BUDGET)
-    rows = jnp.arange(HINT_BUDGET)
-    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
-    nu = jnp.stack([belt.velocity for belt in osc.belts])[touched]
+    osc_at = functools.partial(vary, osc, index)
+    start = _departure(osc_at(guess), codes, resting)
+    orbit = follow(osc_at(guess), start, HINT_BUDGET)
     names = Ends(len(osc.belts))
-    inside = (rows > 0) & (rows < orbit.count)
-    turns = inside & (orbit.ends == names.turn_x2) & (exits[:, 1] * jnp.sign(nu) > 0)
-    hits = inside & (orbit.ends == touched)
-    turn = jnp.where(jnp.any(turns), jnp.argmax(turns), HINT_BUDGET)
-    hit = jnp.where(jnp.any(hits), jnp.argmax(hits), HINT_BUDGET)
-    gap = jnp.abs(nu) - osc.omega * jnp.abs(exits[jnp.minimum(turn, HINT_BUDGET - 1), 1])
-    return jnp.where(hit < turn, -1e-2, jnp.where(turn < HINT_BUDGET, gap, jnp.nan))
+    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
+    side = jnp.sign(jnp.stack([belt.velocity for belt in osc.belts])[touched])
+    turns = (orbit.ends == names.turn_x2) & (exits[:, 1] * side > 0)
+    meets = (turns | (orbit.ends == touched)) & (jnp.arange(HINT_BUDGET) < orbit.count)
+    last = jnp.argmax(meets)
+
+    rows = jnp.arange(SIZES[1])
+    ends = jnp.where(rows < last, orbit.ends[rows], names.unused)
+    ends = ends.at[last].set(names.tangent + touched)
+    durations = jnp.where(rows <= last, orbit.durations[rows], 0.0)
+    z = jnp.concatenate([orbit.entries[rows], durations[:, None]], axis=1)
+
+    def system(steps):
+        chain = Chain(orbit.codes[rows], ends, jnp.full((rows.size, steps), 1 / steps))
+        return Encounter(chain, jnp.stack([touched, touched]), index)
+
+    closing = 3 * rows[-1] + jnp.arange(2)  # replaced by where the orbit begins
+
+    def begins(z, p):
+        return z[0, :2] - _departure(osc_at(p), codes, resting)
+
+    def step(unknowns):
+        z, p = unknowns
+        value, matrix = system(STEPS).linearized(osc, z, p)
+        _, slope = jax.jvp(lambda p: begins(z, p), (p,), (jnp.ones(1),))
+        row = jnp.zeros((2, value.size)).at[:, :2].set(jnp.eye(2)).at[:, -1].set(slope)
+        value, matrix = value.at[closing].set(begins(z, p)), matrix.at[closing].set(row)
+        change = jnp.linalg.solve(matrix, -value)
+        return (change[:-1].reshape(z.shape), change[-1:]), jnp.max(jnp.abs(value)), matrix
+
+    z, p = newton(step, (z, guess)).z
+    value = system(2 * STEPS).residual(osc, z, p).at[closing].set(begins(z, p))
+    exists = jnp.any(meets) & (last < SIZES[1]) & admissible(osc_at(p), system(1).ordinary, z)
+    return p[0], jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)
+
+
+def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
+    """A state on the strong unstable manifold of the equilibrium of a mode, on a belt at rest.
+
+    With x2' = -(x1 - rest) + trace x2 + bend x2^2 and eigenvalues strong > weak, whose product is
+    one, x1 - rest = weak x2 - weak bend / (2 strong - weak) x2^2 is invariant to third order. NaN
+    where the eigenvalues are complex: then the orbit turns back to the belt at once, on a small
+    cycle that touches nothing else, and no curve of tangencies ends here.
+    """
+    mode, zero = Mode(tuple(codes[i] for i in range(len(osc.belts)))), jnp.zeros(())
+    rest = mode_acceleration(osc, mode, zero, zero)
+    trace, twice_bend = jax.jvp(lambda x2: trace_of(osc, mode, rest, x2)[0], (zero,), (zero + 1,))
+    strong = 0.5 * trace + jnp.sqrt(0.25 * trace**2 - 1)
+    weak = 1 / strong
+    x2 = -codes[belt] * DEPARTURE
+    x1 = rest + weak * x2 - 0.5 * weak * twice_bend / (2 * strong - weak) * x2**2
+    return jnp.where(strong > 0, jnp.stack([x1, x2]), jnp.nan)
 
 
 def _sought(condition: AbstractCondition) -> AbstractCondition:
@@ -421,14 +563,12 @@ class _System:
         return self, u, tangent
 
     def tangent(self, u: np.ndarray) -> np.ndarray:
-        """The direction of the curve at u, in one sense or the other."""
-        matrix = np.asarray(_matrix(*self.problem, jnp.asarray(u)))
-        return np.linalg.svd(matrix)[2][-1]
-
-
-@jit
-def _matrix(residual, jacobian, args, u: Array) -> Array:
-    return jax.jacfwd(lambda v: residual(v, args))(u) if jacobian is None else jacobian(u, args)[1]
+        """The direction of the curve at u, in the sense in which a parameter grows."""
+        for axis in (-2, -1):
+            solved = corrected(*self.problem, u, np.eye(u.size)[axis], 0.0)
+            if solved.found:  # it is not where the curve turns back in this parameter
+                break
+        return solved.tangent
 
 
 def _system_of(problem: _Problem, point: BifurcationPoint) -> _System:
@@ -437,7 +577,7 @@ def _system_of(problem: _Problem, point: BifurcationPoint) -> _System:
         return _HopfSystem(problem, point)
     if kind is SuddenSliding:
         return _RestSystem(problem, point)
-    if kind in (NonsmoothFold, GrazingSliding, SlidingExchange):
+    if kind in (NonsmoothFold, GrazingSliding, SlidingExchange, FoldOfCycles):
         return _CycleSystem.begun(problem, point)
     raise ValueError(f"point must be of a kind that has curves, got {point.condition!r}")
 
@@ -488,8 +628,8 @@ def _rest_equations(u: Array, args) -> Array:
     )
 
 
-@jit
-def _look_at_rest(args, u: Array):
+def _third_derivative(u: Array, args) -> Array:
+    """That of x2' by x2 at the fixed point: 16 times the first Lyapunov coefficient."""
     osc, indices, codes = args
     osc, mode = _with(osc, indices, u[-2:]), Mode(tuple(codes))
 
@@ -497,7 +637,27 @@ def _look_at_rest(args, u: Array):
         return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
 
     third = derivative(derivative(derivative(lambda x2: mode_acceleration(osc, mode, u[0], x2))))
-    tests = {**_velocity_tests(osc), ("DegenerateHopf", ()): third(jnp.zeros(()))}
+    return third(jnp.zeros(()))
+
+
+@jit
+def _degenerate_hopf(args, guess: Array) -> tuple[Array, Array]:
+    """(x1, both parameters) where all three vanish, and the largest error."""
+    osc, indices, codes = args
+
+    def equations(osc, u):
+        given = (osc, indices, codes)
+        return jnp.append(_rest_equations(u, given), _third_derivative(u, given))
+
+    u, _, residual, _ = small_newton(equations, osc, guess)
+    return u, residual
+
+
+@jit
+def _look_at_rest(args, u: Array):
+    osc, indices, codes = args
+    osc, mode = _with(osc, indices, u[-2:]), Mode(tuple(codes))
+    tests = {**_velocity_tests(osc), ("DegenerateHopf", ()): _third_derivative(u, args)}
     rest = jnp.zeros(())
     inside = [*boundary_guards(osc, mode, rest), *edge_guards(osc, mode, u[0])]
     residual = jnp.max(jnp.abs(_rest_equations(u, args)))
@@ -540,22 +700,21 @@ class _CycleSystem(_System):
         chain, condition = point.cycle.chain, point.condition
         codes, ends = np.asarray(chain.codes), np.array(chain.ends)
         names = Ends(codes.shape[1])
-        row = -1
-        if isinstance(condition, SlidingExchange):
-            belts = condition.belts
-        else:
-            assert isinstance(condition, NonsmoothFold | GrazingSliding)
+        row, belts, index = -1, (0, 0), problem.indices[0]
+        if isinstance(condition, NonsmoothFold | GrazingSliding):
             belts = (condition.belt, condition.belt)
             # Its stick phase is the one of no duration; the arc before it is tangent.
             own = (codes[:, condition.belt] == 0) & (ends != names.unused)
             durations = np.abs(np.asarray(point.cycle.unknowns)[:, 2])
             row = int(np.argmin(np.where(own, durations, np.inf)))
             ends[(row - 1) % int(np.sum(ends != names.unused))] = names.tangent + condition.belt
-        system = Encounter(
-            Chain(chain.codes, jnp.asarray(ends), chain.mesh),
-            jnp.asarray(np.array(belts)),
-            problem.indices[0],
-        )
+        elif isinstance(condition, SlidingExchange):
+            belts = condition.belts
+        chain = Chain(chain.codes, jnp.asarray(ends), chain.mesh)
+        if isinstance(condition, FoldOfCycles):
+            system = UnitMultiplier(chain, index)
+        else:
+            system = Encounter(chain, jnp.asarray(np.array(belts)), index)
         weights = _weights(np.asarray(point.cycle.unknowns))
         return cls((point.oscillator, problem.indices, system, jnp.asarray(row), weights))
 
@@ -613,12 +772,15 @@ def _look_at_cycle(args, u: Array):
     n = len(osc.belts)
     names = Ends(n)
     rows = jnp.arange(chain.ends.size)
-    touches = row >= 0
+    touches, is_fold = row >= 0, isinstance(system, UnitMultiplier)
     others = chain.used & (rows != row)
     sticks = others & jnp.any(chain.codes == 0, axis=-1)
     slope = jnp.where(jnp.any(sticks), 0.0, slope)
     tests = _velocity_tests(osc)
     tests["FoldGrazing", ()] = jnp.where(touches & ~jnp.any(sticks), slope - 1, jnp.nan)
+    # Largest x1 less its mean. Beyond an equilibrium the equations go on, what is largest and
+    # smallest exchanged.
+    size = z[0, 0] - jnp.mean(z[:, 0], where=chain.used)
     following = jnp.roll(z, -1, axis=0)
     last = rows == jnp.sum(chain.used) - 1
     following = jnp.where(last[:, None], z[0], following)
@@ -631,12 +793,12 @@ def _look_at_cycle(args, u: Array):
         gap = jnp.min(jnp.where(slips, chain.codes[:, belt] * r, jnp.inf))
         nearest = jnp.where(jnp.any(own), shortest, gap)
         # An exchange ends where the phase of sticking vanishes.
-        watched = (touches | jnp.any(own)) & jnp.isfinite(nearest)
-        pair = ("DoubleSliding", (belt,))
-        tests[pair] = jnp.where(watched, nearest, jnp.nan)
-    valid = cycle.status == Status.OK
+        watched = (touches | is_fold | jnp.any(own)) & jnp.isfinite(nearest)
+        name = "FoldGrazing" if is_fold else "DoubleSliding"
+        tests[name, (belt,)] = jnp.where(watched, nearest, jnp.nan)
+    valid = (cycle.status == Status.OK) & ((size > 0) | (not is_fold))
     residual = jnp.max(jnp.abs(_cycle_equations(u, args)))
-    return tests, valid, jnp.where(touches, slope, jnp.nan), residual
+    return tests, valid, jnp.where(touches | is_fold, slope, jnp.nan), residual
 
 
 @jit

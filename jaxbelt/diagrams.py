@@ -189,7 +189,8 @@ class RegionMap(eqx.Module):
     names: of the two parameters, as arguments of `make`; values: of each, [n] and [m]; label: name
     of the region, [n, m], as from `region_name`, "" where the runs were undecided; curves: what
     bounds the regions, see `BifurcationCurve`; make: as given. `example(name)` is a cell well
-    inside a region; `plot()` draws the map, with a portrait of each region.
+    inside a region; `table()` has the curves as rows; `plot()` draws the map, with a portrait of
+    each region.
     """
 
     names: tuple[str, str] = eqx.field(static=True)
@@ -212,6 +213,14 @@ class RegionMap(eqx.Module):
     def oscillator(self, name: str) -> Oscillator:
         """The oscillator in that cell."""
         return self.make(**dict(zip(self.names, self.example(name), strict=True)))
+
+    def table(self) -> list[dict[str, Any]]:
+        """All curves in rows, with their number: see `BifurcationCurve.table`."""
+        return [
+            {"curve": number, **row}
+            for number, curve in enumerate(self.curves)
+            for row in curve.table(self.names)
+        ]
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the map into the axes `ax`, which are returned.

@@ -314,20 +314,52 @@ def gap(osc, onset_belt, belt, slack=0.02):
     than `slack` beyond counts as -slack - |x2'| there (continuous, and far from the pole at
     which Conti's law, continued, ends).
     """
-    y, mode = slip_onset(osc, onset_belt)
-    level = osc.speed(belt)
+    return _gap_from(osc, *slip_onset(osc, onset_belt), (onset_belt, belt), slack)
+
+
+def gap_from_rest(osc, resting, sign, belt, slack=0.02):
+    """The same for the orbit that leaves the equilibrium on a belt at rest, which came there with
+    velocities of that sign, along its stronger unstable direction (of class (b) only).
+
+    It starts on the straight line, 1e-6 away; that is as good as some 10 times its square.
+    """
+    assert osc.belts[resting].velocity == 0
+    mode = tuple(
+        sign if k == resting else int(copysign(1, b.velocity)) for k, b in enumerate(osc.belts)
+    )
+    rest = acceleration(osc, mode)(0.0, 0.0)
+    strong = max(np.roots([1.0, -trace(osc, rest), 1.0]))
+    assert np.isreal(strong)
+    x2 = -sign * 1e-6
+    return _gap_from(osc, (rest + x2 / strong, x2), mode, (resting, belt), slack)
+
+
+def _gap_from(osc, y, mode, belts, slack):
+    run = _to_extremum(osc, y, mode, belts, slack)
+    if run.status == "overshot":
+        return -slack - abs(acceleration(osc, run.mode_end)(*run.y_end))
+    if run.status != "stopped":
+        raise ValueError(f"the orbit from the onset on belt {belts[0]} does not come back")
+    return abs(osc.speed(belts[-1])) - abs(run.stopped_by.x2)
+
+
+def _to_extremum(osc, y, mode, belts, slack):
+    """The run to the first extremum of x2 on the side of the last belt's boundary."""
+    level = osc.speed(belts[-1])
 
     def until(item):
         return isinstance(item, Turn) and item.axis == 1 and item.x2 * level > 0
 
-    run = advance(
-        osc, y, mode, 100.0, until=until, slack={onset_belt: slack, belt: slack}, focus_speed=0.0
-    )
-    if run.status == "overshot":
-        return -slack - abs(acceleration(osc, run.mode_end)(*run.y_end))
-    if run.status != "stopped":
-        raise ValueError(f"the orbit from the onset on belt {onset_belt} does not come back")
-    return abs(level) - abs(run.stopped_by.x2)
+    within = dict.fromkeys(belts, slack)
+    return advance(osc, y, mode, 100.0, until=until, slack=within, focus_speed=0.0)
+
+
+def growth_from_tangency(osc, belt):
+    """Logarithm of the multiplier of a cycle that is tangent to a belt's boundary where slip onset
+    on it is, and touches no other boundary: the integral of the trace."""
+    run = _to_extremum(osc, *slip_onset(osc, belt), (belt,), 0.02)
+    assert run.status == "stopped"
+    return _divergence(osc, run)
 
 
 def nonsmooth_fold(make, bracket, belt):

@@ -1,5 +1,6 @@
-"""Curves in the plane of both velocities: against refined points, closed forms and symmetry."""
+"""Curves in two parameters: against refined points, closed forms, the oracle and symmetry."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import oracle
@@ -47,24 +48,143 @@ def test_the_hopf_curve_is_that_of_the_closed_form(points):
     assert special.kind == "EqualVelocities" and special.values == pytest.approx((0.3, 0.3))
 
 
-def test_every_row_is_what_refine_finds(fold):
-    """Refined over nu0 or nu1, whichever the curve crosses, in the neighbourhood of each row."""
-    condition = jb.GrazingSliding(1)
-    osc = jb.presets.class_b(-0.5, 0.35)
-    where = [jnp.asarray(leaf_index(osc, one)) for one in (nu0, nu1)]
-    rows = range(3, len(fold) - 3, len(fold) // 8)
+def errors(curve, osc, where, condition, rows):
+    """How far rows of a curve are from what is refined near them.
+
+    Refined over the parameter that the curve crosses, the other one as in the row.
+    """
+    found = []
+    indices = [jnp.asarray(leaf_index(osc, one)) for one in where]
     for row in rows:
-        values, chord = fold.values[row], fold.values[row + 1] - fold.values[row - 1]
+        values, chord = curve.values[row], curve.values[row + 1] - curve.values[row - 1]
         free = int(np.argmin(np.abs(chord)))
-        held = vary(osc, where[1 - free], jnp.asarray(values[1 - free])[None])
+        held = vary(osc, indices[1 - free], jnp.asarray(values[1 - free])[None])
         guesses = [
             Guess((-1.0, 1.0), float(values[free]) + offset, condition) for offset in (-1e-3, 1e-3)
         ]
-        found = [point for _, point in refined(held, where[free], guesses)]
-        # Both are exact up to the error of the integration, some 1e-12.
-        assert np.nanmin([abs(float(p.value) - values[free]) for p in found]) < 1e-9
-        assert fold.kinds[row] in {point.kind for point in found}
+        points = [point for _, point in refined(held, indices[free], guesses)]
+        assert curve.kinds[row] in {point.kind for point in points}
+        found.append(np.nanmin([abs(float(point.value) - values[free]) for point in points]))
+    return found
+
+
+def test_every_row_is_what_refine_finds(fold):
+    rows = range(3, len(fold) - 3, len(fold) // 8)
+    osc = jb.presets.class_b(-0.5, 0.35)
+    # Both are exact up to the error of the integration, some 1e-12.
+    assert max(errors(fold, osc, (nu0, nu1), jb.GrazingSliding(1), rows)) < 1e-9
     assert np.max(fold.residual) < 1e-12 and np.all(np.isfinite(fold.values))
+
+
+def zeta(osc):
+    return osc.damping
+
+
+def steepness(osc):
+    return osc.belts[0].friction.steepness
+
+
+@pytest.mark.parametrize(
+    ("number", "where", "span", "step"),
+    [
+        (7, (nu0, zeta), ((0.3, 0.7), (0.3, 0.7)), 0.02),
+        (7, (nu0, steepness), ((0.4, 0.6), (9.0, 11.0)), 0.1),
+        (1, (steepness, zeta), ((9.0, 10.2), (0.3, 0.7)), 0.1),
+    ],
+)
+def test_curves_in_other_parameters(points, number, where, span, step):
+    curve = jb.bifurcation_curve(points[number], where, span, step=step)
+    assert curve.ends == (End.LEFT_SPAN, End.LEFT_SPAN) and len(curve) > 12
+    rows = range(2, len(curve) - 2, len(curve) // 5)
+    found = errors(curve, points[number].oscillator, where, points[number].condition, rows)
+    assert max(found) < 1e-9
+
+
+class Lorentz(jb.AbstractFriction):
+    """mu(r) = kinetic + (static - kinetic)/(1 + (r/velocity)^2), steepest away from r = 0."""
+
+    static: jax.Array
+    kinetic: jax.Array
+    velocity: jax.Array
+
+    def mu(self, speed):
+        return self.kinetic + (self.static - self.kinetic) / (1 + (speed / self.velocity) ** 2)
+
+
+def bell(r):
+    return 0.6 + 0.4 / (1 + (r / 0.4) ** 2)
+
+
+BELL = Lorentz(jnp.asarray(1.0), jnp.asarray(0.6), jnp.asarray(0.4))
+
+
+def test_a_closed_curve_ends_where_it_began():
+    """A trace of zero, -mu'(nu0) - mu'(nu1) = zeta: a closed curve, for -mu' has a maximum."""
+    osc = jb.Oscillator(1.2, (jb.Belt(0.2, BELL), jb.Belt(0.2, BELL)))
+    point = jb.refine(jb.Hopf(), osc, where=nu0)
+    curve = jb.bifurcation_curve(point, (nu0, nu1), ((0.0, 1.0), (0.0, 1.0)), step=0.02)
+    assert curve.ends == (End.CLOSED, End.CLOSED)
+    x, y = curve.values.T / 0.4
+    assert np.allclose(2 * x / (1 + x**2) ** 2 + 2 * y / (1 + y**2) ** 2, 1.2, rtol=0, atol=1e-14)
+    assert np.allclose(curve.values[0], curve.values[-1], rtol=0, atol=1e-14)
+    # Once round, the first row and the last being one.
+    middle = np.mean(curve.values[1:], axis=0)
+    angles = np.unwrap(np.arctan2(*(curve.values - middle).T))
+    assert abs(angles[-1] - angles[0]) == pytest.approx(2 * np.pi)
+    assert [special.kind for special in curve.special] == ["EqualVelocities"] * 2
+
+
+def test_folds_of_cycles_end_at_a_degenerate_hopf_point():
+    """Where -mu' = zeta and the third derivative is 0: for this law at nu = 0.4 and zeta = 1/2."""
+    point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.4, (jb.Belt(0.483, BELL),)), where=nu0)
+    curve = jb.bifurcation_curve(point, (nu0, zeta), ((0.3, 0.7), (0.3, 0.6)), step=0.03)
+    assert set(curve.ends) == {End.STOPPED, End.LEFT_SPAN}
+    (end,) = curve.special
+    assert end.kind == "DegenerateHopf" and end.residual < 1e-13
+    assert end.values == pytest.approx((0.4, 0.5), abs=1e-13)
+    assert np.allclose(curve.multiplier, 1, rtol=0, atol=1e-11) and np.max(curve.residual) < 1e-12
+    inner = curve.values[(curve.values[:, 0] > 0.41) & (curve.values[:, 0] < 0.6)]
+    for value, damping in inner[::3]:
+        osc = jb.Oscillator(float(damping), (jb.Belt(float(value) - 5e-3, BELL),))
+        again = jb.refine(jb.FoldOfCycles(), osc, where=nu0)
+        assert again.value == pytest.approx(value, abs=1e-9)
+
+    value, damping = (float(number) for number in curve.values[-2])
+    expected = oracle_cycles.fold_of_cycles(
+        lambda nu: oracle.Oscillator(damping, (oracle.Belt(nu, bell, 1.0, 1.0),), 1.0),
+        (value - 0.004, value + 0.004),
+        (0.2, 0.8),
+    )
+    assert value == pytest.approx(expected, abs=1e-11)
+
+
+@pytest.mark.slow
+def test_folds_of_cycles_end_where_the_cycle_touches_a_boundary():
+    """That of a second belt with constant friction."""
+    osc = jb.Oscillator(0.4, (jb.Belt(0.49, BELL), jb.Belt(0.37, jb.Coulomb(1.0, 1.0), load=0.02)))
+    point = jb.refine(jb.FoldOfCycles(), osc, where=nu0)
+    curve = jb.bifurcation_curve(point, (nu0, zeta), ((0.3, 0.7), (0.2, 0.6)), step=0.02)
+    grazing, _ = sorted(curve.special, key=lambda special: -special.values[0])
+
+    def make(nu, damping):
+        belts = (
+            oracle.Belt(nu, bell, 1.0, 1.0),
+            oracle.Belt(0.37, lambda r: 1.0 + 0 * r, 1.0, 0.02),
+        )
+        return oracle.Oscillator(damping, belts, 1.0)
+
+    def tangency(damping):
+        bracket = (grazing.values[0] - 0.01, grazing.values[0] + 0.01)
+        return oracle_cycles.nonsmooth_fold(lambda nu: make(nu, damping), bracket, 1)
+
+    def growth(damping):
+        return oracle_cycles.growth_from_tangency(make(tangency(damping), damping), 1)
+
+    assert (grazing.kind, grazing.belts) == ("FoldGrazing", (1,))
+    expected = brentq(growth, grazing.values[1] - 0.004, grazing.values[1] + 0.004, xtol=1e-12)
+    # The oracle's growth is good to some 1e-12.
+    assert grazing.values == pytest.approx((tangency(expected), expected), abs=1e-9)
+    assert curve.ends == (End.STOPPED, End.STOPPED)
 
 
 def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
@@ -90,11 +210,28 @@ def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     assert found == pytest.approx(expected, abs=1e-5)
     rest = fold.special[1]
     assert (rest.kind, rest.belts) == ("BeltAtRest", (0,)) and End.STOPPED in fold.ends
-    # Just beside the end, where the error goes like the velocity to the power 0.9: some 6e-5.
-    beside = brentq(
-        lambda nu: oracle_cycles.gap(oracle.class_b(-1e-5, nu), 0, 1), 0.281, 0.287, xtol=1e-9
+    expected = brentq(
+        lambda nu: oracle_cycles.gap_from_rest(oracle.class_b(0.0, nu), 0, -1, 1),
+        0.28,
+        0.29,
+        xtol=1e-13,
     )
-    assert rest.values == pytest.approx((0.0, beside), abs=1e-4) and rest.residual < 1e-6
+    # The oracle's start is good to 1e-11.
+    assert rest.values == pytest.approx((0.0, expected), abs=1e-10) and rest.residual < 1e-12
+
+
+def test_a_table_has_rows_and_special_points_in_order(fold):
+    table = fold.table(("nu0", "nu1"))
+    assert " ".join(table[0]) == "condition belts nu0 nu1 multiplier residual special"
+    values = np.array([(row["nu0"], row["nu1"]) for row in table])
+    assert np.array_equal(values, fold.path) and len(table) == len(fold) + 2
+    named = [row["special"] for row in table if row["special"]]
+    assert named == ["DoubleSliding 0", "BeltAtRest 0"]
+    # They stand where they belong: no step is longer than one between rows, 0.02, but the last.
+    assert np.max(np.hypot(*np.diff(values[:-1], axis=0).T)) < 0.0201
+    assert {row["belts"] for row in table} == {"1"}
+    assert [row["condition"] for row in table if not row["special"]] == list(fold.kinds)
+    assert "belts[0].velocity" in fold.table()[0]
 
 
 def test_curves_have_the_symmetries_of_the_plane(points, fold):
