@@ -38,7 +38,7 @@ from .bifurcations import (
 from .checks import as_array, require
 from .compiling import each, jit
 from .curves import BifurcationCurve, bifurcation_curve
-from .cycles import SIZES, Cycle, Ends, Turn, polish, unstable_cycle
+from .cycles import SIZES, Cycle, Ends, Turn, find_cycle, polish, unstable_cycle
 from .detection import Label, Path, search
 from .equilibria import Equilibria, equilibria
 from .oscillator import Oscillator
@@ -188,7 +188,8 @@ class RegionMap(eqx.Module):
 
     names: of the two parameters, as arguments of `make`; values: of each, [n] and [m]; label: name
     of the region, [n, m], as from `region_name`, "" where the runs were undecided; curves: what
-    bounds the regions, see `BifurcationCurve`; make: as given. `example(name)` is a cell well
+    bounds the regions, see `BifurcationCurve`; cycles: by the name of a region, the cycles in its
+    example, attracting ones and the unstable one; make: as given. `example(name)` is a cell well
     inside a region; `table()` has the curves as rows; `plot()` draws the map, with a portrait of
     each region.
     """
@@ -197,6 +198,7 @@ class RegionMap(eqx.Module):
     values: tuple[np.ndarray, np.ndarray]
     label: np.ndarray
     curves: tuple[BifurcationCurve, ...]
+    cycles: dict[str, tuple[Cycle, ...]]
     make: Callable[..., Oscillator] = eqx.field(static=True)
 
     @property
@@ -207,8 +209,7 @@ class RegionMap(eqx.Module):
     def example(self, name: str) -> tuple[float, float]:
         """The values of the parameters in the cell of a region that is farthest from its bounds."""
         require(name in self.regions, "name", f"one of {', '.join(self.regions)}", repr(name))
-        row, column = interior(self.label == name)
-        return float(self.values[0][row]), float(self.values[1][column])
+        return _example(self.values, self.label == name)
 
     def oscillator(self, name: str) -> Oscillator:
         """The oscillator in that cell."""
@@ -275,10 +276,36 @@ def region_map(
     where = _leaves_of(make, names, values)
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:
-        label = beside.submit(_cell_names, make, names, values, dict(axes), starts)
+        cells = beside.submit(_cells, make, names, values, dict(axes), starts)
         curves = _bounds(make, names, values, where, step, lines) if where and lines else ()
-        label = label.result()
-    return RegionMap((names[0], names[1]), (values[0], values[1]), label, tuple(curves), make)
+        label, cycles = cells.result()
+    pair = (names[0], names[1]), (values[0], values[1])
+    return RegionMap(*pair, label, tuple(curves), cycles, make)
+
+
+def _cells(make, names, values, axes, starts):
+    """The names of all cells, and the cycles in the example of each region."""
+    label = _cell_names(make, names, values, axes, starts)
+    cycles = {}
+    for name in sorted(set(np.unique(label).tolist()) - {""}):
+        osc = make(**dict(zip(names, _example(values, label == name), strict=True)))
+        cycles[name] = _cycles(osc, starts)
+    return label, cycles
+
+
+def _example(values, inside: np.ndarray) -> tuple[float, float]:
+    row, column = interior(inside)
+    return float(values[0][row]), float(values[1][column])
+
+
+def _cycles(osc: Oscillator, starts) -> tuple[Cycle, ...]:
+    """The cycles that the starts lead to, each once, and the unstable one."""
+    found: dict[tuple[float, ...], Cycle] = {}
+    for cycle in [*(find_cycle(osc, start) for start in starts), unstable_cycle(osc)]:
+        if cycle.status == Status.OK:
+            size = (cycle.x1_min, cycle.x1_max, cycle.period)
+            found.setdefault(tuple(round(float(value), 6) for value in size), cycle)
+    return tuple(found.values())
 
 
 def _cell_names(make, names, values, axes, starts) -> np.ndarray:

@@ -35,14 +35,13 @@ from .basins import Basins
 from .checks import require
 from .compiling import jit
 from .curves import BifurcationCurve
-from .cycles import find_cycle, unstable_cycle
+from .cycles import Cycle
 from .diagrams import BifurcationDiagram, Branch, RegionMap, interior
 from .equilibria import Equilibria, EquilibriumKind
 from .equilibria import equilibria as find_equilibria
 from .friction import AbstractFriction
 from .modes import mode_acceleration, mode_of_state
 from .oscillator import Oscillator
-from .results import Status
 from .simulate import Trajectory
 
 #: One colour a belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
@@ -719,7 +718,7 @@ def draw_region_map(regions: RegionMap, figure: Figure, note: str = "") -> Axes:
     for axis in axes.flat[len(names) :]:
         axis.axis("off")
     for axis, name in zip(axes.flat, names, strict=False):
-        _draw_sketch(axis, regions.oscillator(name), name)
+        _draw_sketch(axis, regions.oscillator(name), regions.cycles[name], name)
     if note:
         lower.supxlabel(note, fontsize="small")
     return ax
@@ -729,9 +728,7 @@ def _has_area(regions: RegionMap, name: str) -> bool:
     return bool(np.any(ndimage.binary_erosion(regions.label == name)))
 
 
-def _draw_sketch(ax: Axes, osc: Oscillator, name: str) -> None:
-    stable, unstable = find_cycle(osc, (3.0, 0.0)), unstable_cycle(osc)
-    cycles = [cycle for cycle in (stable, unstable) if int(cycle.status) == Status.OK]
+def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle], name: str) -> None:
     loops = [np.asarray(cycle.sample(300)) for cycle in cycles]
     rests = find_equilibria(osc)
     x1 = float(rests.x1[0])
