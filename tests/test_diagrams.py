@@ -167,6 +167,17 @@ def test_an_example_lies_in_its_region(cells):
         cells.example("7")
 
 
+def test_cycles_in_the_examples_are_those_of_the_names(cells):
+    """Each once, though several starts lead to it; with the belts that it sticks to."""
+    for name, cycles in cells.cycles.items():
+        stable = [cycle for cycle in cycles if cycle.stable]
+        assert len(stable) == (name[0] in "2345")
+        assert len(cycles) - len(stable) == (name[0] in "25")
+        for cycle in stable:
+            belts = {belt for kind, belt in cycle.signature if kind == EventKind.STICK}
+            assert belts == {"a": {0}, "b": {1}, "c": {0, 1}}[name[1]]
+
+
 def test_impossible_axes_are_named():
     with pytest.raises(ValueError, match="axes must be two arguments of make"):
         jb.region_map(jb.presets.class_b, {"nu0": NU0S})
