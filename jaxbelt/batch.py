@@ -848,10 +848,11 @@ def run(
     devices = jax.local_devices()
     if not runs:
         return
-    # Compiled here, once, and not by each thread.
+    # Compiled here, once, and not by each thread; on a device as there, or they would do it again.
     nothing = np.zeros((1 + derivatives, columns, CHUNK + width))
-    idle = _idle(program, shared, width, columns)
-    kernel(nothing if derivatives else nothing[0], np.int32(0), np.int32(0), idle, False)
+    with jax.default_device(devices[0]):
+        idle = _idle(program, shared, width, columns)
+        kernel(nothing if derivatives else nothing[0], np.int32(0), np.int32(0), idle, False)
     with ThreadPoolExecutor(threads) as pool:
         started = [pool.submit(work, devices[i % len(devices)]) for i in range(threads)]
         for future in started:

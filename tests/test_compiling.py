@@ -62,3 +62,28 @@ def test_runs_with_other_numbers_of_events_compile_nothing():
         jax.monitoring.unregister_event_duration_listener(listen)
     assert second.events.t.size < first.events.t.size
     assert compiled == []
+
+
+class Constant(jb.Coulomb):
+    """A law that no other test uses."""
+
+
+def test_a_sweep_compiles_its_kernel_once():
+    compiled = []
+
+    def listen(name, *_, fun_name="", **__):
+        if name.endswith("backend_compile_duration"):
+            compiled.append(fun_name)
+
+    law = Constant(1.0, 0.8)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        jb.sweep(
+            lambda nu: jb.Oscillator(0.1, (jb.Belt(nu, law, load=1.0),)),
+            {"nu": np.linspace(0.1, 0.5, 5)},
+            y0=(1.0, 0.0),
+            t1=20.0,
+        )
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert sum("_advance" in name for name in compiled) == 1
