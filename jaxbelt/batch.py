@@ -67,7 +67,7 @@ MAX_STEP = 1.5
 #: The way that a Taylor step may bridge to a guard, over the square root of the tolerance.
 LANDING = 0.1
 #: Steps between two looks at the events, and events between two refills.
-STEPS, ROUNDS = 4, 4
+STEPS, ROUNDS = 4, 6
 
 #: Steps that a run may take for each 100 units of time before it is given up.
 MAX_STEPS = 100_000
@@ -170,11 +170,13 @@ class Observer(eqx.Module):
 
     @abc.abstractmethod
     def watch(
-        self, osc: Oscillator, lanes: Lanes, passage: Passage, t1: Array, tol: Array
+        self, osc: Oscillator, lanes: Lanes, passage: Passage, one: Array, t1: Array, tol: Array
     ) -> Lanes:
-        """The lanes after a look at the events; sets `memory`, and `done` to end a run."""
+        """The lanes after a look at the events; sets `memory`, and `done` to end a run.
 
-    def rest(self, osc: Oscillator, lanes: Lanes) -> Lanes:
+        one: an array of ones. What is divided by it is computed once, see the module's text."""
+
+    def rest(self, osc: Oscillator, lanes: Lanes, one: Array) -> Lanes:
         """The same at each refill, for what costs more."""
         return lanes
 
@@ -225,6 +227,15 @@ def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: bool) -> _Wi
     signs = mode.signs
     pulls = tuple(belt.load * sign for belt, sign in zip(osc.belts, signs, strict=True))
     return _Window(x1, (low, high), signs, pulls, ~lanes.done & ~mode.any_stuck)
+
+
+def _once(flag: Array, one: Array) -> Array:
+    """A flag that XLA computes once, not again in each place where it is used."""
+    return jnp.where(flag, 1.0, 0.0) / one > 0
+
+
+def _lowest(arrays: list[Array]) -> Array:
+    return functools.reduce(jnp.minimum, arrays)
 
 
 def _acceleration(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array) -> Array:
@@ -443,7 +454,7 @@ def _pass_events(
     guards = boundary_guards(osc, lanes.mode, lanes.x2)
     if edges:
         guards += edge_guards(osc, lanes.mode, lanes.x1)
-    lowest = functools.reduce(jnp.minimum, guards)
+    lowest = _lowest(guards)
     landed = (lanes.h < 0) & ~lanes.done
     # A lane may also have landed where x2 = 0, which is no guard.
     fired = landed & (lowest <= 1e-12)
@@ -636,7 +647,7 @@ def _advance(
         """Hand in what is done and take new runs."""
         lanes, passes = desk.stream.lanes, desk.stream.passes
         osc = _oscillator(program, shared, desk.stream.rows)
-        lanes = _give_up(observer.rest(osc, lanes), passes, limit)
+        lanes = _give_up(observer.rest(osc, lanes, one), passes, limit)
         finished = lanes.done & (lanes.run >= 0)
         finished = finished & (_rank(finished) < width - desk.filled)
         # The finished ones first, behind what is there; the rest is written over the next time.
@@ -665,7 +676,7 @@ def _advance(
 
     def round_(osc, _, lanes):
         lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
-        lanes = observer.watch(osc, lanes, passage, t1, rtol)
+        lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
         window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema)
 
         def step(_, lanes):
@@ -895,10 +906,10 @@ def _no_mark(lanes: Lanes) -> _Mark:
     return _Mark(zero + jnp.nan, zero, zero, count, count, count)
 
 
-def _renew(mark: _Mark, lanes: Lanes, at: Array) -> tuple[_Mark, Array]:
+def _renew(mark: _Mark, lanes: Lanes, at: Array, one: Array) -> tuple[_Mark, Array]:
     """The marks after the lanes `at` such a state, and which of them are new."""
     age = mark.age + jnp.where(at, 1, 0)
-    new = at & (age >= mark.limit)
+    new = _once(at & (age >= mark.limit), one)
     here = _Mark(
         lanes.x1,
         _code(lanes.mode),
@@ -934,7 +945,7 @@ class Final(Observer):
     def start(self, osc, lanes):
         return _no_mark(lanes)
 
-    def watch(self, osc, lanes, passage, t1, tol):
+    def watch(self, osc, lanes, passage, one, t1, tol):
         if not self.skip:
             return lanes
         mark: _Mark = lanes.memory
@@ -947,7 +958,7 @@ class Final(Observer):
         t = jnp.where(repeats, lanes.t + turns * period, lanes.t)
         events = lanes.events + jnp.where(repeats, turns.astype(per_turn.dtype) * per_turn, 0)
         lanes = eqx.tree_at(lambda n: (n.t, n.events), lanes, (t, events))
-        return eqx.tree_at(lambda n: n.memory, lanes, _renew(mark, lanes, released)[0])
+        return eqx.tree_at(lambda n: n.memory, lanes, _renew(mark, lanes, released, one)[0])
 
     def finish(self, osc, lanes):
         return {
@@ -1024,7 +1035,7 @@ class Attractor(Observer):
             count,
         )
 
-    def watch(self, osc, lanes, passage, t1, tol):
+    def watch(self, osc, lanes, passage, one, t1, tol):
         turn: _Turn = lanes.memory
         sticks = tuple(
             total + jnp.where(stuck, passage.duration, 0.0)
@@ -1032,7 +1043,7 @@ class Attractor(Observer):
         )
         # x1 is extreme where x2 = 0, and a step ends there.
         x1_min, x1_max = jnp.minimum(turn.x1_min, lanes.x1), jnp.maximum(turn.x1_max, lanes.x1)
-        top = passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done
+        top = _once(passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done, one)
 
         mark, amplitude = turn.mark, x1_max - x1_min
         change = lanes.x1 - turn.previous
@@ -1047,10 +1058,12 @@ class Attractor(Observer):
         kind = jnp.where(repeats, CYCLE, UNDECIDED)
         kind = jnp.where(repeats & (amplitude < self.REPEATED), EQUILIBRIUM, kind)
         kind = jnp.where(passage.captured, EQUILIBRIUM, kind)
-        kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind).astype(turn.kind.dtype)
-        found = (kind != UNDECIDED) & (turn.kind == UNDECIDED) & (lanes.run >= 0)
+        kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind)
+        going_on = (turn.kind == UNDECIDED) & (lanes.run >= 0)
+        kind = (jnp.where(going_on, kind, UNDECIDED) / one).astype(turn.kind.dtype)
+        found = kind != UNDECIDED
         resting = found & (kind != CYCLE)
-        renewed, new = _renew(mark, lanes, top & ~found)
+        renewed, new = _renew(mark, lanes, top & ~found, one)
         # An attractor at rest is a point; a new mark begins a new turn.
         fresh = new | resting
         memory = _Turn(
@@ -1064,7 +1077,7 @@ class Attractor(Observer):
             previous=jnp.where(top, lanes.x1, turn.previous),
             change=jnp.where(top, change, turn.change),
             kind=jnp.where(found, kind, turn.kind),
-            period=jnp.where(repeats & found & ~resting, lanes.t - mark.t, turn.period),
+            period=jnp.where(found & ~resting, lanes.t - mark.t, turn.period),
             transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), turn.transient),
             turn_events=jnp.where(found & ~resting, lanes.events - mark.events, turn.turn_events),
         )
@@ -1081,21 +1094,20 @@ class Attractor(Observer):
             ),
         )
 
-    def rest(self, osc, lanes):
+    def rest(self, osc, lanes, one):
         turn: _Turn = lanes.memory
         zero = jnp.zeros_like(lanes.t)
         x1_rest = mode_acceleration(osc, lanes.mode, zero, zero)
         radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), 1e-6)
-        falls = jnp.ones_like(lanes.done)
+        margins = []
         for fraction in DISC.tolist():
             v = fraction * radius
-            falls = falls & (v * mode_acceleration(osc, lanes.mode, x1_rest, v) < 0)
+            margins.append(-v * mode_acceleration(osc, lanes.mode, x1_rest, v))
         for v in (radius, -radius):
-            for guard in boundary_guards(osc, lanes.mode, v):
-                falls = falls & (guard > 0)
-            for guard in edge_guards(osc, lanes.mode, x1_rest + v):
-                falls = falls & (guard > 0)
-        found = falls & ~lanes.mode.any_stuck & ~lanes.done
+            margins += boundary_guards(osc, lanes.mode, v)
+            margins += edge_guards(osc, lanes.mode, x1_rest + v)
+        margin = jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, _lowest(margins)) / one
+        found = margin > 0
         memory = eqx.tree_at(
             lambda m: (m.kind, m.x1_min, m.x1_max, m.sticks, m.transient),
             turn,
@@ -1168,7 +1180,7 @@ class Reduce(Observer):
         axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
         return jax.vmap(self.reducer.init, in_axes=(axes, 0, 0))(osc, lanes.x1, lanes.x2)
 
-    def watch(self, osc, lanes, passage, t1, tol):
+    def watch(self, osc, lanes, passage, one, t1, tol):
         memory, busy, n = lanes.memory, lanes.run >= 0, len(osc.belts)
         sticks = jnp.where(passage.mode.any_stuck, EventKind.STICK.value, EventKind.CROSS.value)
         at_edge = passage.guard >= n
