@@ -791,26 +791,21 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
 
 @functools.lru_cache(maxsize=1)
 def _options() -> tuple[tuple[str, Any], ...]:
-    """Compiler options of the kernel: the emitters that compile it in two thirds of the time, and
-    wide vectors where the processor has them."""
+    """Compiler options of the kernel: wide vectors where the processor has them."""
     if jax.default_backend() != "cpu":
         return ()
-    wanted: list[tuple[str, Any]] = [("xla_cpu_use_fusion_emitters", False)]
     try:
-        if "avx512f" in Path("/proc/cpuinfo").read_text():
-            wanted.append(("xla_cpu_prefer_vector_width", 512))
+        wide = "avx512f" in Path("/proc/cpuinfo").read_text()
     except OSError:
-        pass
-    return tuple(option for option in wanted if _is_known(*option))
-
-
-def _is_known(option: str, value: Any) -> bool:
-    """Whether this version of XLA has an option."""
+        return ()
+    options = {"xla_cpu_prefer_vector_width": 512}
     try:
-        jax.jit(lambda: 0, compiler_options={option: value})()
+        if wide:
+            jax.jit(lambda: 0, compiler_options=options)()
+            return tuple(options.items())
     except jax.errors.JaxRuntimeError:
-        return False
-    return True
+        pass  # a version of XLA that does not know the option
+    return ()
 
 
 def workers() -> int:
