@@ -61,13 +61,13 @@ from .oscillator import Oscillator
 from .results import EventKind, Status
 
 #: First step of a run and after each event, at a tolerance of 1e-8.
-FIRST_STEP = 0.05
-#: Longest step: a sixth of a turn, so that x2 has at most one extremum in it.
-MAX_STEP = 1.0
+FIRST_STEP = 0.1
+#: Longest step: a quarter of a turn, so that x2 has at most one extremum in it.
+MAX_STEP = 1.5
 #: The way that a Taylor step may bridge to a guard, over the square root of the tolerance.
 LANDING = 0.1
 #: Steps between two looks at the events, and events between two refills.
-STEPS, ROUNDS = 4, 8
+STEPS, ROUNDS = 4, 6
 
 #: Steps that a run may take for each 100 units of time before it is given up.
 MAX_STEPS = 100_000
@@ -77,7 +77,9 @@ CHUNK = 2**14
 #: cost more than they bring here.
 WIDTH = {"cpu": 64}
 
-_TABLEAU = diffrax.Tsit5.tableau
+#: Of order eight: twice the stages of order five for a third of the steps at 1e-8, and what a step
+#: costs beside its stages (its path, bounds, choices) is the larger part.
+_TABLEAU = diffrax.Dopri8.tableau
 
 
 def _nystroem() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -168,11 +170,13 @@ class Observer(eqx.Module):
 
     @abc.abstractmethod
     def watch(
-        self, osc: Oscillator, lanes: Lanes, passage: Passage, t1: Array, tol: Array
+        self, osc: Oscillator, lanes: Lanes, passage: Passage, one: Array, t1: Array, tol: Array
     ) -> Lanes:
-        """The lanes after a look at the events; sets `memory`, and `done` to end a run."""
+        """The lanes after a look at the events; sets `memory`, and `done` to end a run.
 
-    def rest(self, osc: Oscillator, lanes: Lanes) -> Lanes:
+        one: an array of ones. What is divided by it is computed once, see the module's text."""
+
+    def rest(self, osc: Oscillator, lanes: Lanes, one: Array) -> Lanes:
         """The same at each refill, for what costs more."""
         return lanes
 
@@ -223,6 +227,15 @@ def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: bool) -> _Wi
     signs = mode.signs
     pulls = tuple(belt.load * sign for belt, sign in zip(osc.belts, signs, strict=True))
     return _Window(x1, (low, high), signs, pulls, ~lanes.done & ~mode.any_stuck)
+
+
+def _once(flag: Array, one: Array) -> Array:
+    """A flag that XLA computes once, not again in each place where it is used."""
+    return jnp.where(flag, 1.0, 0.0) / one > 0
+
+
+def _lowest(arrays: list[Array]) -> Array:
+    return functools.reduce(jnp.minimum, arrays)
 
 
 def _acceleration(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array) -> Array:
@@ -315,7 +328,9 @@ class _Landing(eqx.Module):
     theta: Array
 
 
-def _landing(window: _Window, lanes: Lanes, new: _Attempt, path: _Path, rtol) -> _Landing:
+def _landing(
+    window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rtol, *, extrema: bool
+) -> _Landing:
     low, high = window.x2
     beyond_turn = path.turns & ((path.extremum > high) | (path.extremum < low))
     peak = jnp.where(beyond_turn, path.extremum, new.x2)
@@ -326,7 +341,7 @@ def _landing(window: _Window, lanes: Lanes, new: _Attempt, path: _Path, rtol) ->
     blocked = ((peak > high) | (peak < low)) & ~reached
     target = jnp.where(peak > high, high, low)
     k = lax.stop_gradient(path.k)
-    start, end, poly = lanes.x2, peak, (*k, jnp.zeros_like(peak))
+    start, end, poly = lanes.x2, peak, k
     on_edge, edge = jnp.zeros_like(reached), lanes.x1
     if window.x1 is not None:
         left, right = window.x1
@@ -340,16 +355,19 @@ def _landing(window: _Window, lanes: Lanes, new: _Attempt, path: _Path, rtol) ->
         integral = (h * lanes.x2, h * k[0] / 2, h * k[1] / 3, h * k[2] / 4, h * k[3] / 5)
         beyond = ((new.x1 > right) | (new.x1 < left)) & ~near
         use = beyond & ~blocked
-        poly = lax.stop_gradient(select(use, integral, poly))
+        poly = lax.stop_gradient(select(use, integral, (*poly, jnp.zeros_like(peak))))
         start, end = jnp.where(use, lanes.x1, start), jnp.where(use, new.x1, end)
         target = jnp.where(use, jnp.where(new.x1 > right, right, left), target)
         blocked = blocked | beyond
     until = jnp.where(beyond_turn, path.turn, 1.0)
     theta = _first_root(poly, start - target, until, end - target)
-    # An extremum that close to a bound is no matter for an interpolant: split the step there.
+    # An extremum that close to a bound is no matter for an interpolant, nor is one that is wanted:
+    # split the step there. Near the ends of a step the interpolant is exact to the second order.
     doubt = jnp.abs(path.k[3])
-    grazes = path.turns & ((path.extremum > high - doubt) | (path.extremum < low + doubt))
-    grazes = grazes & ~beyond_turn & (path.turn > 0.05) & (path.turn < 0.95)
+    grazes = (path.extremum > high - doubt) | (path.extremum < low + doubt)
+    if extrema:
+        grazes = grazes | (path.extremum > lanes.upper) | (path.extremum < lanes.lower)
+    grazes = grazes & path.turns & ~beyond_turn & (path.turn > 1e-3) & (path.turn < 1 - 1e-3)
     return _Landing(
         reached=reached,
         delta=delta,
@@ -357,7 +375,7 @@ def _landing(window: _Window, lanes: Lanes, new: _Attempt, path: _Path, rtol) ->
         x2=bound,
         on_edge=on_edge,
         blocked=blocked | grazes,
-        theta=jnp.where(blocked, theta, path.turn),
+        theta=jnp.where(blocked, theta, path.turn) / one,
     )
 
 
@@ -368,7 +386,7 @@ def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol, observ
     h = jnp.where(going, jnp.minimum(lanes.h, left), 0.0)
     new = _attempt(osc, window, one, lanes, h, rtol, atol)
     path = _path(one, lanes, new)
-    at = _landing(window, lanes, new, path, rtol)
+    at = _landing(window, one, lanes, new, path, rtol, extrema=observer.extrema)
 
     last = h >= left
     accepted = going & (new.error <= 1)
@@ -385,9 +403,11 @@ def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol, observ
     if window.x1 is not None:
         x1 = jnp.where(lands & at.on_edge, at.x1, x1)
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
-    # NaN is a large error, too.
-    size = jnp.where(new.error < 1e3, jnp.maximum(new.error, 1e-3), 1e3)
-    proposed = jnp.minimum(h * (0.9 / jnp.sqrt(jnp.sqrt(size))), MAX_STEP)
+    # NaN is a large error, too. The error is of order eight in h.
+    size = jnp.where(new.error < 1e5, jnp.maximum(new.error, 1e-5), 1e5)
+    # No quotient by a root: XLA has an inverse root of its own, which is no vector operation.
+    growth = jnp.sqrt(jnp.sqrt(jnp.sqrt(0.9**8 / size)))
+    proposed = jnp.minimum(h * growth, MAX_STEP)
     proposed = jnp.where(shortened, at.theta * h, jnp.where(lands, -proposed, proposed))
     lower, upper = lanes.lower, lanes.upper
     if observer.extrema:
@@ -407,18 +427,18 @@ def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol, observ
 
 
 def _first_step(rtol):
-    return FIRST_STEP * (1e8 * rtol) ** 0.2
+    return FIRST_STEP * (1e8 * rtol) ** 0.125
 
 
 def _first_root(poly, g_start, end, g_end):
-    """Root in (0, end] of g_start + poly[0] theta + ... + poly[4] theta^5, by Newton's method."""
+    """Root in (0, end] of g_start + poly[0] theta + poly[1] theta^2 ..., by Newton's method."""
     # On the boundary that the lane has just left g vanishes, too: that root is not the one.
     ratio = jnp.abs(g_start) / (jnp.abs(g_start) + jnp.abs(g_end))
     theta = jnp.where(jnp.abs(g_start) > 1e-3 * jnp.abs(g_end), ratio, 1.0) * end
-    k1, k2, k3, k4, k5 = poly
     for _ in range(3):
-        value = g_start + theta * (k1 + theta * (k2 + theta * (k3 + theta * (k4 + theta * k5))))
-        slope = k1 + theta * (2 * k2 + theta * (3 * k3 + theta * (4 * k4 + theta * (5 * k5))))
+        value, slope = poly[-1], jnp.zeros_like(theta)
+        for k in (*reversed(poly[:-1]), g_start):
+            value, slope = value * theta + k, slope * theta + value
         theta = theta - value / jnp.where(slope == 0, 1.0, slope)
     good = (theta > 0) & (theta <= end)
     return lax.stop_gradient(jnp.where(good, theta, 0.5 * end))
@@ -434,7 +454,7 @@ def _pass_events(
     guards = boundary_guards(osc, lanes.mode, lanes.x2)
     if edges:
         guards += edge_guards(osc, lanes.mode, lanes.x1)
-    lowest = functools.reduce(jnp.minimum, guards)
+    lowest = _lowest(guards)
     landed = (lanes.h < 0) & ~lanes.done
     # A lane may also have landed where x2 = 0, which is no guard.
     fired = landed & (lowest <= 1e-12)
@@ -627,7 +647,7 @@ def _advance(
         """Hand in what is done and take new runs."""
         lanes, passes = desk.stream.lanes, desk.stream.passes
         osc = _oscillator(program, shared, desk.stream.rows)
-        lanes = _give_up(observer.rest(osc, lanes), passes, limit)
+        lanes = _give_up(observer.rest(osc, lanes, one), passes, limit)
         finished = lanes.done & (lanes.run >= 0)
         finished = finished & (_rank(finished) < width - desk.filled)
         # The finished ones first, behind what is there; the rest is written over the next time.
@@ -656,7 +676,7 @@ def _advance(
 
     def round_(osc, _, lanes):
         lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
-        lanes = observer.watch(osc, lanes, passage, t1, rtol)
+        lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
         window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema)
 
         def step(_, lanes):
@@ -882,10 +902,10 @@ def _no_mark(lanes: Lanes) -> _Mark:
     return _Mark(zero + jnp.nan, zero, zero, count, count, count)
 
 
-def _renew(mark: _Mark, lanes: Lanes, at: Array) -> tuple[_Mark, Array]:
+def _renew(mark: _Mark, lanes: Lanes, at: Array, one: Array) -> tuple[_Mark, Array]:
     """The marks after the lanes `at` such a state, and which of them are new."""
     age = mark.age + jnp.where(at, 1, 0)
-    new = at & (age >= mark.limit)
+    new = _once(at & (age >= mark.limit), one)
     here = _Mark(
         lanes.x1,
         _code(lanes.mode),
@@ -921,7 +941,7 @@ class Final(Observer):
     def start(self, osc, lanes):
         return _no_mark(lanes)
 
-    def watch(self, osc, lanes, passage, t1, tol):
+    def watch(self, osc, lanes, passage, one, t1, tol):
         if not self.skip:
             return lanes
         mark: _Mark = lanes.memory
@@ -934,7 +954,7 @@ class Final(Observer):
         t = jnp.where(repeats, lanes.t + turns * period, lanes.t)
         events = lanes.events + jnp.where(repeats, turns.astype(per_turn.dtype) * per_turn, 0)
         lanes = eqx.tree_at(lambda n: (n.t, n.events), lanes, (t, events))
-        return eqx.tree_at(lambda n: n.memory, lanes, _renew(mark, lanes, released)[0])
+        return eqx.tree_at(lambda n: n.memory, lanes, _renew(mark, lanes, released, one)[0])
 
     def finish(self, osc, lanes):
         return {
@@ -1011,7 +1031,7 @@ class Attractor(Observer):
             count,
         )
 
-    def watch(self, osc, lanes, passage, t1, tol):
+    def watch(self, osc, lanes, passage, one, t1, tol):
         turn: _Turn = lanes.memory
         sticks = tuple(
             total + jnp.where(stuck, passage.duration, 0.0)
@@ -1019,7 +1039,7 @@ class Attractor(Observer):
         )
         # x1 is extreme where x2 = 0, and a step ends there.
         x1_min, x1_max = jnp.minimum(turn.x1_min, lanes.x1), jnp.maximum(turn.x1_max, lanes.x1)
-        top = passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done
+        top = _once(passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done, one)
 
         mark, amplitude = turn.mark, x1_max - x1_min
         change = lanes.x1 - turn.previous
@@ -1034,10 +1054,12 @@ class Attractor(Observer):
         kind = jnp.where(repeats, CYCLE, UNDECIDED)
         kind = jnp.where(repeats & (amplitude < self.REPEATED), EQUILIBRIUM, kind)
         kind = jnp.where(passage.captured, EQUILIBRIUM, kind)
-        kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind).astype(turn.kind.dtype)
-        found = (kind != UNDECIDED) & (turn.kind == UNDECIDED) & (lanes.run >= 0)
+        kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind)
+        going_on = (turn.kind == UNDECIDED) & (lanes.run >= 0)
+        kind = (jnp.where(going_on, kind, UNDECIDED) / one).astype(turn.kind.dtype)
+        found = kind != UNDECIDED
         resting = found & (kind != CYCLE)
-        renewed, new = _renew(mark, lanes, top & ~found)
+        renewed, new = _renew(mark, lanes, top & ~found, one)
         # An attractor at rest is a point; a new mark begins a new turn.
         fresh = new | resting
         memory = _Turn(
@@ -1051,7 +1073,7 @@ class Attractor(Observer):
             previous=jnp.where(top, lanes.x1, turn.previous),
             change=jnp.where(top, change, turn.change),
             kind=jnp.where(found, kind, turn.kind),
-            period=jnp.where(repeats & found & ~resting, lanes.t - mark.t, turn.period),
+            period=jnp.where(found & ~resting, lanes.t - mark.t, turn.period),
             transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), turn.transient),
             turn_events=jnp.where(found & ~resting, lanes.events - mark.events, turn.turn_events),
         )
@@ -1068,21 +1090,20 @@ class Attractor(Observer):
             ),
         )
 
-    def rest(self, osc, lanes):
+    def rest(self, osc, lanes, one):
         turn: _Turn = lanes.memory
         zero = jnp.zeros_like(lanes.t)
         x1_rest = mode_acceleration(osc, lanes.mode, zero, zero)
         radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), 1e-6)
-        falls = jnp.ones_like(lanes.done)
+        margins = []
         for fraction in DISC.tolist():
             v = fraction * radius
-            falls = falls & (v * mode_acceleration(osc, lanes.mode, x1_rest, v) < 0)
+            margins.append(-v * mode_acceleration(osc, lanes.mode, x1_rest, v))
         for v in (radius, -radius):
-            for guard in boundary_guards(osc, lanes.mode, v):
-                falls = falls & (guard > 0)
-            for guard in edge_guards(osc, lanes.mode, x1_rest + v):
-                falls = falls & (guard > 0)
-        found = falls & ~lanes.mode.any_stuck & ~lanes.done
+            margins += boundary_guards(osc, lanes.mode, v)
+            margins += edge_guards(osc, lanes.mode, x1_rest + v)
+        margin = jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, _lowest(margins)) / one
+        found = margin > 0
         memory = eqx.tree_at(
             lambda m: (m.kind, m.x1_min, m.x1_max, m.sticks, m.transient),
             turn,
@@ -1155,7 +1176,7 @@ class Reduce(Observer):
         axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
         return jax.vmap(self.reducer.init, in_axes=(axes, 0, 0))(osc, lanes.x1, lanes.x2)
 
-    def watch(self, osc, lanes, passage, t1, tol):
+    def watch(self, osc, lanes, passage, one, t1, tol):
         memory, busy, n = lanes.memory, lanes.run >= 0, len(osc.belts)
         sticks = jnp.where(passage.mode.any_stuck, EventKind.STICK.value, EventKind.CROSS.value)
         at_edge = passage.guard >= n

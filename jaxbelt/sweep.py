@@ -24,7 +24,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from . import batch
-from .checks import as_array, check_finite, check_positive, require, require_float64
+from .checks import (
+    as_array,
+    check_finite,
+    check_positive,
+    is_concrete,
+    require,
+    require_float64,
+)
 from .oscillator import Oscillator
 
 #: Results with a number a belt.
@@ -198,7 +205,7 @@ class _Grid:
         )
         self.example.check_scalars()
         leaves, self.structure = jax.tree.flatten(self.example)
-        self.mapped = tuple(self._varies(i) for i in range(len(leaves)))
+        self.mapped = self._varying()
         self.shared = [leaf for leaf, mapped in zip(leaves, self.mapped, strict=True) if not mapped]
 
     def _accepted_by(self, make):
@@ -216,18 +223,17 @@ class _Grid:
                 repr(name),
             )
 
-    def _varies(self, i: int) -> bool:
-        """Whether leaf number i of the oscillator depends on an axis."""
+    def _varying(self) -> tuple[bool, ...]:
+        """For each leaf of the oscillator whether it depends on an axis."""
+        found = []
 
-        def leaf(values):
-            return jax.tree.leaves(self.make(**values))[i]
+        def probe(values):
+            # What does not depend on the mapped values is computed on the spot.
+            found.extend(not is_concrete(leaf) for leaf in jax.tree.leaves(self.make(**values)))
+            return 0
 
-        values = {name: jnp.zeros(2) for name in self.names}
-        try:
-            jax.eval_shape(jax.vmap(leaf, out_axes=None, axis_size=2), values)
-        except ValueError:
-            return True
-        return False
+        jax.vmap(probe, axis_size=2, out_axes=None)({name: np.zeros(2) for name in self.names})
+        return tuple(found)
 
     def program(self, observer: batch.Observer) -> batch.Program:
         leaves = jax.tree.unflatten(self.structure, self.mapped)
