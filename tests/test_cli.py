@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import jaxbelt as jb
 from jaxbelt import reproduce
-from jaxbelt.cli import _belts_of_class, app, parse_belt
+from jaxbelt.cli import _belts_of_class, app, parse_belt, write_rows
 
 runner = CliRunner()
 
@@ -158,6 +158,18 @@ def test_a_run_that_is_cut_short_is_written_and_exits_with_1(tmp_path, monkeypat
         np.isfinite(column(read(tmp_path / "run.csv"), "x1")).tolist()
         == [True] * 200 + [False] * 201
     )
+
+
+def test_rows_read_back_to_the_last_digit(tmp_path):
+    rows = [
+        {"curve": 0, "nu0": 0.1 + 0.2, "multiplier": np.nan, "special": ""},
+        {"curve": 1, "nu0": -1 / 3, "multiplier": 1.5, "special": "BeltAtRest 0 1"},
+    ]
+    write_rows(rows, tmp_path / "curves.csv")
+    found = read(tmp_path / "curves.csv")
+    assert list(found[0]) == list(rows[0]) and found[1]["special"] == "BeltAtRest 0 1"
+    assert column(found, "nu0").tolist() == [0.1 + 0.2, -1 / 3]
+    assert np.isnan(float(found[0]["multiplier"]))
 
 
 def test_the_command_turns_on_float64_by_itself(tmp_path):
