@@ -34,9 +34,9 @@ from .modes import Mode, capacity, mode_acceleration
 from .oscillator import Oscillator
 
 #: Integration steps of order twelve for the slip phase.
-STEPS = 96
-#: The band of the first solution, and how many others there are on the way to the one wanted.
-FIRST, STAGES = 1e-6, 12
+STEPS = 64
+#: The band of the first solution, and how many there are from it to the one wanted.
+FIRST, STAGES = 1e-6, 4
 #: Bands from which the search for the band of a given fold starts.
 TYPICAL = 1e-4
 
@@ -102,9 +102,8 @@ def _fold(point, index, v_star):
         return u, residual
 
     start = jnp.append(jnp.array([1.0, 1.0, 1.0]), point.value)
-    guess, _ = lax.scan(stage, lax.stop_gradient(start), lax.stop_gradient(bands[:-1]))
-    u, residual = stage(guess, v_star)
-    return _known(u[3], v_star, residual)
+    u, residuals = lax.scan(stage, lax.stop_gradient(start), bands)
+    return _known(u[3], v_star, residuals[-1])
 
 
 @jit
