@@ -373,12 +373,23 @@ def _bounds(make, names, values, where, step, lines) -> list[BifurcationCurve]:
     """The curve of every point on a few lines, each curve once."""
     span = tuple((float(along[0]), float(along[-1])) for along in values)
     step = step * max(b - a for a, b in span) / 1.4
+    across = [
+        (along, float(fixed))
+        for along in (0, 1)
+        for a, b in [span[1 - along]]
+        for fixed in a + (b - a) * (np.arange(lines) + 0.37) / lines
+    ]
+
+    def points_on(along: int, fixed: float) -> tuple[BifurcationPoint, ...]:
+        pair = {names[along]: span[along][0], names[1 - along]: fixed}
+        return search(Path(make(**pair), where[along], span[along]))
+
     curves: list[BifurcationCurve] = []
-    for along in (0, 1):
-        a, b = span[1 - along]
-        for fixed in a + (b - a) * (np.arange(lines) + 0.37) / lines:
-            pair = {names[along]: span[along][0], names[1 - along]: float(fixed)}
-            for point in search(Path(make(**pair), where[along], span[along])):
+    # The next lines are searched while curves are followed from those before.
+    with ThreadPoolExecutor(1) as ahead:
+        searches = [(line, ahead.submit(points_on, *line)) for line in across]
+        for (along, fixed), found in searches:
+            for point in found.result():
                 at = np.empty(2)
                 at[along], at[1 - along] = float(point.value), fixed
                 if point.status == Status.OK and not any(
