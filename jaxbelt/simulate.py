@@ -562,6 +562,9 @@ def _unused(belts: int) -> _Record:
 def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     """States and modes at the times ts, each from the arc that it lies in."""
     entries = jnp.where(jnp.isnan(records.t), jnp.inf, lax.stop_gradient(records.t))
+    wanted = ts.size
+    if wanted:
+        ts = jnp.pad(ts, (0, -wanted % SAMPLED), mode="edge")
     # Past the end of the last arc the run either rests, with a reason, or is unknown.
     rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
 
@@ -580,13 +583,12 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
 
     # A few at a time, and those together that are as far from where their arc begins.
     order = jnp.argsort(lax.stop_gradient(jnp.where(stuck, 0.0, since)))
-    filled = jnp.concatenate([order, jnp.zeros(-ts.size % SAMPLED, order.dtype)])
     rows = jax.tree.map(
-        lambda leaf: leaf[filled].reshape(-1, SAMPLED, *leaf.shape[1:]), (arcs, since, stuck)
+        lambda leaf: leaf[order].reshape(-1, SAMPLED, *leaf.shape[1:]), (arcs, since, stuck)
     )
     ys = lax.map(lambda row: jax.vmap(at)(*row), rows).reshape(-1, 2)[jnp.argsort(order)]
     afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
-    return jnp.where(beyond[:, None], afterwards, ys), arcs.mode
+    return jnp.where(beyond[:, None], afterwards, ys)[:wanted], arcs.mode[:wanted]
 
 
 @jit
