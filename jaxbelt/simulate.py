@@ -30,7 +30,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .checks import as_numbers, check_finite, check_positive, is_concrete, pick, require
+from .checks import as_numbers, check_finite, check_positive, is_concrete, require
 from .compiling import jit
 from .derivatives import forward_jacobian
 from .extrapolation import increments, scheme
@@ -754,11 +754,15 @@ def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
     """Cut the padding off where lengths are known, that is, outside of transformations."""
     if not is_concrete(trajectory) or trajectory.ts.ndim != 1:
         return trajectory
-    events = pick(trajectory.events, np.flatnonzero(trajectory.events.kind))
-    arcs = pick(trajectory.arcs, np.flatnonzero(~np.isnan(trajectory.arcs.t)))
-    samples = (trajectory.ts, trajectory.ys, trajectory.modes)
+    known = jax.tree.map(np.asarray, trajectory)
+
+    def rows(tree, numbers):
+        return jax.tree.map(lambda leaf: leaf[numbers], tree)
+
+    samples = (known.ts, known.ys, known.modes)
     if trim_samples:
-        _, distinct = np.unique(trajectory.ts, return_index=True)
-        samples = pick(samples, distinct)
-    ts, ys, modes = samples
-    return Trajectory(ts, ys, modes, events, arcs, trajectory.status)
+        samples = rows(samples, np.unique(known.ts, return_index=True)[1])
+    events = rows(known.events, np.flatnonzero(known.events.kind))
+    arcs = rows(known.arcs, np.flatnonzero(~np.isnan(known.arcs.t)))
+    # Put there as they are: jnp.asarray compiles a program for every shape.
+    return jax.device_put(Trajectory(*samples, events, arcs, known.status))
