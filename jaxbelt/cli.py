@@ -98,7 +98,8 @@ def reproduce(
 
     Writes **critical_values.json** (the critical belt velocities of sections 3.2 and 3.3
     of the paper: printed, computed, residual, iterations) and the figures as **figNN.png**,
-    numbered as in the paper, and prints the table. Takes about a minute, most of it compilation.
+    numbered as in the paper, and prints the table. Takes one to two minutes, most of them
+    compilation.
 
     Example: **jaxbelt reproduce --out results**
     """

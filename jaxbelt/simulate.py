@@ -765,4 +765,5 @@ def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
     events = rows(known.events, np.flatnonzero(known.events.kind))
     arcs = rows(known.arcs, np.flatnonzero(~np.isnan(known.arcs.t)))
     # Put there as they are: jnp.asarray compiles a program for every shape.
-    return jax.device_put(Trajectory(*samples, events, arcs, known.status))
+    (ts, ys, modes), events, arcs = jax.device_put((samples, events, arcs))
+    return Trajectory(ts, ys, modes, events, arcs, trajectory.status)
