@@ -458,6 +458,10 @@ POINT_NAMES = {
     "SlidingExchange": "sliding exchange",
     "SuddenSliding": "belt {belt} at rest",
     "FoldOfCycles": "fold of cycles",
+    "GrazingEdge": "edge grazing, belt {belt}",
+    "CornerCollision": "corner, belt {belt}",
+    "BoundaryEquilibrium": "rest on edge, belt {belt}",
+    "PseudoHopf": "pseudo-Hopf, belt {belt}",
     "Unexplained": "unexplained",
 }
 
