@@ -393,7 +393,7 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
 
     def advance(state):
         t, _, h, y, steps = state
-        h_new = 0.3 / density(osc, codes, y)
+        h_new = 0.2 / density(osc, codes, y)
         return t + h, y, h_new, _step(field, y, h_new, _MEDIUM), steps + 1
 
     zero = jnp.zeros(())
