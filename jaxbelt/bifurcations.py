@@ -74,6 +74,7 @@ from .cycles import (
 from .equilibria import Equilibria, EquilibriumKind, equilibria
 from .modes import (
     STUCK,
+    EdgeFocus,
     Mode,
     boundary_guards,
     capacity,
@@ -863,73 +864,108 @@ def at_hopf(osc: Oscillator, index: int | Array, belts, wanted, size) -> Bifurca
     return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.EQUILIBRIUM)
 
 
-def _edges_of(osc: Oscillator, belt: Array) -> tuple[Array, Array, list[Mode]]:
-    """The two edges of a belt, their numbers, and the contacts at rest to the left and right of
-    each, [2] all."""
-    positions, n = jnp.stack(edges(osc)), len(osc.belts)
-    numbers = jnp.stack([belt, belt + n])
-    at = positions[numbers]
-    return at, numbers, [contact(osc, at, jnp.zeros(2), rightward=side) for side in (False, True)]
+class EdgeRest(eqx.Module):
+    """What vanishes where an equilibrium lies on an edge, by the number of the edge.
+
+    The needed force at rest on one side of it, less what belts at rest there can hold, in one of
+    the two directions (0 where none is at rest).
+    """
+
+    edge: Array
+    rightward: Array
+    limit: Array
+    codes: Array
+
+    def __call__(self, osc: Oscillator) -> Array:
+        at, mode = jnp.stack(edges(osc))[self.edge], Mode(tuple(self.codes))
+        needed = mode_acceleration(osc, mode, at, jnp.zeros(()))
+        return needed + self.limit * capacity(osc, mode)
+
+    def exists(self, osc: Oscillator) -> Array:
+        """Whether the contacts on that side are those."""
+        at = jnp.stack(edges(osc))[self.edge]
+        left, right = _beside_edge(osc, at)
+        return jnp.all(jnp.stack(select(self.rightward, right, left).codes) == self.codes)
+
+
+class EdgeBalance(eqx.Module):
+    """What vanishes where the pseudo-focus at an edge is neither stable nor unstable."""
+
+    edge: Array
+    left: Mode
+    right: Mode
+
+    def _focus(self, osc: Oscillator) -> EdgeFocus:
+        return edge_focus(osc, self.left, self.right, jnp.stack(edges(osc))[self.edge])
+
+    def __call__(self, osc: Oscillator) -> Array:
+        return self._focus(osc).contraction
+
+    def exists(self, osc: Oscillator) -> Array:
+        """Whether there is a pseudo-focus, and no belt at rest touches."""
+        return self._focus(osc).exists & ~self.left.any_stuck & ~self.right.any_stuck
+
+
+def _edges_of(osc: Oscillator, belt: Array) -> Array:
+    """The numbers of the lower and the upper edge of a belt."""
+    return belt + jnp.array([0, len(osc.belts)])
+
+
+def _beside_edge(osc: Oscillator, at: Array) -> tuple[Mode, Mode]:
+    """The contacts at rest to the left and to the right of an edge."""
+    rest = jnp.zeros_like(at)
+    return contact(osc, at, rest, rightward=False), contact(osc, at, rest, rightward=True)
+
+
+def edge_rest(osc: Oscillator, belt: Array) -> EdgeRest:
+    """The equation of a boundary equilibrium at an edge of a belt that is nearest to hold."""
+    cases = []
+    for edge in _edges_of(osc, belt):
+        sides = _beside_edge(osc, jnp.stack(edges(osc))[edge])
+        cases += [
+            EdgeRest(edge, jnp.asarray(rightward), jnp.asarray(limit), jnp.stack(mode.codes))
+            for rightward, mode in zip((False, True), sides, strict=True)
+            for limit in (-1.0, 1.0)
+        ]
+    missing = jnp.stack([jnp.abs(case(osc)) for case in cases])
+    at = jnp.argmin(jnp.where(jnp.isfinite(missing), missing, jnp.inf))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
+
+
+def edge_balance(osc: Oscillator, belt: Array) -> EdgeBalance:
+    """The equation of the pseudo-focus at an edge of a belt, of two the one nearer to balance."""
+    positions = jnp.stack(edges(osc))
+    cases = [
+        EdgeBalance(edge, *_beside_edge(osc, positions[edge])) for edge in _edges_of(osc, belt)
+    ]
+    size = [jnp.where(case.exists(osc), jnp.abs(case(osc)), jnp.inf) for case in cases]
+    at = jnp.argmin(jnp.stack(size))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
 
 
 def at_boundary_equilibrium(osc: Oscillator, index: int | Array, belts, wanted, size):
     """An equilibrium, or the end of a segment of them, lies on an edge of the first belt."""
-    still = lax.stop_gradient(osc)
-    at, numbers, sides = _edges_of(still, belts[0])
-
-    def surplus(osc, mode, edge):
-        """What is missing to rest there, at either limit of what belts at rest can hold."""
-        needed = mode_acceleration(osc, mode, edge, jnp.zeros_like(edge))
-        return jnp.stack([needed - capacity(osc, mode), needed + capacity(osc, mode)])
-
-    missing = jnp.stack([surplus(still, mode, at) for mode in sides])  # [sides, limits, edges]
-    nearest = jnp.argmin(jnp.where(jnp.isfinite(missing), jnp.abs(missing), jnp.inf))
-    side, limit, which = jnp.unravel_index(nearest, missing.shape)
-    edge = numbers[which]
-    codes = jnp.stack([jnp.stack(mode.codes) for mode in sides])[side, :, which]
-    mode = Mode(tuple(codes[i] for i in range(len(osc.belts))))
-
-    def equations(osc, u):
-        osc = vary(osc, index, u)
-        return surplus(osc, mode, jnp.stack(edges(osc))[edge])[limit][None]
-
-    def holds(osc, at):
-        now = [contact(osc, at, jnp.zeros(()), rightward=right) for right in (False, True)]
-        same = jnp.stack(jax.tree.leaves(select(side == 1, now[1], now[0]))) == codes
-        return jnp.all(same)
-
-    return _at_rest_on_edge(osc, index, edge, equations, holds)
+    return _rest_on_edge(osc, index, edge_rest(lax.stop_gradient(osc), belts[0]))
 
 
 def at_pseudo_hopf(osc: Oscillator, index: int | Array, belts, wanted, size):
     """The pseudo-focus at an edge of the first belt is neither stable nor unstable."""
-    still = lax.stop_gradient(osc)
-    at, numbers, sides = _edges_of(still, belts[0])
-    focus = edge_focus(still, *sides, at)
-    which = jnp.argmin(jnp.where(focus.exists, jnp.abs(focus.rate), jnp.inf))
-    edge = numbers[which]
-    left, right = jax.tree.map(lambda x: x[which], sides)
+    return _rest_on_edge(osc, index, edge_balance(lax.stop_gradient(osc), belts[0]))
 
-    def focus_at(osc):
-        return edge_focus(osc, left, right, jnp.stack(edges(osc))[edge])
+
+def _rest_on_edge(osc, index, equation: EdgeRest | EdgeBalance) -> BifurcationPoint:
+    """One equation in the parameter alone."""
 
     def equations(osc, u):
-        return focus_at(vary(osc, index, u)).contraction[None]
+        return equation(vary(osc, index, u))[None]
 
-    def holds(osc, at):
-        return focus.exists[which] & focus_at(osc).exists & ~left.any_stuck & ~right.any_stuck
-
-    return _at_rest_on_edge(osc, index, edge, equations, holds)
-
-
-def _at_rest_on_edge(osc, index, edge, equations, holds) -> BifurcationPoint:
-    """One equation in the parameter, and whether what it says of the edge is so at its solution."""
     u, steps, size, error = small_newton(equations, osc, parameter(osc, index)[None])
     at_point = vary(osc, index, u)
-    at = jnp.stack(edges(at_point))[edge]
-    status = jnp.where(holds(at_point, at), Status.OK.value, Status.NOT_ADMISSIBLE.value)
+    exists = equation.exists(at_point)
+    status = jnp.where(exists, Status.OK.value, Status.NOT_ADMISSIBLE.value)
     status = jnp.where(size < 1e-9, status, Status.NO_CONVERGENCE.value)
-    status = jnp.where(jnp.isfinite(at), status, Status.NOT_TOUCHED.value)
+    has_edge = jnp.isfinite(jnp.stack(edges(at_point))[equation.edge])
+    status = jnp.where(has_edge, status, Status.NOT_TOUCHED.value)
     return _point_without_cycle(osc, index, u[0], steps, size, error, status, Status.EQUILIBRIUM)
 
 
@@ -965,7 +1001,7 @@ def at_rest(osc: Oscillator, index: int | Array, belts, wanted, size) -> Bifurca
     return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.STUCK_FOREVER)
 
 
-#: What solves for a condition, if not `at_cycle`; and which of the two kinds that it finds is meant.
+#: What solves for a condition, if not `at_cycle`; and which of two kinds that one finds is meant.
 _SOLVERS = {
     Hopf: at_hopf,
     SuddenSliding: at_rest,

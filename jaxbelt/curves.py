@@ -29,14 +29,22 @@ from .bifurcations import (
     HINT_BUDGET,
     AbstractCondition,
     BifurcationPoint,
+    BoundaryEquilibrium,
+    CornerCollision,
+    EdgeContact,
     Encounter,
     FoldOfCycles,
+    GrazingEdge,
     GrazingSliding,
     Hopf,
     NonsmoothFold,
+    PseudoHopf,
     SlidingExchange,
     SuddenSliding,
     UnitMultiplier,
+    edge_balance,
+    edge_rest,
+    end_near_edge,
     leaf_index,
     parameter,
     small_newton,
@@ -80,7 +88,7 @@ class SpecialPoint(NamedTuple):
 
     kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
     "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
-    point, and a fold of cycles ends), "DoubleSliding" (the boundary of another belt is touched,
+    point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched,
     too), "BeltAtRest", "EqualVelocities"; belts: concerned; values: of the two parameters;
     residual: the largest error in all equations.
     """
@@ -386,6 +394,9 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
                 for offset in (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0)
             ]
             for _, point in refined(held, problem.indices[free], guesses):
+                if isinstance(condition, GrazingEdge | CornerCollision):
+                    if point.condition != condition:
+                        continue
                 at = [float(parameter(point.oscillator, index)) for index in problem.indices]
                 away = np.array(at) - centre
                 distance = float(np.linalg.norm(away))
@@ -577,7 +588,16 @@ def _system_of(problem: _Problem, point: BifurcationPoint) -> _System:
         return _HopfSystem(problem, point)
     if kind is SuddenSliding:
         return _RestSystem(problem, point)
-    if kind in (NonsmoothFold, GrazingSliding, SlidingExchange, FoldOfCycles):
+    if kind in (BoundaryEquilibrium, PseudoHopf):
+        return _EdgeSystem(problem, point)
+    if kind in (
+        NonsmoothFold,
+        GrazingSliding,
+        SlidingExchange,
+        FoldOfCycles,
+        GrazingEdge,
+        CornerCollision,
+    ):
         return _CycleSystem.begun(problem, point)
     raise ValueError(f"point must be of a kind that has curves, got {point.condition!r}")
 
@@ -689,6 +709,32 @@ def _velocity_equation(u: Array, args) -> Array:
     return jnp.stack([one.velocity for one in osc.belts])[belt][None]
 
 
+class _EdgeSystem(_System):
+    """One equation in the parameters: of what lies at rest on a contact edge."""
+
+    def __init__(self, problem: _Problem, point: BifurcationPoint):
+        condition = point.condition
+        self.residual = _edge_equation
+        self._indices = problem.indices
+        equation_of = edge_rest if isinstance(condition, BoundaryEquilibrium) else edge_balance
+        belt = jnp.asarray(getattr(condition, "belt", 0))
+        self.args = (point.oscillator, problem.indices, equation_of(point.oscillator, belt))
+
+    def unknowns(self, point):
+        return np.array([float(parameter(point.oscillator, index)) for index in self._indices])
+
+    def look(self, u):
+        osc, indices, equation = self.args
+        osc = _with(osc, indices, jnp.asarray(u))
+        tests = {name: float(value) for name, value in _velocity_tests(osc).items()}
+        return _Seen(tests, bool(equation.exists(osc)), np.nan, float(jnp.abs(equation(osc))))
+
+
+def _edge_equation(u: Array, args) -> Array:
+    osc, indices, equation = args
+    return equation(_with(osc, indices, u))[None]
+
+
 class _CycleSystem(_System):
     """3N + 1 equations in the unknowns of a cycle and the parameters, see `bifurcations`."""
 
@@ -713,6 +759,14 @@ class _CycleSystem(_System):
         chain = Chain(chain.codes, jnp.asarray(ends), chain.mesh)
         if isinstance(condition, FoldOfCycles):
             system = UnitMultiplier(chain, index)
+        elif isinstance(condition, GrazingEdge | CornerCollision):
+            z = point.cycle.unknowns
+            turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
+            belt, either = jnp.asarray(condition.belt), jnp.zeros(())
+            _, end, edge = end_near_edge(point.oscillator, turn, belt, either)
+            # In a corner a stick phase that begins or ends there may have no duration.
+            row = (int(end) + 1) % int(np.sum(ends != names.unused))
+            system = EdgeContact(chain, end, edge, index)
         else:
             system = Encounter(chain, jnp.asarray(np.array(belts)), index)
         weights = _weights(np.asarray(point.cycle.unknowns))
@@ -772,8 +826,11 @@ def _look_at_cycle(args, u: Array):
     n = len(osc.belts)
     names = Ends(n)
     rows = jnp.arange(chain.ends.size)
-    touches, is_fold = row >= 0, isinstance(system, UnitMultiplier)
+    is_fold, on_edge = isinstance(system, UnitMultiplier), isinstance(system, EdgeContact)
+    touches = (row >= 0) & (not on_edge)
     others = chain.used & (rows != row)
+    if on_edge:
+        others = others & (rows != system.row)
     sticks = others & jnp.any(chain.codes == 0, axis=-1)
     slope = jnp.where(jnp.any(sticks), 0.0, slope)
     tests = _velocity_tests(osc)
@@ -793,7 +850,7 @@ def _look_at_cycle(args, u: Array):
         gap = jnp.min(jnp.where(slips, chain.codes[:, belt] * r, jnp.inf))
         nearest = jnp.where(jnp.any(own), shortest, gap)
         # An exchange ends where the phase of sticking vanishes.
-        watched = (touches | is_fold | jnp.any(own)) & jnp.isfinite(nearest)
+        watched = (touches | is_fold | on_edge | jnp.any(own)) & jnp.isfinite(nearest)
         name = "FoldGrazing" if is_fold else "DoubleSliding"
         tests[name, (belt,)] = jnp.where(watched, nearest, jnp.nan)
     valid = (cycle.status == Status.OK) & ((size > 0) | (not is_fold))

@@ -20,7 +20,6 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -79,10 +78,10 @@ def scan(
     looked at first. Points of which one undoes what the other did are seen if one of these values
     lies between them.
 
-    Each point has `kind`, `value`, and the rest of a `BifurcationPoint`. Where something changes
-    and no condition explains it, there is a point of kind `Unexplained`, with the status
-    UNEXPLAINED and the value where it happens, good to about 1e-9 of the span. A contact edge or an
-    equilibrium meeting an edge are such changes. `ValueError` names an impossible argument.
+    Each point has `kind`, `value`, and the rest of a `BifurcationPoint`. What happens at contact
+    edges is looked for where there are any. Where something changes and no condition explains it,
+    there is a point of kind `Unexplained`, with the status UNEXPLAINED and the value where it
+    happens, good to about 1e-9 of the span. `ValueError` names an impossible argument.
     """
     return search(Path(osc, where, span), resolution)
 
