@@ -50,6 +50,7 @@ from jaxtyping import Array
 from .checks import is_concrete, number, require
 from .compiling import each, jit
 from .cycles import (
+    AT_REST,
     NEWTON_STEPS,
     SIZES,
     Chain,
@@ -143,6 +144,7 @@ class CornerCollision(_BeltCondition):
 
     It begins, or ceases, to stick to a belt there, or crosses its boundary: beyond, these come in
     another order, or another event comes instead; or, like at a nonsmooth fold, there is no cycle.
+    A guess has to lie on a side where that event is one of the cycle's.
     """
 
 
@@ -235,7 +237,7 @@ def refine(
     at_an_edge = solve in (at_edge, at_boundary_equilibrium, at_pseudo_hopf)
     if at_an_edge and is_concrete(osc):
         ends = [osc.belts[belts[0]].lower, osc.belts[belts[0]].upper]
-        require(np.any(np.isfinite(ends)), "belt", "one with a finite contact edge", belts[0])
+        require(np.any(np.isfinite(ends)), "belt", "one with a finite edge", repr(belts[0]))
     size = max_arcs or room_for(solve)
     # The belts are data: one program is compiled for all of them.
     wanted = np.float64(_SIDES.get(type(condition), 0.0))
@@ -687,9 +689,11 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
     chain, z = meshed(still, turn)
 
     def judge(osc, z, cycle, slope):
-        # A turn at once after the edge is passed solves the equations, too, but they are singular.
+        # A turn at once after the edge is passed solves the equations, too, but they are singular;
+        # and a cycle that has shrunk to a pseudo-focus meets everything there.
         singular = (chain.ends[row] == Ends(n).turn_x1) & (z[row, 2] < 1e-6)
-        fails = (cycle.status == Status.OK) & singular
+        shrunk = cycle.x1_max - cycle.x1_min < AT_REST
+        fails = (cycle.status == Status.OK) & (singular | shrunk)
         status = jnp.where(fails, Status.NO_CONVERGENCE.value, cycle.status)
         return status, jnp.asarray(jnp.nan)
 

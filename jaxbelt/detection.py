@@ -178,6 +178,9 @@ class Path:
         """The values just below and just above."""
         # Not nearer in a short span: a turn counts as repeated when it does so to 1e-7.
         distance = CLOSE * (1.0 + self.length)
+        if value in self.breaks and self.edged:
+            # Turns around a pseudo-focus with a velocity below 1e-5 are lost in rounding.
+            distance *= 30.0
         return value - distance, value + distance
 
     @property

@@ -388,6 +388,45 @@ def grazing(make, bracket, belt, y0=(3.0, 0.0)):
     return _solve(lambda p: gap(make(p), onset_belt, belt), bracket)
 
 
+def edge_grazing(make, bracket, edge, y0=(3.0, 0.0)):
+    """Parameter at which the sticking cycle touches a contact edge that it does not pass.
+
+    make(p) has that edge out of the way, so that touching it has no consequence.
+    """
+
+    def distance(p):
+        cycle = sticking_cycle(make(p), y0)
+        return min(cycle.x1_max - edge, cycle.x1_min - edge, key=abs)
+
+    return _solve(distance, bracket)
+
+
+def corner(make, bracket, belt, start, passages=2, slack=0.02):
+    """Parameter at which an orbit passes a contact edge just with the velocity of a belt.
+
+    start(osc) is its state and mode at first; the passage is the given one; the belt's boundary is
+    not acted upon, so that x2 there goes smoothly through the belt's velocity.
+    """
+
+    def excess(p):
+        osc, count = make(p), [0]
+
+        def until(item):
+            count[0] += isinstance(item, Event) and item.kind == "EDGE"
+            return count[0] == passages
+
+        run = advance(osc, *start(osc), 100.0, until=until, slack={belt: slack}, focus_speed=0.0)
+        assert run.status == "stopped", run.status
+        return run.stopped_by.x2 - osc.speed(belt)
+
+    return _solve(excess, bracket)
+
+
+def pseudo_hopf(make, bracket, edge):
+    """Parameter at which turns around the pseudo-focus at edge(parameter) do not grow or shrink."""
+    return _solve(lambda p: pseudo_focus_rate(make(p), edge(p)), bracket)
+
+
 def fold_of_cycles(make, bracket, distances):
     """Parameter at which two cycles that touch no boundary meet and vanish.
 
