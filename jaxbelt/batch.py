@@ -879,6 +879,53 @@ def run(
             future.result()
 
 
+# --- events as they are told ----------------------------------------------------------------------
+
+
+def _event_kinds(lanes: Lanes, passage: Passage) -> tuple[tuple[Array, Array, Array], ...]:
+    """(happened, kind, belt) of the event that ended a step, and of that which ended a stick phase
+    after it."""
+    sticks = jnp.where(passage.mode.any_stuck, EventKind.STICK.value, EventKind.CROSS.value)
+    at_edge = passage.guard >= len(lanes.mode.codes)
+    kind = jnp.where(at_edge, EventKind.EDGE.value, sticks)
+    release = jnp.where(passage.slips, EventKind.SLIP.value, EventKind.EDGE.value)
+    return (
+        (passage.fired, kind, _belt(passage.before, passage.mode, at_edge)),
+        (passage.released, release, _belt(passage.mode, lanes.mode, ~passage.slips)),
+    )
+
+
+def _belt(before: Mode, after: Mode, at_edge: Array) -> Array:
+    """The lowest belt whose contact changed, or, at an edge, that came or went."""
+    numbers = [jnp.asarray(i) for i in range(len(before.codes))]
+
+    def first_change(a, b):
+        return first_of([p != q for p, q in zip(a, b, strict=True)], numbers, jnp.asarray(-1))
+
+    came = first_change(before.touching, after.touching)
+    return jnp.where(at_edge, came, first_change(before.codes, after.codes))
+
+
+def _append(word: Array, kind: Array, belt: Array, belts: int) -> Array:
+    """A word with one more event; inf if it would no longer be a whole number to the last bit."""
+    longer = word * (len(EventKind) * belts + 1) + (1 + (kind - 1) * belts + belt)
+    return jnp.where(longer < 2.0**53, longer, jnp.inf)
+
+
+def word_events(word: int, belts: int) -> tuple[tuple[EventKind, int], ...]:
+    """The events, (kind, belt) each, that the word of an attractor's signature stands for.
+
+    A word is a number in the base 4 belts + 1: a leading 1, then 1 + (kind - 1) belts + belt for each
+    event.
+    """
+    events = []
+    while word > 1:
+        word, digit = divmod(word, len(EventKind) * belts + 1)
+        kind, belt = divmod(digit - 1, belts)
+        events.append((EventKind(kind + 1), belt))
+    return tuple(reversed(events))
+
+
 # --- what repeats ---------------------------------------------------------------------------------
 
 
@@ -978,14 +1025,15 @@ DISC = np.array([s * j / 8 for j in range(1, 9) for s in (1, -1)])
 class _Turn(eqx.Module):
     """The turn under way, since the last mark; arrays [lanes], sticks one a belt.
 
-    previous, change: the top before, and how far it was from the one before that; period and
-    transient are set when the attractor is found.
+    previous, change: the top before, and how far it was from the one before that; word: the events,
+    see `Attractor`; period and transient are set when the attractor is found.
     """
 
     mark: _Mark
     x1_min: Array
     x1_max: Array
     sticks: tuple[Array, ...]
+    word: Array
     previous: Array
     change: Array
     kind: Array
@@ -1008,6 +1056,8 @@ class Attractor(Observer):
       speeds; a law that wiggles on a scale below r/8 could deceive that. A pseudo-focus is
       recognised by `modes.is_captured`.
     - Stuck for ever: on a belt at rest.
+
+    The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
     """
 
     REPEATED: ClassVar[float] = 1e-7
@@ -1023,6 +1073,7 @@ class Attractor(Observer):
             lanes.x1,
             lanes.x1,
             sticks,
+            zero + 1,
             nothing,
             nothing,
             count,
@@ -1037,6 +1088,10 @@ class Attractor(Observer):
             total + jnp.where(stuck, passage.duration, 0.0)
             for total, stuck in zip(turn.sticks, passage.mode.stuck, strict=True)
         )
+        word = turn.word
+        for happened, kind, belt in _event_kinds(lanes, passage):
+            longer = _append(word, kind, belt, len(osc.belts))
+            word = jnp.where(happened & (belt >= 0), longer, word)
         # x1 is extreme where x2 = 0, and a step ends there.
         x1_min, x1_max = jnp.minimum(turn.x1_min, lanes.x1), jnp.maximum(turn.x1_max, lanes.x1)
         top = _once(passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done, one)
@@ -1070,6 +1125,7 @@ class Attractor(Observer):
                 jnp.where(found & passage.forever & stuck, jnp.inf, jnp.where(fresh, 0.0, total))
                 for total, stuck in zip(sticks, passage.mode.stuck, strict=True)
             ),
+            word=jnp.where(fresh, 1.0, word),
             previous=jnp.where(top, lanes.x1, turn.previous),
             change=jnp.where(top, change, turn.change),
             kind=jnp.where(found, kind, turn.kind),
@@ -1130,8 +1186,10 @@ class Attractor(Observer):
         turn: _Turn = lanes.memory
         undecided = (turn.kind == UNDECIDED) & (lanes.status == Status.OK.value)
         status = jnp.where(undecided, Status.NOT_SETTLED.value, lanes.status)
+        word = jnp.where(jnp.isinf(turn.word), -1.0, turn.word)
         return {
             "kind": turn.kind,
+            "signature": jnp.where(turn.kind == CYCLE, word, 0.0),
             "sticks": tuple(total > 0 for total in turn.sticks),
             "period": turn.period,
             "stick_duration": turn.sticks,
@@ -1177,18 +1235,12 @@ class Reduce(Observer):
         return jax.vmap(self.reducer.init, in_axes=(axes, 0, 0))(osc, lanes.x1, lanes.x2)
 
     def watch(self, osc, lanes, passage, one, t1, tol):
-        memory, busy, n = lanes.memory, lanes.run >= 0, len(osc.belts)
-        sticks = jnp.where(passage.mode.any_stuck, EventKind.STICK.value, EventKind.CROSS.value)
-        at_edge = passage.guard >= n
-        kind = jnp.where(at_edge, EventKind.EDGE.value, sticks)
-        belt = _belt(passage.before, passage.mode, at_edge)
+        memory, busy = lanes.memory, lanes.run >= 0
+        (fired, kind, belt), (released, *release) = _event_kinds(lanes, passage)
         event = Event(passage.t, passage.x1, passage.x2, kind, belt)
-        memory = self._update(memory, event, passage.fired & busy)
-
-        kind = jnp.where(passage.slips, EventKind.SLIP.value, EventKind.EDGE.value)
-        belt = _belt(passage.mode, lanes.mode, ~passage.slips)
-        event = Event(lanes.t, lanes.x1, lanes.x2, kind, belt)
-        memory = self._update(memory, event, passage.released & busy)
+        memory = self._update(memory, event, fired & busy)
+        event = Event(lanes.t, lanes.x1, lanes.x2, *release)
+        memory = self._update(memory, event, released & busy)
         return replace(lanes, memory=memory)
 
     def _update(self, memory, event, happened):
@@ -1197,14 +1249,3 @@ class Reduce(Observer):
     def finish(self, osc, lanes):
         end = End(lanes.t, lanes.x1, lanes.x2, lanes.status)
         return {**jax.vmap(self.reducer.finish)(lanes.memory, end), "status": lanes.status}
-
-
-def _belt(before: Mode, after: Mode, at_edge: Array) -> Array:
-    """The lowest belt whose contact changed, or, at an edge, that came or went."""
-    numbers = [jnp.asarray(i) for i in range(len(before.codes))]
-
-    def first_change(a, b):
-        return first_of([p != q for p, q in zip(a, b, strict=True)], numbers, jnp.asarray(-1))
-
-    came = first_change(before.touching, after.touching)
-    return jnp.where(at_edge, came, first_change(before.codes, after.codes))

@@ -51,6 +51,7 @@ LONG_NAMES = {
     "mode_end": "contact at t1: 1/-1 slips with that sign of nu - omega x2, 0 stuck, "
     "-2/2 mass below/above the belt's interval",
     "kind": "what the run leads to",
+    "signature": "events of one turn of the cycle, by number of flag_meanings",
     "sticks": "whether the attractor sticks to the belt",
     "period": "period of the cycle",
     "stick_duration": "time stuck to the belt in one turn",
@@ -65,6 +66,7 @@ LONG_NAMES = {
 #: Types of what is not a float.
 TYPES = {
     "kind": "int8",
+    "signature": "int64",
     "sticks": "bool",
     "mode_end": "int8",
     "n_events": "int32",
@@ -100,7 +102,8 @@ def sweep(
 
     - `"final"`: x1_end, x2_end, mode_end(belt) (contact codes as in `Trajectory.modes`), n_events.
     - `"attractor"`: kind ("equilibrium", "cycle", "stuck", or "undecided" at t1, which is 3000
-      unless given), sticks(belt), period, stick_duration(belt) in a turn (inf where stuck for
+      unless given), signature (the events of one turn, kind and belt: a number, with its meaning in
+      the attributes flag_values and flag_meanings), sticks(belt), period, stick_duration(belt) in a turn (inf where stuck for
       ever), x1_min, x1_max, x2_min, x2_max on the attractor, transient: the time at which it was
       reached, n_events: of a cycle in one turn, else until it was known. Runs end as soon as
       their attractor is known, see `batch.Attractor`.
@@ -280,6 +283,7 @@ class _Table:
 
     def __init__(self, program, grid: _Grid, derivatives, store, attributes):
         self.grid, self.derivatives = grid, derivatives
+        self.finds_attractors = isinstance(program.observer, batch.Attractor)
         self.layout = batch.layout(program, grid.shared)
         runs = math.prod(grid.shape)
         self.arrays: dict[str, np.ndarray] = {}
@@ -329,15 +333,19 @@ class _Table:
         belts = len(self.grid.example.belts)
         for name in sorted(self.arrays, key=_position):
             values = self.arrays[name]
-            if name == "kind" and "kind" in TYPES and "sticks" in self.arrays:
+            attributes_of = _attributes(name)
+            if self.finds_attractors and name == "kind":
                 values = np.array(batch.KINDS)[values]
+            if self.finds_attractors and name == "signature":
+                values, flags = _signatures(values, belts)
+                attributes_of |= flags
             extra = [f"{name}_{i}" for i in range(values.ndim - 1)]
             if name.split("_d_")[0].removeprefix("d_") in PER_BELT and values.shape[1:] == (belts,):
                 extra = ["belt"]
             variables[name] = (
                 (*self.grid.axes, *extra),
                 values.reshape(*self.grid.shape, *values.shape[1:]),
-                _attributes(name),
+                attributes_of,
             )
         coordinates = {
             name: (name, values, _attributes(name)) for name, values in self.grid.axes.items()
@@ -345,6 +353,33 @@ class _Table:
         if any("belt" in dims for dims, *_ in variables.values()):
             coordinates["belt"] = ("belt", np.arange(belts), _attributes("belt"))
         return xr.Dataset(variables, coordinates, attributes)
+
+
+def _signatures(words: np.ndarray, belts: int) -> tuple[np.ndarray, dict[str, Any]]:
+    """Numbers of the signatures that these words stand for, and CF's attributes that name them.
+
+    A signature begins where the sequence of its events is smallest, so that it does not depend on
+    where the turn began.
+    """
+    different, codes = np.unique(words, return_inverse=True)
+    meanings = [_meaning(int(word), belts) for word in different]
+    names = sorted(set(meanings), key=lambda name: (name != "none", name != "smooth", name))
+    number = {name: i for i, name in enumerate(names)}
+    values = np.array([number[name] for name in meanings], "int16")[codes.reshape(words.shape)]
+    flags = {
+        "flag_values": np.arange(len(names), dtype="int16"),
+        "flag_meanings": " ".join(names),
+    }
+    return values, flags
+
+
+def _meaning(word: int, belts: int) -> str:
+    """A signature as one word; -1 stands for one that is too long to be told."""
+    if word < 1:
+        return "none" if word == 0 else "long"
+    events = batch.word_events(word, belts)
+    turn = min((events[i:] + events[:i] for i in range(len(events))), default=())
+    return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in turn) or "smooth"
 
 
 def _position(name: str) -> tuple[int, str]:

@@ -8,7 +8,8 @@ import oracle_cycles
 import pytest
 
 import jaxbelt as jb
-from jaxbelt import Status
+from jaxbelt import Status, batch
+from jaxbelt.sweep import _signatures
 
 SPAN = 40.0
 #: Both integrate with this tolerance.
@@ -165,6 +166,28 @@ def test_attractors_equal_the_cycles_of_the_oracle():
             np.testing.assert_allclose(here[name], getattr(expected, name), atol=3e-8)
         np.testing.assert_allclose(here.stick_duration, expected.stick_durations, atol=1e-8)
         assert np.array_equal(here.sticks, np.array(expected.stick_durations) > 0)
+        meaning = dataset.signature.flag_meanings.split()[int(here.signature)]
+        assert meaning == signature_word(expected.signature)
+
+
+def signature_word(events):
+    """What a signature is called in a dataset: from where its sequence of events is smallest."""
+    told = [(jb.EventKind[kind], belt) for kind, belt in events]
+    turn = min(told[i:] + told[:i] for i in range(len(told)))
+    return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in turn)
+
+
+def test_signatures_that_are_not_of_one_turn():
+    """At rest there is none; one that no number holds is told to be long."""
+    values, flags = _signatures(np.array([[0, -1], [1, 1]]), belts=2)
+    assert flags["flag_meanings"].split() == ["none", "smooth", "long"]
+    assert values.tolist() == [[0, 2], [1, 1]]
+    assert np.array_equal(flags["flag_values"], [0, 1, 2])
+    word = jnp.ones(())
+    for _ in range(16):
+        word = batch._append(word, jnp.asarray(4), jnp.asarray(1), 2)
+    assert batch.word_events(int(word), 2) == ((jb.EventKind.EDGE, 1),) * 16
+    assert np.isinf(batch._append(word, jnp.asarray(4), jnp.asarray(1), 2))
 
 
 class Late:
@@ -219,5 +242,6 @@ def test_a_cycle_that_crosses_without_sticking():
     there = oracle.Oscillator(-0.05, (oracle.Belt(1.0, *mu), oracle.Belt(-1.0, *mu)))
     run = oracle.simulate(there, (1.5, 0.0), 600.0)
     assert dataset.kind == "cycle" and not dataset.sticks.any() and dataset.n_events == 4
+    assert dataset.signature.flag_meanings == "cross0-cross0-cross1-cross1"
     # It has converged to 1e-7 of the amplitude when it is accepted.
     np.testing.assert_allclose(dataset.period, run.events[-1].t - run.events[-5].t, rtol=1e-6)

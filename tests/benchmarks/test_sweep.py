@@ -189,7 +189,7 @@ def numba_runs(n):
 def test_w1_side_by_side(benchmark, tmp_path, monkeypatch):
     """A table: runs per second of one core, the ratio to Boost.odeint, and the sum of |x1(T)|."""
     monkeypatch.setattr(batch, "workers", lambda: 1)
-    n = 128
+    n = 256
     rows = []
     peer = boost(n, tmp_path)
     if peer is None:
