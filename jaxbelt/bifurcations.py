@@ -747,13 +747,14 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
         orbit, _, top = first_turn(still, x1, distance, size)
         rows = jnp.arange(size) < orbit.count
         sticks = jnp.any(rows & jnp.any(orbit.codes == 0, axis=-1))
-        return orbit, jnp.where(sticks, jnp.nan, jnp.log((top - x1) / distance))
+        return orbit, jnp.log((top - x1) / distance), sticks
 
     def narrow(bracket, _):
         distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
-        orbits, growth = jax.vmap(turn)(distances)
+        orbits, growth, sticks = jax.vmap(turn)(distances)
         change = jnp.diff(growth)
-        extremal = change[1:] * change[:-1] < 0
+        # Its neighbours may stick; what is extremal lies beside them.
+        extremal = (change[1:] * change[:-1] < 0) & ~sticks[1:-1]
         at = 1 + jnp.argmin(jnp.where(extremal, jnp.abs(growth[1:-1]), jnp.inf))
         found = jnp.any(extremal)
         bracket = jnp.where(found, jnp.stack([distances[at - 1], distances[at + 1]]), bracket)
