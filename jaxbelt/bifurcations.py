@@ -94,6 +94,8 @@ from .results import Status, describe
 HINT_BUDGET = 32
 #: Arcs for which each orbit is followed that may lead to a cycle.
 FOLLOWED = 96
+#: How often an orbit that has not settled is followed anew from what it approaches.
+ATTEMPTS = 4
 #: Where some of them start to the right of an equilibrium, so far from it.
 DISTANCES = (0.02, 0.3, 3.0)
 
@@ -469,21 +471,37 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
     """The orbit from a start until it settles, with the status OK where that is on a cycle.
 
     If it has not settled, the last three tops tell what it approaches: their differences form a
-    geometric sequence, so its limit is known (Aitken). It is a cycle if the limit is much nearer to
-    the last top than that is to any equilibrium. The orbit then counts as settled, its last turn as
-    the one that repeats.
+    geometric sequence, so its limit is known (Aitken). If that is much nearer to the last top than
+    this is to any equilibrium, the orbit from there is followed next, for on the way there may be a
+    boundary. What even then has not settled counts as settled, its last turn as the one that
+    repeats.
     """
-    orbit = follow(osc, start, FOLLOWED)
-    rows = jnp.arange(orbit.tops.size)
-    last = jnp.sort(jnp.where(jnp.isnan(orbit.tops), -1, rows))[-3:]
-    tops = orbit.tops[last]
-    before, after = tops[1] - tops[0], tops[2] - tops[1]
-    ratio = after / jnp.where(before == 0, 1.0, before)
-    limit = tops[2] + after * ratio / (1 - ratio)
-    distance = jnp.min(jnp.where(rests.kind > 0, jnp.abs(tops[2] - rests.x1), jnp.inf))
-    away = jnp.abs(limit - tops[2]) < 0.2 * distance
-    pending = (orbit.status == Status.NOT_SETTLED) & (last[0] >= 0) & (before != 0)
-    is_cycle = pending & (jnp.abs(ratio) < 1) & away
+
+    def attempt(state):
+        number, start, *_ = state
+        orbit = follow(osc, start, FOLLOWED)
+        rows = jnp.arange(orbit.tops.size)
+        last = jnp.sort(jnp.where(jnp.isnan(orbit.tops), -1, rows))[-3:]
+        tops = orbit.tops[last]
+        before, after = tops[1] - tops[0], tops[2] - tops[1]
+        ratio = after / jnp.where(before == 0, 1.0, before)
+        limit = tops[2] + after * ratio / (1 - ratio)
+        distance = jnp.min(jnp.where(rests.kind > 0, jnp.abs(tops[2] - rests.x1), jnp.inf))
+        away = jnp.abs(limit - tops[2]) < 0.2 * distance
+        pending = (orbit.status == Status.NOT_SETTLED) & (last[0] >= 0) & (before != 0)
+        is_cycle = pending & (jnp.abs(ratio) < 1) & away
+        return number + 1, jnp.stack([limit, jnp.zeros(())]), orbit, last, is_cycle
+
+    def unsettled(state):
+        number, *_, is_cycle = state
+        return (number == 0) | (is_cycle & (number < ATTEMPTS))
+
+    none = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(attempt, (jnp.asarray(0), start)),
+    )
+    first = (jnp.asarray(0), start, *none[2:])
+    _, _, orbit, last, is_cycle = lax.while_loop(unsettled, attempt, first)
     ended = eqx.tree_at(
         lambda o: (o.repeats, o.count, o.status),
         orbit,

@@ -105,7 +105,9 @@ def search(path: "Path", resolution: int = 96) -> tuple[BifurcationPoint, ...]:
         for a, b in intervals:
             point = found.get((a, b))
             if point is not None:
-                before, after = path.beside(float(point.value))
+                # Beyond a fold orbits pass the place of the cycles slowly.
+                slow = isinstance(point.condition, FoldOfCycles)
+                before, after = path.beside(float(point.value), slow=slow)
                 cut += [[a, max(a, before)], [min(b, after), b]]
             elif b - a <= 1e-9 * path.length:
                 points.append(unexplained_point(path.osc, int(path.index), 0.5 * (a + b), b - a))
@@ -174,12 +176,12 @@ class Path:
         """The oscillator there."""
         return vary(self.osc, self.index, jnp.full(1, value))
 
-    def beside(self, value: float) -> tuple[float, float]:
-        """The values just below and just above."""
+    def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
+        """The values just below and just above; farther off where motions are slow to settle."""
         # Not nearer in a short span: a turn counts as repeated when it does so to 1e-7.
         distance = CLOSE * (1.0 + self.length)
-        if value in self.breaks and self.edged:
-            # Turns around a pseudo-focus with a velocity below 1e-5 are lost in rounding.
+        # Turns around a pseudo-focus with a velocity below 1e-5 are lost in rounding.
+        if slow or (value in self.breaks and self.edged):
             distance *= 30.0
         return value - distance, value + distance
 
