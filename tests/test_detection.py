@@ -8,6 +8,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from laws import BELL, bell
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
@@ -76,6 +77,43 @@ def test_a_path_in_the_damping():
     assert grazing == pytest.approx(expected, abs=1e-9)
     expected = oracle_cycles.nonsmooth_fold(at, (fold - 0.01, fold + 0.01), 0)
     assert fold == pytest.approx(expected, abs=1e-9)
+
+
+def bell_oracle(nu):
+    return oracle.Oscillator(0.4, (oracle.Belt(nu, bell, 1.0, 1.0),), 1.0)
+
+
+def test_small_cycles_that_do_not_stick():
+    """They begin at a supercritical Hopf point and grow until they touch the boundary; on the far
+    side they end beyond a subcritical one, which the scan below goes up to."""
+    osc = jb.Oscillator(0.4, (jb.Belt(0.3, BELL),))
+    points = jb.scan(osc, nu0, (0.02, 0.49))
+    kinds = [jb.Hopf(), jb.GrazingSliding(0), jb.GrazingSliding(0), jb.Hopf()]
+    assert [point.condition for point in points] == kinds
+    for point, bracket in ((points[1], (0.09, 0.1)), (points[2], (0.44, 0.46))):
+        expected = oracle_cycles.nonsmooth_fold(bell_oracle, bracket, 0)
+        assert point.value == pytest.approx(expected, abs=1e-11) and 0 < point.multiplier < 1
+    for point, sign in ((points[0], -1), (points[3], 1)):
+        x = float(point.value) / 0.4  # a trace of zero, -mu' = zeta
+        assert 2 * x / (1 + x**2) ** 2 == pytest.approx(0.4, abs=1e-14)
+        assert np.sign(jb.lyapunov_coefficient(point.oscillator)) == sign
+    # In between the cycle is there: r^2 = -(trace/2)/a, up to a percent so far from the point.
+    beyond = jb.Oscillator(0.4, (jb.Belt(float(points[0].value) + 2e-3, BELL),))
+    cycle = jb.find_cycle(beyond, (float(jb.equilibria(beyond).x1[0]) + 0.05, 0.0))
+    assert cycle.stable and cycle.signature == ()
+    rate, a = jb.equilibria(beyond).rate[0], jb.lyapunov_coefficient(beyond)[0]
+    amplitude = 0.5 * (cycle.x1_max - cycle.x1_min)
+    assert amplitude == pytest.approx(np.sqrt(float(-rate / a)), rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_fold_of_cycles_is_found_once():
+    """Beyond it orbits linger where the cycles were."""
+    osc = jb.Oscillator(0.4, (jb.Belt(0.3, BELL),))
+    points = jb.scan(osc, nu0, (0.47, 0.7))
+    assert [point.condition for point in points] == [jb.Hopf(), jb.FoldOfCycles()]
+    expected = oracle_cycles.fold_of_cycles(bell_oracle, (0.49, 0.503), (0.2, 0.8))
+    assert points[1].value == pytest.approx(expected, abs=1e-11)
 
 
 def test_a_change_that_no_condition_explains_is_reported():
