@@ -557,7 +557,8 @@ def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, s
         slope = jnp.where(jnp.any(others), 0.0, slope)
         swapped = Chain(chain.codes[:, swap], chain.ends, chain.mesh)
         # An exchange needs the same cycle with the belts swapped; a tangency is of one kind.
-        fits = jnp.where(exchange, admissible(osc, swapped, z), wanted * (slope - 1) >= 0)
+        is_wanted = (wanted == 0) | (wanted * (slope - 1) >= 0)  # the slope may be infinite
+        fits = jnp.where(exchange, admissible(osc, swapped, z), is_wanted)
         slope = jnp.where(exchange, jnp.nan, slope)
         other_kind = (cycle.status == Status.OK) & ~fits
         return jnp.where(other_kind, Status.OTHER_KIND.value, cycle.status), slope

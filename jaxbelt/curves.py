@@ -517,12 +517,17 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
 
 
 def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
-    """A state on the strong unstable manifold of the equilibrium of a mode, on a belt at rest.
+    """A state on the orbit that leaves a belt at rest at slip onset, into a slip mode.
+
+    It is on the strong unstable manifold of the mode's equilibrium.
 
     With x2' = -(x1 - rest) + trace x2 + bend x2^2 and eigenvalues strong > weak, whose product is
     one, x1 - rest = weak x2 - weak bend / (2 strong - weak) x2^2 is invariant to third order. NaN
     where the eigenvalues are complex: then the orbit turns back to the belt at once, on a small
     cycle that touches nothing else, and no curve of tangencies ends here.
+
+    Where the law of the belt jumps, slip onset is not at that equilibrium, and the state is one
+    shortly after it: x2' is the jump.
     """
     mode, zero = Mode(tuple(codes[i] for i in range(len(osc.belts)))), jnp.zeros(())
     rest = mode_acceleration(osc, mode, zero, zero)
@@ -531,7 +536,12 @@ def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
     weak = 1 / strong
     x2 = -codes[belt] * DEPARTURE
     x1 = rest + weak * x2 - 0.5 * weak * twice_bend / (2 * strong - weak) * x2**2
-    return jnp.where(strong > 0, jnp.stack([x1, x2]), jnp.nan)
+    jumps = [b.load * (b.friction.static - b.friction.mu(zero)) for b in osc.belts]
+    jump = codes[belt] * jnp.stack(jumps)[belt]
+    is_jump = jnp.abs(jump) > 1e-12
+    onset = rest + jump - 0.5 * x2**2 / jnp.where(is_jump, jump, 1.0)
+    known = is_jump | (strong > 0)
+    return jnp.where(known, jnp.stack([jnp.where(is_jump, onset, x1), x2]), jnp.nan)
 
 
 def _sought(condition: AbstractCondition) -> AbstractCondition:
