@@ -314,7 +314,7 @@ def gap(osc, onset_belt, belt, slack=0.02):
     than `slack` beyond counts as -slack - |x2'| there (continuous, and far from the pole at
     which Conti's law, continued, ends).
     """
-    return _gap_from(osc, *slip_onset(osc, onset_belt), (onset_belt, belt), slack)
+    return gap_from(osc, *slip_onset(osc, onset_belt), (onset_belt, belt), slack)
 
 
 def gap_from_rest(osc, resting, sign, belt, slack=0.02):
@@ -331,10 +331,11 @@ def gap_from_rest(osc, resting, sign, belt, slack=0.02):
     strong = max(np.roots([1.0, -trace(osc, rest), 1.0]))
     assert np.isreal(strong)
     x2 = -sign * 1e-6
-    return _gap_from(osc, (rest + x2 / strong, x2), mode, (resting, belt), slack)
+    return gap_from(osc, (rest + x2 / strong, x2), mode, (resting, belt), slack)
 
 
-def _gap_from(osc, y, mode, belts, slack):
+def gap_from(osc, y, mode, belts, slack=0.02):
+    """The same for the orbit from a state in a mode; the last belt is that of the boundary."""
     run = _to_extremum(osc, y, mode, belts, slack)
     if run.status == "overshot":
         return -slack - abs(acceleration(osc, run.mode_end)(*run.y_end))

@@ -202,6 +202,25 @@ def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     assert rest.values == pytest.approx((0.0, expected), abs=1e-10) and rest.residual < 1e-12
 
 
+def test_a_limit_at_a_belt_at_rest_whose_law_jumps():
+    """Slip onset is away from the equilibrium there, by static - kinetic."""
+    belts = (jb.Belt(-0.05, jb.Coulomb(1.0, 0.6)), jb.Belt(0.395, jb.Conti(1.0, 0.6, 10.0)))
+    point = jb.refine(jb.GrazingSliding(1), jb.Oscillator(0.5, belts), where=nu1)
+    curve = jb.bifurcation_curve(point, (nu0, nu1), ((-0.1, 0.1), (0.05, 0.7)), step=0.02)
+    (rest,) = curve.special
+    mu, static = oracle.conti(1.0, 0.6, 10.0)
+
+    def gap(nu):
+        belts = (oracle.Belt(0.0, lambda r: 0.6, 1.0, 1.0), oracle.Belt(nu, mu, static, 1.0))
+        osc = oracle.Oscillator(0.5, belts, 1.0)
+        onset = oracle.acceleration(osc, (0, 1))(0.0, 0.0) - 1.0
+        return oracle_cycles.gap_from(osc, (onset, 0.0), (-1, 1), (0, 1))
+
+    assert (rest.kind, rest.belts) == ("BeltAtRest", (0,))
+    expected = brentq(gap, 0.39, 0.42, xtol=1e-14)
+    assert rest.values == pytest.approx((0.0, expected), abs=1e-11) and rest.residual < 1e-12
+
+
 def test_a_table_has_rows_and_special_points_in_order(fold):
     table = fold.table(("nu0", "nu1"))
     assert " ".join(table[0]) == "condition belts nu0 nu1 multiplier residual special"

@@ -79,6 +79,24 @@ def test_a_path_in_the_damping():
     assert fold == pytest.approx(expected, abs=1e-9)
 
 
+def test_folds_of_a_law_that_jumps():
+    """Belt 0 holds 0.5 and drags with 0.4: beyond its folds, to both sides, there is no cycle."""
+    belts = (jb.Belt(0.3, jb.Coulomb(1.0, 0.8), load=0.5), jb.Belt(0.35, jb.Conti(1.0, 0.6, 10.0)))
+    points = jb.scan(jb.Oscillator(0.5, belts), nu0, (-0.6, 0.6))
+    kinds = [jb.NonsmoothFold(0), jb.SuddenSliding(0), jb.NonsmoothFold(0)]
+    assert [point.condition for point in points] == kinds
+    mu, static = oracle.conti(1.0, 0.6, 10.0)
+
+    def make(nu):
+        belts = (oracle.Belt(nu, lambda r: 0.8, 1.0, 0.5), oracle.Belt(0.35, mu, static, 1.0))
+        return oracle.Oscillator(0.5, belts, 1.0)
+
+    for point in (points[0], points[2]):
+        bracket = (float(point.value) - 0.01, float(point.value) + 0.01)
+        expected = oracle_cycles.nonsmooth_fold(make, bracket, 0)
+        assert point.value == pytest.approx(expected, abs=1e-11) and point.multiplier == np.inf
+
+
 def bell_oracle(nu):
     return oracle.Oscillator(0.4, (oracle.Belt(nu, bell, 1.0, 1.0),), 1.0)
 
