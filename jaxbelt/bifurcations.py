@@ -930,9 +930,9 @@ class EdgeBalance(eqx.Module):
         return self._focus(osc).exists & ~self.left.any_stuck & ~self.right.any_stuck
 
 
-def _edges_of(osc: Oscillator, belt: Array) -> Array:
+def _edges_of(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     """The numbers of the lower and the upper edge of a belt."""
-    return belt + jnp.array([0, len(osc.belts)])
+    return belt, belt + jnp.asarray(len(osc.belts))
 
 
 def _beside_edge(osc: Oscillator, at: Array) -> tuple[Mode, Mode]:

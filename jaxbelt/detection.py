@@ -105,7 +105,6 @@ def search(path: "Path", resolution: int = 96) -> tuple[BifurcationPoint, ...]:
         for a, b in intervals:
             point = found.get((a, b))
             if point is not None:
-                # Beyond a fold orbits pass the place of the cycles slowly.
                 slow = isinstance(point.condition, FoldOfCycles)
                 before, after = path.beside(float(point.value), slow=slow)
                 cut += [[a, max(a, before)], [min(b, after), b]]
@@ -303,7 +302,11 @@ def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoin
         ]
         for guess, point in refined(path.osc, path.index, guesses):
             a, b = guess.interval
-            if a <= point.value <= b and found[a, b] is None:
+            low, high = a, b
+            if isinstance(point.condition, FoldOfCycles):
+                # Beyond a fold orbits pass the place of the cycles slowly, as if they were there.
+                low, high = path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]
+            if low <= point.value <= high and found[a, b] is None:
                 found[a, b] = point
     return found
 
