@@ -701,10 +701,10 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
 
     turns, distances, rows, numbers, large = each(run)(starts(still, rests))
     at = jnp.argmin(distances)
-    turn, distance, row, edge = jax.tree.map(lambda x: x[at], (turns, distances, rows, numbers))
-    turn, row = _without_excursion(still, turn, row, edge)
+    turn, edge = jax.tree.map(lambda x: x[at], turns), numbers[at]
+    turn, row = _without_excursion(still, turn, rows[at], edge)
     none = jnp.where(jnp.any(large), Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
-    status = jnp.where(jnp.isfinite(distance), Status.OK.value, none)
+    status = jnp.where(jnp.isfinite(distances[at]), Status.OK.value, none)
     chain, z = meshed(still, turn)
 
     def judge(osc, z, cycle, slope):
