@@ -64,6 +64,8 @@ from .results import EventKind, Status
 FIRST_STEP = 0.1
 #: Longest step: a quarter of a turn, so that x2 has at most one extremum in it.
 MAX_STEP = 1.5
+#: Errors over the tolerance below this one are taken for it: they may be rounding.
+LEAST = 1e-5
 #: The way that a Taylor step may bridge to a guard, over the square root of the tolerance.
 LANDING = 0.1
 #: Steps between two looks at the events, and events between two refills.
@@ -105,8 +107,9 @@ class Lanes(eqx.Module):
 
     run: number of the run, -1 for none; begun: the pass in which it began; t, x1, x2, a: time,
     state and x2'; h: next step size; negative where the lane has landed on a bound of its mode and
-    waits for what follows; mode; events: their number; status; done. lower, upper: extrema of x2
-    since `memory` was cleared, where the observer tracks them. memory: the observer's own.
+    waits for what follows; pace: the inverse of the step that would have met the tolerance; mode;
+    events: their number; status; done. lower, upper: extrema of x2 since `memory` was cleared,
+    where the observer tracks them. memory: the observer's own.
     """
 
     run: Array
@@ -116,6 +119,7 @@ class Lanes(eqx.Module):
     x2: Array
     a: Array
     h: Array
+    pace: Array
     mode: Mode
     events: Array
     status: Array
@@ -161,8 +165,9 @@ def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
 class Observer(eqx.Module):
     """What a run hands in, and when it may end early: subclasses are static settings."""
 
-    #: Whether the extrema of a run are wanted: steps then end where x2 = 0.
-    extrema: ClassVar[bool] = False
+    def extrema(self, lanes: Lanes) -> Array | None:
+        """Where the extrema of a run are wanted, for then steps end at them; None: nowhere."""
+        return None
 
     @abc.abstractmethod
     def start(self, osc: Oscillator, lanes: Lanes) -> Any:
@@ -189,16 +194,18 @@ class Observer(eqx.Module):
 
 
 class _Window(eqx.Module):
-    """Where the mode of a lane holds: bounds of x1 and x2; active: it slips; and for its field."""
+    """Where the mode of a lane holds: bounds of x1 and x2; extrema: where they are wanted; active:
+    it slips; and for its field."""
 
     x1: tuple[Array, Array] | None
     x2: tuple[Array, Array]
+    extrema: Array | None
     signs: tuple[Array, ...]
     pulls: tuple[Array, ...]
     active: Array
 
 
-def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: bool) -> _Window:
+def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | None) -> _Window:
     """The bounds of the current modes. Where x1 has to be monotone x2 is bounded by 0, too."""
     mode, inf = lanes.mode, jnp.full_like(lanes.t, jnp.inf)
     low, high = -inf, inf
@@ -206,7 +213,7 @@ def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: bool) -> _Wi
         boundary = belt.velocity / osc.omega
         high = jnp.where(code == 1, jnp.minimum(high, boundary), high)
         low = jnp.where(code == -1, jnp.maximum(low, boundary), low)
-    x1, turns = None, jnp.full_like(lanes.done, extrema)
+    x1, turns = None, jnp.zeros_like(lanes.done) if extrema is None else extrema
     if edges:
         left, right = -inf, inf
         for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
@@ -219,14 +226,14 @@ def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: bool) -> _Wi
         # comes to rest would turn for ever, with steps as small as rounding.
         reach = 4 * (jnp.abs(lanes.x2) + jnp.abs(lanes.a))
         turns = turns | (jnp.minimum(lanes.x1 - left, right - lanes.x1) <= reach)
-    if edges or extrema:
+    if edges or extrema is not None:
         up = turns & ((lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0)))
         down = turns & ((lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0)))
         low = jnp.where(up, jnp.maximum(low, 0.0), low)
         high = jnp.where(down, jnp.minimum(high, 0.0), high)
     signs = mode.signs
     pulls = tuple(belt.load * sign for belt, sign in zip(osc.belts, signs, strict=True))
-    return _Window(x1, (low, high), signs, pulls, ~lanes.done & ~mode.any_stuck)
+    return _Window(x1, (low, high), extrema, signs, pulls, ~lanes.done & ~mode.any_stuck)
 
 
 def _once(flag: Array, one: Array) -> Array:
@@ -328,9 +335,7 @@ class _Landing(eqx.Module):
     theta: Array
 
 
-def _landing(
-    window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rtol, *, extrema: bool
-) -> _Landing:
+def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rtol) -> _Landing:
     low, high = window.x2
     beyond_turn = path.turns & ((path.extremum > high) | (path.extremum < low))
     peak = jnp.where(beyond_turn, path.extremum, new.x2)
@@ -365,8 +370,9 @@ def _landing(
     # split the step there. Near the ends of a step the interpolant is exact to the second order.
     doubt = jnp.abs(path.k[3])
     grazes = (path.extremum > high - doubt) | (path.extremum < low + doubt)
-    if extrema:
-        grazes = grazes | (path.extremum > lanes.upper) | (path.extremum < lanes.lower)
+    if window.extrema is not None:
+        further = (path.extremum > lanes.upper) | (path.extremum < lanes.lower)
+        grazes = grazes | (window.extrema & further)
     grazes = grazes & path.turns & ~beyond_turn & (path.turn > 1e-3) & (path.turn < 1 - 1e-3)
     return _Landing(
         reached=reached,
@@ -379,14 +385,14 @@ def _landing(
     )
 
 
-def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol, observer) -> Lanes:
+def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol) -> Lanes:
     """One step of the lanes that slip: kept, shortened to end on a bound, or rejected."""
     left = t1 - lanes.t
     going = window.active & (lanes.h > 0) & (left > 0)
     h = jnp.where(going, jnp.minimum(lanes.h, left), 0.0)
     new = _attempt(osc, window, one, lanes, h, rtol, atol)
     path = _path(one, lanes, new)
-    at = _landing(window, one, lanes, new, path, rtol, extrema=observer.extrema)
+    at = _landing(window, one, lanes, new, path, rtol)
 
     last = h >= left
     accepted = going & (new.error <= 1)
@@ -404,13 +410,17 @@ def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol, observ
         x1 = jnp.where(lands & at.on_edge, at.x1, x1)
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
     # NaN is a large error, too. The error is of order eight in h.
-    size = jnp.where(new.error < 1e5, jnp.maximum(new.error, 1e-5), 1e5)
-    # No quotient by a root: XLA has an inverse root of its own, which is no vector operation.
-    growth = jnp.sqrt(jnp.sqrt(jnp.sqrt(0.9**8 / size)))
-    proposed = jnp.minimum(h * growth, MAX_STEP)
+    size = jnp.where(new.error < 1e5, jnp.maximum(new.error, LEAST), 1e5)
+    # No power, and no quotient by a root: XLA's are no vector operations.
+    pace = jnp.sqrt(jnp.sqrt(jnp.sqrt(size))) / jnp.where(going, h, 1.0)
+    # A step that was cut short tells little: the pace is at most that.
+    pace = jnp.where(new.error <= LEAST, jnp.minimum(pace, lanes.pace), pace)
+    # What has become slower goes on to do so, on the way to a boundary with its bend of the law.
+    trend = jnp.where(accepted, jnp.maximum(pace, lanes.pace) / lanes.pace, 1.0)
+    proposed = jnp.minimum(0.9 / (pace * trend), MAX_STEP)
     proposed = jnp.where(shortened, at.theta * h, jnp.where(lands, -proposed, proposed))
     lower, upper = lanes.lower, lanes.upper
-    if observer.extrema:
+    if window.extrema is not None:
         extremum = jnp.where(path.turns, path.extremum, x2)
         lower = jnp.where(kept, jnp.minimum(lower, jnp.minimum(x2, extremum)), lower)
         upper = jnp.where(kept, jnp.maximum(upper, jnp.maximum(x2, extremum)), upper)
@@ -421,6 +431,7 @@ def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol, observ
         x2=jnp.where(kept, x2, lanes.x2),
         a=jnp.where(kept, new.a, lanes.a),
         h=lax.stop_gradient(jnp.where(going, proposed, lanes.h)),
+        pace=lax.stop_gradient(jnp.where(accepted, pace, lanes.pace)),
         lower=lower,
         upper=upper,
     )
@@ -432,9 +443,12 @@ def _first_step(rtol):
 
 def _first_root(poly, g_start, end, g_end):
     """Root in (0, end] of g_start + poly[0] theta + poly[1] theta^2 ..., by Newton's method."""
-    # On the boundary that the lane has just left g vanishes, too: that root is not the one.
+    # A lane that moves away from the bound at first comes back to it late in the step. So does one
+    # that has just left it, where g vanishes but for rounding: that root is not the one.
+    nears = (g_start * poly[0] < 0) & (jnp.abs(g_start) > 1e-9 * jnp.abs(g_end))
     ratio = jnp.abs(g_start) / (jnp.abs(g_start) + jnp.abs(g_end))
-    theta = jnp.where(jnp.abs(g_start) > 1e-3 * jnp.abs(g_end), ratio, 1.0) * end
+    straight = jnp.abs(g_start) / jnp.where(nears, jnp.abs(poly[0]), 1.0)
+    theta = jnp.where(nears, jnp.minimum(straight, ratio * end), end)
     for _ in range(3):
         value, slope = poly[-1], jnp.zeros_like(theta)
         for k in (*reversed(poly[:-1]), g_start):
@@ -500,7 +514,7 @@ def _pass_events(
         forever=forever,
     )
     lanes = eqx.tree_at(
-        lambda n: (n.t, n.x1, n.x2, n.a, n.h, n.mode, n.events, n.status, n.done),
+        lambda n: (n.t, n.x1, n.x2, n.a, n.h, n.pace, n.mode, n.events, n.status, n.done),
         lanes,
         (
             t,
@@ -509,6 +523,7 @@ def _pass_events(
             jnp.where(moved, a, lanes.a),
             # The field is new after an event, and so is the step size.
             jnp.where(fired, _first_step(rtol), jnp.abs(lanes.h)),
+            jnp.where(fired, 0.9 / _first_step(rtol), lanes.pace),
             mode,
             lanes.events + jnp.where(fired, 1, 0) + jnp.where(released, 1, 0),
             status,
@@ -567,6 +582,7 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
         x2=x2,
         a=mode_acceleration(osc, mode, x1, x2) + zero,
         h=zero + _first_step(rtol),
+        pace=zero + 0.9 / _first_step(rtol),
         mode=Mode(tuple(code + zero for code in mode.codes)),
         events=jnp.zeros_like(run),
         status=jnp.where(finite, Status.OK.value, Status.NOT_FINITE.value).astype(run.dtype),
@@ -677,10 +693,10 @@ def _advance(
     def round_(osc, _, lanes):
         lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
         lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
-        window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema)
+        window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
 
         def step(_, lanes):
-            return _step(osc, window, one, lanes, t1, rtol, atol, observer)
+            return _step(osc, window, one, lanes, t1, rtol, atol)
 
         return lax.fori_loop(0, STEPS, step, lanes)
 
@@ -915,8 +931,8 @@ def _append(word: Array, kind: Array, belt: Array, belts: int) -> Array:
 def word_events(word: int, belts: int) -> tuple[tuple[EventKind, int], ...]:
     """The events, (kind, belt) each, that the word of an attractor's signature stands for.
 
-    A word is a number in the base 4 belts + 1: a leading 1, then 1 + (kind - 1) belts + belt for each
-    event.
+    A word is a number in the base 4 belts + 1: a leading 1, then for each event
+    1 + (kind - 1) belts + belt.
     """
     events = []
     while word > 1:
@@ -1025,7 +1041,8 @@ DISC = np.array([s * j / 8 for j in range(1, 9) for s in (1, -1)])
 class _Turn(eqx.Module):
     """The turn under way, since the last mark; arrays [lanes], sticks one a belt.
 
-    previous, change: the top before, and how far it was from the one before that; word: the events,
+    tops: how many there were since the last stick phase; previous, change: the top before, and how
+    far it was from the one before that; word: the events,
     see `Attractor`; period and transient are set when the attractor is found.
     """
 
@@ -1034,6 +1051,7 @@ class _Turn(eqx.Module):
     x1_max: Array
     sticks: tuple[Array, ...]
     word: Array
+    tops: Array
     previous: Array
     change: Array
     kind: Array
@@ -1045,10 +1063,10 @@ class _Turn(eqx.Module):
 class Attractor(Observer):
     """Where the run leads; it ends as soon as that is known.
 
-    - A cycle: a top (a maximum of x1, where x2 = 0) repeats. After a stick phase the orbit is a
-      function of the parameters alone, so a turn that sticks repeats to the last bits. One that
-      does not stick converges: it has repeated when what is left of the way to the limit, by the
-      ratio of its last two changes, is below `REPEATED` times the amplitude.
+    - A cycle: an orbit that sticks repeats the end of a stick phase; from there it is a function of
+      the parameters alone, so it does so to the last bits. One that does not stick converges: its
+      top (a maximum of x1, where x2 = 0) has repeated when what is left of the way to the limit, by
+      the ratio of its last two changes, is below `REPEATED` times the amplitude.
     - An equilibrium: the orbit has entered a disc that is attracted by a fixed point. In a slip
       mode x1'' = -(x1 - x1*) + f(x2) with f(0) = 0, so E = (x1 - x1*)^2 + x2^2 obeys
       E' = 2 x2 f(x2). If v f(v) < 0 for all 0 < |v| <= r, and the disc of radius r lies within the
@@ -1061,7 +1079,13 @@ class Attractor(Observer):
     """
 
     REPEATED: ClassVar[float] = 1e-7
-    extrema: ClassVar[bool] = True
+    #: Until then extrema are left out, unless a stick phase has ended: about two turns.
+    SETTLING: ClassVar[float] = 12.0
+    #: Tops without a stick phase after which a run is taken to stick no more.
+    SMOOTH: ClassVar[int] = 2
+
+    def extrema(self, lanes):
+        return ~jnp.isnan(lanes.memory.mark.x1) | (lanes.t > self.SETTLING)
 
     def start(self, osc, lanes):
         zero = jnp.zeros_like(lanes.t)
@@ -1074,6 +1098,7 @@ class Attractor(Observer):
             lanes.x1,
             sticks,
             zero + 1,
+            count,
             nothing,
             nothing,
             count,
@@ -1101,10 +1126,12 @@ class Attractor(Observer):
         ratio = jnp.abs(change / jnp.where(turn.change == 0, 1.0, turn.change))
         left = jnp.where(ratio < 1, ratio / jnp.where(ratio < 1, 1 - ratio, 1.0), jnp.inf)
         moved, close = jnp.abs(lanes.x1 - mark.x1), amplitude * self.REPEATED
-        sticking = functools.reduce(jnp.add, sticks) > 0
         converged = (moved <= close) & ((moved * left <= close) | (moved < 30 * tol * amplitude))
-        repeats = jnp.where(sticking, moved <= 1e-9 * amplitude, converged)
-        repeats = top & repeats & (_code(lanes.mode) == mark.code)
+        released = _once(passage.released & ~lanes.mode.any_stuck & ~lanes.done, one)
+        tops = jnp.where(released, 0, turn.tops + jnp.where(top, 1, 0))
+        section = released | (top & (tops > self.SMOOTH))
+        repeats = jnp.where(released, moved <= 1e-9 * amplitude, converged)
+        repeats = section & repeats & (_code(lanes.mode) == mark.code)
 
         kind = jnp.where(repeats, CYCLE, UNDECIDED)
         kind = jnp.where(repeats & (amplitude < self.REPEATED), EQUILIBRIUM, kind)
@@ -1114,7 +1141,7 @@ class Attractor(Observer):
         kind = (jnp.where(going_on, kind, UNDECIDED) / one).astype(turn.kind.dtype)
         found = kind != UNDECIDED
         resting = found & (kind != CYCLE)
-        renewed, new = _renew(mark, lanes, top & ~found, one)
+        renewed, new = _renew(mark, lanes, section & ~found, one)
         # An attractor at rest is a point; a new mark begins a new turn.
         fresh = new | resting
         memory = _Turn(
@@ -1126,6 +1153,7 @@ class Attractor(Observer):
                 for total, stuck in zip(sticks, passage.mode.stuck, strict=True)
             ),
             word=jnp.where(fresh, 1.0, word),
+            tops=tops,
             previous=jnp.where(top, lanes.x1, turn.previous),
             change=jnp.where(top, change, turn.change),
             kind=jnp.where(found, kind, turn.kind),

@@ -30,7 +30,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .checks import as_numbers, check_finite, check_positive, is_concrete, pick, require
+from .checks import as_numbers, check_finite, check_positive, is_concrete, require
 from .compiling import jit
 from .derivatives import forward_jacobian
 from .extrapolation import increments, scheme
@@ -562,6 +562,9 @@ def _unused(belts: int) -> _Record:
 def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     """States and modes at the times ts, each from the arc that it lies in."""
     entries = jnp.where(jnp.isnan(records.t), jnp.inf, lax.stop_gradient(records.t))
+    wanted = ts.size
+    if wanted:
+        ts = jnp.pad(ts, (0, -wanted % SAMPLED), mode="edge")
     # Past the end of the last arc the run either rests, with a reason, or is unknown.
     rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
 
@@ -580,13 +583,12 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
 
     # A few at a time, and those together that are as far from where their arc begins.
     order = jnp.argsort(lax.stop_gradient(jnp.where(stuck, 0.0, since)))
-    filled = jnp.concatenate([order, jnp.zeros(-ts.size % SAMPLED, order.dtype)])
     rows = jax.tree.map(
-        lambda leaf: leaf[filled].reshape(-1, SAMPLED, *leaf.shape[1:]), (arcs, since, stuck)
+        lambda leaf: leaf[order].reshape(-1, SAMPLED, *leaf.shape[1:]), (arcs, since, stuck)
     )
     ys = lax.map(lambda row: jax.vmap(at)(*row), rows).reshape(-1, 2)[jnp.argsort(order)]
     afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
-    return jnp.where(beyond[:, None], afterwards, ys), arcs.mode
+    return jnp.where(beyond[:, None], afterwards, ys)[:wanted], arcs.mode[:wanted]
 
 
 @jit
@@ -752,11 +754,15 @@ def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
     """Cut the padding off where lengths are known, that is, outside of transformations."""
     if not is_concrete(trajectory) or trajectory.ts.ndim != 1:
         return trajectory
-    events = pick(trajectory.events, np.flatnonzero(trajectory.events.kind))
-    arcs = pick(trajectory.arcs, np.flatnonzero(~np.isnan(trajectory.arcs.t)))
-    samples = (trajectory.ts, trajectory.ys, trajectory.modes)
+    known = jax.tree.map(np.asarray, trajectory)
+
+    def rows(tree, numbers):
+        return jax.tree.map(lambda leaf: leaf[numbers], tree)
+
+    samples = (known.ts, known.ys, known.modes)
     if trim_samples:
-        _, distinct = np.unique(trajectory.ts, return_index=True)
-        samples = pick(samples, distinct)
-    ts, ys, modes = samples
-    return Trajectory(ts, ys, modes, events, arcs, trajectory.status)
+        samples = rows(samples, np.unique(known.ts, return_index=True)[1])
+    events = rows(known.events, np.flatnonzero(known.events.kind))
+    arcs = rows(known.arcs, np.flatnonzero(~np.isnan(known.arcs.t)))
+    # Put there as they are: jnp.asarray compiles a program for every shape.
+    return jax.device_put(Trajectory(*samples, events, arcs, known.status))

@@ -103,10 +103,10 @@ def sweep(
     - `"final"`: x1_end, x2_end, mode_end(belt) (contact codes as in `Trajectory.modes`), n_events.
     - `"attractor"`: kind ("equilibrium", "cycle", "stuck", or "undecided" at t1, which is 3000
       unless given), signature (the events of one turn, kind and belt: a number, with its meaning in
-      the attributes flag_values and flag_meanings), sticks(belt), period, stick_duration(belt) in a turn (inf where stuck for
-      ever), x1_min, x1_max, x2_min, x2_max on the attractor, transient: the time at which it was
-      reached, n_events: of a cycle in one turn, else until it was known. Runs end as soon as
-      their attractor is known, see `batch.Attractor`.
+      the attributes flag_values and flag_meanings), sticks(belt), period, stick_duration(belt) in
+      a turn (inf where stuck for ever), x1_min, x1_max, x2_min, x2_max on the attractor,
+      transient: the time at which it was reached, n_events: of a cycle in one turn, else until it
+      was known. Runs end as soon as their attractor is known, see `batch.Attractor`.
     - an object with three methods for scalars: `init(osc, x1, x2)`, the state of a run, any tree of
       arrays; `update(state, event)`, the state after a `batch.Event` (t, x1, x2, kind, belt); and
       `finish(state, end)`, a dictionary of results from the state and a `batch.End` (t, x1, x2,
