@@ -717,7 +717,8 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
         return status, jnp.asarray(jnp.nan)
 
     p0 = parameter(still, index)[None]
-    return _solved_point(osc, EdgeContact(chain, row, edge, index), z, p0, status, judge)
+    system = EdgeContact(chain=chain, row=row, edge=edge, index=index)
+    return _solved_point(osc, system, z, p0, status, judge)
 
 
 # --- the fold of cycles ---------------------------------------------------------------------------

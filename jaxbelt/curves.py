@@ -776,7 +776,7 @@ class _CycleSystem(_System):
             _, end, edge = end_near_edge(point.oscillator, turn, belt, either)
             # In a corner a stick phase that begins or ends there may have no duration.
             row = (int(end) + 1) % int(np.sum(ends != names.unused))
-            system = EdgeContact(chain, end, edge, index)
+            system = EdgeContact(chain=chain, row=end, edge=edge, index=index)
         else:
             system = Encounter(chain, jnp.asarray(np.array(belts)), index)
         weights = _weights(np.asarray(point.cycle.unknowns))
