@@ -5,11 +5,11 @@ one unknown more, the second parameter, pseudo-arclength follows it (see `contin
 points included. The signature is fixed while it lasts. Functions are watched that vanish where two
 conditions hold at once: the first Lyapunov coefficient on a Hopf curve; on a curve of tangencies
 the multiplier less one, the duration of each other stick phase and the distance of each other
-extremum of x2 from a boundary, as on a curve of folds of cycles, where the cycle's size is watched,
-too; on every curve the velocities and their differences. Where one
-changes its sign the curve is solved for its zero, a point of codimension two. There the signature
-may change; the condition is then refined anew just beyond, and the curve goes on from there with
-the signature that is found.
+extremum of x2 from a boundary, the last two also where a cycle touches a contact edge and on a
+curve of folds of cycles, where the cycle's size is watched, too; on every curve the velocities and
+their differences. Where one changes its sign the curve is solved for its zero, a point of
+codimension two. There the signature may change; the condition is then refined anew just beyond,
+and the curve goes on from there with the signature that is found.
 """
 
 import functools

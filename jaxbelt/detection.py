@@ -2,9 +2,9 @@
 
 What the oscillator does at one value of the parameter is summed up in a label: the kind and the
 stability of every equilibrium, and the signature of every attracting cycle, that is, which belts
-it sticks to and crosses and which contact edges it passes, in the order of one turn. Every cycle
-that sticks comes by a slip onset, so it is found by following the orbits from there; a few starts
-beside the equilibria find the rest.
+it sticks to, slips from and crosses and which contact edges it passes, in the order of one turn. A
+cycle that sticks mostly comes by a slip onset, so it is found by following the orbits from there; a
+few starts beside the equilibria find the rest.
 
 Between two values with one label nothing is taken to happen. Where labels differ the interval is
 narrowed until Newton's method converges from its ends. The conditions that could make this
