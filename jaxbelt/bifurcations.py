@@ -24,6 +24,14 @@ unknowns of fixed-signature shooting (see `cycles`) the same equation is harmles
 - `FoldOfCycles`: the multiplier of a cycle that does not stick is one. There the equations of the
   cycle alone are singular; with this one, and the parameter, they are not. (A cycle that sticks
   has the multiplier zero and takes part in nonsmooth folds only.)
+- `GrazingEdge`, `CornerCollision`: an arc of a cycle ends on a contact edge, though it is not the
+  edge that ends it. Where a turn of x1 ends it, the orbit is tangent to the edge, x2 = 0; where a
+  boundary r_k = 0 or slip onset does, it runs into the corner of that boundary and the edge. Both
+  are one equation, linear in the unknowns. A cycle that passes the edge and turns soon after has
+  that excursion left out: with it the equation is of second order in the velocity at the edge.
+- `BoundaryEquilibrium`: at rest on an edge, the force on one of its sides is zero, or as large as
+  belts at rest there can hold: a fixed point, or the end of a segment, comes to lie on the edge.
+- `PseudoHopf`: at a pseudo-focus the leading term by which turns grow or shrink is zero.
 """
 
 import abc
@@ -40,13 +48,15 @@ from jax import lax
 from jaxtyping import Array
 
 from .checks import is_concrete, number, require
-from .compiling import jit
+from .compiling import each, jit
 from .cycles import (
+    AT_REST,
     NEWTON_STEPS,
     SIZES,
     Chain,
     Cycle,
     Ends,
+    Orbit,
     Turn,
     admissible,
     closure,
@@ -62,21 +72,32 @@ from .cycles import (
     trace_of,
     turn_of,
 )
-from .equilibria import EquilibriumKind, equilibria
+from .equilibria import Equilibria, EquilibriumKind, equilibria
 from .modes import (
     STUCK,
+    EdgeFocus,
     Mode,
     boundary_guards,
     capacity,
+    contact,
+    edge_focus,
     edge_guards,
+    edges,
     mode_acceleration,
     mode_of_state,
+    select,
 )
 from .oscillator import Oscillator
 from .results import Status, describe
 
 #: Arcs for which the orbit from slip onset is followed in search of the signature.
 HINT_BUDGET = 32
+#: Arcs for which each orbit is followed that may lead to a cycle.
+FOLLOWED = 96
+#: How often an orbit that has not settled is followed anew from what it approaches.
+ATTEMPTS = 4
+#: Where some of them start to the right of an equilibrium, so far from it.
+DISTANCES = (0.02, 0.3, 3.0)
 
 
 class AbstractCondition(eqx.Module):
@@ -111,6 +132,30 @@ class SlidingExchange(AbstractCondition):
     """Two belts run at one velocity: the cycle changes from sticking to one to the other."""
 
     belts: tuple[int, int] = eqx.field(static=True)
+
+
+class GrazingEdge(_BeltCondition):
+    """A turn of the cycle, an extremum of x1, touches a contact edge of a belt.
+
+    Beyond, the cycle passes the edge, or there is none: where the edge pushes away to both sides.
+    """
+
+
+class CornerCollision(_BeltCondition):
+    """The cycle runs into a corner of a contact edge of a belt and a boundary r_k = 0.
+
+    It begins, or ceases, to stick to a belt there, or crosses its boundary: beyond, these come in
+    another order, or another event comes instead; or, like at a nonsmooth fold, there is no cycle.
+    A guess has to lie on a side where that event is one of the cycle's.
+    """
+
+
+class BoundaryEquilibrium(_BeltCondition):
+    """A fixed point, or the end of a segment, lies on a contact edge of a belt."""
+
+
+class PseudoHopf(_BeltCondition):
+    """The pseudo-focus at a contact edge of a belt changes its stability."""
 
 
 class Unexplained(AbstractCondition):
@@ -169,9 +214,11 @@ def refine(
     """The bifurcation point near an oscillator, by Newton's method with exact derivatives.
 
     condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`, `SlidingExchange(belts)`,
-    `SuddenSliding(belt)` or `FoldOfCycles()`. osc: a rough guess, on either side of the point.
-    where: selects the parameter that is varied, such as `lambda osc: osc.belts[0].velocity`.
-    max_arcs: room for the arcs of one turn (default 16).
+    `SuddenSliding(belt)`, `FoldOfCycles()`, or of a belt with a contact edge `GrazingEdge(belt)`,
+    `CornerCollision(belt)`, `BoundaryEquilibrium(belt)` or `PseudoHopf(belt)`. osc: a rough guess,
+    on either side of the point. where: selects the parameter that is varied, such as
+    `lambda osc: osc.belts[0].velocity`. max_arcs: room for the arcs of one turn (default 16; where
+    edges are passed 32).
 
     Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`; `value` and
     `cycle` are differentiable with respect to the other parameters. A guess that leads to no such
@@ -188,12 +235,21 @@ def refine(
     belts = (condition.belt,) * 2 if isinstance(condition, _BeltCondition) else belts
     for belt in belts:
         require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
-    size = SIZES[1] if max_arcs is None else max_arcs
+    solve = solver_of(condition)
+    at_an_edge = solve in (at_edge, at_boundary_equilibrium, at_pseudo_hopf)
+    if at_an_edge and is_concrete(osc):
+        ends = [osc.belts[belts[0]].lower, osc.belts[belts[0]].upper]
+        require(np.any(np.isfinite(ends)), "belt", "one with a finite edge", repr(belts[0]))
+    size = max_arcs or room_for(solve)
     # The belts are data: one program is compiled for all of them.
-    solve = _SOLVERS.get(type(condition), at_cycle)
     wanted = np.float64(_SIDES.get(type(condition), 0.0))
     point = _refine(solve, osc, leaf_index(osc, where), np.array(belts), wanted, size)
     return replace(point, condition=condition)
+
+
+def room_for(solve: Callable) -> int:
+    """Room for the arcs of one turn: passing edges takes more of them."""
+    return SIZES[2] if solve is at_edge else SIZES[1]
 
 
 def leaf_index(osc: Oscillator, where: Callable[[Oscillator], Any]) -> int:
@@ -284,11 +340,13 @@ class Encounter(_System):
         g, g_p, g_miss = _value_and_slopes(lambda p, m: self._condition(osc_of(p), m), p[0], miss)
         row = g_miss * jnp.append(blocks[:, 3, :3].reshape(-1), jnp.sum(blocks[:, 3, 3]))
         row = row.at[-1].add(g_p)
-        equations = jnp.concatenate(
-            [jacobian(blocks[:, :3, :3]), blocks[:, :3, 3].reshape(-1, 1)], axis=1
-        )
-        matrix = jnp.concatenate([equations, row[None]])
+        matrix = jnp.concatenate([_cycle_rows(blocks), row[None]])
         return jnp.append(value.reshape(-1), g), matrix
+
+
+def _cycle_rows(blocks: Array) -> Array:
+    """The rows of the matrix that belong to the equations of the cycle."""
+    return jnp.concatenate([jacobian(blocks[:, :3, :3]), blocks[:, :3, 3].reshape(-1, 1)], axis=1)
 
 
 def _value_and_slopes(fn, p, miss):
@@ -395,6 +453,63 @@ def before_onset(osc: Oscillator, belt: int | Array) -> Array:
     return jnp.stack([x1, v])
 
 
+def starts(osc: Oscillator, rests: Equilibria) -> Array:
+    """Where the orbits start that find the cycles, [starts, 2].
+
+    Before slip onset on each belt, and at several distances from an equilibrium.
+    """
+    exists = rests.kind > 0
+    repels = exists & ~rests.stable
+    row = jnp.where(jnp.any(repels), jnp.argmax(repels), jnp.maximum(jnp.sum(exists) - 1, 0))
+    centre = jnp.where(jnp.any(exists), rests.x1[row], 0.0)
+    onsets = [before_onset(osc, belt) for belt in range(len(osc.belts))]
+    others = [jnp.stack([centre + distance, jnp.zeros(())]) for distance in DISTANCES]
+    return jnp.stack([*onsets, *others])
+
+
+def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
+    """The orbit from a start until it settles, with the status OK where that is on a cycle.
+
+    If it has not settled, the last three tops tell what it approaches: their differences form a
+    geometric sequence, so its limit is known (Aitken). If that is much nearer to the last top than
+    this is to any equilibrium, the orbit from there is followed next, for on the way there may be a
+    boundary. What even then has not settled counts as settled, its last turn as the one that
+    repeats.
+    """
+
+    def attempt(state):
+        number, start, *_ = state
+        orbit = follow(osc, start, FOLLOWED)
+        rows = jnp.arange(orbit.tops.size)
+        last = jnp.sort(jnp.where(jnp.isnan(orbit.tops), -1, rows))[-3:]
+        tops = orbit.tops[last]
+        before, after = tops[1] - tops[0], tops[2] - tops[1]
+        ratio = after / jnp.where(before == 0, 1.0, before)
+        limit = tops[2] + after * ratio / (1 - ratio)
+        distance = jnp.min(jnp.where(rests.kind > 0, jnp.abs(tops[2] - rests.x1), jnp.inf))
+        away = jnp.abs(limit - tops[2]) < 0.2 * distance
+        pending = (orbit.status == Status.NOT_SETTLED) & (last[0] >= 0) & (before != 0)
+        is_cycle = pending & (jnp.abs(ratio) < 1) & away
+        return number + 1, jnp.stack([limit, jnp.zeros(())]), orbit, last, is_cycle
+
+    def unsettled(state):
+        number, *_, is_cycle = state
+        return (number == 0) | (is_cycle & (number < ATTEMPTS))
+
+    none = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(attempt, (jnp.asarray(0), start)),
+    )
+    first = (jnp.asarray(0), start, *none[2:])
+    _, _, orbit, last, is_cycle = lax.while_loop(unsettled, attempt, first)
+    ended = eqx.tree_at(
+        lambda o: (o.repeats, o.count, o.status),
+        orbit,
+        (last[1], last[2] + 1, jnp.asarray(Status.OK.value)),
+    )
+    return jax.tree.map(lambda a, b: jnp.where(is_cycle, a, b), ended, orbit)
+
+
 def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
     """A cycle tangent to the boundary of a belt, given twice, or at the exchange of two belts.
 
@@ -442,7 +557,8 @@ def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, s
         slope = jnp.where(jnp.any(others), 0.0, slope)
         swapped = Chain(chain.codes[:, swap], chain.ends, chain.mesh)
         # An exchange needs the same cycle with the belts swapped; a tangency is of one kind.
-        fits = jnp.where(exchange, admissible(osc, swapped, z), wanted * (slope - 1) >= 0)
+        is_wanted = (wanted == 0) | (wanted * (slope - 1) >= 0)  # the slope may be infinite
+        fits = jnp.where(exchange, admissible(osc, swapped, z), is_wanted)
         slope = jnp.where(exchange, jnp.nan, slope)
         other_kind = (cycle.status == Status.OK) & ~fits
         return jnp.where(other_kind, Status.OTHER_KIND.value, cycle.status), slope
@@ -466,9 +582,7 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
     own = turn.used & (turn.codes[:, belt] == 0)
     shortest = jnp.argmin(jnp.where(own, turn.durations, jnp.inf))
 
-    count = jnp.sum(turn.used)
-    last = (rows == count - 1)[:, None]
-    following = jnp.where(last, turn.entries[0], jnp.roll(turn.entries, -1, axis=0))
+    following = turn.exits
     names = Ends(len(osc.belts))
     turns = turn.used & (turn.ends == names.turn_x2)
     turns = turns & (turn.codes[:, belt] == jnp.sign(velocity))
@@ -491,6 +605,120 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
     has_own = jnp.any(own)
     turn = jax.tree.map(lambda a, b: jnp.where(has_own, a, b), turn, new)
     return turn, jnp.where(has_own, shortest, at + 1), has_own | jnp.any(turns)
+
+
+# --- touching a contact edge ----------------------------------------------------------------------
+
+
+class EdgeContact(_System):
+    """A fixed signature, and x1 at the end of the arc `row` is that of an edge, by its number."""
+
+    chain: Chain
+    row: Array
+    edge: Array
+    index: int | Array
+
+    def _miss(self, osc: Oscillator, z: Array) -> Array:
+        following = (self.row + 1) % z.shape[0]  # unused arcs hand the state on
+        return z[following, 0] - jnp.stack(edges(osc))[self.edge]
+
+    def residual(self, osc: Oscillator, z: Array, p: Array) -> Array:
+        osc = vary(osc, self.index, p)
+        value, _ = residual(osc, self.chain, z)
+        return jnp.append(value.reshape(-1), self._miss(osc, z))
+
+    def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
+        def osc_of(p):
+            return vary(osc, self.index, p)
+
+        value, _, blocks = residual_and_blocks(osc_of, self.chain, z, p)
+        miss, row = jax.value_and_grad(lambda z, p: self._miss(osc_of(p), z), (0, 1))(z, p)
+        last = jnp.append(row[0].reshape(-1), row[1])
+        matrix = jnp.concatenate([_cycle_rows(blocks), last[None]])
+        return jnp.append(value.reshape(-1), miss), matrix
+
+
+def end_near_edge(
+    osc: Oscillator, turn: Turn, belt: Array, wanted: Array
+) -> tuple[Array, Array, Array]:
+    """Of the arcs that no edge ends the one whose end is nearest to an edge of the belt.
+
+    wanted: 1 of the arcs that a turn of x1 ends, -1 of those that a boundary or slip onset ends, 0
+    of both. Returns the distance (inf: there is none), the row of the arc, the number of the edge.
+    """
+    n = len(osc.belts)
+    names = Ends(n)
+    positions = jnp.stack(edges(osc))
+    own = jnp.stack([positions[belt], positions[n + belt]])
+    grazes, meets = turn.ends == names.turn_x1, (turn.ends < n) | (turn.ends == names.onset)
+    eligible = turn.used & (grazes & (wanted >= 0) | meets & (wanted <= 0))
+    distance = jnp.abs(turn.exits[:, :1] - own[None])
+    distance = jnp.where(eligible[:, None] & jnp.isfinite(distance), distance, jnp.inf)
+    at = jnp.argmin(distance)
+    return distance.reshape(-1)[at], at // 2, belt + n * (at % 2)
+
+
+def _without_excursion(osc: Oscillator, turn: Turn, row: Array, edge: Array) -> tuple[Turn, Array]:
+    """The turn without what lies beyond the edge, if all of it is the turn of x1 that ends a row;
+    and the row that then ends in that turn of x1."""
+    n = len(osc.belts)
+    names = Ends(n)
+    rows, count = jnp.arange(turn.ends.size), jnp.maximum(jnp.sum(turn.used), 1)
+    passes = (turn.ends >= n) & (turn.ends < 3 * n)
+    passes = passes & (turn.exits[:, 0] == jnp.stack(edges(osc))[edge])
+    # The events before and after; turns of x2 are none.
+    events = turn.used & (turn.ends != names.turn_x2) & (rows != row)
+    before = jnp.argmin(jnp.where(events, (row - rows) % count, rows.size))
+    after = jnp.argmin(jnp.where(events, (rows - row) % count, rows.size))
+    is_excursion = (turn.ends[row] == names.turn_x1) & passes[before] & passes[after]
+    is_excursion = is_excursion & (before != after)
+    left = count - (after - before) % count
+    source = jnp.where(rows < left, (after + 1 + rows) % count, (after + 1) % count)
+    ends = jnp.where(rows < left, turn.ends[source], names.unused).at[left - 1].set(names.turn_x1)
+    durations = jnp.where(rows < left, turn.durations[source], 0.0)
+    without = Turn(turn.codes[source], ends, turn.entries[source], durations)
+    turn = jax.tree.map(lambda a, b: jnp.where(is_excursion, a, b), without, turn)
+    return turn, jnp.where(is_excursion, left - 1, row)
+
+
+def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
+    """A cycle of which an arc ends on an edge of the first belt, though no edge ends it.
+
+    wanted: 1 a turn ends it (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
+    attracting cycles that which comes nearest to this is taken.
+    """
+    n = len(osc.belts)
+    still = lax.stop_gradient(osc)
+    rests = equilibria(still)
+
+    def run(start):
+        orbit = approach(still, rests, start)
+        turn, (_, count) = turn_of(orbit, size, n), last_turn(orbit)
+        found = orbit.status == Status.OK
+        distance, row, edge = end_near_edge(still, turn, belts[0], wanted)
+        distance = jnp.where(found & (count <= size), distance, jnp.inf)
+        return turn, distance, row, edge, found & (count > size)
+
+    turns, distances, rows, numbers, large = each(run)(starts(still, rests))
+    at = jnp.argmin(distances)
+    turn, edge = jax.tree.map(lambda x: x[at], turns), numbers[at]
+    turn, row = _without_excursion(still, turn, rows[at], edge)
+    none = jnp.where(jnp.any(large), Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
+    status = jnp.where(jnp.isfinite(distances[at]), Status.OK.value, none)
+    chain, z = meshed(still, turn)
+
+    def judge(osc, z, cycle, slope):
+        # A turn at once after the edge is passed solves the equations, too, but they are singular;
+        # and a cycle that has shrunk to a pseudo-focus meets everything there.
+        singular = (chain.ends[row] == Ends(n).turn_x1) & (z[row, 2] < 1e-6)
+        shrunk = cycle.x1_max - cycle.x1_min < AT_REST
+        fails = (cycle.status == Status.OK) & (singular | shrunk)
+        status = jnp.where(fails, Status.NO_CONVERGENCE.value, cycle.status)
+        return status, jnp.asarray(jnp.nan)
+
+    p0 = parameter(still, index)[None]
+    system = EdgeContact(chain=chain, row=row, edge=edge, index=index)
+    return _solved_point(osc, system, z, p0, status, judge)
 
 
 # --- the fold of cycles ---------------------------------------------------------------------------
@@ -519,10 +747,8 @@ class UnitMultiplier(_System):
 
         value, _, blocks = residual_and_blocks(osc_of, self.chain, z, p)
         m, row = jax.value_and_grad(slope, (0, 1))(z, p)
-        equations = jnp.concatenate(
-            [jacobian(blocks[:, :3, :3]), blocks[:, :3, 3].reshape(-1, 1)], axis=1
-        )
-        matrix = jnp.concatenate([equations, jnp.append(row[0].reshape(-1), row[1])[None]])
+        last = jnp.append(row[0].reshape(-1), row[1])
+        matrix = jnp.concatenate([_cycle_rows(blocks), last[None]])
         return jnp.append(value.reshape(-1), m - 1), matrix
 
 
@@ -541,13 +767,14 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
         orbit, _, top = first_turn(still, x1, distance, size)
         rows = jnp.arange(size) < orbit.count
         sticks = jnp.any(rows & jnp.any(orbit.codes == 0, axis=-1))
-        return orbit, jnp.where(sticks, jnp.nan, jnp.log((top - x1) / distance))
+        return orbit, jnp.log((top - x1) / distance), sticks
 
     def narrow(bracket, _):
         distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
-        orbits, growth = jax.vmap(turn)(distances)
+        orbits, growth, sticks = jax.vmap(turn)(distances)
         change = jnp.diff(growth)
-        extremal = change[1:] * change[:-1] < 0
+        # Its neighbours may stick; what is extremal lies beside them.
+        extremal = (change[1:] * change[:-1] < 0) & ~sticks[1:-1]
         at = 1 + jnp.argmin(jnp.where(extremal, jnp.abs(growth[1:-1]), jnp.inf))
         found = jnp.any(extremal)
         bracket = jnp.where(found, jnp.stack([distances[at - 1], distances[at + 1]]), bracket)
@@ -662,6 +889,111 @@ def at_hopf(osc: Oscillator, index: int | Array, belts, wanted, size) -> Bifurca
     return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.EQUILIBRIUM)
 
 
+class EdgeRest(eqx.Module):
+    """What vanishes where an equilibrium lies on an edge, by the number of the edge.
+
+    The needed force at rest on one side of it, less what belts at rest there can hold, in one of
+    the two directions (0 where none is at rest).
+    """
+
+    edge: Array
+    rightward: Array
+    limit: Array
+    codes: Array
+
+    def __call__(self, osc: Oscillator) -> Array:
+        at, mode = jnp.stack(edges(osc))[self.edge], Mode(tuple(self.codes))
+        needed = mode_acceleration(osc, mode, at, jnp.zeros(()))
+        return needed + self.limit * capacity(osc, mode)
+
+    def exists(self, osc: Oscillator) -> Array:
+        """Whether the contacts on that side are those."""
+        at = jnp.stack(edges(osc))[self.edge]
+        left, right = _beside_edge(osc, at)
+        return jnp.all(jnp.stack(select(self.rightward, right, left).codes) == self.codes)
+
+
+class EdgeBalance(eqx.Module):
+    """What vanishes where the pseudo-focus at an edge is neither stable nor unstable."""
+
+    edge: Array
+    left: Mode
+    right: Mode
+
+    def _focus(self, osc: Oscillator) -> EdgeFocus:
+        return edge_focus(osc, self.left, self.right, jnp.stack(edges(osc))[self.edge])
+
+    def __call__(self, osc: Oscillator) -> Array:
+        return self._focus(osc).contraction
+
+    def exists(self, osc: Oscillator) -> Array:
+        """Whether there is a pseudo-focus, and no belt at rest touches."""
+        return self._focus(osc).exists & ~self.left.any_stuck & ~self.right.any_stuck
+
+
+def _edges_of(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
+    """The numbers of the lower and the upper edge of a belt."""
+    return belt, belt + jnp.asarray(len(osc.belts))
+
+
+def _beside_edge(osc: Oscillator, at: Array) -> tuple[Mode, Mode]:
+    """The contacts at rest to the left and to the right of an edge."""
+    rest = jnp.zeros_like(at)
+    return contact(osc, at, rest, rightward=False), contact(osc, at, rest, rightward=True)
+
+
+def edge_rest(osc: Oscillator, belt: Array) -> EdgeRest:
+    """The equation of a boundary equilibrium at an edge of a belt that is nearest to hold."""
+    cases = []
+    for edge in _edges_of(osc, belt):
+        sides = _beside_edge(osc, jnp.stack(edges(osc))[edge])
+        cases += [
+            EdgeRest(edge, jnp.asarray(rightward), jnp.asarray(limit), jnp.stack(mode.codes))
+            for rightward, mode in zip((False, True), sides, strict=True)
+            for limit in (-1.0, 1.0)
+        ]
+    missing = jnp.stack([jnp.abs(case(osc)) for case in cases])
+    at = jnp.argmin(jnp.where(jnp.isfinite(missing), missing, jnp.inf))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
+
+
+def edge_balance(osc: Oscillator, belt: Array) -> EdgeBalance:
+    """The equation of the pseudo-focus at an edge of a belt, of two the one nearer to balance."""
+    positions = jnp.stack(edges(osc))
+    cases = [
+        EdgeBalance(edge, *_beside_edge(osc, positions[edge])) for edge in _edges_of(osc, belt)
+    ]
+    size = [jnp.where(case.exists(osc), jnp.abs(case(osc)), jnp.inf) for case in cases]
+    at = jnp.argmin(jnp.stack(size))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
+
+
+def at_boundary_equilibrium(osc: Oscillator, index: int | Array, belts, wanted, size):
+    """An equilibrium, or the end of a segment of them, lies on an edge of the first belt."""
+    return _rest_on_edge(osc, index, edge_rest(lax.stop_gradient(osc), belts[0]))
+
+
+def at_pseudo_hopf(osc: Oscillator, index: int | Array, belts, wanted, size):
+    """The pseudo-focus at an edge of the first belt is neither stable nor unstable."""
+    return _rest_on_edge(osc, index, edge_balance(lax.stop_gradient(osc), belts[0]))
+
+
+def _rest_on_edge(osc, index, equation: EdgeRest | EdgeBalance) -> BifurcationPoint:
+    """One equation in the parameter alone."""
+
+    def equations(osc, u):
+        return equation(vary(osc, index, u))[None]
+
+    u, steps, size, error = small_newton(equations, osc, parameter(osc, index)[None])
+    at_point = vary(osc, index, u)
+    exists = equation.exists(at_point)
+    status = jnp.where(exists, Status.OK.value, Status.NOT_ADMISSIBLE.value)
+    status = jnp.where(size < 1e-9, status, Status.NO_CONVERGENCE.value)
+    has_edge = jnp.isfinite(jnp.stack(edges(at_point))[equation.edge])
+    status = jnp.where(has_edge, status, Status.NOT_TOUCHED.value)
+    return _point_without_cycle(osc, index, u[0], steps, size, error, status, Status.EQUILIBRIUM)
+
+
 def at_rest(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
     """The first of the belts comes to rest, and a cycle sticks to it."""
     belt = belts[0]
@@ -694,6 +1026,19 @@ def at_rest(osc: Oscillator, index: int | Array, belts, wanted, size) -> Bifurca
     return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.STUCK_FOREVER)
 
 
-#: What solves for a condition, if not `at_cycle`; and on which side of one the multiplier lies.
-_SOLVERS = {Hopf: at_hopf, SuddenSliding: at_rest, FoldOfCycles: at_fold_of_cycles}
-_SIDES = {NonsmoothFold: 1.0, GrazingSliding: -1.0}
+#: What solves for a condition, if not `at_cycle`; and which of two kinds that one finds is meant.
+_SOLVERS = {
+    Hopf: at_hopf,
+    SuddenSliding: at_rest,
+    FoldOfCycles: at_fold_of_cycles,
+    GrazingEdge: at_edge,
+    CornerCollision: at_edge,
+    BoundaryEquilibrium: at_boundary_equilibrium,
+    PseudoHopf: at_pseudo_hopf,
+}
+_SIDES = {NonsmoothFold: 1.0, GrazingSliding: -1.0, GrazingEdge: 1.0, CornerCollision: -1.0}
+
+
+def solver_of(condition: AbstractCondition) -> Callable:
+    """What solves for a condition."""
+    return _SOLVERS.get(type(condition), at_cycle)

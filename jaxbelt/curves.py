@@ -5,11 +5,11 @@ one unknown more, the second parameter, pseudo-arclength follows it (see `contin
 points included. The signature is fixed while it lasts. Functions are watched that vanish where two
 conditions hold at once: the first Lyapunov coefficient on a Hopf curve; on a curve of tangencies
 the multiplier less one, the duration of each other stick phase and the distance of each other
-extremum of x2 from a boundary, as on a curve of folds of cycles, where the cycle's size is watched,
-too; on every curve the velocities and their differences. Where one
-changes its sign the curve is solved for its zero, a point of codimension two. There the signature
-may change; the condition is then refined anew just beyond, and the curve goes on from there with
-the signature that is found.
+extremum of x2 from a boundary, the last two also where a cycle touches a contact edge and on a
+curve of folds of cycles, where the cycle's size is watched, too; on every curve the velocities and
+their differences. Where one changes its sign the curve is solved for its zero, a point of
+codimension two. There the signature may change; the condition is then refined anew just beyond,
+and the curve goes on from there with the signature that is found.
 """
 
 import functools
@@ -29,14 +29,22 @@ from .bifurcations import (
     HINT_BUDGET,
     AbstractCondition,
     BifurcationPoint,
+    BoundaryEquilibrium,
+    CornerCollision,
+    EdgeContact,
     Encounter,
     FoldOfCycles,
+    GrazingEdge,
     GrazingSliding,
     Hopf,
     NonsmoothFold,
+    PseudoHopf,
     SlidingExchange,
     SuddenSliding,
     UnitMultiplier,
+    edge_balance,
+    edge_rest,
+    end_near_edge,
     leaf_index,
     parameter,
     small_newton,
@@ -80,7 +88,7 @@ class SpecialPoint(NamedTuple):
 
     kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
     "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
-    point, and a fold of cycles ends), "DoubleSliding" (the boundary of another belt is touched,
+    point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched,
     too), "BeltAtRest", "EqualVelocities"; belts: concerned; values: of the two parameters;
     residual: the largest error in all equations.
     """
@@ -386,6 +394,9 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
                 for offset in (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0)
             ]
             for _, point in refined(held, problem.indices[free], guesses):
+                if isinstance(condition, GrazingEdge | CornerCollision):
+                    if point.condition != condition:
+                        continue
                 at = [float(parameter(point.oscillator, index)) for index in problem.indices]
                 away = np.array(at) - centre
                 distance = float(np.linalg.norm(away))
@@ -506,12 +517,17 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
 
 
 def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
-    """A state on the strong unstable manifold of the equilibrium of a mode, on a belt at rest.
+    """A state on the orbit that leaves a belt at rest at slip onset, into a slip mode.
+
+    It is on the strong unstable manifold of the mode's equilibrium.
 
     With x2' = -(x1 - rest) + trace x2 + bend x2^2 and eigenvalues strong > weak, whose product is
     one, x1 - rest = weak x2 - weak bend / (2 strong - weak) x2^2 is invariant to third order. NaN
     where the eigenvalues are complex: then the orbit turns back to the belt at once, on a small
     cycle that touches nothing else, and no curve of tangencies ends here.
+
+    Where the law of the belt jumps, slip onset is not at that equilibrium, and the state is one
+    shortly after it: x2' is the jump.
     """
     mode, zero = Mode(tuple(codes[i] for i in range(len(osc.belts)))), jnp.zeros(())
     rest = mode_acceleration(osc, mode, zero, zero)
@@ -520,7 +536,12 @@ def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
     weak = 1 / strong
     x2 = -codes[belt] * DEPARTURE
     x1 = rest + weak * x2 - 0.5 * weak * twice_bend / (2 * strong - weak) * x2**2
-    return jnp.where(strong > 0, jnp.stack([x1, x2]), jnp.nan)
+    jumps = [b.load * (b.friction.static - b.friction.mu(zero)) for b in osc.belts]
+    jump = codes[belt] * jnp.stack(jumps)[belt]
+    is_jump = jnp.abs(jump) > 1e-12
+    onset = rest + jump - 0.5 * x2**2 / jnp.where(is_jump, jump, 1.0)
+    known = is_jump | (strong > 0)
+    return jnp.where(known, jnp.stack([jnp.where(is_jump, onset, x1), x2]), jnp.nan)
 
 
 def _sought(condition: AbstractCondition) -> AbstractCondition:
@@ -577,7 +598,16 @@ def _system_of(problem: _Problem, point: BifurcationPoint) -> _System:
         return _HopfSystem(problem, point)
     if kind is SuddenSliding:
         return _RestSystem(problem, point)
-    if kind in (NonsmoothFold, GrazingSliding, SlidingExchange, FoldOfCycles):
+    if kind in (BoundaryEquilibrium, PseudoHopf):
+        return _EdgeSystem(problem, point)
+    if kind in (
+        NonsmoothFold,
+        GrazingSliding,
+        SlidingExchange,
+        FoldOfCycles,
+        GrazingEdge,
+        CornerCollision,
+    ):
         return _CycleSystem.begun(problem, point)
     raise ValueError(f"point must be of a kind that has curves, got {point.condition!r}")
 
@@ -689,6 +719,32 @@ def _velocity_equation(u: Array, args) -> Array:
     return jnp.stack([one.velocity for one in osc.belts])[belt][None]
 
 
+class _EdgeSystem(_System):
+    """One equation in the parameters: of what lies at rest on a contact edge."""
+
+    def __init__(self, problem: _Problem, point: BifurcationPoint):
+        condition = point.condition
+        self.residual = _edge_equation
+        self._indices = problem.indices
+        equation_of = edge_rest if isinstance(condition, BoundaryEquilibrium) else edge_balance
+        belt = jnp.asarray(getattr(condition, "belt", 0))
+        self.args = (point.oscillator, problem.indices, equation_of(point.oscillator, belt))
+
+    def unknowns(self, point):
+        return np.array([float(parameter(point.oscillator, index)) for index in self._indices])
+
+    def look(self, u):
+        osc, indices, equation = self.args
+        osc = _with(osc, indices, jnp.asarray(u))
+        tests = {name: float(value) for name, value in _velocity_tests(osc).items()}
+        return _Seen(tests, bool(equation.exists(osc)), np.nan, float(jnp.abs(equation(osc))))
+
+
+def _edge_equation(u: Array, args) -> Array:
+    osc, indices, equation = args
+    return equation(_with(osc, indices, u))[None]
+
+
 class _CycleSystem(_System):
     """3N + 1 equations in the unknowns of a cycle and the parameters, see `bifurcations`."""
 
@@ -713,6 +769,14 @@ class _CycleSystem(_System):
         chain = Chain(chain.codes, jnp.asarray(ends), chain.mesh)
         if isinstance(condition, FoldOfCycles):
             system = UnitMultiplier(chain, index)
+        elif isinstance(condition, GrazingEdge | CornerCollision):
+            z = point.cycle.unknowns
+            turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
+            belt, either = jnp.asarray(condition.belt), jnp.zeros(())
+            _, end, edge = end_near_edge(point.oscillator, turn, belt, either)
+            # In a corner a stick phase that begins or ends there may have no duration.
+            row = (int(end) + 1) % int(np.sum(ends != names.unused))
+            system = EdgeContact(chain=chain, row=end, edge=edge, index=index)
         else:
             system = Encounter(chain, jnp.asarray(np.array(belts)), index)
         weights = _weights(np.asarray(point.cycle.unknowns))
@@ -772,8 +836,11 @@ def _look_at_cycle(args, u: Array):
     n = len(osc.belts)
     names = Ends(n)
     rows = jnp.arange(chain.ends.size)
-    touches, is_fold = row >= 0, isinstance(system, UnitMultiplier)
+    is_fold, on_edge = isinstance(system, UnitMultiplier), isinstance(system, EdgeContact)
+    touches = (row >= 0) & (not on_edge)
     others = chain.used & (rows != row)
+    if on_edge:
+        others = others & (rows != system.row)
     sticks = others & jnp.any(chain.codes == 0, axis=-1)
     slope = jnp.where(jnp.any(sticks), 0.0, slope)
     tests = _velocity_tests(osc)
@@ -793,7 +860,7 @@ def _look_at_cycle(args, u: Array):
         gap = jnp.min(jnp.where(slips, chain.codes[:, belt] * r, jnp.inf))
         nearest = jnp.where(jnp.any(own), shortest, gap)
         # An exchange ends where the phase of sticking vanishes.
-        watched = (touches | is_fold | jnp.any(own)) & jnp.isfinite(nearest)
+        watched = (touches | is_fold | on_edge | jnp.any(own)) & jnp.isfinite(nearest)
         name = "FoldGrazing" if is_fold else "DoubleSliding"
         tests[name, (belt,)] = jnp.where(watched, nearest, jnp.nan)
     valid = (cycle.status == Status.OK) & ((size > 0) | (not is_fold))

@@ -393,7 +393,7 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
 
     def advance(state):
         t, _, h, y, steps = state
-        h_new = 0.3 / density(osc, codes, y)
+        h_new = 0.2 / density(osc, codes, y)
         return t + h, y, h_new, _step(field, y, h_new, _MEDIUM), steps + 1
 
     zero = jnp.zeros(())
@@ -419,15 +419,18 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
     fired = jnp.argmin(guards(cubic(root)))
 
     def polish(_, state):
-        h_root, *_ = state
+        h_root, _, _, fired = state
         y_root = _step(field, y0, h_root, _MEDIUM)
         value, slope = jax.jvp(guards, (y_root,), (field(y_root),))
-        slope = slope[fired]
         regular = jnp.abs(slope) > 1e-6
-        shift = jnp.where(regular, value[fired] / jnp.where(regular, slope, 1.0), 0.0)
-        return jnp.clip(h_root - shift, 0.0, 1.01 * h), h_root, y_root
+        since = jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0)
+        # Another guard may have fired before this one: the cubic does not tell two that are close.
+        before = jnp.where((value < 0) & (slope < 0), since, -jnp.inf).at[fired].set(since[fired])
+        first = jnp.argmax(before)
+        fired = jnp.where(before[first] > before[fired] + 1e-12, first, fired)
+        return jnp.clip(h_root - since[fired], 0.0, 1.01 * h), h_root, y_root, fired
 
-    _, h_root, y_root = lax.fori_loop(0, 3, polish, (root * h, root * h, y0))
+    _, h_root, y_root, fired = lax.fori_loop(0, 3, polish, (root * h, root * h, y0, fired))
     return t + h_root, y_root, fired, steps >= 200
 
 
@@ -460,7 +463,10 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     rows = jnp.arange(orbit.tops.size)
     same = jnp.abs(orbit.tops - top) < REPEATED * amplitude
     repeats = jnp.max(jnp.where(same, rows, -1))
-    resting = is_top & (orbit.count > 8) & (amplitude < AT_REST)
+    before = jnp.max(jnp.where(jnp.isnan(orbit.tops), -1, rows))
+    # An orbit that sticks is on a cycle, however small: it repeats exactly.
+    stuck_since = jnp.any((rows > before) & jnp.any(orbit.codes == 0, axis=-1))
+    resting = is_top & (orbit.count > 8) & (amplitude < AT_REST) & ~stuck_since
 
     status = jnp.where(stuck & forever, Status.STUCK_FOREVER.value, Status.OK.value)
     status = jnp.where(~stuck & after.captured, Status.PSEUDO_FOCUS.value, status)
@@ -536,6 +542,12 @@ class Turn(eqx.Module):
     @property
     def used(self) -> Array:
         return self.ends != Ends(self.codes.shape[-1]).unused
+
+    @property
+    def exits(self) -> Array:
+        """The states at the ends of the arcs; after the last used one comes the first."""
+        last = jnp.arange(self.ends.size) == jnp.sum(self.used) - 1
+        return jnp.where(last[:, None], self.entries[0], jnp.roll(self.entries, -1, axis=0))
 
 
 def turn_of(orbit: Orbit, size: int, n: int) -> Turn:

@@ -2,9 +2,9 @@
 
 What the oscillator does at one value of the parameter is summed up in a label: the kind and the
 stability of every equilibrium, and the signature of every attracting cycle, that is, which belts
-it sticks to and crosses and which contact edges it passes, in the order of one turn. Every cycle
-that sticks comes by a slip onset, so it is found by following the orbits from there; a few starts
-beside the equilibria find the rest.
+it sticks to, slips from and crosses and which contact edges it passes, in the order of one turn. A
+cycle that sticks mostly comes by a slip onset, so it is found by following the orbits from there; a
+few starts beside the equilibria find the rest.
 
 Between two values with one label nothing is taken to happen. Where labels differ the interval is
 narrowed until Newton's method converges from its ends. The conditions that could make this
@@ -20,7 +20,6 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,34 +28,36 @@ from jaxtyping import Array
 from .bifurcations import (
     AbstractCondition,
     BifurcationPoint,
+    BoundaryEquilibrium,
+    CornerCollision,
     FoldOfCycles,
+    GrazingEdge,
     GrazingSliding,
     Hopf,
     NonsmoothFold,
+    PseudoHopf,
     SlidingExchange,
     SuddenSliding,
-    at_cycle,
-    at_fold_of_cycles,
-    at_hopf,
-    at_rest,
-    before_onset,
+    approach,
+    end_near_edge,
     leaf_index,
+    room_for,
+    solver_of,
+    starts,
     unexplained_point,
     vary,
 )
 from .checks import as_array, check_finite, pick, require
 from .compiling import each, jit
-from .cycles import SIZES, Orbit, Turn, follow, last_turn, turn_events, turn_of
-from .equilibria import Equilibria, equilibria
+from .cycles import SIZES, Ends, Turn, last_turn, turn_events, turn_of
+from .equilibria import equilibria
 from .oscillator import Oscillator
 from .results import EventKind, Status
 
 #: Values of the parameter in one batch, and guesses refined in one batch.
 BATCH, GUESSES = 32, 8
-#: Arcs for which each orbit is followed, and room for those of one turn.
-FOLLOWED, ROOM = 96, SIZES[2]
-#: Starts to the right of an equilibrium, so far from it.
-DISTANCES = (0.02, 0.3, 3.0)
+#: Room for the arcs of one turn.
+ROOM = SIZES[2]
 #: Intervals narrower than this fraction of the span are good guesses for Newton's method.
 NEAR = 1 / 400
 #: Nothing closer than this, and this fraction of the span, is told apart.
@@ -77,10 +78,10 @@ def scan(
     looked at first. Points of which one undoes what the other did are seen if one of these values
     lies between them.
 
-    Each point has `kind`, `value`, and the rest of a `BifurcationPoint`. Where something changes
-    and no condition explains it, there is a point of kind `Unexplained`, with the status
-    UNEXPLAINED and the value where it happens, good to about 1e-9 of the span. A contact edge or an
-    equilibrium meeting an edge are such changes. `ValueError` names an impossible argument.
+    Each point has `kind`, `value`, and the rest of a `BifurcationPoint`. What happens at contact
+    edges is looked for where there are any. Where something changes and no condition explains it,
+    there is a point of kind `Unexplained`, with the status UNEXPLAINED and the value where it
+    happens, good to about 1e-9 of the span. `ValueError` names an impossible argument.
     """
     return search(Path(osc, where, span), resolution)
 
@@ -104,7 +105,8 @@ def search(path: "Path", resolution: int = 96) -> tuple[BifurcationPoint, ...]:
         for a, b in intervals:
             point = found.get((a, b))
             if point is not None:
-                before, after = path.beside(float(point.value))
+                slow = isinstance(point.condition, FoldOfCycles)
+                before, after = path.beside(float(point.value), slow=slow)
                 cut += [[a, max(a, before)], [min(b, after), b]]
             elif b - a <= 1e-9 * path.length:
                 points.append(unexplained_point(path.osc, int(path.index), 0.5 * (a + b), b - a))
@@ -173,10 +175,13 @@ class Path:
         """The oscillator there."""
         return vary(self.osc, self.index, jnp.full(1, value))
 
-    def beside(self, value: float) -> tuple[float, float]:
-        """The values just below and just above."""
+    def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
+        """The values just below and just above; farther off where motions are slow to settle."""
         # Not nearer in a short span: a turn counts as repeated when it does so to 1e-7.
         distance = CLOSE * (1.0 + self.length)
+        # Turns around a pseudo-focus with a velocity below 1e-5 are lost in rounding.
+        if slow or (value in self.breaks and self.edged):
+            distance *= 30.0
         return value - distance, value + distance
 
     @property
@@ -186,6 +191,18 @@ class Path:
             if leaf_index(self.osc, lambda osc, belt=belt: osc.belts[belt].velocity) == self.index:
                 return belt
         return -1
+
+    @property
+    def edged(self) -> list[int]:
+        """Belts with a finite contact edge; one for each place if they share their edges."""
+        belts: list[int] = []
+        known: set[float] = set()
+        for number, belt in enumerate(self.at(0.5 * (self.first + self.last)).belts):
+            own = {float(edge) for edge in (belt.lower, belt.upper) if np.isfinite(edge)}
+            if own - known:
+                belts.append(number)
+            known |= own
+        return belts
 
     def _coincidences(self) -> list[float]:
         """Where the belt that is varied is at rest, or runs with another one."""
@@ -238,47 +255,6 @@ def _look_at(osc: Oscillator) -> _Seen:
     return _Seen(rests.kind, rests.stable, status, turn)
 
 
-def starts(osc: Oscillator, rests: Equilibria) -> Array:
-    """Where the orbits start that find the cycles, [starts, 2].
-
-    Before slip onset on each belt, and at several distances from an equilibrium.
-    """
-    exists = rests.kind > 0
-    repels = exists & ~rests.stable
-    row = jnp.where(jnp.any(repels), jnp.argmax(repels), jnp.maximum(jnp.sum(exists) - 1, 0))
-    centre = jnp.where(jnp.any(exists), rests.x1[row], 0.0)
-    onsets = [before_onset(osc, belt) for belt in range(len(osc.belts))]
-    others = [jnp.stack([centre + distance, jnp.zeros(())]) for distance in DISTANCES]
-    return jnp.stack([*onsets, *others])
-
-
-def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
-    """The orbit from a start until it settles, with the status OK where that is on a cycle.
-
-    If it has not settled, the last three tops tell what it approaches: their differences form a
-    geometric sequence, so its limit is known (Aitken). It is a cycle if the limit is much nearer to
-    the last top than that is to any equilibrium. The orbit then counts as settled, its last turn as
-    the one that repeats.
-    """
-    orbit = follow(osc, start, FOLLOWED)
-    rows = jnp.arange(orbit.tops.size)
-    last = jnp.sort(jnp.where(jnp.isnan(orbit.tops), -1, rows))[-3:]
-    tops = orbit.tops[last]
-    before, after = tops[1] - tops[0], tops[2] - tops[1]
-    ratio = after / jnp.where(before == 0, 1.0, before)
-    limit = tops[2] + after * ratio / (1 - ratio)
-    distance = jnp.min(jnp.where(rests.kind > 0, jnp.abs(tops[2] - rests.x1), jnp.inf))
-    away = jnp.abs(limit - tops[2]) < 0.2 * distance
-    pending = (orbit.status == Status.NOT_SETTLED) & (last[0] >= 0) & (before != 0)
-    is_cycle = pending & (jnp.abs(ratio) < 1) & away
-    ended = eqx.tree_at(
-        lambda o: (o.repeats, o.count, o.status),
-        orbit,
-        (last[1], last[2] + 1, jnp.asarray(Status.OK.value)),
-    )
-    return jax.tree.map(lambda a, b: jnp.where(is_cycle, a, b), ended, orbit)
-
-
 def _label(seen: _Seen) -> tuple[Label, dict[Signature, Turn]]:
     """The label, and a turn of every cycle in it."""
     exists = seen.kind > 0
@@ -295,8 +271,8 @@ def _label(seen: _Seen) -> tuple[Label, dict[Signature, Turn]]:
 
 
 def _signature(turn: Turn) -> Signature:
-    """The events of a turn, from the one that makes the smallest sequence; slip goes unsaid."""
-    events = tuple(event for event in turn_events(turn) if event[0] != EventKind.SLIP)
+    """The events of a turn, from the one that makes the smallest sequence."""
+    events = turn_events(turn)
     return min((events[i:] + events[:i] for i in range(len(events))), default=())
 
 
@@ -316,22 +292,26 @@ def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoin
     found: dict[tuple[float, float], BifurcationPoint | None] = dict.fromkeys(intervals)
     # A fold is looked for last: most intervals in which smooth cycles come or go have another
     # point, and its program takes longest to compile.
-    for conditions_of in (_local_conditions, _fold_conditions):
+    for conditions_of in (_local_conditions, _edge_conditions, _fold_conditions):
         guesses = [
             Guess((a, b), value, condition)
             for (a, b), point in found.items()
             if point is None
-            for condition in conditions_of(path.label(a), path.label(b))
+            for condition in conditions_of(path, path.label(a), path.label(b))
             for value in (a, b)
         ]
         for guess, point in refined(path.osc, path.index, guesses):
             a, b = guess.interval
-            if a <= point.value <= b and found[a, b] is None:
+            low, high = a, b
+            if isinstance(point.condition, FoldOfCycles):
+                # Beyond a fold orbits pass the place of the cycles slowly, as if they were there.
+                low, high = path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]
+            if low <= point.value <= high and found[a, b] is None:
                 found[a, b] = point
     return found
 
 
-def _local_conditions(before: Label, after: Label) -> list[AbstractCondition]:
+def _local_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
     conditions: list[AbstractCondition] = []
     if before.equilibria != after.equilibria:
         conditions.append(Hopf())
@@ -340,7 +320,18 @@ def _local_conditions(before: Label, after: Label) -> list[AbstractCondition]:
     return conditions + [GrazingSliding(belt) for belt in changed]
 
 
-def _fold_conditions(before: Label, after: Label) -> list[AbstractCondition]:
+def _edge_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
+    conditions: list[AbstractCondition] = []
+    if before.equilibria != after.equilibria:
+        kinds = (BoundaryEquilibrium, PseudoHopf)
+        conditions += [kind(belt) for kind in kinds for belt in path.edged]
+    if before.cycles != after.cycles:
+        # Whether an end of an arc on an edge is a turn or a corner is seen when it is found.
+        conditions += [GrazingEdge(belt) for belt in path.edged]
+    return conditions
+
+
+def _fold_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
     return [FoldOfCycles()] if before.smooth != after.smooth else []
 
 
@@ -369,11 +360,12 @@ def refined(
 ) -> list[tuple[Guess, BifurcationPoint]]:
     """The guesses from which a point was found, those of one kind after those of another, with it.
 
-    A tangency, of whichever kind it is looked for, is returned as what it is.
+    A tangency, or an end of an arc on an edge, of whichever kind it is looked for, is returned as
+    what it is.
     """
     out = []
-    for solve in (at_hopf, at_cycle, at_rest, at_fold_of_cycles):
-        own = [guess for guess in guesses if _solver(guess.condition) == solve]
+    for solve in dict.fromkeys(solver_of(guess.condition) for guess in guesses):
+        own = [guess for guess in guesses if solver_of(guess.condition) == solve]
         for batch in (own[i : i + GUESSES] for i in range(0, len(own), GUESSES)):
             # Rows that are not needed are NaN, which ends at once.
             unused = GUESSES - len(batch)
@@ -383,17 +375,22 @@ def refined(
             for lane, guess in enumerate(batch):
                 if solved.status[lane] != Status.OK:
                     continue
-                point, condition = pick(solved, lane), guess.condition
-                if isinstance(condition, GrazingSliding | NonsmoothFold):
-                    is_fold = point.multiplier > 1
-                    condition = (NonsmoothFold if is_fold else GrazingSliding)(condition.belt)
-                out.append((guess, replace(point, condition=condition)))
+                point = pick(solved, lane)
+                out.append((guess, replace(point, condition=_kind_found(guess.condition, point))))
     return out
 
 
-def _solver(condition: AbstractCondition) -> Callable:
-    special = {Hopf: at_hopf, SuddenSliding: at_rest, FoldOfCycles: at_fold_of_cycles}
-    return special.get(type(condition), at_cycle)
+def _kind_found(condition: AbstractCondition, point: BifurcationPoint) -> AbstractCondition:
+    if isinstance(condition, GrazingSliding | NonsmoothFold):
+        return (NonsmoothFold if point.multiplier > 1 else GrazingSliding)(condition.belt)
+    if isinstance(condition, GrazingEdge | CornerCollision):
+        chain, z = point.cycle.chain, point.cycle.unknowns
+        turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
+        belt, either = jnp.asarray(condition.belt), jnp.zeros(())
+        _, row, _ = end_near_edge(point.oscillator, turn, belt, either)
+        is_turn = chain.ends[int(row)] == Ends(chain.codes.shape[-1]).turn_x1
+        return (GrazingEdge if is_turn else CornerCollision)(condition.belt)
+    return condition
 
 
 def _belts(condition: AbstractCondition) -> tuple[int, int]:
@@ -406,6 +403,6 @@ def _belts(condition: AbstractCondition) -> tuple[int, int]:
 @jit
 def _points(solve, osc: Oscillator, index: Array, values: Array, belts: Array) -> BifurcationPoint:
     def one(p, pair):
-        return solve(vary(osc, index, p[None]), index, pair, jnp.zeros(()), SIZES[1])
+        return solve(vary(osc, index, p[None]), index, pair, jnp.zeros(()), room_for(solve))
 
     return each(one)(values, belts)

@@ -458,6 +458,10 @@ POINT_NAMES = {
     "SlidingExchange": "sliding exchange",
     "SuddenSliding": "belt {belt} at rest",
     "FoldOfCycles": "fold of cycles",
+    "GrazingEdge": "edge grazing, belt {belt}",
+    "CornerCollision": "corner, belt {belt}",
+    "BoundaryEquilibrium": "rest on edge, belt {belt}",
+    "PseudoHopf": "pseudo-Hopf, belt {belt}",
     "Unexplained": "unexplained",
 }
 
@@ -617,6 +621,10 @@ CURVE_STYLES: dict[str, dict[str, Any]] = {
     "SlidingExchange": {"color": "black", "linestyle": (0, (3, 1, 1, 1)), "label": "exchange"},
     "SuddenSliding": {"color": "black", "linestyle": (0, (1, 1.2)), "label": "belt at rest"},
     "FoldOfCycles": {"color": "#E69F00", "linestyle": "-", "label": "fold of cycles"},
+    "GrazingEdge": {"color": "#56B4E9", "linestyle": "-", "label": "edge grazing"},
+    "CornerCollision": {"color": "#56B4E9", "linestyle": (0, (3, 1, 1, 1)), "label": "corner"},
+    "BoundaryEquilibrium": {"color": "#D55E00", "linestyle": "-", "label": "rest on edge"},
+    "PseudoHopf": {"color": "#D55E00", "linestyle": (0, (5, 1.5)), "label": "pseudo-Hopf"},
 }
 
 

@@ -74,8 +74,8 @@ ADVICE = {
         "equilibrium is stable, or everything comes to rest there."
     ),
     Status.NOT_TOUCHED: (
-        "No cycle comes near the boundary of that belt here, so no such point is near; try another "
-        "belt or another value of the parameter."
+        "No cycle comes near the boundary or an edge of that belt here, so no such point is near; "
+        "try another belt or another value of the parameter."
     ),
     Status.OTHER_KIND: (
         "The cycle does touch the boundary at a point near here, but the point is of another kind: "

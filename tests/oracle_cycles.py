@@ -314,7 +314,7 @@ def gap(osc, onset_belt, belt, slack=0.02):
     than `slack` beyond counts as -slack - |x2'| there (continuous, and far from the pole at
     which Conti's law, continued, ends).
     """
-    return _gap_from(osc, *slip_onset(osc, onset_belt), (onset_belt, belt), slack)
+    return gap_from(osc, *slip_onset(osc, onset_belt), (onset_belt, belt), slack)
 
 
 def gap_from_rest(osc, resting, sign, belt, slack=0.02):
@@ -331,10 +331,11 @@ def gap_from_rest(osc, resting, sign, belt, slack=0.02):
     strong = max(np.roots([1.0, -trace(osc, rest), 1.0]))
     assert np.isreal(strong)
     x2 = -sign * 1e-6
-    return _gap_from(osc, (rest + x2 / strong, x2), mode, (resting, belt), slack)
+    return gap_from(osc, (rest + x2 / strong, x2), mode, (resting, belt), slack)
 
 
-def _gap_from(osc, y, mode, belts, slack):
+def gap_from(osc, y, mode, belts, slack=0.02):
+    """The same for the orbit from a state in a mode; the last belt is that of the boundary."""
     run = _to_extremum(osc, y, mode, belts, slack)
     if run.status == "overshot":
         return -slack - abs(acceleration(osc, run.mode_end)(*run.y_end))
@@ -386,6 +387,45 @@ def grazing(make, bracket, belt, y0=(3.0, 0.0)):
     else:
         raise ValueError(f"the cycle sticks to belt {belt} at both ends of {bracket}")
     return _solve(lambda p: gap(make(p), onset_belt, belt), bracket)
+
+
+def edge_grazing(make, bracket, edge, y0=(3.0, 0.0)):
+    """Parameter at which the sticking cycle touches a contact edge that it does not pass.
+
+    make(p) has that edge out of the way, so that touching it has no consequence.
+    """
+
+    def distance(p):
+        cycle = sticking_cycle(make(p), y0)
+        return min(cycle.x1_max - edge, cycle.x1_min - edge, key=abs)
+
+    return _solve(distance, bracket)
+
+
+def corner(make, bracket, belt, start, passages=2, slack=0.02):
+    """Parameter at which an orbit passes a contact edge just with the velocity of a belt.
+
+    start(osc) is its state and mode at first; the passage is the given one; the belt's boundary is
+    not acted upon, so that x2 there goes smoothly through the belt's velocity.
+    """
+
+    def excess(p):
+        osc, count = make(p), [0]
+
+        def until(item):
+            count[0] += isinstance(item, Event) and item.kind == "EDGE"
+            return count[0] == passages
+
+        run = advance(osc, *start(osc), 100.0, until=until, slack={belt: slack}, focus_speed=0.0)
+        assert run.status == "stopped", run.status
+        return run.stopped_by.x2 - osc.speed(belt)
+
+    return _solve(excess, bracket)
+
+
+def pseudo_hopf(make, bracket, edge):
+    """Parameter at which turns around the pseudo-focus at edge(parameter) do not grow or shrink."""
+    return _solve(lambda p: pseudo_focus_rate(make(p), edge(p)), bracket)
 
 
 def fold_of_cycles(make, bracket, distances):

@@ -6,6 +6,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from laws import BELL, bell
 
 import jaxbelt as jb
 from jaxbelt import Status
@@ -136,26 +137,13 @@ def test_a_guess_that_fits_no_such_point_is_told_so(condition, nu, status):
     assert jnp.isnan(point.value) and jb.describe(status) in repr(point)
 
 
-class Lorentz(jb.AbstractFriction):
-    """A law of the user's own, mu(r) = kinetic + (static - kinetic)/(1 + (r/velocity)^2)."""
-
-    static: jax.Array
-    kinetic: jax.Array
-    velocity: jax.Array
-
-    def mu(self, speed):
-        return self.kinetic + (self.static - self.kinetic) / (1 + (speed / self.velocity) ** 2)
-
-
 @pytest.mark.parametrize("nu", [0.483, 0.52])
 def test_fold_of_cycles(nu):
     """Two cycles that do not stick meet; from guesses on either side, 0.015 and 0.02 away."""
-    law = Lorentz(jnp.asarray(1.0), jnp.asarray(0.6), jnp.asarray(0.4))
-    point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.4, (jb.Belt(nu, law),)), where=nu0)
+    point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.4, (jb.Belt(nu, BELL),)), where=nu0)
 
     def make(nu):
-        belt = oracle.Belt(nu, lambda r: 0.6 + 0.4 / (1 + (r / 0.4) ** 2), 1.0, 1.0)
-        return oracle.Oscillator(0.4, (belt,), 1.0)
+        return oracle.Oscillator(0.4, (oracle.Belt(nu, bell, 1.0, 1.0),), 1.0)
 
     expected = oracle_cycles.fold_of_cycles(make, (0.49, 0.503), (0.2, 0.8))
     # The oracle's largest value is good to 1e-14, its slope by nu is about 4.

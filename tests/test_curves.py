@@ -1,11 +1,11 @@
 """Curves in two parameters: against refined points, closed forms, the oracle and symmetry."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from laws import BELL, bell
 from scipy.optimize import brentq
 
 import jaxbelt as jb
@@ -100,24 +100,6 @@ def test_curves_in_other_parameters(points, number, where, span, step):
     assert max(found) < 1e-9
 
 
-class Lorentz(jb.AbstractFriction):
-    """mu(r) = kinetic + (static - kinetic)/(1 + (r/velocity)^2), steepest away from r = 0."""
-
-    static: jax.Array
-    kinetic: jax.Array
-    velocity: jax.Array
-
-    def mu(self, speed):
-        return self.kinetic + (self.static - self.kinetic) / (1 + (speed / self.velocity) ** 2)
-
-
-def bell(r):
-    return 0.6 + 0.4 / (1 + (r / 0.4) ** 2)
-
-
-BELL = Lorentz(jnp.asarray(1.0), jnp.asarray(0.6), jnp.asarray(0.4))
-
-
 def test_a_closed_curve_ends_where_it_began():
     """A trace of zero, -mu'(nu0) - mu'(nu1) = zeta: a closed curve, for -mu' has a maximum."""
     osc = jb.Oscillator(1.2, (jb.Belt(0.2, BELL), jb.Belt(0.2, BELL)))
@@ -143,9 +125,9 @@ def test_folds_of_cycles_end_at_a_degenerate_hopf_point():
     assert end.kind == "DegenerateHopf" and end.residual < 1e-13
     assert end.values == pytest.approx((0.4, 0.5), abs=1e-13)
     assert np.allclose(curve.multiplier, 1, rtol=0, atol=1e-11) and np.max(curve.residual) < 1e-12
-    inner = curve.values[(curve.values[:, 0] > 0.41) & (curve.values[:, 0] < 0.6)]
-    for value, damping in inner[::3]:
-        osc = jb.Oscillator(float(damping), (jb.Belt(float(value) - 5e-3, BELL),))
+    # Up to where the cycle nearly touches the boundary and its outer neighbours stick, nu = 0.64.
+    for value, damping in curve.values[curve.values[:, 0] > 0.41][::-2]:
+        osc = jb.Oscillator(float(damping), (jb.Belt(float(value) + 5e-3, BELL),))
         again = jb.refine(jb.FoldOfCycles(), osc, where=nu0)
         assert again.value == pytest.approx(value, abs=1e-9)
 
@@ -218,6 +200,25 @@ def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     )
     # The oracle's start is good to 1e-11.
     assert rest.values == pytest.approx((0.0, expected), abs=1e-10) and rest.residual < 1e-12
+
+
+def test_a_limit_at_a_belt_at_rest_whose_law_jumps():
+    """Slip onset is away from the equilibrium there, by static - kinetic."""
+    belts = (jb.Belt(-0.05, jb.Coulomb(1.0, 0.6)), jb.Belt(0.395, jb.Conti(1.0, 0.6, 10.0)))
+    point = jb.refine(jb.GrazingSliding(1), jb.Oscillator(0.5, belts), where=nu1)
+    curve = jb.bifurcation_curve(point, (nu0, nu1), ((-0.1, 0.1), (0.05, 0.7)), step=0.02)
+    (rest,) = curve.special
+    mu, static = oracle.conti(1.0, 0.6, 10.0)
+
+    def gap(nu):
+        belts = (oracle.Belt(0.0, lambda r: 0.6, 1.0, 1.0), oracle.Belt(nu, mu, static, 1.0))
+        osc = oracle.Oscillator(0.5, belts, 1.0)
+        onset = oracle.acceleration(osc, (0, 1))(0.0, 0.0) - 1.0
+        return oracle_cycles.gap_from(osc, (onset, 0.0), (-1, 1), (0, 1))
+
+    assert (rest.kind, rest.belts) == ("BeltAtRest", (0,))
+    expected = brentq(gap, 0.39, 0.42, xtol=1e-14)
+    assert rest.values == pytest.approx((0.0, expected), abs=1e-11) and rest.residual < 1e-12
 
 
 def test_a_table_has_rows_and_special_points_in_order(fold):

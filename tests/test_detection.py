@@ -8,6 +8,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from laws import BELL, bell
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
@@ -78,17 +79,68 @@ def test_a_path_in_the_damping():
     assert fold == pytest.approx(expected, abs=1e-9)
 
 
+def test_folds_of_a_law_that_jumps():
+    """Belt 0 holds 0.5 and drags with 0.4: beyond its folds, to both sides, there is no cycle."""
+    belts = (jb.Belt(0.3, jb.Coulomb(1.0, 0.8), load=0.5), jb.Belt(0.35, jb.Conti(1.0, 0.6, 10.0)))
+    points = jb.scan(jb.Oscillator(0.5, belts), nu0, (-0.6, 0.6))
+    kinds = [jb.NonsmoothFold(0), jb.SuddenSliding(0), jb.NonsmoothFold(0)]
+    assert [point.condition for point in points] == kinds
+    mu, static = oracle.conti(1.0, 0.6, 10.0)
+
+    def make(nu):
+        belts = (oracle.Belt(nu, lambda r: 0.8, 1.0, 0.5), oracle.Belt(0.35, mu, static, 1.0))
+        return oracle.Oscillator(0.5, belts, 1.0)
+
+    for point in (points[0], points[2]):
+        bracket = (float(point.value) - 0.01, float(point.value) + 0.01)
+        expected = oracle_cycles.nonsmooth_fold(make, bracket, 0)
+        assert point.value == pytest.approx(expected, abs=1e-11) and point.multiplier == np.inf
+
+
+def bell_oracle(nu):
+    return oracle.Oscillator(0.4, (oracle.Belt(nu, bell, 1.0, 1.0),), 1.0)
+
+
+def test_small_cycles_that_do_not_stick():
+    """They begin at a supercritical Hopf point and grow until they touch the boundary; on the far
+    side they end beyond a subcritical one, which the scan below goes up to."""
+    osc = jb.Oscillator(0.4, (jb.Belt(0.3, BELL),))
+    points = jb.scan(osc, nu0, (0.02, 0.49))
+    kinds = [jb.Hopf(), jb.GrazingSliding(0), jb.GrazingSliding(0), jb.Hopf()]
+    assert [point.condition for point in points] == kinds
+    for point, bracket in ((points[1], (0.09, 0.1)), (points[2], (0.44, 0.46))):
+        expected = oracle_cycles.nonsmooth_fold(bell_oracle, bracket, 0)
+        assert point.value == pytest.approx(expected, abs=1e-11) and 0 < point.multiplier < 1
+    for point, sign in ((points[0], -1), (points[3], 1)):
+        x = float(point.value) / 0.4  # a trace of zero, -mu' = zeta
+        assert 2 * x / (1 + x**2) ** 2 == pytest.approx(0.4, abs=1e-14)
+        assert np.sign(jb.lyapunov_coefficient(point.oscillator)) == sign
+    # In between the cycle is there: r^2 = -(trace/2)/a, up to a percent so far from the point.
+    beyond = jb.Oscillator(0.4, (jb.Belt(float(points[0].value) + 2e-3, BELL),))
+    cycle = jb.find_cycle(beyond, (float(jb.equilibria(beyond).x1[0]) + 0.05, 0.0))
+    assert cycle.stable and cycle.signature == ()
+    rate, a = jb.equilibria(beyond).rate[0], jb.lyapunov_coefficient(beyond)[0]
+    amplitude = 0.5 * (cycle.x1_max - cycle.x1_min)
+    assert amplitude == pytest.approx(np.sqrt(float(-rate / a)), rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_fold_of_cycles_is_found_once():
+    """Beyond it orbits linger where the cycles were."""
+    osc = jb.Oscillator(0.4, (jb.Belt(0.3, BELL),))
+    points = jb.scan(osc, nu0, (0.47, 0.7))
+    assert [point.condition for point in points] == [jb.Hopf(), jb.FoldOfCycles()]
+    expected = oracle_cycles.fold_of_cycles(bell_oracle, (0.49, 0.503), (0.2, 0.8))
+    assert points[1].value == pytest.approx(expected, abs=1e-11)
+
+
 def test_a_change_that_no_condition_explains_is_reported():
-    """The fixed point meets the edge beyond which belt 0 no longer drags it."""
-    belts = (
-        jb.Belt(0.8, jb.Conti(1.0, 0.6, 10.0), upper=2.0),
-        jb.Belt(0.9, jb.Conti(1.0, 0.6, 10.0)),
-    )
-    osc = jb.Oscillator(0.5, belts)
-    (point,) = jb.scan(osc, lambda osc: osc.belts[0].upper, (1.0, 1.5), resolution=8)
+    """Belt 0 at rest holds the mass up to 1, but slipping on it takes 0.7 only: the part of the
+    segment of equilibria below -0.7 holds but attracts nothing."""
+    osc = jb.Oscillator(0.5, (jb.Belt(0.0, jb.Coulomb(1.0, 0.7), upper=-0.6),))
+    (point,) = jb.scan(osc, lambda osc: osc.belts[0].upper, (-0.9, -0.5), resolution=8)
     assert point.kind == "Unexplained" and point.status == Status.UNEXPLAINED
-    # There x1 is the friction of both, 2 p1 + (mus - p1) (1/9 + 1/10); known to 1e-9 of the span.
-    assert point.value == pytest.approx(1.2 + 0.4 * (1 / 9 + 1 / 10), abs=1e-9)
+    assert point.value == pytest.approx(-0.7, abs=1e-9)  # known to 1e-9 of the span
     assert "Simulate on both sides" in repr(point)
 
 

@@ -1,0 +1,205 @@
+"""Bifurcations at contact edges: against the oracle and closed forms, found, refined, followed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import Status
+from jaxbelt.continuation import End
+
+
+def nu0(osc):
+    return osc.belts[0].velocity
+
+
+def nu1(osc):
+    return osc.belts[1].velocity
+
+
+def sigma1(osc):
+    return osc.belts[0].upper
+
+
+def overlapping(sigma, nu=0.2):
+    """Class (d) with the edge beyond which belt 0 is left at sigma."""
+    return jb.presets.class_d(0.35, nu, 0.0, sigma)
+
+
+def its_oracle(sigma, nu=0.2):
+    return oracle.class_d(0.35, nu, 0.0, sigma)
+
+
+def from_onset(osc):
+    """Slip onset on belt 1 where it touches alone, x1 = mus - zeta nu1."""
+    return (1 - 0.5 * osc.speed(1), osc.speed(1)), (oracle.ABOVE, 1)
+
+
+@pytest.fixture(scope="module")
+def diagram():
+    return jb.bifurcation_diagram(overlapping(0.6), sigma1, (0.05, 2.5))
+
+
+def test_points_of_overlapping_belts(diagram):
+    """All that happens as the edge moves from the left of all motion to the right of it."""
+    alone = oracle_cycles.sticking_cycle(its_oracle(0.3))
+    both = oracle_cycles.sticking_cycle(its_oracle(2.5))
+    friction = [0.6 + 0.4 / (1 + 10 * nu) for nu in (0.35, 0.2)]
+    expected = [
+        (jb.GrazingEdge(0), alone.x1_min),
+        (
+            jb.CornerCollision(0),
+            oracle_cycles.corner(its_oracle, (0.605, 0.625), 1, from_onset),
+        ),
+        (jb.BoundaryEquilibrium(0), friction[1]),
+        (jb.CornerCollision(0), 1 - 0.5 * 0.2),  # slip onset on belt 1, belt 0 being left
+        (jb.PseudoHopf(0), oracle_cycles.pseudo_hopf(its_oracle, (0.9, 0.95), lambda p: p)),
+        (jb.BoundaryEquilibrium(0), sum(friction)),
+        # Slip onset on belt 1 while belt 0, faster by 0.15, pulls along.
+        (jb.CornerCollision(0), 1 - 0.5 * 0.2 + 0.6 + 0.4 / 2.5),
+        (jb.GrazingEdge(0), both.x1_max),
+    ]
+    assert [point.condition for point in diagram.points] == [kind for kind, _ in expected]
+    for point, (_, value) in zip(diagram.points, expected, strict=True):
+        # The oracle integrates to 1e-13.
+        assert point.value == pytest.approx(value, abs=1e-11)
+        assert point.status == Status.OK and point.error < 1e-11
+
+
+def test_branches_go_on_beyond_them(diagram):
+    """A branch of equilibria, one of attracting cycles; the unstable cycle shrinks to the edge."""
+    rests, attracting, repelling = diagram.branches
+    values = [float(point.value) for point in diagram.points]
+    for branch in (rests, attracting):
+        assert branch.values[0] == 0.05 and branch.values[-1] == 2.5
+        assert np.max(np.abs(np.diff(branch.x1_max))) < 0.03
+    assert np.all(rests.stable == (rests.values < values[4])) and np.all(attracting.stable)
+    assert np.allclose(attracting.x1_max[attracting.values > values[7]], attracting.x1_max[-1])
+    assert repelling.values[-1] == pytest.approx(values[4], abs=2e-3)
+    assert repelling.x1_max[-1] - repelling.x1_min[-1] < 1e-3
+    texts = {text.get_text() for text in diagram.plot(quantity="x1").texts}
+    assert {"edge grazing, belt 0", "corner, belt 0", "pseudo-Hopf, belt 0"} <= texts
+
+
+def test_points_of_sequential_belts():
+    """Class (c); beyond the corner there is no cycle, as the phase of sticking vanished there."""
+    points = jb.scan(jb.presets.class_c(0.35, -0.25, 0.4), nu0, (-0.7, 0.7))
+
+    def make(nu):
+        return oracle.class_c(nu, -0.25, 0.4)
+
+    def from_edge(osc):
+        return (0.4, osc.speed(0)), (oracle.ABOVE, -1)
+
+    expected = [
+        # Left of the edge belt 0 is alone; see the paper's class (a).
+        (jb.NonsmoothFold(0), -0.267134534361),
+        (jb.Hopf(), -(np.sqrt(8) - 1) / 10),
+        (jb.SuddenSliding(0), 0.0),
+        (jb.PseudoHopf(0), oracle_cycles.pseudo_hopf(make, (0.1, 0.2), lambda _: 0.4)),
+        (jb.CornerCollision(0), oracle_cycles.corner(make, (0.23, 0.236), 0, from_edge)),
+    ]
+    assert [point.condition for point in points] == [kind for kind, _ in expected]
+    # The cycle of the corner all but repeats without sticking: errors of 1e-14 count a hundredfold.
+    for point, (_, value) in zip(points, expected, strict=True):
+        assert point.value == pytest.approx(value, abs=1e-11)
+    corner = expected[-1][1]
+    assert oracle_cycles.sticking_cycle(make(corner - 1e-7), T=400.0) is not None
+    assert oracle_cycles.sticking_cycle(make(corner + 1e-7), T=400.0) is None
+
+
+def test_an_edge_that_pushes_away_ends_the_cycle():
+    """It touches the lower edge of belt 1; from beyond, the mass goes to another equilibrium."""
+    points = jb.scan(jb.presets.class_d(0.3, 0.2, -0.2, 0.6), nu0, (-0.7, 0.7))
+    assert [point.condition for point in points] == [
+        jb.GrazingEdge(1),
+        jb.NonsmoothFold(0),
+        jb.Hopf(),
+        jb.BoundaryEquilibrium(1),
+        jb.SuddenSliding(0),
+        jb.CornerCollision(0),
+    ]
+    start = (0.9 - 0.6 - 0.4 / 8.6, 0.2)  # slip onset on belt 1 against belt 0
+    expected = oracle_cycles.edge_grazing(
+        lambda nu: oracle.class_d(nu, 0.2, -9.0, 9.0), (-0.57, -0.55), -0.2, start
+    )
+    assert points[0].value == pytest.approx(expected, abs=1e-11)
+    # The fixed point between the edges: the pulls of both belts, eq. (24), add to the edge.
+    assert points[3].value == pytest.approx(-0.02, abs=1e-15)
+    expected = oracle_cycles.corner(
+        lambda nu: oracle.class_d(nu, 0.2, -0.2, 0.6), (0.19, 0.195), 0, from_onset
+    )
+    assert points[5].value == pytest.approx(expected, abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("condition", "number", "offset"),
+    [
+        (jb.GrazingEdge(0), 0, -0.01),
+        (jb.GrazingEdge(0), 0, 0.03),  # the cycle passes the edge
+        (jb.GrazingEdge(0), 7, -0.03),
+        (jb.CornerCollision(0), 1, -0.02),
+        (jb.CornerCollision(0), 1, 0.02),
+        (jb.BoundaryEquilibrium(0), 2, 0.1),
+        (jb.PseudoHopf(0), 4, -0.02),
+    ],
+)
+def test_refined_from_either_side(diagram, condition, number, offset):
+    exact = float(diagram.points[number].value)
+    point = jb.refine(condition, overlapping(exact + offset), where=sigma1)
+    assert point.status == Status.OK and point.condition == condition
+    assert point.value == pytest.approx(exact, abs=1e-12)
+    assert point.iterations <= 6 and point.residual < 1e-11 and point.error < 1e-11
+
+
+def test_what_fits_no_such_point_is_told_so():
+    # Everything comes to rest.
+    point = jb.refine(jb.GrazingEdge(0), jb.presets.class_d(0.35, 0.6, 0.0, 0.6), where=sigma1)
+    assert point.status == Status.NOT_TOUCHED and jnp.isnan(point.value)
+    with pytest.raises(ValueError, match="belt must be one with a finite edge, got 0"):
+        jb.refine(jb.GrazingEdge(0), jb.presets.class_a(0.2), where=nu0)
+
+
+def test_the_end_of_a_segment_on_an_edge():
+    """Belt 1 at rest holds what is within its capacity of the pull of belt 0."""
+    osc = jb.presets.class_d(0.35, 0.0, 0.0, 0.6)
+    point = jb.refine(jb.BoundaryEquilibrium(1), osc, where=lambda osc: osc.belts[1].lower)
+    pull = 0.6 + 0.4 / 4.5
+    assert point.value == pytest.approx(pull - 1, abs=1e-14) and point.status == Status.OK
+
+
+def test_slope_of_a_corner():
+    def value(nu):
+        osc = overlapping(0.62, nu)
+        return jb.refine(jb.CornerCollision(0), osc, where=sigma1, max_arcs=16).value
+
+    found, slope = jax.jvp(value, (0.2,), (1.0,))
+    difference, _ = oracle.richardson(
+        lambda nu: oracle_cycles.corner(
+            lambda sigma: its_oracle(sigma, nu), (0.605, 0.63), 1, from_onset
+        ),
+        0.2,
+        5e-3,
+    )
+    assert slope == pytest.approx(difference, rel=1e-7) and jnp.isfinite(found)
+
+
+def test_curves(diagram):
+    """Where the rows lie exactly is known: in closed form, or from the oracle."""
+    where, span = (sigma1, nu1), ((0.05, 2.5), (0.1, 0.3))
+    rests, grazing = (
+        jb.bifurcation_curve(diagram.points[i], where, span, step=0.03) for i in (2, 0)
+    )
+    assert rests.ends == (End.LEFT_SPAN, End.LEFT_SPAN)
+    sigma, nu = rests.values.T
+    assert np.allclose(sigma, 0.6 + 0.4 / (1 + 10 * nu), rtol=0, atol=1e-14)
+    for sigma, nu in grazing.values[1:-1:5].tolist():
+        alone = oracle_cycles.sticking_cycle(its_oracle(0.3, nu))
+        assert sigma == pytest.approx(alone.x1_min, abs=1e-11)
+    # It ends where the cycle does, which is that of class (a).
+    (fold,) = grazing.special
+    assert (fold.kind, fold.belts) == ("DoubleSliding", (1,)) and End.STOPPED in grazing.ends
+    assert fold.values[1] == pytest.approx(0.267134534361, abs=1e-11)
