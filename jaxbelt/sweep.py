@@ -361,11 +361,12 @@ def _signatures(words: np.ndarray, belts: int) -> tuple[np.ndarray, dict[str, An
     A signature begins where the sequence of its events is smallest, so that it does not depend on
     where the turn began.
     """
-    different, codes = np.unique(words, return_inverse=True)
+    different = np.unique(words)
     meanings = [_meaning(int(word), belts) for word in different]
     names = sorted(set(meanings), key=lambda name: (name != "none", name != "smooth", name))
     number = {name: i for i, name in enumerate(names)}
-    values = np.array([number[name] for name in meanings], "int16")[codes.reshape(words.shape)]
+    numbers = np.array([number[name] for name in meanings], "int16")
+    values = numbers[np.searchsorted(different, words)]
     flags = {
         "flag_values": np.arange(len(names), dtype="int16"),
         "flag_meanings": " ".join(names),
