@@ -487,11 +487,12 @@ def _codes(mode: Mode) -> Array:
 
 def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _Record]:
     stuck = state.mode.any_stuck
-    # Under vmap both branches run; a stuck lane then has no slip arc to follow.
+    # Under vmap both branches run; lanes that are stuck or done then have no slip arc to follow.
+    slip_until = jnp.where(stuck | state.done, state.t, t1)
     step = lax.cond(
         stuck,
         lambda: _stick_segment(osc, state, t1),
-        lambda: _slip_segment(osc, state, jnp.where(stuck, state.t, t1), rtol, atol),
+        lambda: _slip_segment(osc, state, slip_until, rtol, atol),
     )
     t = state.t + step.duration
     finite = jnp.isfinite(t) & jnp.isfinite(step.y[0]) & jnp.isfinite(step.y[1])
@@ -588,6 +589,7 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     )
     ys = lax.map(lambda row: jax.vmap(at)(*row), rows).reshape(-1, 2)[jnp.argsort(order)]
     afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
+    ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)
     return jnp.where(beyond[:, None], afterwards, ys)[:wanted], arcs.mode[:wanted]
 
 

@@ -97,10 +97,14 @@ def integrate(field, osc: Oscillator, width: Array, y0, t0, ts, rtol, atol) -> A
 
     NaN from where the integrator ran out of steps.
     """
+    known = ~jnp.any(jnp.isnan(jnp.stack([*jax.tree.leaves(osc), width])))
 
     def advance(carry, t):
         now, y = carry
-        y = _flow(field, osc, width, y, t - now, rtol, atol)
+        # What is not a number would reject every step, and keep a batch waiting.
+        goes = known & jnp.isfinite(y[0]) & jnp.isfinite(y[1])
+        y = _flow(field, osc, width, y, jnp.where(goes, t - now, 0.0), rtol, atol)
+        y = tuple(jnp.where(goes, part, jnp.nan) for part in y)
         return (t, y), jnp.stack(y)
 
     return lax.scan(advance, (t0, (y0[0], y0[1])), ts)[1]

@@ -171,6 +171,7 @@ def test_the_end_of_a_segment_on_an_edge():
     assert point.value == pytest.approx(pull - 1, abs=1e-14) and point.status == Status.OK
 
 
+@pytest.mark.slow
 def test_slope_of_a_corner():
     def value(nu):
         osc = overlapping(0.62, nu)

@@ -202,6 +202,7 @@ def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     assert rest.values == pytest.approx((0.0, expected), abs=1e-10) and rest.residual < 1e-12
 
 
+@pytest.mark.slow
 def test_a_limit_at_a_belt_at_rest_whose_law_jumps():
     """Slip onset is away from the equilibrium there, by static - kinetic."""
     belts = (jb.Belt(-0.05, jb.Coulomb(1.0, 0.6)), jb.Belt(0.395, jb.Conti(1.0, 0.6, 10.0)))

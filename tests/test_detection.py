@@ -101,6 +101,7 @@ def bell_oracle(nu):
     return oracle.Oscillator(0.4, (oracle.Belt(nu, bell, 1.0, 1.0),), 1.0)
 
 
+@pytest.mark.slow
 def test_small_cycles_that_do_not_stick():
     """They begin at a supercritical Hopf point and grow until they touch the boundary; on the far
     side they end beyond a subcritical one, which the scan below goes up to."""

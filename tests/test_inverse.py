@@ -107,6 +107,7 @@ def test_standard_errors_are_those_of_the_oracles_derivatives(fitted):
     )
 
 
+@pytest.mark.slow
 def test_velocities_with_gaps_and_unknown_noise(motion):
     x2, sigma = noisy(motion[:, 1], 1)
     x2[100:120] = np.nan

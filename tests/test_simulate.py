@@ -227,22 +227,29 @@ def test_a_stick_phase_forgets_the_start():
 # --- batched --------------------------------------------------------------------------------------
 
 
-def test_vmap_equals_a_loop():
+def one_of_class_d(nu, y0, edges):
+    osc = jb.presets.class_d(nu[0], nu[1], edges[0], edges[1])
+    return simulate(osc, y0, 30.0, ts=jnp.linspace(0.0, 30.0, 31), max_segments=512)
+
+
+all_of_class_d = jax.jit(jax.vmap(one_of_class_d))
+
+
+def mixed_lanes():
+    """Velocities, starts and edges of 24 runs; a third of them without edges."""
     rng = np.random.default_rng(5)
     nu = jnp.asarray(rng.uniform(-0.7, 0.7, (24, 2)))
     y0 = jnp.asarray(rng.uniform([-3, -1.5], [3, 1.5], (24, 2)))
     edges = jnp.asarray(np.sort(rng.uniform(-1, 2, (24, 2)), axis=1))
-    edges = edges.at[:8].set(jnp.array([-jnp.inf, jnp.inf]))
+    return nu, y0, edges.at[:8].set(jnp.array([-jnp.inf, jnp.inf]))
 
-    def run(nu, y0, edges):
-        osc = jb.presets.class_d(nu[0], nu[1], edges[0], edges[1])
-        return simulate(osc, y0, 30.0, ts=jnp.linspace(0.0, 30.0, 31), max_segments=512)
 
-    single = jax.jit(run)
-    batch = jax.jit(jax.vmap(run))(nu, y0, edges)
+def test_vmap_equals_a_loop():
+    lanes = mixed_lanes()
+    single, batch = jax.jit(one_of_class_d), all_of_class_d(*lanes)
     seen = set()
-    for i in range(len(nu)):
-        alone = single(nu[i], y0[i], edges[i])
+    for i in range(24):
+        alone = single(*(column[i] for column in lanes))
         assert alone.status == batch.status[i]
         np.testing.assert_array_equal(alone.events.kind, batch.events.kind[i])
         np.testing.assert_allclose(alone.events.t, batch.events.t[i], rtol=0, atol=1e-12)
@@ -252,21 +259,23 @@ def test_vmap_equals_a_loop():
 
 
 def test_a_lane_that_is_not_finite_harms_no_other():
-    nus = jnp.array([0.3, jnp.nan, 0.4])
-    run = jax.jit(
-        jax.vmap(
-            lambda nu: simulate(
-                jb.presets.class_d(nu, 0.35, -jnp.inf, jnp.inf),
-                jnp.array([2.5, 0.0]),
-                30.0,
-                ts=jnp.linspace(0.0, 30.0, 31),
-                max_segments=512,
-            )
-        )
-    )(nus)
-    assert run.status.tolist() == [Status.OK, Status.NOT_FINITE, Status.OK]
-    assert np.all(np.isnan(run.ys[1]))
-    assert np.all(np.isfinite(run.ys[jnp.array([0, 2])]))
+    nu, y0, edges = mixed_lanes()
+    sound = all_of_class_d(nu, y0, edges)
+    hurt = all_of_class_d(nu.at[3, 0].set(jnp.nan), y0.at[11, 1].set(jnp.nan), edges)
+    lost = np.isin(np.arange(24), [3, 11])
+    assert np.all(hurt.status[lost] == Status.NOT_FINITE) and np.all(np.isnan(hurt.ys[lost]))
+    for name in ("ys", "status", "modes"):
+        np.testing.assert_array_equal(getattr(hurt, name)[~lost], getattr(sound, name)[~lost])
+
+
+def test_nor_does_one_of_the_switch_model():
+    def run(nu):
+        osc = jb.presets.class_b(nu, 0.35)
+        return jb.simulate(osc, (3.0, 0.0), 10.0, ts=jnp.linspace(0, 10, 5), formulation="switch")
+
+    out = jax.jit(jax.vmap(run))(jnp.array([0.3, jnp.nan]))
+    assert np.all(np.isfinite(out.ys[0])) and np.all(np.isnan(out.ys[1]))
+    assert out.status[0] == Status.OK and out.status[1] != Status.OK
 
 
 # --- formulations ---------------------------------------------------------------------------------
