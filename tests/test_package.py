@@ -130,7 +130,8 @@ def test_examples_of_the_readme_run():
 
 
 def test_ci_runs_the_test_command_of_the_readme():
-    """The lines of .ci/run that read the command find it, and pytest is started nowhere else."""
+    """The lines of .ci/run that read the command find it, its exit code counts, and pytest is
+    started nowhere else."""
     ci = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     (extraction,) = re.findall(r"^command=.*$", ci, re.MULTILINE)
     run = subprocess.run(
@@ -142,7 +143,9 @@ def test_ci_runs_the_test_command_of_the_readme():
         timeout=60,
     )
     assert run.stdout == readme_command("tests")
-    assert ci.rstrip().endswith('bash -euo pipefail -c "$command"')
+    assert ci.count("$command") == 3  # looked at, shown, run
+    assert 'bash -euo pipefail -c "$command") || tested=$?' in ci
+    assert ci.rstrip().endswith("exit $((tested || linted))")
     assert "pytest" not in ci
 
 
