@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.optimize import brentq
 
 from .bifurcations import (
     HINT_BUDGET,
@@ -352,6 +351,8 @@ def _row(problem: _Problem, at: CurvePoint, seen: "_Seen") -> _Row:
 
 def _between(problem: _Problem, system: "_System", before, after) -> list[SpecialPoint]:
     """The points of codimension two between two neighbours: where a watched function vanishes."""
+    from scipy.optimize import brentq  # half a second that only curves need
+
     (a, seen_a), (b, seen_b) = before, after
     length = float((b.u - a.u) @ a.tangent)
     found = []

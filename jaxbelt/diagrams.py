@@ -25,7 +25,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
-from scipy.ndimage import distance_transform_edt
 
 from .bifurcations import (
     AbstractCondition,
@@ -245,6 +244,8 @@ def interior(inside: np.ndarray) -> tuple[int, int]:
 
     Of several the last one: where the plane is symmetric, that with the larger parameters.
     """
+    from scipy.ndimage import distance_transform_edt  # a quarter of a second that only maps need
+
     depth = np.asarray(distance_transform_edt(np.pad(inside, 1)))[1:-1, 1:-1]
     row, column = np.argwhere(depth > np.max(depth) - 1e-9)[-1]
     return int(row), int(column)

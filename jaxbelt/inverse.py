@@ -30,7 +30,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
@@ -259,6 +258,8 @@ def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Recor
 @jit
 def _search(starts, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
     """Adam from many starts, (u [starts, p], shift [starts]): where each ends, and its misfit."""
+    import optax  # a quarter of a second that only this search needs
+
     optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, SEARCH_STEPS))
 
     def misfit(unknown):
