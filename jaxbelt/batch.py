@@ -43,6 +43,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .compiling import one_kernel
 from .modes import (
     ABOVE,
     BELOW,
@@ -690,15 +691,22 @@ def _advance(
             handed[1:],
         )
 
-    def round_(osc, _, lanes):
-        lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
-        lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
-        window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
+    @one_kernel
+    def work(shared, rows, lanes, one, t1, rtol, atol):
+        """ROUNDS times: past the events, and some steps."""
+        osc = _oscillator(program, shared, rows)
 
-        def step(_, lanes):
-            return _step(osc, window, one, lanes, t1, rtol, atol)
+        def round_(_, lanes):
+            lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
+            lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
+            window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
 
-        return lax.fori_loop(0, STEPS, step, lanes)
+            def step(_, lanes):
+                return _step(osc, window, one, lanes, t1, rtol, atol)
+
+            return lax.fori_loop(0, STEPS, step, lanes)
+
+        return lax.fori_loop(0, ROUNDS, round_, lanes)
 
     def at_work(stream):
         return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
@@ -716,8 +724,8 @@ def _advance(
 
         def inner(desk):
             desk = refill(desk, block, taken, available)
-            osc = _oscillator(program, shared, desk.stream.rows)
-            lanes = lax.fori_loop(0, ROUNDS, functools.partial(round_, osc), desk.stream.lanes)
+            stream = desk.stream
+            lanes = work(shared, stream.rows, stream.lanes, one, t1, rtol, atol)
             return replace(desk, stream=replace(desk.stream, lanes=lanes))
 
         nothing = [jnp.zeros_like(one) for _ in results]

@@ -336,12 +336,17 @@ class Encounter(_System):
         def osc_of(p):
             return vary(osc, self.index, p)
 
-        value, miss, blocks = residual_and_blocks(osc_of, self.chain, z, p)
+        value, miss, blocks = residual_and_blocks(*_along(osc_of, p), self.chain, z)
         g, g_p, g_miss = _value_and_slopes(lambda p, m: self._condition(osc_of(p), m), p[0], miss)
         row = g_miss * jnp.append(blocks[:, 3, :3].reshape(-1), jnp.sum(blocks[:, 3, 3]))
         row = row.at[-1].add(g_p)
         matrix = jnp.concatenate([_cycle_rows(blocks), row[None]])
         return jnp.append(value.reshape(-1), g), matrix
+
+
+def _along(osc_of: Callable[[Array], Oscillator], p: Array) -> tuple[Oscillator, Oscillator]:
+    """The oscillator at the parameter, [1], and its derivative by it."""
+    return jax.jvp(osc_of, (p,), (jnp.ones_like(p),))
 
 
 def _cycle_rows(blocks: Array) -> Array:
@@ -396,7 +401,7 @@ def _accuracy(osc: Oscillator, system: _System, z: Array, p: Array, matrix: Arra
     def value(mesh):
         return eqx.tree_at(lambda s: s.chain.mesh, system, mesh).residual(osc, z, p)
 
-    values = jax.vmap(value)(meshes)
+    values = lax.map(value, meshes)
     weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
     rounding = 1e-15 * (1 + jnp.max(jnp.abs(z))) * jnp.sum(jnp.abs(weights))
     return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
@@ -631,7 +636,7 @@ class EdgeContact(_System):
         def osc_of(p):
             return vary(osc, self.index, p)
 
-        value, _, blocks = residual_and_blocks(osc_of, self.chain, z, p)
+        value, _, blocks = residual_and_blocks(*_along(osc_of, p), self.chain, z)
         miss, row = jax.value_and_grad(lambda z, p: self._miss(osc_of(p), z), (0, 1))(z, p)
         last = jnp.append(row[0].reshape(-1), row[1])
         matrix = jnp.concatenate([_cycle_rows(blocks), last[None]])
@@ -745,7 +750,7 @@ class UnitMultiplier(_System):
         def slope(z, p):
             return closure(osc_of(p), self.chain, z)[1]
 
-        value, _, blocks = residual_and_blocks(osc_of, self.chain, z, p)
+        value, _, blocks = residual_and_blocks(*_along(osc_of, p), self.chain, z)
         m, row = jax.value_and_grad(slope, (0, 1))(z, p)
         last = jnp.append(row[0].reshape(-1), row[1])
         matrix = jnp.concatenate([_cycle_rows(blocks), last[None]])

@@ -1,4 +1,7 @@
-"""How functions are compiled so that nobody waits long: `jit`, `traced_once` and `each`."""
+"""How functions are compiled so that nobody waits long.
+
+`jit`, `traced_once` and `each` save the time of compiling, `one_kernel` that of running.
+"""
 
 import functools
 from collections.abc import Callable
@@ -7,6 +10,8 @@ from typing import Any
 import equinox as eqx
 import jax
 from jax import lax
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from .checks import is_concrete
 
@@ -57,6 +62,93 @@ def traced_once(function: Callable) -> Any:
     """The function itself, for functions that stand in many places: its trace is kept."""
     filter_jit: Any = eqx.filter_jit
     return filter_jit(function, inline=True)
+
+
+#: How XLA's CPU compiler is told to put a call into one piece of machine code, and not to dissolve
+#: it before. It does so by itself with loops on less than a kilobyte.
+IN_ONE_PIECE = {"xla_cpu_small_call": "true", "inlineable": "false"}
+#: What is inside of the call would inherit the mark.
+NOT_MARKED = {"xla_cpu_small_call": "false", "inlineable": "true"}
+#: Operations that it can do there, those of Equinox's loops among them. It cannot sort, nor write to
+#: places that differ in a batch, nor call libraries.
+POSSIBLE = frozenset(
+    """abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh broadcast_in_dim
+    cbrt ceil clamp concatenate cond convert_element_type copy copy_p copysign cos cosh cumsum
+    custom_jvp_call custom_vjp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq
+    exp exp2 expand_dims expm1 floor gather ge gt integer_pow iota is_finite jit le log log1p
+    logistic lt max min mul ne neg nextafter nonbatchable not or pad pjit pow reduce_and
+    reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt scan
+    select_if_vmap select_n shift_left shift_right_arithmetic shift_right_logical sign sin sinh
+    slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose unvmap_all
+    unvmap_any unvmap_max while xor""".split()
+)
+#: Nor share out the work on larger arrays among threads.
+LARGEST = 256
+
+
+def _is_possible(jaxpr: Any) -> bool:
+    for equation in jaxpr.eqns:
+        sizes = [variable.aval.size for variable in equation.outvars]
+        if equation.primitive.name not in POSSIBLE or max(sizes, default=0) > LARGEST:
+            return False
+        parts = [getattr(one, "jaxpr", one) for one in jax.tree.leaves(equation.params)]
+        if not all(_is_possible(part) for part in parts if hasattr(part, "eqns")):
+            return False
+    return True
+
+
+def one_kernel(function: Callable) -> Callable:
+    """The same function of arrays, that closes over none; on the CPU as one piece of machine code.
+
+    Else XLA's runtime calls a piece of code for every few operations, every time round a loop, and
+    for a few numbers that takes longer than the operations do. In a batch, in derivatives, and
+    where something in it is not possible in one piece, the function is as it was.
+    """
+
+    @jax.custom_jvp
+    def in_one_piece(*args):
+        closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        if not _is_possible(closed.jaxpr):
+            return function(*args)
+        out = _in_one_piece(closed.jaxpr, closed.consts, jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(shape), out)
+
+    @in_one_piece.defjvp
+    def _(primals, tangents):
+        return jax.jvp(function, primals, tangents)
+
+    @functools.wraps(function)
+    def call(*args):
+        return (in_one_piece if jax.default_backend() == "cpu" else function)(*args)
+
+    return call
+
+
+def _in_one_piece(jaxpr: Any, *args) -> list[jax.Array]:
+    """What the jaxpr gives, as one piece of machine code where it is not in a batch."""
+
+    def evaluate(constants, arguments):
+        return jaxpr_as_fun(ClosedJaxpr(jaxpr, constants))(*arguments)
+
+    @jax.jit
+    def unmarked(*args):
+        with set_xla_metadata(**NOT_MARKED):
+            # Handed through: XLA fails where an argument is not used,
+            return evaluate(*args), args
+
+    @jax.custom_batching.custom_vmap
+    def alone(*args):
+        with set_xla_metadata(**IN_ONE_PIECE):
+            # or is a constant, which the barrier hides from it.
+            return unmarked(*lax.optimization_barrier(args))[0]
+
+    @alone.def_vmap
+    def _(axis_size, batched, *args):
+        axes = jax.tree.map(lambda one: 0 if one else None, tuple(batched))
+        out = jax.vmap(evaluate, axes, axis_size=axis_size)(*args)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return alone(*args)
 
 
 def each(function: Callable) -> Callable:

@@ -32,7 +32,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from .checks import as_array, check_finite, is_concrete, number, pick, require
-from .compiling import jit
+from .compiling import jit, one_kernel
 from .equilibria import EquilibriumKind, equilibria
 from .extrapolation import Scheme, increments, scheme
 from .modes import (
@@ -232,10 +232,50 @@ def _arc_equations(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
     return jnp.where(is_tangent, jnp.concatenate([point, after - unknown[:2]]), ordinary)
 
 
+@one_kernel
+def _equations(osc: Oscillator, chain: Chain, z: Array) -> Array:
+    """`_arc_equations` of all arcs, [N, 4]."""
+
+    def one(row):
+        codes, end, mesh, unknown = row
+        return _arc_equations(osc, codes, end, mesh, unknown)
+
+    return lax.map(one, (chain.codes, chain.ends, chain.mesh, z))
+
+
+@one_kernel
+def _equations_and_blocks(osc: Oscillator, along: Oscillator | None, chain: Chain, z: Array):
+    """`_arc_equations` of all arcs, [N, 4], and their derivatives, [N, 4, 3 or 4]."""
+    size = 3 if along is None else 4
+
+    def one(row):
+        codes, end, mesh, unknown = row
+
+        def equations(osc, u):
+            return _arc_equations(osc, codes, end, mesh, u)
+
+        def column(direction):
+            if along is None:
+                of_unknown = functools.partial(equations, osc)
+                return jax.jvp(of_unknown, (unknown,), (direction,))
+            moved = jax.tree.map(lambda slope: direction[3] * slope, along)
+            return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
+
+        def followed():
+            return jax.vmap(column, out_axes=(None, -1))(jnp.eye(size))
+
+        def unused():  # ends as it begins
+            return jnp.append(unknown, 0.0), jnp.diag(jnp.array([1.0, 1.0, 1.0, 0.0]))[:, :size]
+
+        return lax.cond(end == Ends(codes.size).unused, unused, followed)
+
+    return lax.map(one, (chain.codes, chain.ends, chain.mesh, z))
+
+
 def residual(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
     """The 3N equations at the unknowns z, [N, 3]: mismatch of x1, of x2, guard, for every arc; and
     the miss of the tangent arcs, zero where there is none."""
-    out = jax.vmap(functools.partial(_arc_equations, osc))(chain.codes, chain.ends, chain.mesh, z)
+    out = _equations(osc, chain, z)
     return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3])
 
 
@@ -244,23 +284,12 @@ def _next_entries(z):
 
 
 def residual_and_blocks(
-    osc_of: Callable[[Array], Oscillator], chain: Chain, z: Array, p: Array
+    osc: Oscillator, along: Oscillator | None, chain: Chain, z: Array
 ) -> tuple[Array, Array, Array]:
-    """`residual` at the parameters p, a vector, of an oscillator osc_of(p), and its derivatives:
-    those of the equations of each arc with respect to its (x1, x2, T, p), [N, 4, 3 + len(p)]."""
-
-    def one(codes, end, mesh, unknown):
-        def equations(u):
-            return _arc_equations(osc_of(u[3:]), codes, end, mesh, u[:3])
-
-        def column(direction):
-            return jax.jvp(equations, (unknown,), (direction,))
-
-        value, columns = jax.vmap(column, out_axes=(None, -1))(jnp.eye(unknown.size))
-        return value, columns
-
-    unknowns = jnp.concatenate([z, jnp.broadcast_to(p, (z.shape[0], p.size))], axis=1)
-    out, blocks = jax.vmap(one)(chain.codes, chain.ends, chain.mesh, unknowns)
+    """`residual`, and its derivatives: those of the equations of each arc with respect to its
+    (x1, x2, T), and, where the direction `along` in the space of oscillators is given, along that,
+    [N, 4, 3 or 4]."""
+    out, blocks = _equations_and_blocks(osc, along, chain, z)
     return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3]), blocks
 
 
@@ -315,7 +344,7 @@ def newton(step: Callable[[Any], tuple[Any, Array, Array]], start: Any) -> Newto
 
 
 def _newton_step(osc, chain, z):
-    value, _, blocks = residual_and_blocks(lambda _: osc, chain, z, jnp.zeros(0))
+    value, _, blocks = residual_and_blocks(osc, None, chain, z)
     matrix = jacobian(blocks[:, :3])
     step = jnp.linalg.solve(matrix, -value.reshape(-1))
     return step.reshape(z.shape), jnp.max(jnp.abs(value)), matrix
@@ -338,7 +367,7 @@ def _(primals, tangents):
     _, shift = jax.jvp(
         lambda moved: residual(eqx.combine(moved, fixed), chain, z)[0], (moved,), (tangents[0],)
     )
-    _, _, blocks = residual_and_blocks(lambda _: osc, chain, z, jnp.zeros(0))
+    _, _, blocks = residual_and_blocks(osc, None, chain, z)
     z_dot = jnp.linalg.solve(jacobian(blocks[:, :3]), -shift.reshape(-1)).reshape(z.shape)
     return (z, iterations), (z_dot, None)
 
@@ -425,7 +454,8 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
         regular = jnp.abs(slope) > 1e-6
         since = jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0)
         # Another guard may have fired before this one: the cubic does not tell two that are close.
-        before = jnp.where((value < 0) & (slope < 0), since, -jnp.inf).at[fired].set(since[fired])
+        late = (value < 0) & (slope < 0) | (jnp.arange(value.size) == fired)
+        before = jnp.where(late, since, -jnp.inf)
         first = jnp.argmax(before)
         fired = jnp.where(before[first] > before[fired] + 1e-12, first, fired)
         return jnp.clip(h_root - since[fired], 0.0, 1.01 * h), h_root, y_root, fired
@@ -473,14 +503,18 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     status = jnp.where(resting, Status.EQUILIBRIUM.value, status)
     bad = ~jnp.all(jnp.isfinite(y_end)) | (~stuck & lost)
     status = jnp.where(bad, Status.NOT_FINITE.value, status)
-    i = orbit.count
+    own = rows == orbit.count
+
+    def put(column, value):  # column.at[i].set would be a scatter in batches
+        return jnp.where(own.reshape(-1, *[1] * value.ndim), value, column)
+
     return Orbit(
-        entries=orbit.entries.at[i].set(y),
-        durations=orbit.durations.at[i].set(duration),
-        codes=orbit.codes.at[i].set(codes),
-        ends=orbit.ends.at[i].set(end),
-        tops=orbit.tops.at[i].set(top),
-        count=i + 1,
+        entries=put(orbit.entries, y),
+        durations=put(orbit.durations, duration),
+        codes=put(orbit.codes, codes),
+        ends=put(orbit.ends, end),
+        tops=put(orbit.tops, top),
+        count=orbit.count + 1,
         y=y_end,
         code=code,
         low=jnp.where(is_top, y_end[0], jnp.minimum(orbit.low, y_end[0])),
@@ -488,6 +522,14 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
         status=status,
         done=(status != Status.OK) | (repeats >= 0),
     )
+
+
+@one_kernel
+def _follow_from(osc: Oscillator, start: Orbit) -> Orbit:
+    def going(orbit):
+        return ~orbit.done & (orbit.count < orbit.tops.size)
+
+    return lax.while_loop(going, functools.partial(_next_arc, osc), start)
 
 
 def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
@@ -509,9 +551,7 @@ def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
         status=jnp.asarray(Status.OK.value),
         done=jnp.asarray(False),
     )
-    orbit = lax.while_loop(
-        lambda orbit: ~orbit.done & (orbit.count < budget), functools.partial(_next_arc, osc), start
-    )
+    orbit = _follow_from(osc, start)
     status = jnp.where(orbit.done, orbit.status, Status.NOT_SETTLED.value)
     return eqx.tree_at(lambda orbit: orbit.status, orbit, status)
 
@@ -718,9 +758,18 @@ def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
     One multiplier of a planar cycle is 1, so this is the other one. Contact edges have determinant
     one: their saltation matrix is [[1, 0], [jump of x2' / x2, 1]].
     """
+    entries = jnp.roll(z[:, :2], -1, axis=0)
+    errors, factors = _errors_and_factors(osc, chain, following_codes(chain), z, entries)
+    return jnp.max(errors), jnp.prod(factors)
+
+
+@one_kernel
+def _errors_and_factors(osc: Oscillator, chain: Chain, following: Array, z: Array, entries: Array):
+    """What each arc contributes to `closure`."""
     n = len(osc.belts)
 
-    def one(codes, end, mesh, unknown, following, entry):
+    def one(row):
+        codes, end, mesh, unknown, following, entry = row
         after = flow(osc, codes, mesh, unknown[:2], unknown[2], trace_of)
         guard = _guard(osc, codes, end, after[:2], unknown[2])
         before_crossing = mode_acceleration(osc, _mode(codes), after[0], after[1])
@@ -732,11 +781,7 @@ def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
         error = jnp.maximum(jnp.max(jnp.abs(after[:2] - entry)), jnp.abs(guard))
         return error, growth * jnp.where(crosses, ratio, 1.0)
 
-    entries = jnp.roll(z[:, :2], -1, axis=0)
-    errors, factors = jax.vmap(one)(
-        chain.codes, chain.ends, chain.mesh, z, following_codes(chain), entries
-    )
-    return jnp.max(errors), jnp.prod(factors)
+    return lax.map(one, (chain.codes, chain.ends, chain.mesh, z, following, entries))
 
 
 def following_codes(chain: Chain) -> Array:

@@ -52,7 +52,7 @@ from .compiling import each, jit
 from .cycles import SIZES, Ends, Turn, last_turn, turn_events, turn_of
 from .equilibria import equilibria
 from .oscillator import Oscillator
-from .results import EventKind, Status
+from .results import EventKind, Status, of_one_turn
 
 #: Values of the parameter in one batch, and guesses refined in one batch.
 BATCH, GUESSES = 32, 8
@@ -263,17 +263,11 @@ def _label(seen: _Seen) -> tuple[Label, dict[Signature, Turn]]:
     for start, status in enumerate(seen.status):
         turn = jax.tree.map(lambda x, i=start: x[i], seen.turn)
         if status == Status.OK:
-            cycles.setdefault(_signature(turn), turn)
+            cycles.setdefault(of_one_turn(turn_events(turn)), turn)
         if start == len(seen.status) - 1 and not cycles and not any(stable for _, stable in rests):
             # Nothing holds the orbits but a cycle that they approach slowly.
             cycles[()] = turn
     return Label(rests, frozenset(cycles)), cycles
-
-
-def _signature(turn: Turn) -> Signature:
-    """The events of a turn, from the one that makes the smallest sequence."""
-    events = turn_events(turn)
-    return min((events[i:] + events[:i] for i in range(len(events))), default=())
 
 
 # --- what makes the difference between two values -------------------------------------------------

@@ -4,6 +4,7 @@
 """
 
 import enum
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -118,3 +119,9 @@ class EventKind(enum.IntEnum):
     SLIP = 2
     CROSS = 3
     EDGE = 4
+
+
+def of_one_turn(events: Sequence[tuple[EventKind, int]]) -> tuple[tuple[EventKind, int], ...]:
+    """The events of a turn, (kind, belt) each, wherever it was begun: the least of the orders."""
+    turn = tuple(events)
+    return min((turn[i:] + turn[:i] for i in range(len(turn))), default=())

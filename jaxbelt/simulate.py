@@ -4,8 +4,8 @@ A trajectory is a chain of arcs. In a slip arc the orbit runs in the smooth fiel
 a guard of the mode vanishes; a stick arc is known in closed form. The chain is a `lax.scan` of
 segments, an arc each, so that it works under `jit`, `vmap`, and derivatives forward and reverse.
 
-Slip arcs are integrated by `diffrax.diffeqsolve` (Tsit5) with one scalar event, the smallest
-guard. It is looked at after each step; where it is negative, the step is made once more, shorter,
+Slip arcs are integrated by `diffrax.diffeqsolve` with one scalar event, the smallest guard. It is
+looked at after each step; where it is negative, the step is made once more, shorter,
 so that it ends on the first root. That root cannot hide within the step: besides the boundaries
 and edges, an arc also ends where the acceleration changes its sign (and, before a contact edge,
 where the velocity does), unless no boundary (no edge) is within reach. Between two such turns x2
@@ -19,7 +19,7 @@ Samples at given times are taken from the arcs afterwards, all in parallel.
 import functools
 import math
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -31,7 +31,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from .checks import as_numbers, check_finite, check_positive, is_concrete, require
-from .compiling import jit
+from .compiling import jit, one_kernel
 from .derivatives import forward_jacobian
 from .extrapolation import increments, scheme
 from .modes import (
@@ -52,9 +52,9 @@ from .oscillator import Oscillator
 from .results import EventKind, Status, describe
 from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
-#: Longest step, in units of 1/(angular frequency of the spring): well below half a turn.
+#: Longest step, as a fraction of the longest slip arc: well below half a turn.
 MAX_STEP = 0.5
-#: First step of an arc.
+#: First step, as a fraction of what may be left of an arc.
 FIRST_STEP = 0.2
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
 #: because near-grazing events amplify them.
@@ -63,9 +63,8 @@ SAFETY = 0.03
 MAX_ARC = 1.0
 #: Segments are run in blocks of so many; the budget is rounded up to whole blocks.
 BLOCK = 32
-#: Samples computed at once: on the CPU XLA uses threads of its own for more than 512 bytes, which
-#: cost more than they bring here.
-SAMPLED = 64
+#: Samples computed at once.
+SAMPLED = 32
 #: Steps that one segment may take before it is given up.
 MAX_STEPS = 100_000
 
@@ -132,37 +131,11 @@ class Trajectory(eqx.Module):
 # --- slip arcs ------------------------------------------------------------------------------------
 
 
-class _RememberStart(diffrax.AbstractAdaptiveSolver):
-    """A solver that also keeps where its last step began: its state is ((x1, x2), (t, x1, x2)).
-
-    The wrapped solver sees (x1, x2) alone; carrying the memory through its stages doubles the time.
-    """
-
-    solver: diffrax.AbstractSolver
-    term_structure = diffrax.ODETerm
-    interpolation_cls = diffrax.LocalLinearInterpolation
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0[0], args)
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        start, memory = y0
-        y, error, _, solver_state, result = self.solver.step(
-            terms, t0, t1, start, args, solver_state, made_jump
-        )
-        y1 = (y, (t0, *start))
-        error = (error, jax.tree.map(jnp.zeros_like, memory))
-        return y1, error, {"y0": y0, "y1": y1}, solver_state, result
-
-
 class _Extrapolation(diffrax.AbstractAdaptiveSolver):
-    """The midpoint rule extrapolated to order eight, the error from the extrapolation to six."""
+    """The midpoint rule extrapolated to order eight, the error from the extrapolation to six.
+
+    Its state is where its last step began and where it ended, (t, x1, x2) each.
+    """
 
     scheme: ClassVar = scheme((2, 4, 6, 8), (2, 4, 6))
     term_structure = diffrax.ODETerm
@@ -172,7 +145,7 @@ class _Extrapolation(diffrax.AbstractAdaptiveSolver):
         return 7  # that of the controlled error
 
     def init(self, terms, t0, t1, y0, args):
-        return None
+        return (t0, *y0), (t0, *y0)
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
@@ -184,30 +157,8 @@ class _Extrapolation(diffrax.AbstractAdaptiveSolver):
         best, lower = increments(field, y0, t1 - t0, self.scheme)
         y1 = tuple(a + b for a, b in zip(y0, best, strict=True))
         error = tuple(a - b for a, b in zip(best, lower, strict=True))
-        return y1, error, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
-
-
-_SOLVER = _Extrapolation()
-
-
-def _controller(rtol, atol):
-    # The error of a step is that of the state, not of the memory beside it.
-    def norm(y):
-        x1, x2 = y[0] if isinstance(y[0], tuple) else y
-        return jnp.maximum(jnp.abs(x1), jnp.abs(x2))
-
-    return diffrax.PIDController(rtol=rtol, atol=atol, dtmax=MAX_STEP, norm=norm)
-
-
-def _field(osc, mode):
-    """The slip field for states (x1, x2), and for those with a memory beside them."""
-
-    def field(t, y, args):
-        if isinstance(y[0], tuple):
-            return field(t, y[0], args), jax.tree.map(jnp.zeros_like, y[1])
-        return _velocity(osc, mode, y)
-
-    return diffrax.ODETerm(field)
+        last = (t0, *y0), (t1, *y1)
+        return y1, error, {"y0": y0, "y1": y1}, last, diffrax.RESULTS.successful
 
 
 def _velocity(osc, mode, y):
@@ -217,10 +168,42 @@ def _velocity(osc, mode, y):
 
 def _single_step(osc, mode, y, h):
     """The state one step of size h after y, in the field of the mode."""
-    term, zero = _field(osc, mode), jnp.zeros_like(h)
-    solver_state = _SOLVER.init(term, zero, h, y, None)
-    y, *_ = _SOLVER.step(term, zero, h, y, None, solver_state, False)
-    return y
+    best, _ = increments(functools.partial(_velocity, osc, mode), y, h, _Extrapolation.scheme)
+    return tuple(a + b for a, b in zip(y, best, strict=True))
+
+
+def _integrate(osc, mode, y, span, rtol, atol, left=None):
+    """From y in the slip field for the time `span`, or until left(t, y, ...).
+
+    Returns the last step's beginning and end, (t, x1, x2) each, t as a fraction of the span, and
+    whether it left. In units of the span the times are plain numbers: where they are not, diffrax
+    checks them with a callback, and that has no place in one kernel. Nor have the writes into
+    arrays that saving a result is in a batch; so the result is the solver's state.
+    """
+
+    def field(t, y, args):
+        return tuple(span * slope for slope in _velocity(osc, mode, y))
+
+    def norm(y):
+        # A lane that has nothing to do, and may be NaN, must not keep a batch waiting.
+        return jnp.where(span > 0, jnp.maximum(*(jnp.abs(part) for part in y)), 0.0)
+
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        _Extrapolation(),
+        t0=0.0,
+        t1=1.0,
+        dt0=FIRST_STEP,
+        y0=y,
+        saveat=diffrax.SaveAt(solver_state=True),
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol, dtmax=MAX_STEP, norm=norm),
+        event=None if left is None else diffrax.Event(left),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    last: Any = solution.solver_state
+    return *last, solution.event_mask
 
 
 def _guards(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], y) -> Array:
@@ -285,36 +268,22 @@ class _SlipArc(eqx.Module):
 
 
 @forward_jacobian
+@one_kernel
 def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
     """Follow the slip arc from y until a guard fires or the time span is over."""
 
     def left_mode(t, y, args, **kwargs):
         # A rejected first step leaves t = 0, where a guard may vanish.
-        return (t > 0) & (jnp.min(_guards(osc, mode, turn, y[0])) < 0)
+        return (t > 0) & (jnp.min(_guards(osc, mode, turn, y)) < 0)
 
-    zero = jnp.zeros_like(span)
-    solution = diffrax.diffeqsolve(
-        _field(osc, mode),
-        _RememberStart(_SOLVER),
-        t0=zero,
-        t1=span,
-        dt0=jnp.full_like(span, FIRST_STEP),
-        y0=(y, (zero, *y)),
-        saveat=diffrax.SaveAt(t1=True),
-        stepsize_controller=_controller(SAFETY * rtol, SAFETY * atol),
-        event=diffrax.Event(left_mode),
-        adjoint=diffrax.ForwardMode(),
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    t_end, (y_end, (t_start, *y_start)) = jax.tree.map(
-        lambda leaf: leaf[-1], (solution.ts, solution.ys)
-    )
-    hit = jnp.asarray(solution.event_mask)
-    finished = hit | (t_end >= span)
+    started, reached, hit = _integrate(osc, mode, y, span, SAFETY * rtol, SAFETY * atol, left_mode)
+    (t_start, *start), (t_end, *y_end) = started, reached
+    hit = jnp.asarray(hit)
+    finished = hit | (t_end >= 1)
+    t_start, t_end = span * t_start, span * t_end
 
     # Make the last step once more, to the root instead of beyond it.
-    start = tuple(y_start)
+    start, y_end = tuple(start), tuple(y_end)
     last = lax.stop_gradient(t_end - t_start)
     frozen = lax.stop_gradient((osc, mode, turn))
     f_osc, f_mode, f_start = lax.stop_gradient((osc, mode, start))
@@ -352,22 +321,11 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
 
 
 @forward_jacobian
+@one_kernel
 def _flow(osc, mode, y, duration, rtol, atol):
     """The state after `duration` in the slip field of the mode, no events looked for."""
-    solution = diffrax.diffeqsolve(
-        _field(osc, mode),
-        _SOLVER,
-        t0=jnp.zeros_like(duration),
-        t1=duration,
-        dt0=jnp.full_like(duration, FIRST_STEP),
-        y0=y,
-        saveat=diffrax.SaveAt(t1=True),
-        stepsize_controller=_controller(rtol, atol),
-        adjoint=diffrax.ForwardMode(),
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    return jax.tree.map(lambda leaf: leaf[-1], solution.ys)
+    _, (_, *y_end), _ = _integrate(osc, mode, y, duration, rtol, atol)
+    return tuple(y_end)
 
 
 # --- segments -------------------------------------------------------------------------------------
@@ -575,7 +533,7 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     since = jnp.where(beyond, 0.0, ts - arcs.t)
     stuck = jnp.any(arcs.mode == 0, axis=1)
 
-    def at(arc, since, stuck):
+    def at(osc, rtol, atol, arc, since, stuck):
         mode = Mode(tuple(arc.mode[j].astype(float) for j in range(len(osc.belts))))
         flown = _flow(osc, mode, (arc.y[0], arc.y[1]), jnp.where(stuck, 0.0, since), rtol, atol)
         v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
@@ -587,7 +545,9 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     rows = jax.tree.map(
         lambda leaf: leaf[order].reshape(-1, SAMPLED, *leaf.shape[1:]), (arcs, since, stuck)
     )
-    ys = lax.map(lambda row: jax.vmap(at)(*row), rows).reshape(-1, 2)[jnp.argsort(order)]
+    some = one_kernel(jax.vmap(at, (None, None, None, 0, 0, 0)))
+    ys = lax.map(lambda row: some(osc, rtol, atol, *row), rows)
+    ys = ys.reshape(-1, 2)[jnp.argsort(order)]
     afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
     ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)
     return jnp.where(beyond[:, None], afterwards, ys)[:wanted], arcs.mode[:wanted]

@@ -33,6 +33,7 @@ from .checks import (
     require_float64,
 )
 from .oscillator import Oscillator
+from .results import of_one_turn
 
 #: Results with a number a belt.
 PER_BELT = ("sticks", "stick_duration", "mode_end")
@@ -378,8 +379,7 @@ def _meaning(word: int, belts: int) -> str:
     """A signature as one word; -1 stands for one that is too long to be told."""
     if word < 1:
         return "none" if word == 0 else "long"
-    events = batch.word_events(word, belts)
-    turn = min((events[i:] + events[:i] for i in range(len(events))), default=())
+    turn = of_one_turn(batch.word_events(word, belts))
     return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in turn) or "smooth"
 
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 
 import jaxbelt as jb
 from jaxbelt import compiling
@@ -87,3 +88,119 @@ def test_a_sweep_compiles_its_kernel_once():
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     assert sum("_advance" in name for name in compiled) == 1
+
+
+# --- one kernel -----------------------------------------------------------------------------------
+
+MARK = 'inlineable="false"'  # not on the loops that XLA puts into one piece by itself
+
+
+def descend(start, rates):
+    """A loop whose length depends on the numbers."""
+
+    def step(state):
+        x, n = state
+        return x * (1 - rates["slow"]), n + 1
+
+    return lax.while_loop(lambda state: state[0] > 0.1, step, (start, 0))
+
+
+def expected(start, slow):
+    n = int(np.ceil(np.log(0.1 / start) / np.log(1 - slow)))
+    return start * (1 - slow) ** n, n
+
+
+def check(values, start, slow):
+    x, n = expected(start, slow)
+    assert int(values[1]) == n
+    assert float(values[0]) == pytest.approx(x, rel=1e-12)
+
+
+def program(function, *args) -> str:
+    return jax.jit(function).lower(*args).compile().as_text()
+
+
+piece = compiling.one_kernel(descend)
+# An argument that is not used, and what is a constant where it is compiled, are the hard ones.
+RATES = {"slow": 0.2, "unused": jnp.arange(3)}
+
+
+def test_the_result_is_that_of_the_function():
+    check(piece(2.0, RATES), 2.0, 0.2)
+    check(jax.jit(piece)(2.0, RATES), 2.0, 0.2)
+
+
+def test_constants_are_no_matter():
+    check(jax.jit(lambda: piece(2.0, RATES))(), 2.0, 0.2)
+    check(jax.jit(lambda x: piece(x, RATES))(2.0), 2.0, 0.2)
+    check(jax.jit(lambda r: piece(2.0, {"slow": r, "unused": r}))(0.2), 2.0, 0.2)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the CPU's compiler")
+def test_it_is_one_piece_of_machine_code():
+    assert MARK in program(piece, 2.0, RATES)
+    assert MARK not in program(descend, 2.0, RATES)
+
+
+def test_in_loops_and_branches():
+    def sums(x):
+        def body(total, start):
+            return total + lax.cond(start > 1, lambda: piece(start, RATES)[0], lambda: start), None
+
+        return lax.scan(body, 0.0, x)[0]
+
+    starts = np.array([2.0, 0.5, 3.0])
+    wanted = expected(2.0, 0.2)[0] + 0.5 + expected(3.0, 0.2)[0]
+    assert float(jax.jit(sums)(starts)) == pytest.approx(wanted, rel=1e-12)
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
+def test_a_batch_gives_what_a_loop_gives(wrap):
+    starts = jnp.array([2.0, 0.05, 3.0])
+    batch = wrap(jax.vmap(lambda x: piece(x, RATES)))(starts)
+    rows = [piece(x, RATES) for x in starts]
+    assert [float(x) for x in batch[0]] == [float(x) for x, _ in rows]
+    assert [int(n) for n in batch[1]] == [int(n) for _, n in rows]
+
+
+def test_an_empty_batch():
+    assert jax.vmap(lambda x: piece(x, RATES))(jnp.zeros(0))[0].shape == (0,)
+
+
+def test_derivatives():
+    def fixed(x, a):
+        return lax.scan(lambda x, _: (x + a * jnp.sin(x), None), x, length=5)[0]
+
+    for take in (jax.grad, jax.jacfwd, lambda f: jax.jacfwd(jax.grad(f))):
+        exact = take(fixed)(0.7, 0.3)
+        assert float(take(compiling.one_kernel(fixed))(0.7, 0.3)) == pytest.approx(
+            float(exact), rel=1e-14
+        )
+        batch = jax.jit(jax.vmap(take(compiling.one_kernel(fixed)), (0, None)))(
+            jnp.full(3, 0.7), 0.3
+        )
+        np.testing.assert_allclose(batch, exact, rtol=1e-14)
+
+
+def lookup(x):
+    return jax.pure_callback(lambda x: np.asarray(x) ** 2, jax.ShapeDtypeStruct((3,), float), x)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        jnp.sort,
+        jnp.argsort,
+        lambda x: jnp.linalg.solve(jnp.diag(x), x),
+        lambda x: jnp.zeros(3).at[x.astype(int) % 3].add(x),
+        lambda x: jnp.fft.fft(x).real,
+        lambda x: jax.random.normal(jax.random.key(0), (3,)) + x,
+        lambda x: jnp.sum(jnp.sin(jnp.outer(jnp.linspace(0, 1, 100_000), x)), axis=0),
+        lookup,
+    ],
+)
+def test_what_cannot_be_one_piece_is_what_it_was(function):
+    x = jnp.array([3.0, 1.0, 2.0])
+    np.testing.assert_allclose(jax.jit(compiling.one_kernel(function))(x), function(x), rtol=1e-13)
+    if jax.default_backend() == "cpu":
+        assert MARK not in program(compiling.one_kernel(function), x)
