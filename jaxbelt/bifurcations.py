@@ -792,9 +792,10 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
 
     def judge(osc, z_found, cycle, slope):
         # A cycle that has shrunk to the equilibrium has multiplier one too: a Hopf point.
-        size = jnp.max(z[:, 0]) - jnp.min(z[:, 0])
-        shrunk = cycle.x1_max - cycle.x1_min < 0.2 * size
-        fails = (cycle.status == Status.OK) & (shrunk | ~(jnp.abs(slope - 1) < 1e-6))
+        shrunk = jnp.ptp(z_found[:, 0]) < 0.2 * jnp.ptp(z[:, 0])
+        other = (cycle.status == Status.OK) & ~(jnp.abs(slope - 1) < 1e-6)
+        solved = (cycle.status == Status.OK) | (cycle.status == Status.NO_CONVERGENCE)
+        fails = other | (shrunk & solved)
         return jnp.where(fails, Status.NO_FOLD.value, cycle.status), jnp.asarray(jnp.nan)
 
     p0 = parameter(still, index)[None]

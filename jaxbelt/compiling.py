@@ -69,8 +69,8 @@ def traced_once(function: Callable) -> Any:
 IN_ONE_PIECE = {"xla_cpu_small_call": "true", "inlineable": "false"}
 #: What is inside of the call would inherit the mark.
 NOT_MARKED = {"xla_cpu_small_call": "false", "inlineable": "true"}
-#: Operations that it can do there, those of Equinox's loops among them. It cannot sort, nor write to
-#: places that differ in a batch, nor call libraries.
+#: Operations that it can do there, those of Equinox's loops among them. It cannot sort, nor write
+#: to places that differ in a batch, nor call libraries.
 POSSIBLE = frozenset(
     """abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh broadcast_in_dim
     cbrt ceil clamp concatenate cond convert_element_type copy copy_p copysign cos cosh cumsum

@@ -195,8 +195,8 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     return jnp.where(stuck, stuck_end, slipped)
 
 
-def _guard(osc: Oscillator, codes: Array, end: Array, y: Array, duration: Array) -> Array:
-    """What vanishes at the end y of an arc."""
+def _guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
+    """What vanishes at the end y of an arc; zero for an unused one."""
     mode = _mode(codes)
     values = [
         *[belt.velocity - osc.omega * y[1] for belt in osc.belts],
@@ -204,7 +204,6 @@ def _guard(osc: Oscillator, codes: Array, end: Array, y: Array, duration: Array)
         mode_acceleration(osc, mode, y[0], y[1]),
         y[1],
         y[0] - onset_position(osc, mode),
-        duration,
     ]
     return sum((jnp.where(end == i, value, 0.0) for i, value in enumerate(values)), jnp.zeros(()))
 
@@ -212,11 +211,19 @@ def _guard(osc: Oscillator, codes: Array, end: Array, y: Array, duration: Array)
 def _arc_equations(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
     """(x1, x2, guard, 0) at the end of one arc, from its unknowns (x1, x2, T).
 
-    An arc that is to end tangent to the boundary of a belt ends at the point of it with x2' = 0.
-    Trial arcs that run past there meet the pole of the friction law, so this one is followed
-    backwards, from that point, to where it begins: (x1, x2) are the point's, the last two the
-    misses of x1 and of x2. That is one equation more, a condition on the oscillator.
+    An unused arc ends as it begins, and its guard is its duration. One that is to end tangent to the
+    boundary of a belt ends at the point of it with x2' = 0. Trial arcs that run past there meet the
+    pole of the friction law, so this one is followed backwards, from that point, to where it
+    begins: (x1, x2) are the point's, the last two the misses of x1 and of x2. That is one equation
+    more, a condition on the oscillator.
     """
+    is_unused = end == Ends(len(osc.belts)).unused
+    follow = functools.partial(_followed, osc, codes, end, mesh)
+    return lax.cond(is_unused, lambda u: jnp.append(u, 0.0), follow, unknown)
+
+
+def _followed(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
+    """`_arc_equations` of an arc that is used."""
     names = Ends(len(osc.belts))
     is_tangent = end >= names.tangent
     velocity = jnp.zeros(())
@@ -227,7 +234,7 @@ def _arc_equations(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
     start = jnp.where(is_tangent, point, unknown[:2])
     duration = jnp.where(is_tangent, -unknown[2], unknown[2])
     after = flow(osc, codes, jnp.where(is_tangent, jnp.flip(mesh), mesh), start, duration)
-    guard = _guard(osc, codes, end, after, unknown[2])
+    guard = _guard(osc, codes, end, after)
     ordinary = jnp.concatenate([after, guard[None], jnp.zeros(1)])
     return jnp.where(is_tangent, jnp.concatenate([point, after - unknown[:2]]), ordinary)
 
@@ -261,13 +268,7 @@ def _equations_and_blocks(osc: Oscillator, along: Oscillator | None, chain: Chai
             moved = jax.tree.map(lambda slope: direction[3] * slope, along)
             return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
 
-        def followed():
-            return jax.vmap(column, out_axes=(None, -1))(jnp.eye(size))
-
-        def unused():  # ends as it begins
-            return jnp.append(unknown, 0.0), jnp.diag(jnp.array([1.0, 1.0, 1.0, 0.0]))[:, :size]
-
-        return lax.cond(end == Ends(codes.size).unused, unused, followed)
+        return jax.vmap(column, out_axes=(None, -1))(jnp.eye(size))
 
     return lax.map(one, (chain.codes, chain.ends, chain.mesh, z))
 
@@ -771,7 +772,7 @@ def _errors_and_factors(osc: Oscillator, chain: Chain, following: Array, z: Arra
     def one(row):
         codes, end, mesh, unknown, following, entry = row
         after = flow(osc, codes, mesh, unknown[:2], unknown[2], trace_of)
-        guard = _guard(osc, codes, end, after[:2], unknown[2])
+        guard = _guard(osc, codes, end, after[:2])
         before_crossing = mode_acceleration(osc, _mode(codes), after[0], after[1])
         after_crossing = mode_acceleration(osc, _mode(following), entry[0], entry[1])
         slips = jnp.all(codes != 0) & (unknown[2] != 0)
