@@ -70,15 +70,14 @@ LEAST = 1e-5
 #: The way that a Taylor step may bridge to a guard, over the square root of the tolerance.
 LANDING = 0.1
 #: Steps between two looks at the events, and events between two refills.
-STEPS, ROUNDS = 4, 6
+STEPS, ROUNDS = 4, 4
 
 #: Steps that a run may take for each 100 units of time before it is given up.
 MAX_STEPS = 100_000
 #: Runs that the kernel is given at once.
 CHUNK = 2**14
-#: Lanes. On the CPU XLA runs programs on buffers of up to 512 bytes without its own threads, which
-#: cost more than they bring here.
-WIDTH = {"cpu": 64}
+#: Lanes. On the CPU few, which stay near the processor, but more than is lost at each refill.
+WIDTH = {"cpu": 128}
 
 #: Of order eight: twice the stages of order five for a third of the steps at 1e-8, and what a step
 #: costs beside its stages (its path, bounds, choices) is the larger part.
@@ -642,6 +641,59 @@ class _Desk(eqx.Module):
     columns: list[Array]
 
 
+def _refill(program: Program, shared, rtol, limit, block, begun, available, desk: _Desk) -> _Desk:
+    """Hand in what is done and take new runs, numbered from `begun`."""
+    observer, one = program.observer, desk.stream.one
+    slots = jnp.arange(one.size, dtype=jnp.int32)
+    lanes, passes = desk.stream.lanes, desk.stream.passes
+    osc = _oscillator(program, shared, desk.stream.rows)
+    lanes = _give_up(observer.rest(osc, lanes, one), passes, limit)
+    finished = lanes.done & (lanes.run >= 0)
+    finished = finished & (_rank(finished) < one.size - desk.filled)
+    # In order, behind what is there.
+    source = jnp.searchsorted(_rank(finished), slots - desk.filled)
+    new = [lanes.run, *_columns(observer.finish(osc, lanes))]
+    pairs = zip([desk.numbers, *desk.columns], new, strict=True)
+    handed = [
+        jnp.where(slots < desk.filled, old, value.at[source].get(mode="fill", fill_value=-1))
+        for old, value in pairs
+    ]
+
+    free = lanes.done & (finished | (lanes.run < 0))
+    place = desk.begun + _rank(free)
+    takes = free & (place < available)
+    place = jnp.where(takes, place, 0)
+    pairs = zip(block, desk.stream.rows, strict=True)
+    rows = tuple(jnp.where(takes, column[place], row) for column, row in pairs)
+    osc = _oscillator(program, shared, rows)
+    fresh = _begin(program, osc, begun + place, rows[0], rows[1], passes, rtol)
+    lanes = choose(takes, fresh, replace(lanes, run=jnp.where(free, -1, lanes.run)))
+    return _Desk(
+        Stream(lanes, rows, passes + 1, one),
+        desk.begun + jnp.sum(takes, dtype=jnp.int32),
+        desk.filled + jnp.sum(finished, dtype=jnp.int32),
+        handed[0],
+        handed[1:],
+    )
+
+
+def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> Lanes:
+    """ROUNDS times: past the events, and some steps."""
+    osc, observer = _oscillator(program, shared, rows), program.observer
+
+    def round_(_, lanes):
+        lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
+        lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
+        window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
+
+        def step(_, lanes):
+            return _step(osc, window, one, lanes, t1, rtol, atol)
+
+        return lax.fori_loop(0, STEPS, step, lanes)
+
+    return lax.fori_loop(0, ROUNDS, round_, lanes)
+
+
 def _advance(
     program: Program, shared, t1, rtol, atol, limit, queue, first, count, stream: Stream, drain
 ):
@@ -651,65 +703,30 @@ def _advance(
     from `first`, `count` of them are real. Returns the lanes, and, in order of completion, numbers
     (-1 where there is none) and results [columns, runs + 3 lanes].
 
-    Two loops, because on the CPU XLA does the operations of a loop one after the other if all of
-    its arrays are small, and else by threads that cost more than they bring. The inner loop sees
+    Two loops, because on the CPU only loops on small arrays can be one kernel. The inner loop sees
     small ones only: as many new runs, and as many results, as there are lanes.
     """
-    observer, one = program.observer, stream.one
-    width = one.size
+    width = stream.one.size
     size = queue[0].size + 2 * width
-    slots = jnp.arange(width, dtype=jnp.int32)
-
-    def refill(desk: _Desk, block, taken, available) -> _Desk:
-        """Hand in what is done and take new runs."""
-        lanes, passes = desk.stream.lanes, desk.stream.passes
-        osc = _oscillator(program, shared, desk.stream.rows)
-        lanes = _give_up(observer.rest(osc, lanes, one), passes, limit)
-        finished = lanes.done & (lanes.run >= 0)
-        finished = finished & (_rank(finished) < width - desk.filled)
-        # The finished ones first, behind what is there; the rest is written over the next time.
-        source = jnp.argsort(~finished)[jnp.maximum(slots - desk.filled, 0)]
-        number = jnp.where(finished, lanes.run, -1)
-        new = [number, *_columns(observer.finish(osc, lanes))]
-        pairs = zip([desk.numbers, *desk.columns], new, strict=True)
-        handed = [jnp.where(slots < desk.filled, old, value[source]) for old, value in pairs]
-
-        free = lanes.done & (finished | (lanes.run < 0))
-        place = desk.begun + _rank(free)
-        takes = free & (place < available)
-        place = jnp.where(takes, place, 0)
-        pairs = zip(block, desk.stream.rows, strict=True)
-        rows = tuple(jnp.where(takes, column[place], row) for column, row in pairs)
-        osc = _oscillator(program, shared, rows)
-        fresh = _begin(program, osc, first + taken + place, rows[0], rows[1], passes, rtol)
-        lanes = choose(takes, fresh, replace(lanes, run=jnp.where(free, -1, lanes.run)))
-        return _Desk(
-            Stream(lanes, rows, passes + 1, one),
-            desk.begun + jnp.sum(takes, dtype=jnp.int32),
-            desk.filled + jnp.sum(finished, dtype=jnp.int32),
-            handed[0],
-            handed[1:],
-        )
-
-    @one_kernel
-    def work(shared, rows, lanes, one, t1, rtol, atol):
-        """ROUNDS times: past the events, and some steps."""
-        osc = _oscillator(program, shared, rows)
-
-        def round_(_, lanes):
-            lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
-            lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
-            window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
-
-            def step(_, lanes):
-                return _step(osc, window, one, lanes, t1, rtol, atol)
-
-            return lax.fori_loop(0, STEPS, step, lanes)
-
-        return lax.fori_loop(0, ROUNDS, round_, lanes)
 
     def at_work(stream):
         return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
+
+    @one_kernel
+    def fill(shared, t1, rtol, atol, limit, block, begun, available, last, desk):
+        """Work until the block of runs is taken or the desk is full."""
+
+        def unfinished(desk):
+            left = (desk.begun < available) | (last & at_work(desk.stream))
+            return left & (desk.filled < width)
+
+        def go_on(desk):
+            desk = _refill(program, shared, rtol, limit, block, begun, available, desk)
+            stream = desk.stream
+            lanes = _work(program, shared, stream.rows, stream.lanes, stream.one, t1, rtol, atol)
+            return replace(desk, stream=replace(stream, lanes=lanes))
+
+        return lax.while_loop(unfinished, go_on, desk)
 
     def outer(state):
         stream, taken, written, numbers, results = state
@@ -717,20 +734,9 @@ def _advance(
         block = tuple(lax.dynamic_slice(column, (taken,), (width,)) for column in queue)
         available = jnp.minimum(count - taken, width)
         last = drain & (taken + available >= count)
-
-        def going_on(desk):
-            left = (desk.begun < available) | (last & at_work(desk.stream))
-            return left & (desk.filled < width)
-
-        def inner(desk):
-            desk = refill(desk, block, taken, available)
-            stream = desk.stream
-            lanes = work(shared, stream.rows, stream.lanes, one, t1, rtol, atol)
-            return replace(desk, stream=replace(desk.stream, lanes=lanes))
-
-        nothing = [jnp.zeros_like(one) for _ in results]
-        desk = _Desk(stream, zero, zero, jnp.full_like(slots, -1), nothing)
-        desk = lax.while_loop(going_on, inner, desk)
+        nothing = [jnp.zeros_like(stream.one) for _ in results]
+        desk = _Desk(stream, zero, zero, jnp.full(width, -1, dtype=jnp.int32), nothing)
+        desk = fill(shared, t1, rtol, atol, limit, block, first + taken, available, last, desk)
         numbers = lax.dynamic_update_slice(numbers, desk.numbers, (written,))
         pairs = zip(results, desk.columns, strict=True)
         results = [lax.dynamic_update_slice(whole, part, (written,)) for whole, part in pairs]

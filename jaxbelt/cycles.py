@@ -211,9 +211,9 @@ def _guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
 def _arc_equations(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
     """(x1, x2, guard, 0) at the end of one arc, from its unknowns (x1, x2, T).
 
-    An unused arc ends as it begins, and its guard is its duration. One that is to end tangent to the
-    boundary of a belt ends at the point of it with x2' = 0. Trial arcs that run past there meet the
-    pole of the friction law, so this one is followed backwards, from that point, to where it
+    An unused arc ends as it begins, and its guard is its duration. One that is to end tangent to
+    the boundary of a belt ends at the point of it with x2' = 0. Trial arcs that run past there meet
+    the pole of the friction law, so this one is followed backwards, from that point, to where it
     begins: (x1, x2) are the point's, the last two the misses of x1 and of x2. That is one equation
     more, a condition on the oscillator.
     """
