@@ -249,7 +249,7 @@ def refine(
 
 def room_for(solve: Callable) -> int:
     """Room for the arcs of one turn: passing edges takes more of them."""
-    return SIZES[2] if solve is at_edge else SIZES[1]
+    return SIZES[1] if solve is at_edge else SIZES[0]
 
 
 def leaf_index(osc: Oscillator, where: Callable[[Oscillator], Any]) -> int:
@@ -776,7 +776,7 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
 
     def narrow(bracket, _):
         distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
-        orbits, growth, sticks = jax.vmap(turn)(distances)
+        orbits, growth, sticks = each(turn)(distances)
         change = jnp.diff(growth)
         # Its neighbours may stick; what is extremal lies beside them.
         extremal = (change[1:] * change[:-1] < 0) & ~sticks[1:-1]

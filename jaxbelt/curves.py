@@ -487,7 +487,7 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
     meets = (turns | (orbit.ends == touched)) & (jnp.arange(HINT_BUDGET) < orbit.count)
     last = jnp.argmax(meets)
 
-    rows = jnp.arange(SIZES[1])
+    rows = jnp.arange(SIZES[0])
     ends = jnp.where(rows < last, orbit.ends[rows], names.unused)
     ends = ends.at[last].set(names.tangent + touched)
     durations = jnp.where(rows <= last, orbit.durations[rows], 0.0)
@@ -513,7 +513,7 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
 
     z, p = newton(step, (z, guess)).z
     value = system(2 * STEPS).residual(osc, z, p).at[closing].set(begins(z, p))
-    exists = jnp.any(meets) & (last < SIZES[1]) & admissible(osc_at(p), system(1).ordinary, z)
+    exists = jnp.any(meets) & (last < SIZES[0]) & admissible(osc_at(p), system(1).ordinary, z)
     return p[0], jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)
 
 

@@ -22,6 +22,7 @@ The signature comes from following the orbit, with the same steps and with the t
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -32,7 +33,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from .checks import as_array, check_finite, is_concrete, number, pick, require
-from .compiling import jit, one_kernel
+from .compiling import each, jit, one_kernel
 from .equilibria import EquilibriumKind, equilibria
 from .extrapolation import Scheme, increments, scheme
 from .modes import (
@@ -55,8 +56,8 @@ from .oscillator import Oscillator
 from .results import EventKind, Status, describe
 from .simulate import Arcs
 
-#: Arcs in a chain: what is needed is rounded up to one of these; the second one under a trace.
-SIZES = (8, 16, 32, 64)
+#: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
+SIZES = (16, 32, 64)
 #: Integration steps per slip arc (an arc is about a quarter of a turn at most).
 STEPS = 8
 #: Arcs that an orbit is followed for before it is given up.
@@ -840,20 +841,24 @@ def _first_failure(status: Array, fine: Array, code: Status) -> Array:
 
 
 @jit
-def _follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
-    return follow(osc, y0, budget)
+def _turn_reached(osc: Oscillator, y0: Array, size: int) -> tuple[Turn, Array, Array]:
+    """The turn that the start leads to, in `size` arcs; how many it has, and a status."""
+    orbit = follow(osc, y0, BUDGET)
+    # Where there is no cycle the first arc still gives finite numbers to calculate with.
+    turn = orbit.repeats, orbit.count
+    turn = select(orbit.status == Status.OK, turn, (jnp.asarray(-1), jnp.asarray(1)))
+    orbit = eqx.tree_at(lambda orbit: (orbit.repeats, orbit.count), orbit, turn)
+    _, count = last_turn(orbit)
+    return turn_of(orbit, size, len(osc.belts)), count, _if_it_fits(orbit.status, count, size)
+
+
+def _if_it_fits(status: Array, count: Array, size: int) -> Array:
+    return _first_failure(status, count <= size, Status.TOO_MANY_ARCS)
 
 
 @jit
-def _polish(osc: Oscillator, orbit: Orbit, size: int) -> Cycle:
-    _, count = last_turn(orbit)
-    status = _first_failure(orbit.status, count <= size, Status.TOO_MANY_ARCS)
-    # Where there is no cycle a turn of the orbit still gives finite numbers to calculate with.
-    return polish(osc, turn_of(orbit, size, len(osc.belts)), status)
-
-
 def polish(osc: Oscillator, turn: Turn, status: Array) -> Cycle:
-    """The cycle that a turn nearly is, by Newton's method."""
+    """The cycle that a turn nearly is, by Newton's method; one program for all that need it."""
     chain, guess = meshed(lax.stop_gradient(osc), turn)
     z, iterations = _solve(osc, chain, guess)
     return cycle_of(osc, chain, z, iterations, status)[0]
@@ -878,17 +883,13 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     osc.check()
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
-    orbit = _follow(osc, y0, BUDGET)
-    return _polish(osc, orbit, _room(orbit, max_arcs))
-
-
-def _room(orbit: Orbit, max_arcs: int | None) -> int:
-    if max_arcs is not None:
-        return max_arcs
-    if not is_concrete(orbit):
-        return SIZES[1]
-    needed = int(orbit.count - 1 - orbit.repeats) if int(orbit.status) == Status.OK else 0
-    return next((size for size in SIZES if size >= needed), SIZES[-1])
+    turn, count, status = _turn_reached(osc, y0, max_arcs or SIZES[-1])
+    if max_arcs is None and is_concrete(count):
+        needed = int(count) if int(status) == Status.OK else 0
+        turn = pick(turn, slice(next(size for size in SIZES if size >= needed)))
+    elif max_arcs is None:
+        turn, status = pick(turn, slice(SIZES[0])), _if_it_fits(status, count, SIZES[0])
+    return polish(osc, turn, status)
 
 
 # --- the unstable cycle ---------------------------------------------------------------------------
@@ -914,8 +915,8 @@ def unstable_cycle(osc: Oscillator, *, max_arcs: int | None = None) -> Cycle:
     )
     osc.check_scalars()
     osc.check()
-    size = SIZES[1] if max_arcs is None else max_arcs
-    return _unstable_cycle(osc, size)
+    turn, status, distance = _separating_turn(osc, max_arcs or SIZES[0])
+    return _if_meant(polish(osc, turn, status), turn.entries[0, 0], distance)
 
 
 def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
@@ -933,7 +934,8 @@ def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
 
 
 @jit
-def _unstable_cycle(osc: Oscillator, size: int) -> Cycle:
+def _separating_turn(osc: Oscillator, size: int) -> tuple[Turn, Array, Array]:
+    """A turn near the unstable cycle, a status, and how far from the equilibrium it begins."""
     still = lax.stop_gradient(osc)
     rests = equilibria(still)
     eligible = rests.stable & (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
@@ -948,7 +950,7 @@ def _unstable_cycle(osc: Oscillator, size: int) -> Cycle:
 
     def narrow(bracket, _):
         distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
-        orbits, inside = jax.vmap(turn)(distances)
+        orbits, inside = each(turn)(distances)
         first = jnp.argmin(inside)
         bounded = ~inside[-1] & (first > 0)
         low, high = distances[jnp.maximum(first - 1, 0)], distances[first]
@@ -958,22 +960,23 @@ def _unstable_cycle(osc: Oscillator, size: int) -> Cycle:
 
     bracket, (found, orbits) = lax.scan(narrow, jnp.array([1e-4, 10.0]), None, length=REFINEMENTS)
     orbit = jax.tree.map(lambda leaf: leaf[-1], orbits)
-    chain, guess = meshed(still, turn_of(orbit, size, len(osc.belts)))
-    z, iterations = _solve(osc, chain, guess)
     status = jnp.where(exists & found[0], Status.OK.value, Status.NO_UNSTABLE_CYCLE.value)
-    cycle, _ = cycle_of(osc, chain, z, iterations, status)
-    # A cycle that Newton found elsewhere, or shrunk to the equilibrium, is not the one meant.
-    same = (jnp.abs(z[0, 0] - guess[0, 0]) < 0.1 * bracket[0]) & (cycle.multiplier > 1)
+    return turn_of(orbit, size, len(osc.belts)), status, bracket[0]
+
+
+@jit
+def _if_meant(cycle: Cycle, x1: Array, distance: Array) -> Cycle:
+    """The cycle, if it repels and passes by x1; one that Newton's method found elsewhere, or that
+    has shrunk to the equilibrium, is not the one meant."""
+    same = (jnp.abs(cycle.unknowns[0, 0] - x1) < 0.1 * distance) & (cycle.multiplier > 1)
     missing = (cycle.status == Status.OK) & ~same | (cycle.status == Status.NOT_ADMISSIBLE)
     missing = missing | (cycle.status == Status.NO_CONVERGENCE)
     status = jnp.where(missing, Status.NO_UNSTABLE_CYCLE.value, cycle.status)
     known = functools.partial(jnp.where, status == Status.OK)
-    return Cycle(
-        oscillator=osc,
-        chain=chain,
+    return replace(
+        cycle,
         unknowns=known(cycle.unknowns, jnp.nan),
         multiplier=known(cycle.multiplier, jnp.nan),
         residual=known(cycle.residual, jnp.nan),
-        iterations=iterations,
         status=status,
     )

@@ -57,7 +57,7 @@ from .results import EventKind, Status, of_one_turn
 #: Values of the parameter in one batch, and guesses refined in one batch.
 BATCH, GUESSES = 32, 8
 #: Room for the arcs of one turn.
-ROOM = SIZES[2]
+ROOM = SIZES[1]
 #: Intervals narrower than this fraction of the span are good guesses for Newton's method.
 NEAR = 1 / 400
 #: Nothing closer than this, and this fraction of the span, is told apart.

@@ -44,8 +44,6 @@ from .oscillator import Oscillator
 from .results import EventKind, Status
 from .sweep import sweep
 
-#: Cycles in one batch.
-BATCH = 32
 #: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
 SAME = 1e-2
 
@@ -429,7 +427,8 @@ class _Piece(NamedTuple):
 
 
 def _equilibrium_pieces(path: Path, nodes: Sequence[np.ndarray]) -> list[_Piece]:
-    found = _in_batches(_rests, path, np.concatenate(nodes))
+    values = np.concatenate(nodes)
+    found = jax.tree.map(np.asarray, _rests(path.osc, path.index, values))
     pieces = []
     for stretch, rows in enumerate(_consecutive(nodes)):
         values, here = nodes[stretch], jax.tree.map(lambda x, rows=rows: x[rows], found)
@@ -462,13 +461,9 @@ def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Labe
             wanted.append((stretch, np.array(at), turns))
     pieces = []
     if wanted:
-        turns = [turn for _, _, group in wanted for turn in group]
-        unused = Ends(len(path.osc.belts)).unused
-        arcs = max(int(np.sum(turn.ends != unused)) for turn in turns)
-        room = next(size for size in SIZES if size >= arcs)
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves)[:, :room], *turns)
         groups = [values for _, values, _ in wanted]
-        cycles = _in_batches(_attracting, path, np.concatenate(groups), stacked)
+        turns = [turn for _, _, group in wanted for turn in group]
+        cycles = _attracting(path, np.concatenate(groups), turns)
         pieces += _as_pieces(path, cycles, groups, [stretch for stretch, _, _ in wanted])
     # An unstable cycle lies between an equilibrium and a cycle that both attract.
     both = [
@@ -533,36 +528,36 @@ def _consecutive(groups: Sequence[np.ndarray]) -> list[np.ndarray]:
     return [np.arange(end - len(group), end) for group, end in zip(groups, ends, strict=True)]
 
 
-def _in_batches(program, path: Path, values: np.ndarray, more: Any = None) -> Any:
-    """What a program gives at all values (and for one more argument), as NumPy arrays."""
-    parts = []
-    for begin in range(0, len(values), BATCH):
-        rows = np.minimum(np.arange(begin, begin + BATCH), len(values) - 1)
-        given = jax.tree.map(lambda x, rows=rows: jnp.asarray(x[rows]), (values, more))
-        parts.append(jax.tree.map(np.asarray, program(path.osc, path.index, *given)))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(values)], *parts)
-
-
 @jit
-def _rests(osc: Oscillator, index: Array, values: Array, _: None) -> Equilibria:
-    return jax.vmap(lambda p: equilibria(vary(osc, index, p[None])))(values)
+def _rests(osc: Oscillator, index: Array, values: Array) -> Equilibria:
+    return each(lambda p: equilibria(vary(osc, index, p[None])))(values)
 
 
-@jit
-def _attracting(osc: Oscillator, index: Array, values: Array, turns: Turn) -> _Rows:
+# Cycles are found one by one: the programs are those that everybody has compiled.
+
+
+def _attracting(path: Path, values: np.ndarray, turns: Sequence[Turn]) -> _Rows:
+    unused = Ends(len(path.osc.belts)).unused
+    arcs = max(int(np.sum(turn.ends != unused)) for turn in turns)
+    room = slice(next(size for size in SIZES if size >= arcs))
+    turns = [jax.tree.map(lambda leaf: leaf[room], turn) for turn in turns]
     ok = jnp.asarray(Status.OK.value)
-    return each(lambda p, turn: _row(polish(vary(osc, index, p[None]), turn, ok)))(values, turns)
+    return _as_rows(
+        [polish(path.at(value), turn, ok) for value, turn in zip(values, turns, strict=True)]
+    )
 
 
 def _repelling(path: Path, values: np.ndarray) -> _Rows:
-    # One by one: the program is the one that everybody has compiled.
-    cycles = [unstable_cycle(path.at(value)) for value in values]
+    return _as_rows([unstable_cycle(path.at(value)) for value in values])
+
+
+def _as_rows(cycles: Sequence[Cycle]) -> _Rows:
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *cycles)
-    return jax.tree.map(np.asarray, _as_rows(stacked))
+    return jax.tree.map(np.asarray, _rows_of(stacked))
 
 
 @jit
-def _as_rows(cycles: Cycle) -> _Rows:
+def _rows_of(cycles: Cycle) -> _Rows:
     return jax.vmap(_row)(cycles)
 
 
