@@ -264,15 +264,17 @@ def leaf_index(osc: Oscillator, where: Callable[[Oscillator], Any]) -> int:
 
 
 def vary(osc: Oscillator, index: int | Array, p: Array) -> Oscillator:
-    """The oscillator with the parameter of that number replaced by p, [1].
+    """The oscillator with the parameters of these numbers, one or [k], replaced by p, [k].
 
-    Where the number is an array, one program serves all parameters.
+    Where the numbers are arrays, one program serves all parameters.
     """
     leaves, structure = jax.tree.flatten(osc)
-    if is_concrete(index) and (isinstance(index, int) or is_concrete((osc, p))):
-        leaves[int(index)] = p[0]
-    else:
-        leaves = [jnp.where(index == i, p[0], leaf) for i, leaf in enumerate(leaves)]
+    numbers = [index] if isinstance(index, int) or index.ndim == 0 else index
+    for which, value in zip(numbers, p, strict=True):
+        if is_concrete(index) and (isinstance(index, int) or is_concrete((osc, p))):
+            leaves[int(which)] = value
+        else:
+            leaves = [jnp.where(which == i, value, leaf) for i, leaf in enumerate(leaves)]
     return jax.tree.unflatten(structure, leaves)
 
 
@@ -292,21 +294,43 @@ def _refine(solve: Callable, osc: Oscillator, index, belts, wanted, size) -> Bif
 
 # --- systems of a cycle and one condition ---------------------------------------------------------
 
-# 3N + 1 equations in 3N + 1 unknowns: those of the cycle, and the parameter with the condition.
+# 3N + 1 equations: those of the cycle, and a condition. Unknown are the cycle and a parameter; or
+# two parameters, along a curve.
 
 
-class _System(eqx.Module):
-    """A fixed signature and a condition, for the parameter of that number."""
+class System(eqx.Module):
+    """A fixed signature and a condition."""
 
     chain: eqx.AbstractVar[Chain]
-    index: eqx.AbstractVar[int | Array]
 
     @abc.abstractmethod
-    def residual(self, osc: Oscillator, z: Array, p: Array) -> Array: ...
+    def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
+        """What vanishes there; miss: that of the tangent arcs, see `cycles.residual`."""
 
-    @abc.abstractmethod
-    def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
-        """The residual, and its Jacobian with respect to (z, p)."""
+    def residual(self, osc: Oscillator, z: Array) -> Array:
+        """The 3N + 1 equations at the unknowns z of the cycle, [N, 3]."""
+        value, miss = residual(osc, self.chain, z)
+        return jnp.append(value.reshape(-1), self.condition(osc, z, miss))
+
+    def linearized(
+        self, osc_of: Callable[[Array], Oscillator], z: Array, p: Array
+    ) -> tuple[Array, Array]:
+        """The residual at the parameters p, [k], and its Jacobian with respect to (z, p)."""
+        osc, along = osc_of(p), jax.jacfwd(osc_of)(p)
+        value, miss, blocks = residual_and_blocks(osc, along, self.chain, z)
+        of_state, of_parameter = blocks[:, :, :3], blocks[:, :, 3:]
+
+        def condition(z, p, miss):
+            return self.condition(osc_of(p), z, miss)
+
+        last, (by_z, by_p, by_miss) = jax.value_and_grad(condition, (0, 1, 2))(z, p, miss)
+        by_parameter = of_parameter[:, :3].reshape(-1, p.size)
+        rows = jnp.concatenate([jacobian(of_state[:, :3]), by_parameter], axis=1)
+        row = jnp.append(
+            (by_z + by_miss * of_state[:, 3]).reshape(-1),
+            by_p + by_miss * jnp.sum(of_parameter[:, 3], axis=0),
+        )
+        return jnp.append(value.reshape(-1), last), jnp.concatenate([rows, row[None]])
 
     @property
     def ordinary(self) -> Chain:
@@ -316,55 +340,23 @@ class _System(eqx.Module):
         return Chain(self.chain.codes, ends, self.chain.mesh)
 
 
-class Encounter(_System):
+class Encounter(System):
     """Two belts run at one velocity; if they are the same, an arc is tangent to its boundary."""
 
     chain: Chain
     belts: Array
-    index: int | Array
 
-    def _condition(self, osc: Oscillator, miss: Array) -> Array:
+    def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
         difference = _velocity(osc, self.belts[0]) - _velocity(osc, self.belts[1])
         return jnp.where(self.belts[0] != self.belts[1], difference, miss)
 
-    def residual(self, osc: Oscillator, z: Array, p: Array) -> Array:
-        osc = vary(osc, self.index, p)
-        value, miss = residual(osc, self.chain, z)
-        return jnp.append(value.reshape(-1), self._condition(osc, miss))
-
-    def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
-        def osc_of(p):
-            return vary(osc, self.index, p)
-
-        value, miss, blocks = residual_and_blocks(*_along(osc_of, p), self.chain, z)
-        g, g_p, g_miss = _value_and_slopes(lambda p, m: self._condition(osc_of(p), m), p[0], miss)
-        row = g_miss * jnp.append(blocks[:, 3, :3].reshape(-1), jnp.sum(blocks[:, 3, 3]))
-        row = row.at[-1].add(g_p)
-        matrix = jnp.concatenate([_cycle_rows(blocks), row[None]])
-        return jnp.append(value.reshape(-1), g), matrix
-
-
-def _along(osc_of: Callable[[Array], Oscillator], p: Array) -> tuple[Oscillator, Oscillator]:
-    """The oscillator at the parameter, [1], and its derivative by it."""
-    return jax.jvp(osc_of, (p,), (jnp.ones_like(p),))
-
-
-def _cycle_rows(blocks: Array) -> Array:
-    """The rows of the matrix that belong to the equations of the cycle."""
-    return jnp.concatenate([jacobian(blocks[:, :3, :3]), blocks[:, :3, 3].reshape(-1, 1)], axis=1)
-
-
-def _value_and_slopes(fn, p, miss):
-    value, (slope_p, slope_miss) = jax.value_and_grad(lambda p, m: fn(p[None], m), (0, 1))(p, miss)
-    return value, slope_p, slope_miss
-
 
 @eqx.filter_custom_jvp
-def _solve_system(osc, system, z0, p0):
+def _solve_system(osc, index, system, z0, p0):
     """Unknowns, the parameter, the steps of Newton's method and the matrix of the last one."""
 
     def step(unknowns):
-        value, matrix = system.linearized(osc, *unknowns)
+        value, matrix = system.linearized(functools.partial(vary, osc, index), *unknowns)
         change = jnp.linalg.solve(matrix, -value)
         return (change[:-1].reshape(z0.shape), change[-1:]), jnp.max(jnp.abs(value)), matrix
 
@@ -374,22 +366,22 @@ def _solve_system(osc, system, z0, p0):
 
 @_solve_system.def_jvp
 def _(primals, tangents):
-    osc, system, z0, p0 = primals
-    z, p, steps, matrix = _solve_system(osc, system, z0, p0)
+    osc, index, system, z0, p0 = primals
+    z, p, steps, matrix = _solve_system(osc, index, system, z0, p0)
     moved, fixed = eqx.partition(
         osc, jax.tree.map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
     )
     _, shift = jax.jvp(
-        lambda moved: system.residual(eqx.combine(moved, fixed), z, p),
+        lambda moved: system.residual(vary(eqx.combine(moved, fixed), index, p), z),
         (moved,),
         (tangents[0],),
     )
-    _, slopes = system.linearized(osc, z, p)
+    _, slopes = system.linearized(functools.partial(vary, osc, index), z, p)
     change = jnp.linalg.solve(slopes, -shift)
     return (z, p, steps, matrix), (change[:-1].reshape(z.shape), change[-1:], None, None)
 
 
-def _accuracy(osc: Oscillator, system: _System, z: Array, p: Array, matrix: Array):
+def _accuracy(osc: Oscillator, system: System, z: Array, matrix: Array):
     """The residual, and a bound on the error of p: what the residual with halved steps and rounding
     do to it."""
     mesh = system.chain.mesh
@@ -399,7 +391,7 @@ def _accuracy(osc: Oscillator, system: _System, z: Array, p: Array, matrix: Arra
     )
 
     def value(mesh):
-        return eqx.tree_at(lambda s: s.chain.mesh, system, mesh).residual(osc, z, p)
+        return eqx.tree_at(lambda s: s.chain.mesh, system, mesh).residual(osc, z)
 
     values = lax.map(value, meshes)
     weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
@@ -407,14 +399,15 @@ def _accuracy(osc: Oscillator, system: _System, z: Array, p: Array, matrix: Arra
     return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
 
 
-def _solved_point(osc, system, z0, p0, status, judge) -> BifurcationPoint:
+def _solved_point(osc, index, system, z0, status, judge) -> BifurcationPoint:
     """Solve; judge(osc, z, cycle, slope), slope the cycle's multiplier with stick phases left out,
     gives the status and the multiplier to be told."""
-    z, p, steps, matrix = _solve_system(osc, system, z0, p0)
+    p0 = lax.stop_gradient(parameter(osc, index)[None])
+    z, p, steps, matrix = _solve_system(osc, index, system, z0, p0)
     iterations = jnp.sum(~jnp.isnan(steps))
-    at_point = vary(osc, system.index, p)
+    at_point = vary(osc, index, p)
     cycle, slope = cycle_of(at_point, system.ordinary, z, iterations, status)
-    size, error = _accuracy(*lax.stop_gradient((osc, system, z, p, matrix)))
+    size, error = _accuracy(*lax.stop_gradient((at_point, system, z, matrix)))
     status, multiplier = judge(at_point, z, cycle, slope)
     known = functools.partial(jnp.where, status == Status.OK)
     return BifurcationPoint(
@@ -425,7 +418,7 @@ def _solved_point(osc, system, z0, p0, status, judge) -> BifurcationPoint:
         steps=steps,
         error=known(error, jnp.nan),
         multiplier=known(multiplier, jnp.nan),
-        oscillator=vary(osc, system.index, known(p, jnp.nan)),
+        oscillator=vary(osc, index, known(p, jnp.nan)),
         cycle=cycle,
         status=status,
     )
@@ -572,9 +565,8 @@ def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, s
     before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
     tangent = chain.ends.at[before].set(names.tangent + belt)
     ends = jnp.where(exchange, chain.ends, tangent)
-    system = Encounter(chain=Chain(chain.codes, ends, chain.mesh), belts=belts, index=index)
-    p0 = parameter(still, index)[None]
-    return _solved_point(osc, system, z, p0, status, judge)
+    system = Encounter(chain=Chain(chain.codes, ends, chain.mesh), belts=belts)
+    return _solved_point(osc, index, system, z, status, judge)
 
 
 def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, Array]:
@@ -615,32 +607,16 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
 # --- touching a contact edge ----------------------------------------------------------------------
 
 
-class EdgeContact(_System):
-    """A fixed signature, and x1 at the end of the arc `row` is that of an edge, by its number."""
+class EdgeContact(System):
+    """A cycle, and x1 at the end of the arc `row` is that of an edge, by its number."""
 
     chain: Chain
     row: Array
     edge: Array
-    index: int | Array
 
-    def _miss(self, osc: Oscillator, z: Array) -> Array:
+    def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
         following = (self.row + 1) % z.shape[0]  # unused arcs hand the state on
         return z[following, 0] - jnp.stack(edges(osc))[self.edge]
-
-    def residual(self, osc: Oscillator, z: Array, p: Array) -> Array:
-        osc = vary(osc, self.index, p)
-        value, _ = residual(osc, self.chain, z)
-        return jnp.append(value.reshape(-1), self._miss(osc, z))
-
-    def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
-        def osc_of(p):
-            return vary(osc, self.index, p)
-
-        value, _, blocks = residual_and_blocks(*_along(osc_of, p), self.chain, z)
-        miss, row = jax.value_and_grad(lambda z, p: self._miss(osc_of(p), z), (0, 1))(z, p)
-        last = jnp.append(row[0].reshape(-1), row[1])
-        matrix = jnp.concatenate([_cycle_rows(blocks), last[None]])
-        return jnp.append(value.reshape(-1), miss), matrix
 
 
 def end_near_edge(
@@ -721,9 +697,8 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
         status = jnp.where(fails, Status.NO_CONVERGENCE.value, cycle.status)
         return status, jnp.asarray(jnp.nan)
 
-    p0 = parameter(still, index)[None]
-    system = EdgeContact(chain=chain, row=row, edge=edge, index=index)
-    return _solved_point(osc, system, z, p0, status, judge)
+    system = EdgeContact(chain=chain, row=row, edge=edge)
+    return _solved_point(osc, index, system, z, status, judge)
 
 
 # --- the fold of cycles ---------------------------------------------------------------------------
@@ -732,29 +707,13 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
 STARTS = 48
 
 
-class UnitMultiplier(_System):
-    """A cycle with its signature fixed, and multiplier one."""
+class UnitMultiplier(System):
+    """A cycle with multiplier one."""
 
     chain: Chain
-    index: int | Array
 
-    def residual(self, osc: Oscillator, z: Array, p: Array) -> Array:
-        osc = vary(osc, self.index, p)
-        value, _ = residual(osc, self.chain, z)
-        return jnp.append(value.reshape(-1), closure(osc, self.chain, z)[1] - 1)
-
-    def linearized(self, osc: Oscillator, z: Array, p: Array) -> tuple[Array, Array]:
-        def osc_of(p):
-            return vary(osc, self.index, p)
-
-        def slope(z, p):
-            return closure(osc_of(p), self.chain, z)[1]
-
-        value, _, blocks = residual_and_blocks(*_along(osc_of, p), self.chain, z)
-        m, row = jax.value_and_grad(slope, (0, 1))(z, p)
-        last = jnp.append(row[0].reshape(-1), row[1])
-        matrix = jnp.concatenate([_cycle_rows(blocks), last[None]])
-        return jnp.append(value.reshape(-1), m - 1), matrix
+    def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
+        return closure(osc, self.chain, z)[1] - 1
 
 
 def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
@@ -798,8 +757,7 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
         fails = other | (shrunk & solved)
         return jnp.where(fails, Status.NO_FOLD.value, cycle.status), jnp.asarray(jnp.nan)
 
-    p0 = parameter(still, index)[None]
-    return _solved_point(osc, UnitMultiplier(chain, index), z, p0, status, judge)
+    return _solved_point(osc, index, UnitMultiplier(chain), z, status, judge)
 
 
 # --- points without a cycle -----------------------------------------------------------------------

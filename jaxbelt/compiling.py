@@ -82,8 +82,8 @@ POSSIBLE = frozenset(
     sign sin sinh slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose
     unvmap_all unvmap_any unvmap_max while xor""".split()
 )
-#: Nor share out the work on larger arrays among threads.
-LARGEST = 256
+#: Nor share out the work on large arrays among threads, as it wants to from 32 KiB on.
+LARGEST = 1024
 
 
 def _is_possible(jaxpr: Any) -> bool:

@@ -495,7 +495,7 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
 
     def system(steps):
         chain = Chain(orbit.codes[rows], ends, jnp.full((rows.size, steps), 1 / steps))
-        return Encounter(chain, jnp.stack([touched, touched]), index)
+        return Encounter(chain, jnp.stack([touched, touched]))
 
     closing = 3 * rows[-1] + jnp.arange(2)  # replaced by where the orbit begins
 
@@ -504,7 +504,7 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
 
     def step(unknowns):
         z, p = unknowns
-        value, matrix = system(STEPS).linearized(osc, z, p)
+        value, matrix = system(STEPS).linearized(osc_at, z, p)
         _, slope = jax.jvp(lambda p: begins(z, p), (p,), (jnp.ones(1),))
         row = jnp.zeros((2, value.size)).at[:, :2].set(jnp.eye(2)).at[:, -1].set(slope)
         value, matrix = value.at[closing].set(begins(z, p)), matrix.at[closing].set(row)
@@ -512,7 +512,7 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
         return (change[:-1].reshape(z.shape), change[-1:]), jnp.max(jnp.abs(value)), matrix
 
     z, p = newton(step, (z, guess)).z
-    value = system(2 * STEPS).residual(osc, z, p).at[closing].set(begins(z, p))
+    value = system(2 * STEPS).residual(osc_at(p), z).at[closing].set(begins(z, p))
     exists = jnp.any(meets) & (last < SIZES[0]) & admissible(osc_at(p), system(1).ordinary, z)
     return p[0], jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)
 
@@ -613,10 +613,6 @@ def _system_of(problem: _Problem, point: BifurcationPoint) -> _System:
     raise ValueError(f"point must be of a kind that has curves, got {point.condition!r}")
 
 
-def _with(osc: Oscillator, indices: Array, pair: Array) -> Oscillator:
-    return vary(vary(osc, indices[0], pair[:1]), indices[1], pair[1:])
-
-
 def _velocity_tests(osc: Oscillator) -> dict[tuple[str, tuple[int, ...]], Any]:
     velocities = [belt.velocity for belt in osc.belts]
     tests: dict[tuple[str, tuple[int, ...]], Any] = {}
@@ -652,7 +648,7 @@ class _HopfSystem(_System):
 
 def _rest_equations(u: Array, args) -> Array:
     osc, indices, codes = args
-    osc, mode = _with(osc, indices, u[-2:]), Mode(tuple(codes))
+    osc, mode = vary(osc, indices, u[-2:]), Mode(tuple(codes))
     rest = jnp.zeros(())
     return jnp.append(
         mode_acceleration(osc, mode, u[0], rest)[None], trace_of(osc, mode, u[0], rest)
@@ -662,7 +658,7 @@ def _rest_equations(u: Array, args) -> Array:
 def _third_derivative(u: Array, args) -> Array:
     """That of x2' by x2 at the fixed point: 16 times the first Lyapunov coefficient."""
     osc, indices, codes = args
-    osc, mode = _with(osc, indices, u[-2:]), Mode(tuple(codes))
+    osc, mode = vary(osc, indices, u[-2:]), Mode(tuple(codes))
 
     def derivative(fn):
         return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
@@ -687,7 +683,7 @@ def _degenerate_hopf(args, guess: Array) -> tuple[Array, Array]:
 @jit
 def _look_at_rest(args, u: Array):
     osc, indices, codes = args
-    osc, mode = _with(osc, indices, u[-2:]), Mode(tuple(codes))
+    osc, mode = vary(osc, indices, u[-2:]), Mode(tuple(codes))
     tests = {**_velocity_tests(osc), ("DegenerateHopf", ()): _third_derivative(u, args)}
     rest = jnp.zeros(())
     inside = [*boundary_guards(osc, mode, rest), *edge_guards(osc, mode, u[0])]
@@ -709,14 +705,14 @@ class _RestSystem(_System):
 
     def look(self, u):
         osc, indices, belt = self.args
-        tests = _velocity_tests(jax.tree.map(np.asarray, _with(osc, indices, jnp.asarray(u))))
+        tests = _velocity_tests(jax.tree.map(np.asarray, vary(osc, indices, jnp.asarray(u))))
         tests = {name: float(v) for name, v in tests.items() if name[1] != (int(belt),)}
         return _Seen(tests, True, np.nan, 0.0)
 
 
 def _velocity_equation(u: Array, args) -> Array:
     osc, indices, belt = args
-    osc = _with(osc, indices, u)
+    osc = vary(osc, indices, u)
     return jnp.stack([one.velocity for one in osc.belts])[belt][None]
 
 
@@ -736,14 +732,14 @@ class _EdgeSystem(_System):
 
     def look(self, u):
         osc, indices, equation = self.args
-        osc = _with(osc, indices, jnp.asarray(u))
+        osc = vary(osc, indices, jnp.asarray(u))
         tests = {name: float(value) for name, value in _velocity_tests(osc).items()}
         return _Seen(tests, bool(equation.exists(osc)), np.nan, float(jnp.abs(equation(osc))))
 
 
 def _edge_equation(u: Array, args) -> Array:
     osc, indices, equation = args
-    return equation(_with(osc, indices, u))[None]
+    return equation(vary(osc, indices, u))[None]
 
 
 class _CycleSystem(_System):
@@ -757,7 +753,7 @@ class _CycleSystem(_System):
         chain, condition = point.cycle.chain, point.condition
         codes, ends = np.asarray(chain.codes), np.array(chain.ends)
         names = Ends(codes.shape[1])
-        row, belts, index = -1, (0, 0), problem.indices[0]
+        row, belts = -1, (0, 0)
         if isinstance(condition, NonsmoothFold | GrazingSliding):
             belts = (condition.belt, condition.belt)
             # Its stick phase is the one of no duration; the arc before it is tangent.
@@ -769,7 +765,7 @@ class _CycleSystem(_System):
             belts = condition.belts
         chain = Chain(chain.codes, jnp.asarray(ends), chain.mesh)
         if isinstance(condition, FoldOfCycles):
-            system = UnitMultiplier(chain, index)
+            system = UnitMultiplier(chain)
         elif isinstance(condition, GrazingEdge | CornerCollision):
             z = point.cycle.unknowns
             turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
@@ -777,9 +773,9 @@ class _CycleSystem(_System):
             _, end, edge = end_near_edge(point.oscillator, turn, belt, either)
             # In a corner a stick phase that begins or ends there may have no duration.
             row = (int(end) + 1) % int(np.sum(ends != names.unused))
-            system = EdgeContact(chain=chain, row=end, edge=edge, index=index)
+            system = EdgeContact(chain=chain, row=end, edge=edge)
         else:
-            system = Encounter(chain, jnp.asarray(np.array(belts)), index)
+            system = Encounter(chain, jnp.asarray(np.array(belts)))
         weights = _weights(np.asarray(point.cycle.unknowns))
         return cls((point.oscillator, problem.indices, system, jnp.asarray(row), weights))
 
@@ -804,33 +800,26 @@ def _weights(z):
 
 
 def _parts(u: Array, args):
+    """The oscillators by both parameters, the system, the unknowns of the cycle, the parameters."""
     osc, indices, system, _, weights = args
-    return vary(osc, indices[1], u[-1:]), system, (u[:-2] / weights).reshape(-1, 3), u[-2:-1]
+    return functools.partial(vary, osc, indices), system, (u[:-2] / weights).reshape(-1, 3), u[-2:]
 
 
 def _cycle_equations(u: Array, args) -> Array:
-    osc, system, z, p = _parts(u, args)
-    return system.residual(osc, z, p)
+    osc_of, system, z, p = _parts(u, args)
+    return system.residual(osc_of(p), z)
 
 
 def _cycle_jacobian(u: Array, args) -> tuple[Array, Array]:
-    osc, system, z, p = _parts(u, args)
-    value, matrix = system.linearized(osc, z, p)
-    indices = args[1]
-
-    def of_second(q):
-        return system.residual(vary(osc, indices[1], q), z, p)
-
-    _, column = jax.jvp(of_second, (u[-1:],), (jnp.ones(1),))
-    matrix = matrix.at[:, :-1].divide(args[4][None])
-    return value, jnp.concatenate([matrix, column[:, None]], axis=1)
+    osc_of, system, z, p = _parts(u, args)
+    value, matrix = system.linearized(osc_of, z, p)
+    return value, matrix.at[:, :-2].divide(args[4][None])
 
 
 @jit
 def _look_at_cycle(args, u: Array):
-    osc, system, z, p = _parts(u, args)
-    row = args[3]
-    osc = vary(osc, args[1][0], p)
+    osc_of, system, z, p = _parts(u, args)
+    osc, row = osc_of(p), args[3]
     chain = system.ordinary
     ok = jnp.asarray(Status.OK.value)
     cycle, slope = cycle_of(osc, chain, z, jnp.asarray(0), ok)
@@ -871,8 +860,8 @@ def _look_at_cycle(args, u: Array):
 
 @jit
 def _meshed_anew(args, u: Array):
-    osc, system, z, p = _parts(u, args)
+    osc_of, system, z, p = _parts(u, args)
     chain = system.chain
     turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
-    fresh, _ = meshed(vary(osc, args[1][0], p), turn)
+    fresh, _ = meshed(osc_of(p), turn)
     return (*args[:2], eqx.tree_at(lambda s: s.chain, system, fresh), args[3], _weights(z))

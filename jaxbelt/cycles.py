@@ -253,8 +253,8 @@ def _equations(osc: Oscillator, chain: Chain, z: Array) -> Array:
 
 @one_kernel
 def _equations_and_blocks(osc: Oscillator, along: Oscillator | None, chain: Chain, z: Array):
-    """`_arc_equations` of all arcs, [N, 4], and their derivatives, [N, 4, 3 or 4]."""
-    size = 3 if along is None else 4
+    """`_arc_equations` of all arcs, [N, 4], and their derivatives, [N, 4, 3 + k]."""
+    more = 0 if along is None else jax.tree.leaves(along)[0].size
 
     def one(row):
         codes, end, mesh, unknown = row
@@ -266,10 +266,10 @@ def _equations_and_blocks(osc: Oscillator, along: Oscillator | None, chain: Chai
             if along is None:
                 of_unknown = functools.partial(equations, osc)
                 return jax.jvp(of_unknown, (unknown,), (direction,))
-            moved = jax.tree.map(lambda slope: direction[3] * slope, along)
+            moved = jax.tree.map(lambda slopes: jnp.sum(slopes * direction[3:]), along)
             return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
 
-        return jax.vmap(column, out_axes=(None, -1))(jnp.eye(size))
+        return jax.vmap(column, out_axes=(None, -1))(jnp.eye(3 + more))
 
     return lax.map(one, (chain.codes, chain.ends, chain.mesh, z))
 
@@ -289,8 +289,8 @@ def residual_and_blocks(
     osc: Oscillator, along: Oscillator | None, chain: Chain, z: Array
 ) -> tuple[Array, Array, Array]:
     """`residual`, and its derivatives: those of the equations of each arc with respect to its
-    (x1, x2, T), and, where the direction `along` in the space of oscillators is given, along that,
-    [N, 4, 3 or 4]."""
+    (x1, x2, T), and along the k directions `along` in the space of oscillators, if they are given
+    (an oscillator of arrays [k]), [N, 4, 3 + k]."""
     out, blocks = _equations_and_blocks(osc, along, chain, z)
     return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3]), blocks
 
