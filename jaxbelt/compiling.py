@@ -3,6 +3,7 @@
 `jit`, `traced_once` and `each` save the time of compiling, `one_kernel` that of running.
 """
 
+import contextvars
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -86,6 +87,10 @@ POSSIBLE = frozenset(
 LARGEST = 1024
 
 
+#: Whether what is traced becomes part of a piece already.
+_is_part = contextvars.ContextVar("is_part", default=False)
+
+
 def _is_possible(jaxpr: Any) -> bool:
     for equation in jaxpr.eqns:
         sizes = [variable.aval.size for variable in equation.outvars]
@@ -107,7 +112,13 @@ def one_kernel(function: Callable) -> Callable:
 
     @jax.custom_jvp
     def in_one_piece(*args):
-        closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        if _is_part.get():
+            return function(*args)
+        mark = _is_part.set(True)
+        try:
+            closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        finally:
+            _is_part.reset(mark)
         if not _is_possible(closed.jaxpr):
             return function(*args)
         out = _in_one_piece(closed.jaxpr, closed.consts, jax.tree.leaves(args))

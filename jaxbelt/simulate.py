@@ -232,30 +232,35 @@ def _first_root(
     """
     f_start, f_end = jnp.min(at_start), jnp.min(at_end)
     f_start = jnp.where(f_start > 1e-12, f_start, -f_end)
+    shortest = 5e-13 * end
 
     def unfinished(state):
-        a, _, b, _, _, at_c, count = state
-        return (b - a > 1e-12 * end) & (jnp.min(at_c) != 0) & (count < 60)
+        a, _, b, _, _, _, at_c, count = state
+        return (b - a > 2 * shortest) & (jnp.min(at_c) != 0) & (count < 60)
 
     def improve(state):
-        a, fa, b, fb, _, _, count = state
-        c = (a * fb - b * fa) / (fb - fa)
+        a, fa, b, fb, left, _, _, count = state
+        # Not nearer to an end: once that is the root, up to rounding, the other follows at once.
+        c = jnp.clip((a * fb - b * fa) / (fb - fa), a + shortest, b - shortest)
         at_c = guards(c)
         fc = jnp.min(at_c)
         inside = fc > 0
+        # An end that stays for the second time counts half.
+        fa, fb = jnp.where(left < 0, 0.5, 1.0) * fa, jnp.where(left > 0, 0.5, 1.0) * fb
         return (
             jnp.where(inside, c, a),
-            jnp.where(inside, fc, 0.5 * fa),
+            jnp.where(inside, fc, fa),
             jnp.where(inside, b, c),
-            jnp.where(inside, 0.5 * fb, fc),
+            jnp.where(inside, fb, fc),
+            jnp.where(inside, 1, -1),
             c,
             at_c,
             count + 1,
         )
 
-    start = (jnp.zeros_like(end), f_start, end, f_end, end, at_end, 0)
+    start = (jnp.zeros_like(end), f_start, end, f_end, 0, end, at_end, 0)
     state = lax.while_loop(unfinished, improve, start)
-    return state[4], state[5]
+    return state[5], state[6]
 
 
 class _SlipArc(eqx.Module):
@@ -483,9 +488,11 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
         finite = finite & jnp.all(~jnp.isnan(leaf))
     status = jnp.where(finite, Status.OK.value, Status.NOT_FINITE.value)
     start = _State(t0, y, mode, _turn_signs(osc, mode, y), status, ~finite)
-    blank = _unused(len(osc.belts))
 
-    def segment(state, _):
+    def segment(given, state):
+        osc, t1, rtol, atol = given
+        blank = _unused(len(osc.belts))
+
         def advance():
             new, record = _segment(osc, state, t1, rtol, atol)
             keep = functools.partial(jnp.where, state.done)
@@ -496,13 +503,19 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
 
     # In blocks, because stepping over what is left of the budget is not free.
     length = min(BLOCK, max_segments)
-    blank_block = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length, *leaf.shape)), blank)
+    blank = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (length, *leaf.shape)), _unused(len(osc.belts))
+    )
+
+    @one_kernel
+    def segments(given, state):
+        return lax.scan(lambda state, _: segment(given, state), state, length=length)
 
     def block(state, _):
         return lax.cond(
             eqxi.unvmap_any(~state.done),
-            lambda: lax.scan(segment, state, length=length),
-            lambda: (state, blank_block),
+            lambda: segments((osc, t1, rtol, atol), state),
+            lambda: (state, blank),
         )
 
     final, records = lax.scan(block, start, length=-(-max_segments // length))
