@@ -154,6 +154,19 @@ def test_in_loops_and_branches():
     assert float(jax.jit(sums)(starts)) == pytest.approx(wanted, rel=1e-12)
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the CPU's compiler")
+def test_a_piece_within_a_piece_is_part_of_it():
+    @compiling.one_kernel
+    def twice(x, rates):
+        return piece(piece(x, rates)[0] + 2.0, rates)
+
+    start = expected(2.0, 0.2)[0] + 2.0
+    check(jax.jit(twice)(2.0, RATES), start, 0.2)
+    assert program(twice, 2.0, RATES).count(MARK) == program(piece, 2.0, RATES).count(MARK)
+    grown = jax.jacfwd(lambda x: twice(x, RATES)[0])(2.0)
+    assert float(grown) == pytest.approx(0.8 ** sum(expected(x, 0.2)[1] for x in (2.0, start)))
+
+
 @pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
 def test_a_batch_gives_what_a_loop_gives(wrap):
     starts = jnp.array([2.0, 0.05, 3.0])
