@@ -352,7 +352,10 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
         left, right = window.x1
         edge = jnp.where(new.x2 > 0, right, left)
         near = jnp.abs(edge - new.x1) <= reach * jnp.abs(new.x2)
-        delta1 = jnp.where(near, edge - new.x1, 1e300) / jnp.where(near, new.x2, 1.0)
+        slope = jnp.where(near, new.x2, 1.0)
+        delta1 = jnp.where(near, edge - new.x1, 1e300) / slope
+        # The next term, too: in hundreds of slow passages of an edge it adds up.
+        delta1 = jnp.where(near, delta1 - 0.5 * new.a * delta1**2 / slope, delta1)
         on_edge = near & (delta1 < delta)
         reached, delta = reached | near, jnp.minimum(delta, delta1)
         # x1 over the step is the integral of x2; x2 keeps its sign, so x1 is monotone.

@@ -74,14 +74,12 @@ NOT_MARKED = {"xla_cpu_small_call": "false", "inlineable": "true"}
 #: to places that differ in a batch, nor call libraries.
 POSSIBLE = frozenset(
     """abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh broadcast_in_dim
-    cbrt ceil clamp concatenate cond convert_element_type copy copy_p copysign cos cosh cumsum
-    custom_jvp_call custom_vjp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq
-    eq_to exp exp2 expand_dims expm1 floor gather ge gt integer_pow iota is_finite jit le le_to
-    log log1p logistic lt lt_to max min mul ne neg nextafter nonbatchable not or pad pjit pow
-    reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round
-    rsqrt scan select_if_vmap select_n shift_left shift_right_arithmetic shift_right_logical
-    sign sin sinh slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose
-    unvmap_all unvmap_any unvmap_max while xor""".split()
+    cbrt ceil clamp concatenate cond convert_element_type copy cos cosh cumsum
+    custom_jvp_call div dynamic_slice eq exp exp2 expm1 floor gather ge gt integer_pow iota
+    is_finite jit le le_to log log1p logistic lt max min mul ne neg nextafter nonbatchable not
+    or pow reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev
+    round rsqrt scan select_if_vmap select_n sign sin sinh slice sqrt square squeeze stack
+    stop_gradient sub tan tanh transpose unvmap_any while xor""".split()
 )
 #: Nor share out the work on large arrays among threads, as it wants to from 32 KiB on.
 LARGEST = 1024

@@ -195,6 +195,32 @@ def test_derivatives():
         np.testing.assert_allclose(batch, exact, rtol=1e-14)
 
 
+#: What a friction law may be made of.
+MATH = [
+    *(jnp.abs, jnp.sign, jnp.floor, jnp.ceil, jnp.round, jnp.square, jnp.sqrt, jnp.cbrt),
+    *(jnp.exp, jnp.exp2, jnp.expm1, jnp.log, jnp.log1p, lax.rsqrt, lax.logistic),
+    *(jnp.sin, jnp.cos, jnp.tan, jnp.arcsin, jnp.arccos, jnp.arctan),
+    *(jnp.sinh, jnp.cosh, jnp.tanh, jnp.arcsinh, lambda x: jnp.arccosh(1 + x), jnp.arctanh),
+    *(lambda x: x**3, lambda x: x**2.5, lambda x: jnp.arctan2(x, 2.0), lambda x: x % 0.3),
+    *(lambda x: jnp.clip(x, 0.2, 0.6), jnp.isfinite),
+    *(lambda x: jnp.prod(x) * x, lambda x: (x > 0.5) ^ (x > 0.3), lambda x: jnp.cumsum(x)[::-1]),
+    *(lambda x: x[jnp.argmax(x)], lambda x: jnp.nextafter(x, 1.0), jax.nn.softplus),
+]
+
+
+def test_what_a_law_may_be_made_of_is_possible():
+    def add_up(x):
+        return lax.fori_loop(
+            0, 3, lambda i, y: y + sum(f(x + 0.1 * i).astype(float) for f in MATH), 0.0 * x
+        )
+
+    x = jnp.array([0.2, 0.41, 0.65])
+    piece = compiling.one_kernel(add_up)
+    np.testing.assert_allclose(jax.jit(piece)(x), add_up(x), rtol=1e-13)
+    if jax.default_backend() == "cpu":
+        assert MARK in program(piece, x)
+
+
 def lookup(x):
     return jax.pure_callback(lambda x: np.asarray(x) ** 2, jax.ShapeDtypeStruct((3,), float), x)
 
