@@ -75,16 +75,15 @@ from .cycles import (
 from .equilibria import Equilibria, EquilibriumKind, equilibria
 from .modes import (
     STUCK,
-    EdgeFocus,
     Mode,
     boundary_guards,
     capacity,
     contact,
-    edge_focus,
     edge_guards,
     edges,
     mode_acceleration,
     mode_of_state,
+    push_and_trace,
     select,
 )
 from .oscillator import Oscillator
@@ -870,6 +869,12 @@ class EdgeRest(eqx.Module):
         needed = mode_acceleration(osc, mode, at, jnp.zeros(()))
         return needed + self.limit * capacity(osc, mode)
 
+    def meets_hopf(self, osc: Oscillator) -> Array:
+        """What vanishes where the curve of this meets that of a Hopf point; NaN for a segment."""
+        mode = Mode(tuple(self.codes))
+        _, trace = push_and_trace(osc, mode, jnp.stack(edges(osc))[self.edge])
+        return jnp.where(mode.any_stuck, jnp.nan, trace)
+
     def exists(self, osc: Oscillator) -> Array:
         """Whether the contacts on that side are those."""
         at = jnp.stack(edges(osc))[self.edge]
@@ -884,15 +889,27 @@ class EdgeBalance(eqx.Module):
     left: Mode
     right: Mode
 
-    def _focus(self, osc: Oscillator) -> EdgeFocus:
-        return edge_focus(osc, self.left, self.right, jnp.stack(edges(osc))[self.edge])
+    def _sides(self, osc: Oscillator):
+        at = jnp.stack(edges(osc))[self.edge]
+        return push_and_trace(osc, self.left, at), push_and_trace(osc, self.right, at)
 
     def __call__(self, osc: Oscillator) -> Array:
-        return self._focus(osc).contraction
+        # The contraction of `modes.edge_focus` times both pushes: regular where one of them is 0.
+        (a_left, trace_left), (a_right, trace_right) = self._sides(osc)
+        return trace_right * a_left - trace_left * a_right
+
+    def inside(self, osc: Oscillator) -> Array:
+        """The weaker of the two pushes towards the edge; negative where one pushes away."""
+        (a_left, _), (a_right, _) = self._sides(osc)
+        return jnp.minimum(a_left, -a_right)
 
     def exists(self, osc: Oscillator) -> Array:
         """Whether there is a pseudo-focus, and no belt at rest touches."""
-        return self._focus(osc).exists & ~self.left.any_stuck & ~self.right.any_stuck
+        return (self.inside(osc) > 0) & ~self.left.any_stuck & ~self.right.any_stuck
+
+    def meets_hopf(self, osc: Oscillator) -> Array:
+        """What vanishes where the curve of this meets that of a Hopf point."""
+        return self.inside(osc)
 
 
 def _edges_of(osc: Oscillator, belt: Array) -> tuple[Array, Array]:

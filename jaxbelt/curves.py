@@ -87,8 +87,10 @@ class SpecialPoint(NamedTuple):
 
     kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
     "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
-    point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched,
-    too), "BeltAtRest", "EqualVelocities"; belts: concerned; values: of the two parameters;
+    point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too),
+    "BoundaryHopf" (a Hopf point on a contact edge: there the curves of boundary equilibria and of
+    pseudo-Hopf points meet its own), "BeltAtRest", "EqualVelocities"; belts: concerned; values: of
+    the two parameters;
     residual: the largest error in all equations.
     """
 
@@ -686,9 +688,11 @@ def _look_at_rest(args, u: Array):
     osc, mode = vary(osc, indices, u[-2:]), Mode(tuple(codes))
     tests = {**_velocity_tests(osc), ("DegenerateHopf", ()): _third_derivative(u, args)}
     rest = jnp.zeros(())
-    inside = [*boundary_guards(osc, mode, rest), *edge_guards(osc, mode, u[0])]
+    nearest = jnp.min(jnp.stack(edge_guards(osc, mode, u[0])))
+    tests["BoundaryHopf", ()] = jnp.where(jnp.isfinite(nearest), nearest, jnp.nan)
+    inside = jnp.stack([*boundary_guards(osc, mode, rest), nearest])
     residual = jnp.max(jnp.abs(_rest_equations(u, args)))
-    return tests, jnp.all(jnp.stack(inside) > 0), residual
+    return tests, jnp.all(inside > 0), residual
 
 
 class _RestSystem(_System):
@@ -731,10 +735,17 @@ class _EdgeSystem(_System):
         return np.array([float(parameter(point.oscillator, index)) for index in self._indices])
 
     def look(self, u):
-        osc, indices, equation = self.args
-        osc = vary(osc, indices, jnp.asarray(u))
-        tests = {name: float(value) for name, value in _velocity_tests(osc).items()}
-        return _Seen(tests, bool(equation.exists(osc)), np.nan, float(jnp.abs(equation(osc))))
+        tests, valid, residual = _look_at_edge(self.args, jnp.asarray(u))
+        tests = {name: float(value) for name, value in tests.items()}
+        return _Seen(tests, bool(valid), np.nan, float(residual))
+
+
+@jit
+def _look_at_edge(args, u: Array):
+    osc, indices, equation = args
+    osc = vary(osc, indices, u)
+    tests = {**_velocity_tests(osc), ("BoundaryHopf", ()): equation.meets_hopf(osc)}
+    return tests, equation.exists(osc), jnp.abs(equation(osc))
 
 
 def _edge_equation(u: Array, args) -> Array:

@@ -371,6 +371,12 @@ class EdgeFocus(eqx.Module):
     nonlinearity: Array
 
 
+def push_and_trace(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array]:
+    """x2' of a slip mode at rest, (x1, 0), and its derivative by x2."""
+    rest = jnp.zeros_like(x1)
+    return jax.jvp(lambda x2: mode_acceleration(osc, mode, x1, x2), (rest,), (jnp.ones_like(rest),))
+
+
 def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFocus:
     """The pseudo-focus at x1 = edge between the slip modes to its left and right.
 
@@ -378,14 +384,8 @@ def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFoc
     where nonlinearity bounds the size of the coefficient of that last term. rate is S over
     3 (1/a_L + 1/|a_R|) and turn_time is 2/a_L + 2/|a_R|.
     """
-    rest = jnp.zeros_like(edge)
-
-    def push_and_trace(mode):
-        return jax.jvp(
-            lambda x2: mode_acceleration(osc, mode, edge, x2), (rest,), (jnp.ones_like(rest),)
-        )
-
-    (a_left, trace_left), (a_right, trace_right) = push_and_trace(left), push_and_trace(right)
+    a_left, trace_left = push_and_trace(osc, left, edge)
+    a_right, trace_right = push_and_trace(osc, right, edge)
     exists = (a_left > 0) & (a_right < 0)
     a_l, a_r = jnp.where(exists, a_left, 1.0), jnp.where(exists, -a_right, 1.0)
     contraction = trace_left / a_l + trace_right / a_r

@@ -204,3 +204,29 @@ def test_curves(diagram):
     (fold,) = grazing.special
     assert (fold.kind, fold.belts) == ("DoubleSliding", (1,)) and End.STOPPED in grazing.ends
     assert fold.values[1] == pytest.approx(0.267134534361, abs=1e-11)
+
+
+def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
+    """Of belt 1 alone to the right of the edge, and of both belts to the left of it."""
+    where, span = (sigma1, nu1), ((0.05, 2.5), (0.1, 0.3))
+    alone = (np.sqrt(8) - 1) / 10  # where 0.4 * 10 / (1 + 10 nu)^2 is the damping, 0.5
+    both = (np.sqrt(4 / (0.5 - 4 / 4.5**2)) - 1) / 10
+    pull = 0.6 + 0.4 / (1 + 10 * np.array([alone, both]))
+    expected = [(pull[0], alone), (0.6 + 0.4 / 4.5 + pull[1], both)]
+
+    balanced = jb.bifurcation_curve(diagram.points[4], where, span, step=0.03)
+    assert balanced.ends == (End.STOPPED, End.STOPPED)
+    found = sorted(point.values for point in balanced.special)
+    assert [point.kind for point in balanced.special] == ["BoundaryHopf"] * 2
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+    for number, corner in ((2, expected[0]), (5, expected[1])):
+        rests = jb.bifurcation_curve(diagram.points[number], where, span, step=0.03)
+        (point,) = rests.special
+        assert point.kind == "BoundaryHopf"
+        np.testing.assert_allclose(point.values, corner, rtol=0, atol=1e-12)
+
+    hopf = jb.refine(jb.Hopf(), overlapping(1.8, 0.25), where=nu1)
+    (point,) = jb.bifurcation_curve(hopf, where, span, step=0.03).special
+    assert point.kind == "BoundaryHopf"
+    np.testing.assert_allclose(point.values, expected[1], rtol=0, atol=1e-12)
