@@ -5,13 +5,13 @@ a guard of the mode vanishes; a stick arc is known in closed form. The chain is 
 segments, an arc each, so that it works under `jit`, `vmap`, and derivatives forward and reverse.
 
 Slip arcs are integrated by `diffrax.diffeqsolve` with one scalar event, the smallest guard. It is
-looked at after each step; where it is negative, the step is made once more, shorter,
-so that it ends on the first root. That root cannot hide within the step: besides the boundaries
-and edges, an arc also ends where the acceleration changes its sign (and, before a contact edge,
-where the velocity does), unless no boundary (no edge) is within reach. Between two such turns x2
-(x1) is monotone, so the sign at the end of a step tells all. Between two zeros of x2' lies a zero
-of x2, since x2'' = -x2 there: more than one turn in a step would take a turn of the phase within
-it, which `MAX_STEP` excludes.
+looked at after each step; where it is negative, the step is made once more, shorter, so that it
+ends on the first root. That root cannot hide within the step: besides the boundaries and edges, an
+arc also ends where the acceleration changes its sign (and, before a contact edge, where the
+velocity does), unless no boundary (no edge) is within reach. Between two such turns x2 (x1) is
+monotone, so the sign at the end of a step tells all. Between two zeros of x2' lies a zero of x2,
+since x2'' = -x2 there: more than one turn in a step would take a turn of the phase within it, which
+`MAX_ARC` and `MAX_STEP` exclude.
 
 Samples at given times are taken from the arcs afterwards, all in parallel.
 """
@@ -52,14 +52,12 @@ from .oscillator import Oscillator
 from .results import EventKind, Status, describe
 from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
-#: Longest step, as a fraction of the longest slip arc: well below half a turn.
-MAX_STEP = 0.5
-#: First step, as a fraction of what may be left of an arc.
-FIRST_STEP = 0.2
+#: Longest and first step, as fractions of the time that is integrated over, MAX_ARC at most.
+MAX_STEP, FIRST_STEP = 0.5, 0.2
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
 #: because near-grazing events amplify them.
 SAFETY = 0.03
-#: Longest slip arc; longer ones are cut, so that samples start near their time.
+#: Longest slip arc, well below half a turn; longer ones are cut. Samples start near their time so.
 MAX_ARC = 1.0
 #: Segments are run in blocks of so many; the budget is rounded up to whole blocks.
 BLOCK = 32
