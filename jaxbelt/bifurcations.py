@@ -898,18 +898,15 @@ class EdgeBalance(eqx.Module):
         (a_left, trace_left), (a_right, trace_right) = self._sides(osc)
         return trace_right * a_left - trace_left * a_right
 
-    def inside(self, osc: Oscillator) -> Array:
-        """The weaker of the two pushes towards the edge; negative where one pushes away."""
-        (a_left, _), (a_right, _) = self._sides(osc)
-        return jnp.minimum(a_left, -a_right)
-
     def exists(self, osc: Oscillator) -> Array:
         """Whether there is a pseudo-focus, and no belt at rest touches."""
-        return (self.inside(osc) > 0) & ~self.left.any_stuck & ~self.right.any_stuck
+        return (self.meets_hopf(osc) > 0) & ~self.left.any_stuck & ~self.right.any_stuck
 
     def meets_hopf(self, osc: Oscillator) -> Array:
-        """What vanishes where the curve of this meets that of a Hopf point."""
-        return self.inside(osc)
+        """What vanishes where the curve of this meets that of a Hopf point: the weaker of the two
+        pushes towards the edge, negative where one pushes away."""
+        (a_left, _), (a_right, _) = self._sides(osc)
+        return jnp.minimum(a_left, -a_right)
 
 
 def _edges_of(osc: Oscillator, belt: Array) -> tuple[Array, Array]:

@@ -864,6 +864,11 @@ def polish(osc: Oscillator, turn: Turn, status: Array) -> Cycle:
     return cycle_of(osc, chain, z, iterations, status)[0]
 
 
+def room_of(arcs: int) -> int:
+    """The size of a chain that so many arcs, SIZES[-1] at most, are given."""
+    return next(size for size in SIZES if size >= arcs)
+
+
 def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Cycle:
     """The steady cycle that the start y0 leads to.
 
@@ -886,7 +891,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     turn, count, status = _turn_reached(osc, y0, max_arcs or SIZES[-1])
     if max_arcs is None and is_concrete(count):
         needed = int(count) if int(status) == Status.OK else 0
-        turn = pick(turn, slice(next(size for size in SIZES if size >= needed)))
+        turn = pick(turn, slice(room_of(needed)))
     elif max_arcs is None:
         turn, status = pick(turn, slice(SIZES[0])), _if_it_fits(status, count, SIZES[0])
     return polish(osc, turn, status)

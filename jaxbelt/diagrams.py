@@ -15,7 +15,7 @@ points are found by `scan` along a few lines across the map, and their curves ar
 """
 
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple
@@ -32,12 +32,11 @@ from .bifurcations import (
     GrazingSliding,
     NonsmoothFold,
     SuddenSliding,
-    vary,
 )
 from .checks import as_array, require
-from .compiling import each, jit
+from .compiling import jit
 from .curves import BifurcationCurve, bifurcation_curve
-from .cycles import SIZES, Cycle, Ends, Turn, find_cycle, polish, unstable_cycle
+from .cycles import Cycle, Ends, Turn, find_cycle, polish, room_of, unstable_cycle
 from .detection import Label, Path, search
 from .equilibria import Equilibria, equilibria
 from .oscillator import Oscillator
@@ -427,8 +426,7 @@ class _Piece(NamedTuple):
 
 
 def _equilibrium_pieces(path: Path, nodes: Sequence[np.ndarray]) -> list[_Piece]:
-    values = np.concatenate(nodes)
-    found = jax.tree.map(np.asarray, _rests(path.osc, path.index, values))
+    found = _stacked(_rests, map(path.at, np.concatenate(nodes)))
     pieces = []
     for stretch, rows in enumerate(_consecutive(nodes)):
         values, here = nodes[stretch], jax.tree.map(lambda x, rows=rows: x[rows], found)
@@ -504,6 +502,7 @@ class _Rows(NamedTuple):
     stick_velocities: Any
 
 
+@jit
 def _row(cycle: Cycle) -> _Rows:
     osc, chain = cycle.oscillator, cycle.chain
     stuck = jnp.any((chain.codes == 0) & chain.used[:, None], axis=0)
@@ -528,37 +527,31 @@ def _consecutive(groups: Sequence[np.ndarray]) -> list[np.ndarray]:
     return [np.arange(end - len(group), end) for group, end in zip(groups, ends, strict=True)]
 
 
+# One by one: so one program serves any number of them.
+
+
+def _stacked(program, items: Iterable[Any]) -> Any:
+    """What the program gives of each, as NumPy arrays of many rows."""
+    rows = [jax.tree.map(np.asarray, program(item)) for item in items]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+
+
 @jit
-def _rests(osc: Oscillator, index: Array, values: Array) -> Equilibria:
-    return each(lambda p: equilibria(vary(osc, index, p[None])))(values)
-
-
-# Cycles are found one by one: the programs are those that everybody has compiled.
+def _rests(osc: Oscillator) -> Equilibria:
+    return equilibria(osc)
 
 
 def _attracting(path: Path, values: np.ndarray, turns: Sequence[Turn]) -> _Rows:
     unused = Ends(len(path.osc.belts)).unused
-    arcs = max(int(np.sum(turn.ends != unused)) for turn in turns)
-    room = slice(next(size for size in SIZES if size >= arcs))
+    room = slice(room_of(max(int(np.sum(turn.ends != unused)) for turn in turns)))
     turns = [jax.tree.map(lambda leaf: leaf[room], turn) for turn in turns]
     ok = jnp.asarray(Status.OK.value)
-    return _as_rows(
-        [polish(path.at(value), turn, ok) for value, turn in zip(values, turns, strict=True)]
-    )
+    pairs = zip(values, turns, strict=True)
+    return _stacked(_row, (polish(path.at(value), turn, ok) for value, turn in pairs))
 
 
 def _repelling(path: Path, values: np.ndarray) -> _Rows:
-    return _as_rows([unstable_cycle(path.at(value)) for value in values])
-
-
-def _as_rows(cycles: Sequence[Cycle]) -> _Rows:
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *cycles)
-    return jax.tree.map(np.asarray, _rows_of(stacked))
-
-
-@jit
-def _rows_of(cycles: Cycle) -> _Rows:
-    return jax.vmap(_row)(cycles)
+    return _stacked(_row, (unstable_cycle(path.at(value)) for value in values))
 
 
 # --- from pieces to branches ----------------------------------------------------------------------
