@@ -8,12 +8,11 @@ J. Kurths, How basin stability complements the linear-stability paradigm, Nature
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import numpy as np
-import xarray as xr
 from jaxtyping import Array, ArrayLike
 
 from . import batch
@@ -22,6 +21,9 @@ from .cycles import Cycle, find_cycle, unstable_cycle
 from .equilibria import equilibria
 from .oscillator import Oscillator
 from .sweep import LONG_ENOUGH, sweep
+
+if TYPE_CHECKING:
+    import xarray
 
 #: Attractors of one kind whose extrema differ by less than this are one.
 SAME = 1e-4
@@ -38,13 +40,13 @@ class Basins(eqx.Module):
     """
 
     oscillator: Oscillator
-    dataset: xr.Dataset = eqx.field(static=True)
+    dataset: "xarray.Dataset" = eqx.field(static=True)
     attractors: tuple[str, ...] = eqx.field(static=True)
     cycles: tuple[Cycle, ...]
     boundary: Cycle
 
     @property
-    def label(self) -> xr.DataArray:
+    def label(self) -> "xarray.DataArray":
         return self.dataset["label"]
 
     def __repr__(self) -> str:
@@ -122,7 +124,7 @@ def basins(
     return Basins(oscillator, dataset, attractors, tuple(cycles), unstable_cycle(oscillator))
 
 
-def _labels(osc: Oscillator, dataset: xr.Dataset) -> tuple[np.ndarray, tuple[str, ...]]:
+def _labels(osc: Oscillator, dataset: "xarray.Dataset") -> tuple[np.ndarray, tuple[str, ...]]:
     """Numbers of the attractors, the most frequent first, and their names."""
     kinds = np.asarray(dataset["kind"])
     sticks = np.asarray(dataset["sticks"]).astype(bool)

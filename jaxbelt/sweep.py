@@ -13,12 +13,11 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jaxtyping import ArrayLike
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -34,6 +33,9 @@ from .checks import (
 )
 from .oscillator import Oscillator
 from .results import of_one_turn
+
+if TYPE_CHECKING:
+    import xarray
 
 #: Results with a number a belt.
 PER_BELT = ("sticks", "stick_duration", "mode_end")
@@ -89,7 +91,7 @@ def sweep(
     derivatives: Sequence[str] = (),
     store: str | Path | None = None,
     progress: bool | None = None,
-) -> xr.Dataset:
+) -> "xarray.Dataset":
     """Run an oscillator from every point of a grid of parameters and starts.
 
     make: a function of parameters that returns an `Oscillator`, such as `jb.presets.class_b`; the
@@ -329,7 +331,9 @@ class _Table:
                     self.arrays[f"d_{name}_d_{by}"][runs] = derivative
         self.arrays["status"][runs] = status
 
-    def dataset(self, attributes: dict[str, Any]) -> xr.Dataset:
+    def dataset(self, attributes: dict[str, Any]) -> "xarray.Dataset":
+        import xarray  # with pandas, half of what `import jaxbelt` would take
+
         variables = {}
         belts = len(self.grid.example.belts)
         for name in sorted(self.arrays, key=_position):
@@ -353,7 +357,7 @@ class _Table:
         }
         if any("belt" in dims for dims, *_ in variables.values()):
             coordinates["belt"] = ("belt", np.arange(belts), _attributes("belt"))
-        return xr.Dataset(variables, coordinates, attributes)
+        return xarray.Dataset(variables, coordinates, attributes)
 
 
 def _signatures(words: np.ndarray, belts: int) -> tuple[np.ndarray, dict[str, Any]]:
