@@ -19,7 +19,7 @@ from . import batch
 from .checks import as_array, check_finite, require
 from .cycles import Cycle, find_cycle, unstable_cycle
 from .equilibria import equilibria
-from .oscillator import Oscillator
+from .oscillator import Oscillator, check_oscillator
 from .sweep import LONG_ENOUGH, sweep
 
 if TYPE_CHECKING:
@@ -94,9 +94,7 @@ def basins(
     when a run that reached no attractor is given up. rtol, atol: tolerances of a step. progress:
     whether to show a bar, as in `sweep`. `ValueError` names an argument that is impossible.
     """
-    require(isinstance(oscillator, Oscillator), "oscillator", "an Oscillator", oscillator)
-    oscillator.check_scalars()
-    oscillator.check()
+    check_oscillator(oscillator, "oscillator")
     axes = {"x1": np.asarray(as_array(x1, "x1", (None,))), "x2": as_array(x2, "x2", (None,))}
     for name, values in axes.items():
         check_finite(values, name)
@@ -183,9 +181,7 @@ def basin_stability(
     from `jax.random.key`; t1, rtol, atol as in `basins`. The standard error of a fraction f is
     sqrt(f (1 - f) / n). `ValueError` names an argument that is impossible.
     """
-    require(isinstance(oscillator, Oscillator), "oscillator", "an Oscillator", oscillator)
-    oscillator.check_scalars()
-    oscillator.check()
+    check_oscillator(oscillator, "oscillator")
     corners = as_array(box, "box", (2, 2))
     check_finite(corners, "box")
     require(np.all(np.asarray(corners)[:, 0] < np.asarray(corners)[:, 1]), "box", "not empty", box)

@@ -86,7 +86,7 @@ from .modes import (
     push_and_trace,
     select,
 )
-from .oscillator import Oscillator
+from .oscillator import Oscillator, check_oscillator
 from .results import Status, describe
 
 #: Arcs for which the orbit from slip onset is followed in search of the signature.
@@ -224,11 +224,7 @@ def refine(
     point gives a status that says why, and NaN. `ValueError` names an impossible argument.
     """
     require(isinstance(condition, AbstractCondition), "condition", "such as jb.Hopf()", condition)
-    require(
-        isinstance(osc, Oscillator), "osc", "an Oscillator, such as jb.presets.class_b(...)", osc
-    )
-    osc.check_scalars()
-    osc.check()
+    check_oscillator(osc)
     n = len(osc.belts)
     belts = condition.belts if isinstance(condition, SlidingExchange) else (0, 0)
     belts = (condition.belt,) * 2 if isinstance(condition, _BeltCondition) else belts

@@ -52,7 +52,7 @@ from .modes import (
     stick_phase,
     stick_velocity,
 )
-from .oscillator import Oscillator
+from .oscillator import Oscillator, check_oscillator
 from .results import EventKind, Status, describe
 from .simulate import Arcs
 
@@ -881,11 +881,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     `jax.vmap`. Where the start leads to an equilibrium, or nothing repeats, the status says so.
     `ValueError` names an argument that is impossible.
     """
-    require(
-        isinstance(osc, Oscillator), "osc", "an Oscillator, such as jb.presets.class_b(...)", osc
-    )
-    osc.check_scalars()
-    osc.check()
+    check_oscillator(osc)
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     turn, count, status = _turn_reached(osc, y0, max_arcs or SIZES[-1])
@@ -915,11 +911,7 @@ def unstable_cycle(osc: Oscillator, *, max_arcs: int | None = None) -> Cycle:
     between it and its neighbour the search is repeated, and Newton's method does the rest. With
     several stable equilibria the leftmost is taken.
     """
-    require(
-        isinstance(osc, Oscillator), "osc", "an Oscillator, such as jb.presets.class_b(...)", osc
-    )
-    osc.check_scalars()
-    osc.check()
+    check_oscillator(osc)
     turn, status, distance = _separating_turn(osc, max_arcs or SIZES[0])
     return _if_meant(polish(osc, turn, status), turn.entries[0, 0], distance)
 

@@ -51,7 +51,7 @@ from .checks import as_array, check_finite, pick, require
 from .compiling import each, jit
 from .cycles import SIZES, Ends, Turn, last_turn, turn_events, turn_of
 from .equilibria import equilibria
-from .oscillator import Oscillator
+from .oscillator import Oscillator, check_oscillator
 from .results import EventKind, Status, of_one_turn
 
 #: Values of the parameter in one batch, and guesses refined in one batch.
@@ -148,14 +148,7 @@ class Path:
     """A path in one parameter: its labels, each computed once, and turns of the cycles in them."""
 
     def __init__(self, osc, where, span):
-        require(
-            isinstance(osc, Oscillator),
-            "osc",
-            "an Oscillator, such as jb.presets.class_b(...)",
-            osc,
-        )
-        osc.check_scalars()
-        osc.check()
+        check_oscillator(osc)
         span = as_array(span, "span", (2,))
         check_finite(span, "span")
         self.first, self.last = (float(end) for end in span)

@@ -21,7 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .checks import is_concrete, number, pick, require
+from .checks import is_concrete, number, pick
 from .compiling import jit
 from .modes import (
     ABOVE,
@@ -34,7 +34,7 @@ from .modes import (
     mode_acceleration,
     settle,
 )
-from .oscillator import Oscillator
+from .oscillator import Oscillator, check_oscillator
 
 
 class EquilibriumKind(enum.IntEnum):
@@ -122,11 +122,7 @@ def equilibria(osc: Oscillator) -> Equilibria:
 
 
 def _check(osc):
-    require(
-        isinstance(osc, Oscillator), "osc", "an Oscillator, such as jb.presets.class_b(...)", osc
-    )
-    osc.check_scalars()
-    osc.check()
+    check_oscillator(osc)
 
 
 def _trim(rows, found: Equilibria):

@@ -37,7 +37,7 @@ from .bifurcations import AbstractCondition, refine
 from .checks import as_array, check_finite, require
 from .compiling import jit
 from .cycles import Cycle, find_cycle
-from .oscillator import Oscillator
+from .oscillator import Oscillator, check_oscillator
 from .results import Status, describe
 from .simulate import simulate
 from .smoothing import smooth_field
@@ -498,9 +498,7 @@ def fit(
     friction may exchange their velocities. See `Fit.status`. `ValueError` names an argument that is
     impossible.
     """
-    require(isinstance(oscillator, Oscillator), "oscillator", "an Oscillator", oscillator)
-    oscillator.check_scalars()
-    oscillator.check()
+    check_oscillator(oscillator, "oscillator")
     times, values, sigmas = _checked_record(ts, x1, x2, noise)
     require(isinstance(starts, int) and starts > 0, "starts", "a positive integer", starts)
     selection, u = _select(oscillator, where, bounds)
@@ -719,9 +717,7 @@ def design(
     what lies behind a bifurcation at which the cycle vanishes. `ValueError` names an argument that
     is impossible.
     """
-    require(isinstance(oscillator, Oscillator), "oscillator", "an Oscillator", oscillator)
-    oscillator.check_scalars()
-    oscillator.check()
+    check_oscillator(oscillator, "oscillator")
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     functionals, intervals = _checked_targets(targets)

@@ -70,7 +70,7 @@ class Belt(eqx.Module):
         """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
         check_finite(self.velocity, f"velocity of {owner}")
         check_nonnegative(self.load, f"load of {owner}")
-        self.friction.check(f"friction of {owner}")
+        type(self.friction).check(self.friction, f"friction of {owner}")
         if is_concrete((self.lower, self.upper)):
             require(not np.isnan(self.lower), f"lower of {owner}", "a number", self.lower)
             if not np.asarray(self.lower) < np.asarray(self.upper):
@@ -103,24 +103,35 @@ class Oscillator(eqx.Module):
     def check(self) -> None:
         """Raise a `ValueError` that names the first field with an impossible known value."""
         # As NumPy's, when they are known: a look at an array of JAX's costs a hundred times more.
+        # And checks are taken from their class: Equinox makes a module of a method of an object.
         osc = jax.tree.map(np.asarray, self) if is_concrete(self) else self
         check_finite(osc.damping, "damping")
         check_positive(osc.omega, "omega")
         require(len(osc.belts) > 0, "belts", "at least one Belt", "none")
         for i, belt in enumerate(osc.belts):
             require(isinstance(belt, Belt), f"belts[{i}]", "a Belt", belt)
-            belt.check(f"belt {i}")
-
-    def check_scalars(self) -> None:
-        """Raise where a parameter is batched; then the right tool is `jax.vmap`."""
-        for path, leaf in jax.tree_util.tree_leaves_with_path(self):
-            if eqx.is_inexact_array(leaf) and (leaf.ndim > 0 or leaf.dtype != jnp.float64):
-                as_array(leaf, jax.tree_util.keystr(path, simple=True, separator="."))
+            Belt.check(belt, f"belt {i}")
 
     def __repr__(self) -> str:
         belts = ", ".join(map(repr, self.belts))
         damping, omega = number(self.damping), number(self.omega)
         return f"Oscillator(damping={damping}, belts=({belts},), omega={omega})"
+
+
+def check_oscillator(osc: Any, field: str = "osc") -> None:
+    """Raise a `ValueError` unless it is one oscillator, all its known values possible."""
+    require(
+        isinstance(osc, Oscillator), field, "an Oscillator, such as jb.presets.class_b(...)", osc
+    )
+    check_scalars(osc)
+    Oscillator.check(osc)
+
+
+def check_scalars(osc: Oscillator) -> None:
+    """Raise where a parameter is batched; then the right tool is `jax.vmap`."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(osc):
+        if eqx.is_inexact_array(leaf) and (leaf.ndim > 0 or leaf.dtype != jnp.float64):
+            as_array(leaf, jax.tree_util.keystr(path, simple=True, separator="."))
 
 
 @traced_once

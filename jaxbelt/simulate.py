@@ -48,7 +48,7 @@ from .modes import (
     stick_phase,
     stick_velocity,
 )
-from .oscillator import Oscillator
+from .oscillator import Oscillator, check_oscillator
 from .results import EventKind, Status, describe
 from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
@@ -652,11 +652,7 @@ def simulate(
 
     `ValueError` names the argument that is impossible. See `Trajectory` for what comes back.
     """
-    require(
-        isinstance(osc, Oscillator), "osc", "an Oscillator, such as jb.presets.class_b(...)", osc
-    )
-    osc.check_scalars()
-    osc.check()
+    check_oscillator(osc)
     y0 = as_numbers(y0, "y0", (2,))
     check_finite(y0, "y0")
     t0, t1 = as_numbers(t0, "t0"), as_numbers(t1, "t1")
@@ -734,7 +730,7 @@ def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
 
     samples = (known.ts, known.ys, known.modes)
     if trim_samples:
-        samples = rows(samples, np.unique(known.ts, return_index=True)[1])
+        samples = rows(samples, np.flatnonzero(np.diff(known.ts, prepend=-np.inf)))
     events = rows(known.events, np.flatnonzero(known.events.kind))
     arcs = rows(known.arcs, np.flatnonzero(~np.isnan(known.arcs.t)))
     # Put there as they are: jnp.asarray compiles a program for every shape.

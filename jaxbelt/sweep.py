@@ -31,7 +31,7 @@ from .checks import (
     require,
     require_float64,
 )
-from .oscillator import Oscillator
+from .oscillator import Oscillator, check_scalars
 from .results import of_one_turn
 
 if TYPE_CHECKING:
@@ -209,7 +209,7 @@ class _Grid:
             "a function that returns an Oscillator",
             f"one that returns {type(self.example).__name__}",
         )
-        self.example.check_scalars()
+        check_scalars(self.example)
         leaves, self.structure = jax.tree.flatten(self.example)
         self.mapped = self._varying()
         self.shared = [leaf for leaf, mapped in zip(leaves, self.mapped, strict=True) if not mapped]
