@@ -105,7 +105,7 @@ def continue_curve(
 
     solve = functools.partial(corrected, residual, jacobian, args)
 
-    first = solve(u0, way / jnp.linalg.norm(way), 0.0)
+    first = solve(u0, way / np.linalg.norm(way), 0.0)
     if not first.found:
         return
     point = _point(first, 0.0)

@@ -201,11 +201,12 @@ def bifurcation_curve(
     require(int(point.status) == Status.OK, "point", "one with status OK", repr(point))
     require(len(where) == 2, "where", "two functions", repr(where))
     osc = point.oscillator
-    indices = jnp.asarray(np.array([leaf_index(osc, one) for one in where]))
-    require(indices[0] != indices[1], "where", "two different parameters", "one twice")
+    numbers = [leaf_index(osc, one) for one in where]
+    indices = jnp.asarray(np.array(numbers))
+    require(numbers[0] != numbers[1], "where", "two different parameters", "one twice")
     limits = np.stack([np.asarray(as_array(ends, "span", (2,))) for ends in span])
     check_finite(limits, "span")
-    start = np.array([float(parameter(osc, index)) for index in indices])
+    start = np.array([float(parameter(osc, number)) for number in numbers])
     inside = np.all((limits[:, 0] <= start) & (start <= limits[:, 1]))
     require(inside, "span", f"around the point {start.tolist()}", limits.tolist())
     problem = _Problem(point.condition, osc, indices, limits, step, max_points)
@@ -460,7 +461,7 @@ def _limit_at_rest(problem: _Problem, system, rows: list[_Row]) -> SpecialPoint 
         still = vary(problem.osc, problem.indices[held], jnp.zeros(1))
         belts = (jnp.asarray(resting), jnp.asarray(condition.belt))
         # A cycle begins at the end of its longest stick phase, which is the one on that belt.
-        codes = system.args[2].chain.codes[0]
+        codes = jnp.asarray(np.asarray(system.args[2].chain.codes)[0])
         value, residual = _tangent_departure(
             still, problem.indices[1 - held], codes, *belts, jnp.full(1, guess)
         )

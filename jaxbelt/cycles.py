@@ -913,7 +913,7 @@ def unstable_cycle(osc: Oscillator, *, max_arcs: int | None = None) -> Cycle:
     """
     check_oscillator(osc)
     turn, status, distance = _separating_turn(osc, max_arcs or SIZES[0])
-    return _if_meant(polish(osc, turn, status), turn.entries[0, 0], distance)
+    return _if_meant(polish(osc, turn, status), turn, distance)
 
 
 def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
@@ -962,10 +962,11 @@ def _separating_turn(osc: Oscillator, size: int) -> tuple[Turn, Array, Array]:
 
 
 @jit
-def _if_meant(cycle: Cycle, x1: Array, distance: Array) -> Cycle:
-    """The cycle, if it repels and passes by x1; one that Newton's method found elsewhere, or that
-    has shrunk to the equilibrium, is not the one meant."""
-    same = (jnp.abs(cycle.unknowns[0, 0] - x1) < 0.1 * distance) & (cycle.multiplier > 1)
+def _if_meant(cycle: Cycle, turn: Turn, distance: Array) -> Cycle:
+    """The cycle, if it repels and begins near the turn; one that Newton's method found elsewhere, or
+    that has shrunk to the equilibrium, is not the one meant."""
+    near = jnp.abs(cycle.unknowns[0, 0] - turn.entries[0, 0]) < 0.1 * distance
+    same = near & (cycle.multiplier > 1)
     missing = (cycle.status == Status.OK) & ~same | (cycle.status == Status.NOT_ADMISSIBLE)
     missing = missing | (cycle.status == Status.NO_CONVERGENCE)
     status = jnp.where(missing, Status.NO_UNSTABLE_CYCLE.value, cycle.status)

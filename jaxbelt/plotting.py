@@ -315,10 +315,10 @@ def _window(osc, paths, equilibria, xlim, ylim):
     x1 += [x for path in paths for x in (path[:, 0].min(), path[:, 0].max())]
     if not paths:
         # Nothing but the oscillator: every fixed point lies within the reach of friction.
-        reach = 1 + sum(float(b.load * b.friction.static) for b in osc.belts)
+        reach = 1 + sum(float(b.load) * float(b.friction.static) for b in osc.belts)
         x1 += [-reach, reach]
     x1 += [float(e) for b in osc.belts for e in (b.lower, b.upper) if np.isfinite(float(e))]
-    x2 = [0.0, *(float(b.velocity / osc.omega) for b in osc.belts)]
+    x2 = [0.0, *(float(b.velocity) / float(osc.omega) for b in osc.belts)]
     x2 += [x for path in paths for x in (path[:, 1].min(), path[:, 1].max())]
     if not paths:
         x2 += [-1.0, 1.0]
@@ -767,7 +767,7 @@ def plot_friction_law(
     """
     ax = _new_axes() if ax is None else ax
     r = jnp.linspace(0.0, speed, 401)
-    mu, static = np.asarray(friction.mu(r)), float(friction.static)
+    mu, static = np.asarray(jit(type(friction).mu)(friction, r)), float(friction.static)
     ax.axhline(0, color="0.7", linewidth=0.6)
     ax.axvline(0, color="0.7", linewidth=0.6)
     for sign in (1, -1):

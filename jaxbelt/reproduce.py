@@ -308,7 +308,7 @@ def _with_symbols(remark: str) -> str:
 def _equilibria(osc: Oscillator) -> Equilibria:
     """Where the mass can rest. A subcritical Hopf point repels, whatever rounding says of it."""
     found = equilibria(_with_two_belts(osc))
-    attracts = found.stable & ~(jnp.abs(found.rate) < 1e-9)
+    attracts = np.asarray(found.stable) & ~(np.abs(np.asarray(found.rate)) < 1e-9)
     return eqx.tree_at(lambda rows: rows.stable, found, attracts)
 
 
