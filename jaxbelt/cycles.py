@@ -963,7 +963,7 @@ def _separating_turn(osc: Oscillator, size: int) -> tuple[Turn, Array, Array]:
 
 @jit
 def _if_meant(cycle: Cycle, turn: Turn, distance: Array) -> Cycle:
-    """The cycle, if it repels and begins near the turn; one that Newton's method found elsewhere, or
+    """The cycle, if it repels and begins near the turn; one found elsewhere by Newton's method, or
     that has shrunk to the equilibrium, is not the one meant."""
     near = jnp.abs(cycle.unknowns[0, 0] - turn.entries[0, 0]) < 0.1 * distance
     same = near & (cycle.multiplier > 1)
