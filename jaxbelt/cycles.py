@@ -920,7 +920,7 @@ def unstable_cycle(osc: Oscillator, *, max_arcs: int | None = None) -> Cycle:
     )
     osc.check_scalars()
     osc.check()
-    turn, status, distance = _separating_turn(osc, max_arcs or SIZES[0])
+    turn, status, distance = separating_turn(osc, max_arcs or SIZES[0])
     return _if_meant(polish(osc, turn, status), turn.entries[0, 0], distance)
 
 
@@ -939,7 +939,7 @@ def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
 
 
 @jit
-def _separating_turn(osc: Oscillator, size: int) -> tuple[Turn, Array, Array]:
+def separating_turn(osc: Oscillator, size: int) -> tuple[Turn, Array, Array]:
     """A turn near the unstable cycle, a status, and how far from the equilibrium it begins."""
     still = lax.stop_gradient(osc)
     rests = equilibria(still)
