@@ -69,6 +69,7 @@ from .cycles import (
     newton,
     residual,
     residual_and_blocks,
+    separating_turn,
     trace_of,
     turn_of,
 )
@@ -137,7 +138,10 @@ class GrazingEdge(_BeltCondition):
     """A turn of the cycle, an extremum of x1, touches a contact edge of a belt.
 
     Beyond, the cycle passes the edge, or there is none: where the edge pushes away to both sides.
+    unstable: of the cycle from `unstable_cycle`, not of an attracting one.
     """
+
+    unstable: bool = eqx.field(static=True, default=False)
 
 
 class CornerCollision(_BeltCondition):
@@ -231,7 +235,7 @@ def refine(
     for belt in belts:
         require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
     solve = solver_of(condition)
-    at_an_edge = solve in (at_edge, at_boundary_equilibrium, at_pseudo_hopf)
+    at_an_edge = solve in (at_edge, at_edge_unstable, at_boundary_equilibrium, at_pseudo_hopf)
     if at_an_edge and is_concrete(osc):
         ends = [osc.belts[belts[0]].lower, osc.belts[belts[0]].upper]
         require(np.any(np.isfinite(ends)), "belt", "one with a finite edge", repr(belts[0]))
@@ -658,10 +662,10 @@ def _without_excursion(osc: Oscillator, turn: Turn, row: Array, edge: Array) -> 
 
 
 def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
-    """A cycle of which an arc ends on an edge of the first belt, though no edge ends it.
+    """An attracting cycle of which an arc ends on an edge of the first belt, not by that edge.
 
     wanted: 1 a turn ends it (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
-    attracting cycles that which comes nearest to this is taken.
+    these cycles that which comes nearest to this is taken.
     """
     n = len(osc.belts)
     still = lax.stop_gradient(osc)
@@ -677,10 +681,27 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
 
     turns, distances, rows, numbers, large = each(run)(starts(still, rests))
     at = jnp.argmin(distances)
-    turn, edge = jax.tree.map(lambda x: x[at], turns), numbers[at]
-    turn, row = _without_excursion(still, turn, rows[at], edge)
+    turn = jax.tree.map(lambda x: x[at], turns)
     none = jnp.where(jnp.any(large), Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
     status = jnp.where(jnp.isfinite(distances[at]), Status.OK.value, none)
+    return _edge_contact(osc, index, turn, rows[at], numbers[at], status, repels=False)
+
+
+def at_edge_unstable(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
+    """The unstable cycle around a stable equilibrium, with a turn on an edge of the first belt."""
+    still = lax.stop_gradient(osc)
+    turn, status, _ = separating_turn(still, size)
+    distance, row, edge = end_near_edge(still, turn, belts[0], jnp.ones(()))
+    near = (status != Status.OK) | jnp.isfinite(distance)
+    status = jnp.where(near, status, Status.NOT_TOUCHED.value)
+    return _edge_contact(osc, index, turn, row, edge, status, repels=True)
+
+
+def _edge_contact(osc, index, turn: Turn, row, edge, status, *, repels: bool) -> BifurcationPoint:
+    """The cycle near a turn for which the end of that row lies on that edge."""
+    n = len(osc.belts)
+    still = lax.stop_gradient(osc)
+    turn, row = _without_excursion(still, turn, row, edge)
     chain, z = meshed(still, turn)
 
     def judge(osc, z, cycle, slope):
@@ -688,8 +709,10 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
         # and a cycle that has shrunk to a pseudo-focus meets everything there.
         singular = (chain.ends[row] == Ends(n).turn_x1) & (z[row, 2] < 1e-6)
         shrunk = cycle.x1_max - cycle.x1_min < AT_REST
-        fails = (cycle.status == Status.OK) & (singular | shrunk)
-        status = jnp.where(fails, Status.NO_CONVERGENCE.value, cycle.status)
+        solved = cycle.status == Status.OK
+        status = jnp.where(solved & (singular | shrunk), Status.NO_CONVERGENCE.value, cycle.status)
+        if repels:
+            status = jnp.where(solved & ~(slope > 1), Status.NO_UNSTABLE_CYCLE.value, status)
         return status, jnp.asarray(jnp.nan)
 
     system = EdgeContact(chain=chain, row=row, edge=edge)
@@ -1015,4 +1038,6 @@ _SIDES = {NonsmoothFold: 1.0, GrazingSliding: -1.0, GrazingEdge: 1.0, CornerColl
 
 def solver_of(condition: AbstractCondition) -> Callable:
     """What solves for a condition."""
+    if isinstance(condition, GrazingEdge) and condition.unstable:
+        return at_edge_unstable
     return _SOLVERS.get(type(condition), at_cycle)

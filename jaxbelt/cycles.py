@@ -912,7 +912,7 @@ def unstable_cycle(osc: Oscillator, *, max_arcs: int | None = None) -> Cycle:
     several stable equilibria the leftmost is taken.
     """
     check_oscillator(osc)
-    turn, status, distance = _separating_turn(osc, max_arcs or SIZES[0])
+    turn, status, distance = separating_turn(osc, max_arcs or SIZES[0])
     return _if_meant(polish(osc, turn, status), turn, distance)
 
 
@@ -931,7 +931,7 @@ def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
 
 
 @jit
-def _separating_turn(osc: Oscillator, size: int) -> tuple[Turn, Array, Array]:
+def separating_turn(osc: Oscillator, size: int) -> tuple[Turn, Array, Array]:
     """A turn near the unstable cycle, a status, and how far from the equilibrium it begins."""
     still = lax.stop_gradient(osc)
     rests = equilibria(still)

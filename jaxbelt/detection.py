@@ -12,6 +12,9 @@ difference are refined from there, and what is found inside the interval is a bi
 same is then asked of what is left of the interval on either side, so that points are found that lie
 closer together than the first values did. A difference that no condition explains is narrowed as
 far as numbers go, and reported. Values are looked at in batches by one compiled program.
+
+Labels know what attracts. Where contact edges are touched by the unstable cycle that a diagram
+shows is found in the same way from its signature, see `edges_touched`.
 """
 
 from collections import Counter
@@ -39,6 +42,7 @@ from .bifurcations import (
     SlidingExchange,
     SuddenSliding,
     approach,
+    at_edge,
     end_near_edge,
     leaf_index,
     room_for,
@@ -49,7 +53,7 @@ from .bifurcations import (
 )
 from .checks import as_array, check_finite, pick, require
 from .compiling import each, jit
-from .cycles import SIZES, Ends, Turn, last_turn, turn_events, turn_of
+from .cycles import SIZES, Cycle, Ends, Turn, last_turn, turn_events, turn_of, unstable_cycle
 from .equilibria import equilibria
 from .oscillator import Oscillator, check_oscillator
 from .results import EventKind, Status, of_one_turn
@@ -79,9 +83,11 @@ def scan(
     lies between them.
 
     Each point has `kind`, `value`, and the rest of a `BifurcationPoint`. What happens at contact
-    edges is looked for where there are any. Where something changes and no condition explains it,
-    there is a point of kind `Unexplained`, with the status UNEXPLAINED and the value where it
-    happens, good to about 1e-9 of the span. `ValueError` names an impossible argument.
+    edges is looked for where there are any; where an unstable cycle touches them only
+    `bifurcation_diagram` says, as what attracts stays the same. Where something changes and no
+    condition explains it, there is a point of kind `Unexplained`, with the status UNEXPLAINED and
+    the value where it happens, good to about 1e-9 of the span. `ValueError` names an impossible
+    argument.
     """
     return search(Path(osc, where, span), resolution)
 
@@ -114,7 +120,49 @@ def search(path: "Path", resolution: int = 96) -> tuple[BifurcationPoint, ...]:
                 cut.append(list(np.linspace(a, b, 3 if b - a <= NEAR * path.length else 9)))
         path.look([value for values in cut for value in values])
         intervals = [pair for values in cut for pair in pairwise(values) if pair[0] < pair[1]]
+    return by_value(points)
+
+
+def by_value(points: Sequence[BifurcationPoint]) -> tuple[BifurcationPoint, ...]:
+    """The points in order."""
     return tuple(sorted(points, key=lambda point: float(point.value)))
+
+
+def edges_touched(path: "Path", values: np.ndarray) -> tuple[BifurcationPoint, ...]:
+    """Where the unstable cycle begins or ceases to pass a contact edge.
+
+    values: in order, in a stretch in which nothing else happens. Those at which no such cycle is
+    found are passed over.
+    """
+
+    def signature(value):
+        return of_one_turn(path.unstable(value).signature)
+
+    def changes(values):
+        known = [v for v in map(float, values) if path.unstable(v).status == Status.OK]
+        return [(a, b) for a, b in pairwise(known) if a < b and signature(a) != signature(b)]
+
+    points, intervals = [], changes(values) if path.edged else []
+    while intervals:
+        a, b = intervals.pop()
+        guesses = [
+            Guess((a, b), value, GrazingEdge(belt, unstable=True))
+            for belt in path.edged
+            for value in (a, b)
+        ]
+        solved = (point for _, point in refined(path.osc, path.index, guesses))
+        point = next((point for point in solved if a < point.value < b), None)
+        middle = 0.5 * (a + b)
+        if point is not None:
+            points.append(point)
+            path.unstable_cycles[float(point.value)] = point.cycle
+            before, after = path.beside(float(point.value))
+            intervals += changes([a, max(a, before)]) + changes([min(b, after), b])
+        elif path.unstable(middle).status == Status.OK and b - a > 1e-9 * path.length:
+            intervals += changes([a, middle, b])
+        else:
+            points.append(unexplained_point(path.osc, int(path.index), middle, b - a))
+    return by_value(points)
 
 
 # --- what the oscillator does at one value --------------------------------------------------------
@@ -162,11 +210,18 @@ class Path:
         self.name = jax.tree_util.keystr(paths[int(self.index)]).removeprefix(".")
         self.labels: dict[float, Label] = {}
         self.turns: dict[float, dict[Signature, Turn]] = {}
+        self.unstable_cycles: dict[float, Cycle] = {}
         self.breaks = self._coincidences()
 
     def at(self, value: float) -> Oscillator:
         """The oscillator there."""
         return vary(self.osc, self.index, jnp.full(1, value))
+
+    def unstable(self, value: float) -> Cycle:
+        """The unstable cycle there, or why there is none; computed once."""
+        if value not in self.unstable_cycles:
+            self.unstable_cycles[value] = unstable_cycle(self.at(value))
+        return self.unstable_cycles[value]
 
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
         """The values just below and just above; farther off where motions are slow to settle."""
@@ -370,7 +425,7 @@ def refined(
 def _kind_found(condition: AbstractCondition, point: BifurcationPoint) -> AbstractCondition:
     if isinstance(condition, GrazingSliding | NonsmoothFold):
         return (NonsmoothFold if point.multiplier > 1 else GrazingSliding)(condition.belt)
-    if isinstance(condition, GrazingEdge | CornerCollision):
+    if isinstance(condition, GrazingEdge | CornerCollision) and solver_of(condition) is at_edge:
         chain, z = point.cycle.chain, point.cycle.unknowns
         turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
         belt, either = jnp.asarray(condition.belt), jnp.zeros(())

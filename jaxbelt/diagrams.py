@@ -37,7 +37,7 @@ from .checks import as_array, require
 from .compiling import jit
 from .curves import BifurcationCurve, bifurcation_curve
 from .cycles import Cycle, Ends, Turn, find_cycle, polish, room_of, unstable_cycle
-from .detection import Label, Path, search
+from .detection import Label, Path, by_value, edges_touched, search
 from .equilibria import Equilibria, equilibria
 from .oscillator import Oscillator
 from .results import EventKind, Status
@@ -82,9 +82,10 @@ class Branch(eqx.Module):
 class BifurcationDiagram(eqx.Module):
     """What `bifurcation_diagram` returns.
 
-    points: the special points in order, as from `scan`; branches: of equilibria, then of cycles;
-    regions: (first, last, name) of every stretch between points, see `region_name`; oscillator:
-    the one that was given; name: of the parameter, as the path to it. `plot()` draws it.
+    points: the special points in order, as from `scan`, and those at which an unstable cycle
+    touches a contact edge; branches: of equilibria, then of cycles; regions: (first, last, name) of
+    every stretch between points of `scan`, see `region_name`; oscillator: the one that was given;
+    name: of the parameter, as the path to it. `plot()` draws it.
     """
 
     points: tuple[BifurcationPoint, ...]
@@ -135,6 +136,12 @@ def bifurcation_diagram(
     path.look(np.concatenate(nodes))
     middles = [float(values[len(values) // 2]) for values in nodes]
     labels = [path.label(value) for value in middles]
+    for stretch in _separated(labels):
+        found = edges_touched(path, nodes[stretch])
+        points = by_value([*points, *found])
+        at = [float(point.value) for point in found if point.status == Status.OK]
+        nodes[stretch] = np.sort(np.append(nodes[stretch], at))
+    path.look(np.concatenate(nodes))
     pieces = [*_equilibrium_pieces(path, nodes), *_cycle_pieces(path, nodes, labels)]
     names = [region_name(path.at(v), label) for v, label in zip(middles, labels, strict=True)]
     return BifurcationDiagram(
@@ -153,6 +160,15 @@ def _nodes(path: Path, a: float, b: float, rows: int) -> np.ndarray:
     first = path.beside(a)[1] if a in path.breaks or a != path.first else a
     last = path.beside(b)[0] if b in path.breaks or b != path.last else b
     return first + (last - first) * inner
+
+
+def _separated(labels: Sequence[Label]) -> list[int]:
+    """The stretches with an unstable cycle, between an equilibrium and a cycle that attract."""
+    return [
+        stretch
+        for stretch, label in enumerate(labels)
+        if label.cycles and any(stable for _, stable in label.equilibria)
+    ]
 
 
 def region_name(osc: Oscillator, label: Label) -> str:
@@ -463,12 +479,7 @@ def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Labe
         turns = [turn for _, _, group in wanted for turn in group]
         cycles = _attracting(path, np.concatenate(groups), turns)
         pieces += _as_pieces(path, cycles, groups, [stretch for stretch, _, _ in wanted])
-    # An unstable cycle lies between an equilibrium and a cycle that both attract.
-    both = [
-        stretch
-        for stretch, label in enumerate(labels)
-        if label.cycles and any(stable for _, stable in label.equilibria)
-    ]
+    both = _separated(labels)
     if both:
         groups = [nodes[stretch] for stretch in both]
         cycles = _repelling(path, np.concatenate(groups))
@@ -551,7 +562,7 @@ def _attracting(path: Path, values: np.ndarray, turns: Sequence[Turn]) -> _Rows:
 
 
 def _repelling(path: Path, values: np.ndarray) -> _Rows:
-    return _stacked(_row, (unstable_cycle(path.at(value)) for value in values))
+    return _stacked(_row, (path.unstable(float(value)) for value in values))
 
 
 # --- from pieces to branches ----------------------------------------------------------------------

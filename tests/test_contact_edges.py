@@ -8,8 +8,10 @@ import oracle_cycles
 import pytest
 
 import jaxbelt as jb
-from jaxbelt import Status
+from jaxbelt import EventKind, Status
 from jaxbelt.continuation import End
+
+EDGE = EventKind.EDGE
 
 
 def nu0(osc):
@@ -38,6 +40,10 @@ def from_onset(osc):
     return (1 - 0.5 * osc.speed(1), osc.speed(1)), (oracle.ABOVE, 1)
 
 
+#: What the unstable cycle does, which `scan` does not look for.
+INSIDE = jb.GrazingEdge(0, unstable=True)
+
+
 @pytest.fixture(scope="module")
 def diagram():
     return jb.bifurcation_diagram(overlapping(0.6), sigma1, (0.05, 2.5))
@@ -47,6 +53,7 @@ def test_points_of_overlapping_belts(diagram):
     """All that happens as the edge moves from the left of all motion to the right of it."""
     alone = oracle_cycles.sticking_cycle(its_oracle(0.3))
     both = oracle_cycles.sticking_cycle(its_oracle(2.5))
+    inside = oracle_cycles.unstable_cycle(its_oracle(0.3))
     friction = [0.6 + 0.4 / (1 + 10 * nu) for nu in (0.35, 0.2)]
     expected = [
         (jb.GrazingEdge(0), alone.x1_min),
@@ -54,6 +61,7 @@ def test_points_of_overlapping_belts(diagram):
             jb.CornerCollision(0),
             oracle_cycles.corner(its_oracle, (0.605, 0.625), 1, from_onset),
         ),
+        (INSIDE, inside.x1_min),
         (jb.BoundaryEquilibrium(0), friction[1]),
         (jb.CornerCollision(0), 1 - 0.5 * 0.2),  # slip onset on belt 1, belt 0 being left
         (jb.PseudoHopf(0), oracle_cycles.pseudo_hopf(its_oracle, (0.9, 0.95), lambda p: p)),
@@ -72,7 +80,7 @@ def test_points_of_overlapping_belts(diagram):
 def test_branches_go_on_beyond_them(diagram):
     """A branch of equilibria, one of attracting cycles; the unstable cycle shrinks to the edge."""
     rests, attracting, repelling = diagram.branches
-    values = [float(point.value) for point in diagram.points]
+    values = [float(point.value) for point in diagram.points if point.condition != INSIDE]
     for branch in (rests, attracting):
         assert branch.values[0] == 0.05 and branch.values[-1] == 2.5
         assert np.max(np.abs(np.diff(branch.x1_max))) < 0.03
@@ -82,6 +90,36 @@ def test_branches_go_on_beyond_them(diagram):
     assert repelling.x1_max[-1] - repelling.x1_min[-1] < 1e-3
     texts = {text.get_text() for text in diagram.plot(quantity="x1").texts}
     assert {"edge grazing, belt 0", "corner, belt 0", "pseudo-Hopf, belt 0"} <= texts
+
+
+def test_an_unstable_cycle_touches_the_edge_on_one_side_and_the_other():
+    """The edge comes into it from the left and goes out to the right; one branch all along."""
+    osc = jb.presets.class_d(0.4, 0.25, 0.0, 0.6)
+    diagram = jb.bifurcation_diagram(osc, sigma1, (0.4, 1.6), rows=60)
+    points = [point for point in diagram.points if point.condition == INSIDE]
+    left, right = (
+        oracle_cycles.unstable_cycle(oracle.class_d(0.4, 0.25, 0.0, edge)) for edge in (0.05, 2.5)
+    )
+    # The oracle integrates to 1e-13.
+    for point, expected in zip(points, (left.x1_min, right.x1_max), strict=True):
+        assert point.value == pytest.approx(expected, abs=1e-11)
+        assert point.residual < 1e-11 and point.error < 1e-11 and point.cycle.multiplier > 1
+    for point, within in zip(points, (1e-3, -1e-3), strict=True):
+        for offset, signature in ((-within, ()), (within, ((EDGE, 0), (EDGE, 0)))):
+            beside = jb.presets.class_d(0.4, 0.25, 0.0, float(point.value) + offset)
+            assert jb.unstable_cycle(beside).signature == signature
+    (branch,) = (branch for branch in diagram.branches if not np.any(branch.stable))
+    assert branch.kind == "cycle" and (branch.values[0], branch.values[-1]) == (0.4, 1.6)
+    outside = branch.values < left.x1_min
+    assert np.allclose(branch.x1_min[outside], left.x1_min, rtol=0, atol=1e-11)
+    outside = branch.values > right.x1_max
+    assert np.allclose(branch.x1_max[outside], right.x1_max, rtol=0, atol=1e-11)
+    row = len(branch) // 2
+    passing = oracle_cycles.unstable_cycle(
+        oracle.class_d(0.4, 0.25, 0.0, float(branch.values[row]))
+    )
+    assert branch.x1_max[row] == pytest.approx(passing.x1_max, abs=1e-9)
+    assert branch.multiplier[row] == pytest.approx(passing.multiplier, rel=1e-7)
 
 
 def test_points_of_sequential_belts():
@@ -140,11 +178,13 @@ def test_an_edge_that_pushes_away_ends_the_cycle():
     [
         (jb.GrazingEdge(0), 0, -0.01),
         (jb.GrazingEdge(0), 0, 0.03),  # the cycle passes the edge
-        (jb.GrazingEdge(0), 7, -0.03),
+        (INSIDE, 2, -0.1),
+        (INSIDE, 2, 0.03),
+        (jb.GrazingEdge(0), 8, -0.03),
         (jb.CornerCollision(0), 1, -0.02),
         (jb.CornerCollision(0), 1, 0.02),
-        (jb.BoundaryEquilibrium(0), 2, 0.1),
-        (jb.PseudoHopf(0), 4, -0.02),
+        (jb.BoundaryEquilibrium(0), 3, 0.1),
+        (jb.PseudoHopf(0), 5, -0.02),
     ],
 )
 def test_refined_from_either_side(diagram, condition, number, offset):
@@ -152,15 +192,18 @@ def test_refined_from_either_side(diagram, condition, number, offset):
     point = jb.refine(condition, overlapping(exact + offset), where=sigma1)
     assert point.status == Status.OK and point.condition == condition
     assert point.value == pytest.approx(exact, abs=1e-12)
-    assert point.iterations <= 6 and point.residual < 1e-11 and point.error < 1e-11
+    assert point.iterations <= 7 and point.residual < 1e-11 and point.error < 1e-11
 
 
 def test_what_fits_no_such_point_is_told_so():
     # Everything comes to rest.
     point = jb.refine(jb.GrazingEdge(0), jb.presets.class_d(0.35, 0.6, 0.0, 0.6), where=sigma1)
     assert point.status == Status.NOT_TOUCHED and jnp.isnan(point.value)
-    with pytest.raises(ValueError, match="belt must be one with a finite edge, got 0"):
-        jb.refine(jb.GrazingEdge(0), jb.presets.class_a(0.2), where=nu0)
+    point = jb.refine(INSIDE, jb.presets.class_d(0.35, 0.6, 0.0, 0.6), where=sigma1)
+    assert point.status == Status.NO_UNSTABLE_CYCLE and jnp.isnan(point.value)
+    for condition in (jb.GrazingEdge(0), INSIDE):
+        with pytest.raises(ValueError, match="belt must be one with a finite edge, got 0"):
+            jb.refine(condition, jb.presets.class_a(0.2), where=nu0)
 
 
 def test_the_end_of_a_segment_on_an_edge():
@@ -192,7 +235,7 @@ def test_curves(diagram):
     """Where the rows lie exactly is known: in closed form, or from the oracle."""
     where, span = (sigma1, nu1), ((0.05, 2.5), (0.1, 0.3))
     rests, grazing = (
-        jb.bifurcation_curve(diagram.points[i], where, span, step=0.03) for i in (2, 0)
+        jb.bifurcation_curve(diagram.points[i], where, span, step=0.03) for i in (3, 0)
     )
     assert rests.ends == (End.LEFT_SPAN, End.LEFT_SPAN)
     sigma, nu = rests.values.T
@@ -206,6 +249,21 @@ def test_curves(diagram):
     assert fold.values[1] == pytest.approx(0.267134534361, abs=1e-11)
 
 
+def test_curve_of_an_unstable_cycle_that_touches_the_edge(diagram):
+    """Up to the nonsmooth fold of belt 1 alone, and down to its Hopf point, which it shrinks to."""
+    where, span = (sigma1, nu1), ((0.05, 2.5), (0.1, 0.3))
+    grazing = jb.bifurcation_curve(diagram.points[2], where, span, step=0.03)
+    for sigma, nu in grazing.values[1:-4:3].tolist():
+        alone = oracle_cycles.unstable_cycle(its_oracle(0.05, nu))
+        assert sigma == pytest.approx(alone.x1_min, abs=1e-9)
+    (fold,) = grazing.special
+    assert fold.values[1] == pytest.approx(0.267134534361, abs=1e-11)
+    hopf = (np.sqrt(8) - 1) / 10
+    shrunk = grazing.values[np.argmax(grazing.values[:, 0])]
+    # The radius goes like the root of the distance from the Hopf point.
+    assert shrunk == pytest.approx([0.6 + 0.4 / (1 + 10 * hopf), hopf], abs=1e-3)
+
+
 def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
     """Of belt 1 alone to the right of the edge, and of both belts to the left of it."""
     where, span = (sigma1, nu1), ((0.05, 2.5), (0.1, 0.3))
@@ -214,13 +272,13 @@ def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
     pull = 0.6 + 0.4 / (1 + 10 * np.array([alone, both]))
     expected = [(pull[0], alone), (0.6 + 0.4 / 4.5 + pull[1], both)]
 
-    balanced = jb.bifurcation_curve(diagram.points[4], where, span, step=0.03)
+    balanced = jb.bifurcation_curve(diagram.points[5], where, span, step=0.03)
     assert balanced.ends == (End.STOPPED, End.STOPPED)
     found = sorted(point.values for point in balanced.special)
     assert [point.kind for point in balanced.special] == ["BoundaryHopf"] * 2
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
-    for number, corner in ((2, expected[0]), (5, expected[1])):
+    for number, corner in ((3, expected[0]), (6, expected[1])):
         rests = jb.bifurcation_curve(diagram.points[number], where, span, step=0.03)
         (point,) = rests.special
         assert point.kind == "BoundaryHopf"
