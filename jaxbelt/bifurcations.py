@@ -240,10 +240,10 @@ def refine(
         ends = [osc.belts[belts[0]].lower, osc.belts[belts[0]].upper]
         require(np.any(np.isfinite(ends)), "belt", "one with a finite edge", repr(belts[0]))
     size = max_arcs or room_for(solve)
-    # The belts are data: one program is compiled for all of them.
-    wanted = np.float64(_SIDES.get(type(condition), 0.0))
-    point = _refine(solve, osc, leaf_index(osc, where), np.array(belts), wanted, size)
-    return replace(point, condition=condition)
+    # Parameter and belts are data: the same programs serve all of them.
+    data = leaf_index(osc, where), belts, _SIDES.get(type(condition), 0.0)
+    index, pair, wanted = (jnp.asarray(np.array(one)) for one in data)
+    return replace(solve(osc, index, pair, wanted, size), condition=condition)
 
 
 def room_for(solve: Callable) -> int:
@@ -269,9 +269,11 @@ def vary(osc: Oscillator, index: int | Array, p: Array) -> Oscillator:
     """
     leaves, structure = jax.tree.flatten(osc)
     numbers = [index] if isinstance(index, int) or index.ndim == 0 else index
-    for which, value in zip(numbers, p, strict=True):
-        if is_concrete(index) and (isinstance(index, int) or is_concrete((osc, p))):
-            leaves[int(which)] = value
+    known = is_concrete((osc, index, p))
+    # What is known is taken apart in NumPy, which compiles nothing.
+    for which, value in zip(numbers, np.asarray(p) if known else p, strict=True):
+        if known or isinstance(index, int):
+            leaves[int(which)] = jnp.asarray(value)
         else:
             leaves = [jnp.where(which == i, value, leaf) for i, leaf in enumerate(leaves)]
     return jax.tree.unflatten(structure, leaves)
@@ -281,14 +283,6 @@ def parameter(osc: Oscillator, index: int | Array) -> Array:
     """The parameter of that number."""
     leaves = jax.tree.leaves(osc)
     return leaves[int(index)] if is_concrete(index) else jnp.stack(leaves)[index]
-
-
-@jit
-def _refine(solve: Callable, osc: Oscillator, index, belts, wanted, size) -> BifurcationPoint:
-    p0 = parameter(osc, index)[None]
-    # Derivatives with respect to the varied parameter itself would be those of the guess.
-    osc = vary(osc, index, lax.stop_gradient(p0))
-    return solve(osc, index, belts, wanted, size)
 
 
 # --- systems of a cycle and one condition ---------------------------------------------------------
@@ -398,9 +392,11 @@ def _accuracy(osc: Oscillator, system: System, z: Array, matrix: Array):
     return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
 
 
+@jit
 def _solved_point(osc, index, system, z0, status, judge) -> BifurcationPoint:
     """Solve; judge(osc, z, cycle, slope), slope the cycle's multiplier with stick phases left out,
-    gives the status and the multiplier to be told."""
+    gives the status and the multiplier to be told. It carries its data with it, as `eqx.Partial`:
+    one program serves a kind of system."""
     p0 = lax.stop_gradient(parameter(osc, index)[None])
     z, p, steps, matrix = _solve_system(osc, index, system, z0, p0)
     iterations = jnp.sum(~jnp.isnan(steps))
@@ -507,18 +503,40 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
     return jax.tree.map(lambda a, b: jnp.where(is_cycle, a, b), ended, orbit)
 
 
+@jit
+def _onset_orbit(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array, Orbit]:
+    """The orbit from slip onset on the first of the belts, its start, and the oscillator.
+
+    This is the one given but for the velocity of that belt: where it is at rest, no orbit leaves.
+    """
+    velocities = [
+        jnp.where((belts[0] == i) & (one.velocity == 0), 1e-2, one.velocity)
+        for i, one in enumerate(osc.belts)
+    ]
+    moving = eqx.tree_at(lambda o: [one.velocity for one in o.belts], osc, velocities)
+    moving = lax.stop_gradient(moving)
+    start = before_onset(moving, belts[0])
+    return moving, start, follow(moving, start, HINT_BUDGET)
+
+
 def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
     """A cycle tangent to the boundary of a belt, given twice, or at the exchange of two belts.
 
     wanted: 1 a fold, -1 grazing, 0 either; its multiplier tells which it is.
     """
+    _, _, orbit = _onset_orbit(osc, belts)
+    return _solved_point(osc, index, *_touching(osc, orbit, belts, wanted, size))
+
+
+@jit
+def _touching(osc: Oscillator, orbit: Orbit, belts: Array, wanted: Array, size: int):
+    """The system of `at_cycle` with a guess of its unknowns, a status, and the judge."""
     belt, other = belts[0], belts[1]
     exchange = belt != other
     n = len(osc.belts)
     names = Ends(n)
     still = lax.stop_gradient(osc)
     velocity = _velocity(still, belt)
-    orbit = follow(still, before_onset(still, belt), HINT_BUDGET)
     repeated = orbit.status == Status.OK
 
     # Either a cycle was found, or the orbit left the boundary for good: then its first turn from
@@ -545,27 +563,29 @@ def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, s
     fits = count < jnp.where(exchange, size + 1, size)  # a tangency may need one arc more
     status = jnp.where(usable & ~fits, Status.TOO_MANY_ARCS.value, status)
     status = jnp.where(velocity == 0, Status.STUCK_FOREVER.value, status)
-    swap = jnp.arange(n).at[belt].set(other).at[other].set(belt)
-
-    def judge(osc, z, cycle, slope):
-        chain = cycle.chain
-        others = jnp.any(chain.codes == 0, axis=-1) & chain.used & (jnp.arange(size) != row)
-        slope = jnp.where(z[row, 2] > 1e-6, jnp.inf, slope)  # a square root of rounding is no phase
-        slope = jnp.where(jnp.any(others), 0.0, slope)
-        swapped = Chain(chain.codes[:, swap], chain.ends, chain.mesh)
-        # An exchange needs the same cycle with the belts swapped; a tangency is of one kind.
-        is_wanted = (wanted == 0) | (wanted * (slope - 1) >= 0)  # the slope may be infinite
-        fits = jnp.where(exchange, admissible(osc, swapped, z), is_wanted)
-        slope = jnp.where(exchange, jnp.nan, slope)
-        other_kind = (cycle.status == Status.OK) & ~fits
-        return jnp.where(other_kind, Status.OTHER_KIND.value, cycle.status), slope
 
     # The arc before the stick arc is the one that becomes tangent.
     before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
     tangent = chain.ends.at[before].set(names.tangent + belt)
     ends = jnp.where(exchange, chain.ends, tangent)
     system = Encounter(chain=Chain(chain.codes, ends, chain.mesh), belts=belts)
-    return _solved_point(osc, index, system, z, status, judge)
+    return system, z, status, eqx.Partial(_judge_encounter, belts, wanted, row)
+
+
+def _judge_encounter(belts, wanted, row, osc: Oscillator, z, cycle: Cycle, slope):
+    belt, other = belts[0], belts[1]
+    exchange, chain = belt != other, cycle.chain
+    others = jnp.any(chain.codes == 0, axis=-1) & chain.used & (jnp.arange(chain.ends.size) != row)
+    slope = jnp.where(z[row, 2] > 1e-6, jnp.inf, slope)  # a square root of rounding is no phase
+    slope = jnp.where(jnp.any(others), 0.0, slope)
+    swap = jnp.arange(len(osc.belts)).at[belt].set(other).at[other].set(belt)
+    swapped = Chain(chain.codes[:, swap], chain.ends, chain.mesh)
+    # An exchange needs the same cycle with the belts swapped; a tangency is of one kind.
+    is_wanted = (wanted == 0) | (wanted * (slope - 1) >= 0)  # the slope may be infinite
+    fits = jnp.where(exchange, admissible(osc, swapped, z), is_wanted)
+    slope = jnp.where(exchange, jnp.nan, slope)
+    other_kind = (cycle.status == Status.OK) & ~fits
+    return jnp.where(other_kind, Status.OTHER_KIND.value, cycle.status), slope
 
 
 def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, Array]:
@@ -667,6 +687,13 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
     wanted: 1 a turn ends it (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
     these cycles that which comes nearest to this is taken.
     """
+    turn = _turn_near_edge(osc, belts, wanted, size)
+    return _solved_point(osc, index, *_edge_contact(osc, *turn, np.array(False)))
+
+
+@jit
+def _turn_near_edge(osc: Oscillator, belts: Array, wanted: Array, size: int):
+    """The turn of `at_edge`, the row of its arc, the number of the edge, a status."""
     n = len(osc.belts)
     still = lax.stop_gradient(osc)
     rests = equilibria(still)
@@ -684,39 +711,46 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
     turn = jax.tree.map(lambda x: x[at], turns)
     none = jnp.where(jnp.any(large), Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
     status = jnp.where(jnp.isfinite(distances[at]), Status.OK.value, none)
-    return _edge_contact(osc, index, turn, rows[at], numbers[at], status, repels=False)
+    return turn, rows[at], numbers[at], status
 
 
 def at_edge_unstable(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
     """The unstable cycle around a stable equilibrium, with a turn on an edge of the first belt."""
-    still = lax.stop_gradient(osc)
-    turn, status, _ = separating_turn(still, size)
-    distance, row, edge = end_near_edge(still, turn, belts[0], jnp.ones(()))
+    turn, status, _ = separating_turn(osc, size)
+    turn = turn, *_turn_on_edge(osc, turn, belts, status)
+    return _solved_point(osc, index, *_edge_contact(osc, *turn, np.array(True)))
+
+
+@jit
+def _turn_on_edge(osc: Oscillator, turn: Turn, belts: Array, status: Array):
+    """The row of a turn in which x1 turns nearest to an edge of the first belt, the number of the
+    edge, a status."""
+    distance, row, edge = end_near_edge(osc, turn, belts[0], jnp.ones(()))
     near = (status != Status.OK) | jnp.isfinite(distance)
-    status = jnp.where(near, status, Status.NOT_TOUCHED.value)
-    return _edge_contact(osc, index, turn, row, edge, status, repels=True)
+    return row, edge, jnp.where(near, status, Status.NOT_TOUCHED.value)
 
 
-def _edge_contact(osc, index, turn: Turn, row, edge, status, *, repels: bool) -> BifurcationPoint:
-    """The cycle near a turn for which the end of that row lies on that edge."""
-    n = len(osc.belts)
+@jit
+def _edge_contact(osc, turn: Turn, row, edge, status, repels):
+    """The system of the cycle near a turn for which the end of that row lies on that edge, with a
+    guess of its unknowns, a status, and the judge."""
     still = lax.stop_gradient(osc)
     turn, row = _without_excursion(still, turn, row, edge)
     chain, z = meshed(still, turn)
-
-    def judge(osc, z, cycle, slope):
-        # A turn at once after the edge is passed solves the equations, too, but they are singular;
-        # and a cycle that has shrunk to a pseudo-focus meets everything there.
-        singular = (chain.ends[row] == Ends(n).turn_x1) & (z[row, 2] < 1e-6)
-        shrunk = cycle.x1_max - cycle.x1_min < AT_REST
-        solved = cycle.status == Status.OK
-        status = jnp.where(solved & (singular | shrunk), Status.NO_CONVERGENCE.value, cycle.status)
-        if repels:
-            status = jnp.where(solved & ~(slope > 1), Status.NO_UNSTABLE_CYCLE.value, status)
-        return status, jnp.asarray(jnp.nan)
-
     system = EdgeContact(chain=chain, row=row, edge=edge)
-    return _solved_point(osc, index, system, z, status, judge)
+    return system, z, status, eqx.Partial(_judge_contact, row, repels)
+
+
+def _judge_contact(row, repels, osc: Oscillator, z, cycle: Cycle, slope):
+    # A turn at once after the edge is passed solves the equations, too, but they are singular;
+    # and a cycle that has shrunk to a pseudo-focus meets everything there.
+    turns = cycle.chain.ends[row] == Ends(len(osc.belts)).turn_x1
+    shrunk = cycle.x1_max - cycle.x1_min < AT_REST
+    fails = turns & (z[row, 2] < 1e-6) | shrunk
+    solved = cycle.status == Status.OK
+    status = jnp.where(solved & fails, Status.NO_CONVERGENCE.value, cycle.status)
+    attracts = solved & repels & ~(slope > 1)
+    return jnp.where(attracts, Status.NO_UNSTABLE_CYCLE.value, status), jnp.asarray(jnp.nan)
 
 
 # --- the fold of cycles ---------------------------------------------------------------------------
@@ -740,6 +774,12 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
     So the guess is the first turn whose growth is extremal among its neighbours'; of several the
     one that closes best.
     """
+    return _solved_point(osc, index, *_extremal_turn(osc, size))
+
+
+@jit
+def _extremal_turn(osc: Oscillator, size: int):
+    """The system of `at_fold_of_cycles` with a guess of its unknowns, a status, and the judge."""
     still = lax.stop_gradient(osc)
     rests = equilibria(still)
     eligible = (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
@@ -766,16 +806,16 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
     orbit, found = jax.tree.map(lambda leaf: leaf[-1], (orbits, found))
     chain, z = meshed(still, turn_of(orbit, size, len(osc.belts)))
     status = jnp.where(jnp.any(eligible) & found, Status.OK.value, Status.NO_FOLD.value)
+    return UnitMultiplier(chain), z, status, eqx.Partial(_judge_fold, jnp.ptp(z[:, 0]))
 
-    def judge(osc, z_found, cycle, slope):
-        # A cycle that has shrunk to the equilibrium has multiplier one too: a Hopf point.
-        shrunk = jnp.ptp(z_found[:, 0]) < 0.2 * jnp.ptp(z[:, 0])
-        other = (cycle.status == Status.OK) & ~(jnp.abs(slope - 1) < 1e-6)
-        solved = (cycle.status == Status.OK) | (cycle.status == Status.NO_CONVERGENCE)
-        fails = other | (shrunk & solved)
-        return jnp.where(fails, Status.NO_FOLD.value, cycle.status), jnp.asarray(jnp.nan)
 
-    return _solved_point(osc, index, UnitMultiplier(chain), z, status, judge)
+def _judge_fold(width, osc: Oscillator, z, cycle: Cycle, slope):
+    # A cycle that has shrunk to the equilibrium has multiplier one too: a Hopf point.
+    shrunk = jnp.ptp(z[:, 0]) < 0.2 * width
+    other = (cycle.status == Status.OK) & ~(jnp.abs(slope - 1) < 1e-6)
+    solved = (cycle.status == Status.OK) | (cycle.status == Status.NO_CONVERGENCE)
+    fails = other | (shrunk & solved)
+    return jnp.where(fails, Status.NO_FOLD.value, cycle.status), jnp.asarray(jnp.nan)
 
 
 # --- points without a cycle -----------------------------------------------------------------------
@@ -845,6 +885,7 @@ def unexplained_point(osc: Oscillator, index: int, value: float, width: float) -
     return replace(point, condition=Unexplained(), status=status)
 
 
+@jit
 def at_hopf(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
     """A fixed point whose trace vanishes."""
     rests = equilibria(lax.stop_gradient(osc))
@@ -965,11 +1006,13 @@ def edge_balance(osc: Oscillator, belt: Array) -> EdgeBalance:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
 
 
+@jit
 def at_boundary_equilibrium(osc: Oscillator, index: int | Array, belts, wanted, size):
     """An equilibrium, or the end of a segment of them, lies on an edge of the first belt."""
     return _rest_on_edge(osc, index, edge_rest(lax.stop_gradient(osc), belts[0]))
 
 
+@jit
 def at_pseudo_hopf(osc: Oscillator, index: int | Array, belts, wanted, size):
     """The pseudo-focus at an edge of the first belt is neither stable nor unstable."""
     return _rest_on_edge(osc, index, edge_balance(lax.stop_gradient(osc), belts[0]))
@@ -993,16 +1036,12 @@ def _rest_on_edge(osc, index, equation: EdgeRest | EdgeBalance) -> BifurcationPo
 
 def at_rest(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
     """The first of the belts comes to rest, and a cycle sticks to it."""
+    return _belt_at_rest(osc, index, belts, *_onset_orbit(osc, belts))
+
+
+@jit
+def _belt_at_rest(osc, index, belts, moving: Oscillator, start: Array, orbit: Orbit):
     belt = belts[0]
-    still = lax.stop_gradient(osc)
-    # From a guess on the point itself there is no orbit to follow; its cycles lie beside it.
-    velocities = [
-        jnp.where((belt == i) & (one.velocity == 0), 1e-2, one.velocity)
-        for i, one in enumerate(still.belts)
-    ]
-    beside = eqx.tree_at(lambda o: [one.velocity for one in o.belts], still, velocities)
-    start = before_onset(beside, belt)
-    orbit = follow(beside, start, HINT_BUDGET)
     rows = jnp.arange(HINT_BUDGET)
     turn = (rows > orbit.repeats) & (rows < orbit.count)
     sticks = (orbit.status == Status.OK) & jnp.any(turn & (orbit.codes[:, belt] == 0))
@@ -1013,7 +1052,7 @@ def at_rest(osc: Oscillator, index: int | Array, belts, wanted, size) -> Bifurca
     def equations(osc, u):
         osc = vary(osc, index, u[1:])
         nu = _velocity(osc, belt)
-        limit = jnp.sign(_velocity(beside, belt)) * capacity(osc, mode)
+        limit = jnp.sign(_velocity(moving, belt)) * capacity(osc, mode)
         return jnp.stack([mode_acceleration(osc, mode, u[0], rest) + limit, nu])
 
     p0 = parameter(osc, index)

@@ -51,15 +51,15 @@ from .bifurcations import (
     unexplained_point,
     vary,
 )
-from .checks import as_array, check_finite, pick, require
+from .checks import as_array, check_finite, require
 from .compiling import each, jit
 from .cycles import SIZES, Cycle, Ends, Turn, last_turn, turn_events, turn_of, unstable_cycle
 from .equilibria import equilibria
 from .oscillator import Oscillator, check_oscillator
 from .results import EventKind, Status, of_one_turn
 
-#: Values of the parameter in one batch, and guesses refined in one batch.
-BATCH, GUESSES = 32, 8
+#: Values of the parameter in one batch.
+BATCH = 32
 #: Room for the arcs of one turn.
 ROOM = SIZES[1]
 #: Intervals narrower than this fraction of the span are good guesses for Newton's method.
@@ -215,7 +215,7 @@ class Path:
 
     def at(self, value: float) -> Oscillator:
         """The oscillator there."""
-        return vary(self.osc, self.index, jnp.full(1, value))
+        return vary(self.osc, self.index, jnp.asarray(np.array([value])))
 
     def unstable(self, value: float) -> Cycle:
         """The unstable cycle there, or why there is none; computed once."""
@@ -408,16 +408,11 @@ def refined(
     out = []
     for solve in dict.fromkeys(solver_of(guess.condition) for guess in guesses):
         own = [guess for guess in guesses if solver_of(guess.condition) == solve]
-        for batch in (own[i : i + GUESSES] for i in range(0, len(own), GUESSES)):
-            # Rows that are not needed are NaN, which ends at once.
-            unused = GUESSES - len(batch)
-            values = jnp.asarray(np.array([g.value for g in batch] + [np.nan] * unused))
-            belts = jnp.asarray(np.array([_belts(g.condition) for g in batch] + [(0, 0)] * unused))
-            solved = jax.tree.map(np.asarray, _points(solve, osc, index, values, belts))
-            for lane, guess in enumerate(batch):
-                if solved.status[lane] != Status.OK:
-                    continue
-                point = pick(solved, lane)
+        for guess in own:
+            data = [guess.value], _belts(guess.condition), 0.0
+            p, belts, either = (jnp.asarray(np.array(one)) for one in data)
+            point = solve(vary(osc, index, p), index, belts, either, room_for(solve))
+            if int(point.status) == Status.OK:
                 out.append((guess, replace(point, condition=_kind_found(guess.condition, point))))
     return out
 
@@ -440,11 +435,3 @@ def _belts(condition: AbstractCondition) -> tuple[int, int]:
         return condition.belts
     belt = getattr(condition, "belt", 0)
     return belt, belt
-
-
-@jit
-def _points(solve, osc: Oscillator, index: Array, values: Array, belts: Array) -> BifurcationPoint:
-    def one(p, pair):
-        return solve(vary(osc, index, p[None]), index, pair, jnp.zeros(()), room_for(solve))
-
-    return each(one)(values, belts)
