@@ -66,6 +66,7 @@ from .cycles import (
     jacobian,
     last_turn,
     meshed,
+    multiplier_and_slopes,
     newton,
     residual,
     residual_and_blocks,
@@ -73,7 +74,7 @@ from .cycles import (
     trace_of,
     turn_of,
 )
-from .equilibria import Equilibria, EquilibriumKind, equilibria
+from .equilibria import Equilibria, EquilibriumKind, candidates
 from .modes import (
     STUCK,
     Mode,
@@ -312,11 +313,7 @@ class System(eqx.Module):
         osc, along = osc_of(p), jax.jacfwd(osc_of)(p)
         value, miss, blocks = residual_and_blocks(osc, along, self.chain, z)
         of_state, of_parameter = blocks[:, :, :3], blocks[:, :, 3:]
-
-        def condition(z, p, miss):
-            return self.condition(osc_of(p), z, miss)
-
-        last, (by_z, by_p, by_miss) = jax.value_and_grad(condition, (0, 1, 2))(z, p, miss)
+        last, (by_z, by_p, by_miss) = self.condition_and_slopes(osc_of, z, p, miss)
         by_parameter = of_parameter[:, :3].reshape(-1, p.size)
         rows = jnp.concatenate([jacobian(of_state[:, :3]), by_parameter], axis=1)
         row = jnp.append(
@@ -324,6 +321,14 @@ class System(eqx.Module):
             by_p + by_miss * jnp.sum(of_parameter[:, 3], axis=0),
         )
         return jnp.append(value.reshape(-1), last), jnp.concatenate([rows, row[None]])
+
+    def condition_and_slopes(self, osc_of: Callable[[Array], Oscillator], z, p: Array, miss):
+        """The condition at the parameters p, and its derivatives with respect to z, p and miss."""
+
+        def condition(z, p, miss):
+            return self.condition(osc_of(p), z, miss)
+
+        return jax.value_and_grad(condition, (0, 1, 2))(z, p, miss)
 
     @property
     def ordinary(self) -> Chain:
@@ -687,16 +692,15 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
     wanted: 1 a turn ends it (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
     these cycles that which comes nearest to this is taken.
     """
-    turn = _turn_near_edge(osc, belts, wanted, size)
+    turn = _turn_near_edge(osc, candidates(osc), belts, wanted, size)
     return _solved_point(osc, index, *_edge_contact(osc, *turn, np.array(False)))
 
 
 @jit
-def _turn_near_edge(osc: Oscillator, belts: Array, wanted: Array, size: int):
+def _turn_near_edge(osc: Oscillator, rests: Equilibria, belts: Array, wanted: Array, size: int):
     """The turn of `at_edge`, the row of its arc, the number of the edge, a status."""
     n = len(osc.belts)
-    still = lax.stop_gradient(osc)
-    rests = equilibria(still)
+    still, rests = lax.stop_gradient((osc, rests))
 
     def run(start):
         orbit = approach(still, rests, start)
@@ -767,6 +771,11 @@ class UnitMultiplier(System):
     def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
         return closure(osc, self.chain, z)[1] - 1
 
+    def condition_and_slopes(self, osc_of: Callable[[Array], Oscillator], z, p: Array, miss):
+        along = jax.jacfwd(osc_of)(p)
+        product, by_z, by_p = multiplier_and_slopes(osc_of(p), along, self.chain, z)
+        return product - 1, (by_z, by_p, jnp.zeros_like(miss))
+
 
 def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
     """Two cycles meet where a turn neither grows nor shrinks, and neither do its neighbours.
@@ -774,14 +783,13 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
     So the guess is the first turn whose growth is extremal among its neighbours'; of several the
     one that closes best.
     """
-    return _solved_point(osc, index, *_extremal_turn(osc, size))
+    return _solved_point(osc, index, *_extremal_turn(osc, candidates(osc), size))
 
 
 @jit
-def _extremal_turn(osc: Oscillator, size: int):
+def _extremal_turn(osc: Oscillator, rests: Equilibria, size: int):
     """The system of `at_fold_of_cycles` with a guess of its unknowns, a status, and the judge."""
-    still = lax.stop_gradient(osc)
-    rests = equilibria(still)
+    still, rests = lax.stop_gradient((osc, rests))
     eligible = (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
     x1 = jnp.where(jnp.any(eligible), rests.x1[jnp.argmax(eligible)], 0.0)
 
@@ -885,10 +893,14 @@ def unexplained_point(osc: Oscillator, index: int, value: float, width: float) -
     return replace(point, condition=Unexplained(), status=status)
 
 
-@jit
 def at_hopf(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
     """A fixed point whose trace vanishes."""
-    rests = equilibria(lax.stop_gradient(osc))
+    return _hopf_point(osc, index, candidates(osc))
+
+
+@jit
+def _hopf_point(osc: Oscillator, index: int | Array, rests: Equilibria) -> BifurcationPoint:
+    rests = lax.stop_gradient(rests)
     fixed = rests.kind == EquilibriumKind.FIXED_POINT
     row = jnp.argmin(jnp.where(fixed, jnp.abs(rests.rate), jnp.inf))
     codes = rests.modes[row].astype(float)

@@ -34,7 +34,7 @@ from jaxtyping import Array, ArrayLike
 
 from .checks import as_array, check_finite, is_concrete, number, pick, require
 from .compiling import each, jit, one_kernel
-from .equilibria import EquilibriumKind, equilibria
+from .equilibria import Equilibria, EquilibriumKind, candidates
 from .extrapolation import Scheme, increments, scheme
 from .modes import (
     Mode,
@@ -768,22 +768,62 @@ def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
 @one_kernel
 def _errors_and_factors(osc: Oscillator, chain: Chain, following: Array, z: Array, entries: Array):
     """What each arc contributes to `closure`."""
-    n = len(osc.belts)
+
+    return lax.map(
+        lambda row: _error_and_factor(osc, *row),
+        (chain.codes, chain.ends, chain.mesh, following, z, entries),
+    )
+
+
+def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, entry):
+    after = flow(osc, codes, mesh, unknown[:2], unknown[2], trace_of)
+    guard = _guard(osc, codes, end, after[:2])
+    before_crossing = mode_acceleration(osc, _mode(codes), after[0], after[1])
+    after_crossing = mode_acceleration(osc, _mode(following), entry[0], entry[1])
+    slips = jnp.all(codes != 0) & (unknown[2] != 0)
+    crosses = (end < len(osc.belts)) & jnp.all(following != 0)
+    ratio = after_crossing / jnp.where(crosses, before_crossing, 1.0)
+    growth = jnp.where(slips, jnp.exp(jnp.where(slips, after[2], 0.0)), 1.0)
+    error = jnp.maximum(jnp.max(jnp.abs(after[:2] - entry)), jnp.abs(guard))
+    return error, growth * jnp.where(crosses, ratio, 1.0)
+
+
+def multiplier_and_slopes(
+    osc: Oscillator, along: Oscillator, chain: Chain, z: Array
+) -> tuple[Array, Array, Array]:
+    """The determinant that `closure` gives, and its derivatives: with respect to z, [N, 3], and
+    along the k directions `along`, as for `residual_and_blocks`, [k].
+
+    Arc by arc: backwards through all of them the program takes five times as long to compile.
+    """
+    entries = jnp.roll(z[:, :2], -1, axis=0)
+    factors, slopes = _factors_and_slopes(osc, along, chain, following_codes(chain), z, entries)
+    product = jnp.prod(factors)
+    slopes = slopes * (product / factors)[:, None]
+    by_z = slopes[:, :3].at[:, :2].add(jnp.roll(slopes[:, 3:5], 1, axis=0))
+    return product, by_z, jnp.sum(slopes[:, 5:], axis=0)
+
+
+@one_kernel
+def _factors_and_slopes(osc, along: Oscillator, chain: Chain, following, z: Array, entries: Array):
+    """The factor of each arc, [N], and its derivatives with respect to its unknowns, the entry of
+    the next one, and along the directions, [N, 5 + k]."""
+    more = jax.tree.leaves(along)[0].size
 
     def one(row):
-        codes, end, mesh, unknown, following, entry = row
-        after = flow(osc, codes, mesh, unknown[:2], unknown[2], trace_of)
-        guard = _guard(osc, codes, end, after[:2])
-        before_crossing = mode_acceleration(osc, _mode(codes), after[0], after[1])
-        after_crossing = mode_acceleration(osc, _mode(following), entry[0], entry[1])
-        slips = jnp.all(codes != 0) & (unknown[2] != 0)
-        crosses = (end < n) & jnp.all(following != 0)
-        ratio = after_crossing / jnp.where(crosses, before_crossing, 1.0)
-        growth = jnp.where(slips, jnp.exp(jnp.where(slips, after[2], 0.0)), 1.0)
-        error = jnp.maximum(jnp.max(jnp.abs(after[:2] - entry)), jnp.abs(guard))
-        return error, growth * jnp.where(crosses, ratio, 1.0)
+        codes, end, mesh, following, unknown, entry = row
 
-    return lax.map(one, (chain.codes, chain.ends, chain.mesh, z, following, entries))
+        def factor(osc, unknown, entry):
+            return _error_and_factor(osc, codes, end, mesh, following, unknown, entry)[1]
+
+        def column(direction):
+            moved = jax.tree.map(lambda slopes: jnp.sum(slopes * direction[5:]), along)
+            tangents = moved, direction[:3], direction[3:5]
+            return jax.jvp(factor, (osc, unknown, entry), tangents)
+
+        return jax.vmap(column, out_axes=(None, -1))(jnp.eye(5 + more))
+
+    return lax.map(one, (chain.codes, chain.ends, chain.mesh, following, z, entries))
 
 
 def following_codes(chain: Chain) -> Array:
@@ -930,11 +970,14 @@ def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
     return eqx.tree_at(lambda o: (o.repeats, o.count), orbit, closed), meets, top
 
 
-@jit
 def separating_turn(osc: Oscillator, size: int) -> tuple[Turn, Array, Array]:
     """A turn near the unstable cycle, a status, and how far from the equilibrium it begins."""
-    still = lax.stop_gradient(osc)
-    rests = equilibria(still)
+    return _separating_turn(osc, candidates(osc), size)
+
+
+@jit
+def _separating_turn(osc: Oscillator, rests: Equilibria, size: int):
+    still, rests = lax.stop_gradient((osc, rests))
     eligible = rests.stable & (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
     exists = jnp.any(eligible)
     x1 = jnp.where(exists, rests.x1[jnp.argmax(eligible)], 0.0)

@@ -38,7 +38,7 @@ from .compiling import jit
 from .curves import BifurcationCurve, bifurcation_curve
 from .cycles import Cycle, Ends, Turn, find_cycle, polish, room_of, unstable_cycle
 from .detection import Label, Path, by_value, edges_touched, search
-from .equilibria import Equilibria, equilibria
+from .equilibria import candidates, equilibria
 from .oscillator import Oscillator
 from .results import EventKind, Status
 from .sweep import sweep
@@ -442,7 +442,7 @@ class _Piece(NamedTuple):
 
 
 def _equilibrium_pieces(path: Path, nodes: Sequence[np.ndarray]) -> list[_Piece]:
-    found = _stacked(_rests, map(path.at, np.concatenate(nodes)))
+    found = _stacked(candidates, map(path.at, np.concatenate(nodes)))
     pieces = []
     for stretch, rows in enumerate(_consecutive(nodes)):
         values, here = nodes[stretch], jax.tree.map(lambda x, rows=rows: x[rows], found)
@@ -545,11 +545,6 @@ def _stacked(program, items: Iterable[Any]) -> Any:
     """What the program gives of each, as NumPy arrays of many rows."""
     rows = [jax.tree.map(np.asarray, program(item)) for item in items]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
-
-
-@jit
-def _rests(osc: Oscillator) -> Equilibria:
-    return equilibria(osc)
 
 
 def _attracting(path: Path, values: np.ndarray, turns: Sequence[Turn]) -> _Rows:

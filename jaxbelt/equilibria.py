@@ -116,13 +116,9 @@ def equilibria(osc: Oscillator) -> Equilibria:
     contact codes. A fixed point exactly on an edge is listed with the zone that it belongs to, and
     its eigenvalues and stability are those of that side alone.
     """
-    _check(osc)
-    found = _equilibria(osc)
-    return _trim(found, found)
-
-
-def _check(osc):
     check_oscillator(osc)
+    found = candidates(osc)
+    return _trim(found, found)
 
 
 def _trim(rows, found: Equilibria):
@@ -133,12 +129,12 @@ def _trim(rows, found: Equilibria):
 
 
 @jit
-def _equilibria(osc: Oscillator) -> Equilibria:
-    """All candidates, one a zone and one an edge, sorted; those that are none come last as NaN."""
+def candidates(osc: Oscillator) -> Equilibria:
+    """One row a zone and one an edge, sorted; those without an equilibrium come last as NaN."""
     positions = jnp.sort(jnp.stack(edges(osc)))
     zones, points = _in_zones(osc, positions), _at_edges(osc, positions)
-    candidates = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), zones, points)
-    return candidates[jnp.argsort(candidates.x1)]
+    rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), zones, points)
+    return rows[jnp.argsort(rows.x1)]
 
 
 # --- within the zones: fixed points and segments ------------------------------------------------
@@ -273,14 +269,14 @@ def lyapunov_coefficient(osc: Oscillator) -> Array:
     so of its ten derivatives only two do not vanish, d^2 x2'/dx2^2, which enters in products with
     vanishing ones only, and d^3 x2'/dx2^3: a = (d^3 x2'/dx2^3) / 16.
     """
-    _check(osc)
+    check_oscillator(osc)
     found, coefficients = _lyapunov_coefficients(osc)
     return _trim(coefficients, found)
 
 
 @jit
 def _lyapunov_coefficients(osc: Oscillator) -> tuple[Equilibria, Array]:
-    found = _equilibria(osc)
+    found = candidates(osc)
     mode = Mode(tuple(codes.astype(found.x1.dtype) for codes in jnp.moveaxis(found.modes, -1, 0)))
     is_fixed = found.kind == EquilibriumKind.FIXED_POINT
     rest = jnp.zeros_like(found.x1)
