@@ -43,22 +43,26 @@ def swept(n, **options):
     return jb.sweep(jb.presets.class_b, w1(n), **options)
 
 
-def boost(n, folder):
-    """Seconds and the sum of |x1(T)| of the C++ program beside this file, or None."""
+def built(source, folder):
+    """The C++ program of that name beside this file, built for this processor, or None."""
     compiler = shutil.which("g++")
     if compiler is None:
         return None
-    source, program = Path(__file__).with_name("sweep_peer.cpp"), folder / "peer"
-    build = [compiler, "-std=c++17", "-O3", "-march=native", "-o", str(program), str(source)]
-    if subprocess.run(build, capture_output=True).returncode != 0:
-        return None
-    runs = [
-        subprocess.run(
-            [program, str(n), str(SPAN), str(TOLERANCE)], capture_output=True, check=True
-        )
-        for _ in range(3)
-    ]
-    return min(tuple(map(float, run.stdout.split())) for run in runs)
+    program = folder / Path(source).stem
+    build = [compiler, "-std=c++17", "-O3", "-march=native", "-o", str(program)]
+    build.append(str(Path(__file__).with_name(source)))
+    return program if subprocess.run(build, capture_output=True).returncode == 0 else None
+
+
+def printed(program, *arguments):
+    """The numbers that a program prints."""
+    run = subprocess.run([program, *map(str, arguments)], capture_output=True, check=True)
+    return tuple(map(float, run.stdout.split()))
+
+
+def fastest(program, n):
+    """Seconds and the sum of |x1(T)|."""
+    return min(printed(program, n, SPAN, TOLERANCE) for _ in range(3))
 
 
 def vmapped(n):
@@ -191,11 +195,19 @@ def test_w1_side_by_side(benchmark, tmp_path, monkeypatch):
     monkeypatch.setattr(batch, "workers", lambda: 1)
     n = 256
     rows = []
-    peer = boost(n, tmp_path)
+    peer = built("sweep_peer.cpp", tmp_path)
     if peer is None:
         print("Boost.odeint: skipped, no g++ or no Boost headers")
     else:
-        rows.append(("Boost.odeint (C++)", n, *peer))
+        rows.append(("Boost.odeint (C++)", n, *fastest(peer, n)))
+    limit = built("sweep_limit.cpp", tmp_path)
+    if limit is None:
+        print("by hand: skipped, no g++ that compiles it")
+    else:
+        bits = int(*printed(limit))
+        if bits < 512:
+            print(f"by hand: no AVX-512, so this is the limit of registers of {bits} bits")
+        rows.append((f"by hand, {bits}-bit SIMD (C++)", n, *fastest(limit, n)))
     seconds, dataset = processor_time(lambda: swept(n))
     rows.append(("sweep", n, seconds, float(np.abs(dataset.x1_end).sum())))
     looped = numba_runs(64)
@@ -215,7 +227,7 @@ def test_w1_side_by_side(benchmark, tmp_path, monkeypatch):
         # Each beside `sweep` on the same grid.
         same = float(np.abs(swept(size).x1_end).sum())
         print(
-            f"{name:20s} n={size:4d} {rate:9.0f} runs/s {rate / base:7.3f} of the first, "
+            f"{name:27s} n={size:4d} {rate:9.0f} runs/s {rate / base:7.3f} of the first, "
             f"sum of |x1| {total:.6f}, off by {abs(total / same - 1):.0e}"
         )
     benchmark(lambda: swept(n))
