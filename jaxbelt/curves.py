@@ -526,8 +526,10 @@ def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
 
     With x2' = -(x1 - rest) + trace x2 + bend x2^2 and eigenvalues strong > weak, whose product is
     one, x1 - rest = weak x2 - weak bend / (2 strong - weak) x2^2 is invariant to third order. NaN
-    where the eigenvalues are complex: then the orbit turns back to the belt at once, on a small
-    cycle that touches nothing else, and no curve of tangencies ends here.
+    where they are negative, as nothing departs then, and where they are complex, a +- i b: the
+    orbit turns back to the belt within half a turn, on a cycle with -exp(pi a/b) times the belt's
+    velocity as its smallest x2. It shrinks with that velocity, so it touches nothing else, and no
+    curve of tangencies to another belt ends here.
 
     Where the law of the belt jumps, slip onset is not at that equilibrium, and the state is one
     shortly after it: x2' is the jump.
