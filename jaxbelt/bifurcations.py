@@ -154,7 +154,8 @@ class CornerCollision(_BeltCondition):
 
     It begins, or ceases, to stick to a belt there, or crosses its boundary: beyond, these come in
     another order, or another event comes instead; or, like at a nonsmooth fold, there is no cycle.
-    A guess has to lie on a side where that event is one of the cycle's.
+    A guess has to lie on a side where that event is one of the cycle's. On the other side the
+    status is NOT_TOUCHED where there is no cycle, else mostly NO_CONVERGENCE; `scan` tries both.
     """
 
 
