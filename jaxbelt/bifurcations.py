@@ -685,32 +685,36 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
         orbit = approach(still, rests, start)
         turn, (_, count) = turn_of(orbit, size, n), last_turn(orbit)
         found = orbit.status == Status.OK
-        distance, row, edge = end_near_edge(still, turn, belts[0], wanted)
+        distance, _, _ = end_near_edge(still, turn, belts[0], wanted)
         distance = jnp.where(found & (count <= size), distance, jnp.inf)
-        return turn, distance, row, edge, found & (count > size)
+        return turn, distance, found & (count > size)
 
-    turns, distances, rows, numbers, large = each(run)(starts(still, rests))
+    turns, distances, large = each(run)(starts(still, rests))
     at = jnp.argmin(distances)
     turn = jax.tree.map(lambda x: x[at], turns)
     none = jnp.where(jnp.any(large), Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
     status = jnp.where(jnp.isfinite(distances[at]), Status.OK.value, none)
-    return _edge_contact(osc, index, turn, rows[at], numbers[at], status, repels=False)
+    return edge_contact(osc, index, belts[0], wanted, turn, status, jnp.asarray(False))
 
 
 def at_edge_unstable(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
     """The unstable cycle around a stable equilibrium, with a turn on an edge of the first belt."""
-    still = lax.stop_gradient(osc)
-    turn, status, _ = separating_turn(still, size)
-    distance, row, edge = end_near_edge(still, turn, belts[0], jnp.ones(()))
-    near = (status != Status.OK) | jnp.isfinite(distance)
-    status = jnp.where(near, status, Status.NOT_TOUCHED.value)
-    return _edge_contact(osc, index, turn, row, edge, status, repels=True)
+    turn, status, _ = separating_turn(osc, size)
+    return edge_contact(osc, index, belts[0], wanted, turn, status, jnp.asarray(True))
 
 
-def _edge_contact(osc, index, turn: Turn, row, edge, status, *, repels: bool) -> BifurcationPoint:
-    """The cycle near a turn for which the end of that row lies on that edge."""
+def edge_contact(
+    osc: Oscillator, index: int | Array, belt, wanted, turn: Turn, status: Array, repels: Array
+) -> BifurcationPoint:
+    """The cycle near a turn of which an arc ends on an edge of the belt, wanted as for `at_edge`.
+
+    status: of the turn; repels: whether the cycle is to be an unstable one.
+    """
     n = len(osc.belts)
     still = lax.stop_gradient(osc)
+    distance, row, edge = end_near_edge(still, turn, belt, wanted)
+    near = (status != Status.OK) | jnp.isfinite(distance)
+    status = jnp.where(near, status, Status.NOT_TOUCHED.value)
     turn, row = _without_excursion(still, turn, row, edge)
     chain, z = meshed(still, turn)
 
@@ -721,8 +725,8 @@ def _edge_contact(osc, index, turn: Turn, row, edge, status, *, repels: bool) ->
         shrunk = cycle.x1_max - cycle.x1_min < AT_REST
         solved = cycle.status == Status.OK
         status = jnp.where(solved & (singular | shrunk), Status.NO_CONVERGENCE.value, cycle.status)
-        if repels:
-            status = jnp.where(solved & ~(slope > 1), Status.NO_UNSTABLE_CYCLE.value, status)
+        other = solved & repels & ~(slope > 1)
+        status = jnp.where(other, Status.NO_UNSTABLE_CYCLE.value, status)
         return status, jnp.asarray(jnp.nan)
 
     system = EdgeContact(chain=chain, row=row, edge=edge)

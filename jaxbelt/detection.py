@@ -43,6 +43,7 @@ from .bifurcations import (
     SuddenSliding,
     approach,
     at_edge,
+    edge_contact,
     end_near_edge,
     leaf_index,
     room_for,
@@ -53,7 +54,17 @@ from .bifurcations import (
 )
 from .checks import as_array, check_finite, pick, require
 from .compiling import each, jit
-from .cycles import SIZES, Cycle, Ends, Turn, last_turn, turn_events, turn_of, unstable_cycle
+from .cycles import (
+    SIZES,
+    Cycle,
+    Ends,
+    Turn,
+    as_turn,
+    last_turn,
+    turn_events,
+    turn_of,
+    unstable_cycle,
+)
 from .equilibria import equilibria
 from .oscillator import Oscillator
 from .results import EventKind, Status, of_one_turn
@@ -146,9 +157,10 @@ def edges_touched(path: "Path", values: np.ndarray) -> tuple[BifurcationPoint, .
     while intervals:
         a, b = intervals.pop()
         guesses = [
-            Guess((a, b), value, GrazingEdge(belt, unstable=True))
-            for belt in path.edged
+            Guess((a, b), value, GrazingEdge(belt, unstable=True), turn)
             for value in (a, b)
+            for turn in [as_turn(path.unstable(value), ROOM)]
+            for belt in path.edged
         ]
         solved = (point for _, point in refined(path.osc, path.index, guesses))
         point = next((point for point in solved if a < point.value < b), None)
@@ -329,11 +341,15 @@ def _label(seen: _Seen) -> tuple[Label, dict[Signature, Turn]]:
 
 
 class Guess(NamedTuple):
-    """A value near which a condition may hold, and the interval in which it is looked for."""
+    """A value near which a condition may hold, and the interval in which it is looked for.
+
+    turn: of the cycle that may touch an edge, where it is known, with ROOM arcs.
+    """
 
     interval: tuple[float, float]
     value: float
     condition: AbstractCondition
+    turn: Turn | None = None
 
 
 def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoint | None]:
@@ -343,11 +359,12 @@ def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoin
     # point, and its program takes longest to compile.
     for conditions_of in (_local_conditions, _edge_conditions, _fold_conditions):
         guesses = [
-            Guess((a, b), value, condition)
+            Guess((a, b), value, condition, turn)
             for (a, b), point in found.items()
             if point is None
             for condition in conditions_of(path, path.label(a), path.label(b))
             for value in (a, b)
+            for turn in _turns(path, value, condition)
         ]
         for guess, point in refined(path.osc, path.index, guesses):
             a, b = guess.interval
@@ -358,6 +375,11 @@ def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoin
             if low <= point.value <= high and found[a, b] is None:
                 found[a, b] = point
     return found
+
+
+def _turns(path: Path, value: float, condition: AbstractCondition) -> Sequence[Turn | None]:
+    """Those of the attracting cycles there, for what needs one; else one None."""
+    return list(path.turns[value].values()) if solver_of(condition) is at_edge else [None]
 
 
 def _local_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
@@ -413,20 +435,33 @@ def refined(
     what it is.
     """
     out = []
-    for solve in dict.fromkeys(solver_of(guess.condition) for guess in guesses):
-        own = [guess for guess in guesses if solver_of(guess.condition) == solve]
+    for solve in dict.fromkeys(map(_solver, guesses)):
+        own = [guess for guess in guesses if _solver(guess) == solve]
         for batch in (own[i : i + GUESSES] for i in range(0, len(own), GUESSES)):
             # Rows that are not needed are NaN, which ends at once.
             unused = GUESSES - len(batch)
             values = jnp.asarray(np.array([g.value for g in batch] + [np.nan] * unused))
             belts = jnp.asarray(np.array([_belts(g.condition) for g in batch] + [(0, 0)] * unused))
-            solved = jax.tree.map(np.asarray, _points(solve, osc, index, values, belts))
+            if solve is edge_contact:
+                lanes = [*batch, *[batch[0]] * unused]
+                turns = jax.tree.map(lambda *rows: jnp.stack(rows), *[g.turn for g in lanes])
+                repels = jnp.asarray(
+                    np.array([getattr(g.condition, "unstable", False) for g in lanes])
+                )
+                solved = _contacts(osc, index, values, belts[:, 0], turns, repels)
+            else:
+                solved = _points(solve, osc, index, values, belts)
+            solved = jax.tree.map(np.asarray, solved)
             for lane, guess in enumerate(batch):
                 if solved.status[lane] != Status.OK:
                     continue
                 point = pick(solved, lane)
                 out.append((guess, replace(point, condition=_kind_found(guess.condition, point))))
     return out
+
+
+def _solver(guess: Guess) -> Callable:
+    return edge_contact if guess.turn is not None else solver_of(guess.condition)
 
 
 def _kind_found(condition: AbstractCondition, point: BifurcationPoint) -> AbstractCondition:
@@ -455,3 +490,14 @@ def _points(solve, osc: Oscillator, index: Array, values: Array, belts: Array) -
         return solve(vary(osc, index, p[None]), index, pair, jnp.zeros(()), room_for(solve))
 
     return each(one)(values, belts)
+
+
+@jit
+def _contacts(
+    osc: Oscillator, index: Array, values, belts, turns: Turn, repels
+) -> BifurcationPoint:
+    def one(p, belt, turn, repels):
+        either, known = jnp.zeros(()), jnp.asarray(Status.OK.value)
+        return edge_contact(vary(osc, index, p[None]), index, belt, either, turn, known, repels)
+
+    return each(one)(values, belts, turns, repels)
