@@ -234,7 +234,8 @@ class Path:
 
     def at(self, value: float) -> Oscillator:
         """The oscillator there."""
-        return vary(self.osc, self.index, jnp.full(1, value))
+        # Of one type, whichever that of the value: else programs are compiled twice.
+        return vary(self.osc, self.index, jnp.asarray(np.array([value])))
 
     def unstable(self, value: float) -> Cycle:
         """The unstable cycle there, or why there is none; computed once."""
