@@ -126,7 +126,12 @@ class SuddenSliding(_BeltCondition):
 
 
 class FoldOfCycles(AbstractCondition):
-    """Two cycles that do not stick, a stable and an unstable one, meet and vanish."""
+    """Two cycles that do not stick, a stable and an unstable one, meet and vanish.
+
+    Near a degenerate Hopf point, where both shrink to the equilibrium, those with x1_max - x1_min
+    above 0.005 are found. A guess may be some two times as far from the point as that is from the
+    Hopf point.
+    """
 
 
 class SlidingExchange(AbstractCondition):
@@ -150,7 +155,8 @@ class CornerCollision(_BeltCondition):
 
     It begins, or ceases, to stick to a belt there, or crosses its boundary: beyond, these come in
     another order, or another event comes instead; or, like at a nonsmooth fold, there is no cycle.
-    A guess has to lie on a side where that event is one of the cycle's.
+    A guess has to lie on a side where that event is one of the cycle's. On the other side the
+    status is NOT_TOUCHED where there is no cycle, else mostly NO_CONVERGENCE; `scan` tries both.
     """
 
 
@@ -692,13 +698,13 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
     wanted: 1 a turn ends it (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
     these cycles that which comes nearest to this is taken.
     """
-    turn = _turn_near_edge(osc, candidates(osc), belts, wanted, size)
-    return _solved_point(osc, index, *_edge_contact(osc, *turn, np.array(False)))
+    turn, status = _turn_near_edge(osc, candidates(osc), belts, wanted, size)
+    return edge_contact(osc, index, belts, wanted, turn, status, repels=False)
 
 
 @jit
 def _turn_near_edge(osc: Oscillator, rests: Equilibria, belts: Array, wanted: Array, size: int):
-    """The turn of `at_edge`, the row of its arc, the number of the edge, a status."""
+    """The turn of `at_edge` and a status."""
     n = len(osc.belts)
     still, rests = lax.stop_gradient((osc, rests))
 
@@ -706,39 +712,42 @@ def _turn_near_edge(osc: Oscillator, rests: Equilibria, belts: Array, wanted: Ar
         orbit = approach(still, rests, start)
         turn, (_, count) = turn_of(orbit, size, n), last_turn(orbit)
         found = orbit.status == Status.OK
-        distance, row, edge = end_near_edge(still, turn, belts[0], wanted)
+        distance, _, _ = end_near_edge(still, turn, belts[0], wanted)
         distance = jnp.where(found & (count <= size), distance, jnp.inf)
-        return turn, distance, row, edge, found & (count > size)
+        return turn, distance, found & (count > size)
 
-    turns, distances, rows, numbers, large = each(run)(starts(still, rests))
+    turns, distances, large = each(run)(starts(still, rests))
     at = jnp.argmin(distances)
     turn = jax.tree.map(lambda x: x[at], turns)
     none = jnp.where(jnp.any(large), Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
     status = jnp.where(jnp.isfinite(distances[at]), Status.OK.value, none)
-    return turn, rows[at], numbers[at], status
+    return turn, status
 
 
 def at_edge_unstable(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
     """The unstable cycle around a stable equilibrium, with a turn on an edge of the first belt."""
     turn, status, _ = separating_turn(osc, size)
-    turn = turn, *_turn_on_edge(osc, turn, belts, status)
-    return _solved_point(osc, index, *_edge_contact(osc, *turn, np.array(True)))
+    return edge_contact(osc, index, belts, wanted, turn, status, repels=True)
+
+
+def edge_contact(
+    osc: Oscillator, index: int | Array, belts, wanted, turn: Turn, status: Array, *, repels: bool
+) -> BifurcationPoint:
+    """The cycle near a turn of which an arc ends on an edge of the first belt.
+
+    wanted: as for `at_edge`; status: of the turn; repels: whether the cycle is to be unstable.
+    """
+    unstable = jnp.asarray(np.array(repels))
+    return _solved_point(osc, index, *_touching_edge(osc, belts, wanted, turn, status, unstable))
 
 
 @jit
-def _turn_on_edge(osc: Oscillator, turn: Turn, belts: Array, status: Array):
-    """The row of a turn in which x1 turns nearest to an edge of the first belt, the number of the
-    edge, a status."""
-    distance, row, edge = end_near_edge(osc, turn, belts[0], jnp.ones(()))
-    near = (status != Status.OK) | jnp.isfinite(distance)
-    return row, edge, jnp.where(near, status, Status.NOT_TOUCHED.value)
-
-
-@jit
-def _edge_contact(osc, turn: Turn, row, edge, status, repels):
-    """The system of the cycle near a turn for which the end of that row lies on that edge, with a
-    guess of its unknowns, a status, and the judge."""
+def _touching_edge(osc: Oscillator, belts: Array, wanted, turn: Turn, status: Array, repels):
+    """The system of `edge_contact` with a guess of its unknowns, a status, and the judge."""
     still = lax.stop_gradient(osc)
+    distance, row, edge = end_near_edge(still, turn, belts[0], wanted)
+    near = (status != Status.OK) | jnp.isfinite(distance)
+    status = jnp.where(near, status, Status.NOT_TOUCHED.value)
     turn, row = _without_excursion(still, turn, row, edge)
     chain, z = meshed(still, turn)
     system = EdgeContact(chain=chain, row=row, edge=edge)
@@ -781,7 +790,9 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
     """Two cycles meet where a turn neither grows nor shrinks, and neither do its neighbours.
 
     So the guess is the first turn whose growth is extremal among its neighbours'; of several the
-    one that closes best.
+    one that closes best. Near a fixed point with eigenvalues rate +- i frequency the growth tends
+    to 2 pi rate/frequency, and it has an extremum there that is no more than an effect of where
+    turns begin: it differs from that limit by a term of second order in the rate.
     """
     return _solved_point(osc, index, *_extremal_turn(osc, candidates(osc), size))
 
@@ -791,7 +802,10 @@ def _extremal_turn(osc: Oscillator, rests: Equilibria, size: int):
     """The system of `at_fold_of_cycles` with a guess of its unknowns, a status, and the judge."""
     still, rests = lax.stop_gradient((osc, rests))
     eligible = (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
-    x1 = jnp.where(jnp.any(eligible), rests.x1[jnp.argmax(eligible)], 0.0)
+    row = jnp.argmax(eligible)
+    x1 = jnp.where(jnp.any(eligible), rests.x1[row], 0.0)
+    rate = jnp.where(rests.kind[row] == EquilibriumKind.FIXED_POINT, rests.rate[row], 0.0)
+    limit = 2 * jnp.pi * rate / jnp.sqrt(jnp.maximum(1 - rate**2, 1e-12))
 
     def turn(distance):
         orbit, _, top = first_turn(still, x1, distance, size)
@@ -805,6 +819,7 @@ def _extremal_turn(osc: Oscillator, rests: Equilibria, size: int):
         change = jnp.diff(growth)
         # Its neighbours may stick; what is extremal lies beside them.
         extremal = (change[1:] * change[:-1] < 0) & ~sticks[1:-1]
+        extremal = extremal & (jnp.abs(growth - limit) > 0.05 * jnp.abs(growth))[1:-1]
         at = 1 + jnp.argmin(jnp.where(extremal, jnp.abs(growth[1:-1]), jnp.inf))
         found = jnp.any(extremal)
         bracket = jnp.where(found, jnp.stack([distances[at - 1], distances[at + 1]]), bracket)

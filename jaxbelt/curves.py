@@ -64,7 +64,7 @@ from .cycles import (
     newton,
     trace_of,
 )
-from .detection import Guess, refined
+from .detection import refined
 from .equilibria import EquilibriumKind, equilibria
 from .modes import Mode, boundary_guards, edge_guards, mode_acceleration
 from .oscillator import Oscillator
@@ -393,11 +393,11 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
         for side in (1.0, -1.0):
             values = centre + side * 0.5 * problem.step * np.eye(2)[1 - free]
             held = vary(problem.osc, problem.indices[1 - free], jnp.asarray(values[1 - free])[None])
-            guesses = [
-                Guess((-np.inf, np.inf), float(values[free]) + offset * problem.step, condition)
-                for offset in (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0)
-            ]
-            for _, point in refined(held, problem.indices[free], guesses):
+            for offset in (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0):
+                guess = float(values[free]) + offset * problem.step
+                point = refined(held, problem.indices[free], guess, condition)
+                if point is None:
+                    continue
                 if isinstance(condition, GrazingEdge | CornerCollision):
                     if point.condition != condition:
                         continue
@@ -527,8 +527,10 @@ def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
 
     With x2' = -(x1 - rest) + trace x2 + bend x2^2 and eigenvalues strong > weak, whose product is
     one, x1 - rest = weak x2 - weak bend / (2 strong - weak) x2^2 is invariant to third order. NaN
-    where the eigenvalues are complex: then the orbit turns back to the belt at once, on a small
-    cycle that touches nothing else, and no curve of tangencies ends here.
+    where they are negative, as nothing departs then, and where they are complex, a +- i b: the
+    orbit turns back to the belt within half a turn, on a cycle with -exp(pi a/b) times the belt's
+    velocity as its smallest x2. It shrinks with that velocity, so it touches nothing else, and no
+    curve of tangencies to another belt ends here.
 
     Where the law of the belt jumps, slip onset is not at that equilibrium, and the state is one
     shortly after it: x2' is the jump.

@@ -712,6 +712,15 @@ class Cycle(eqx.Module):
         )
 
 
+def as_turn(cycle: Cycle, size: int) -> Turn:
+    """The turn that a cycle is, padded to `size` arcs."""
+    chain, z = cycle.chain, cycle.unknowns
+    own = np.arange(size) < len(z)
+    source = np.where(own, np.arange(size), 0)
+    ends = jnp.where(own, chain.ends[source], Ends(chain.codes.shape[-1]).unused)
+    return Turn(chain.codes[source], ends, z[source, :2], jnp.where(own, z[source, 2], 0.0))
+
+
 def turn_events(turn: Chain | Turn) -> tuple[tuple[EventKind, int], ...]:
     """The events of one turn, (kind, belt) each; for EDGE the lowest belt that comes or goes."""
     codes, ends = np.asarray(turn.codes), np.asarray(turn.ends)

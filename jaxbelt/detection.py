@@ -43,6 +43,8 @@ from .bifurcations import (
     SuddenSliding,
     approach,
     at_edge,
+    at_edge_unstable,
+    edge_contact,
     end_near_edge,
     leaf_index,
     room_for,
@@ -53,7 +55,17 @@ from .bifurcations import (
 )
 from .checks import as_array, check_finite, require
 from .compiling import each, jit
-from .cycles import SIZES, Cycle, Ends, Turn, last_turn, turn_events, turn_of, unstable_cycle
+from .cycles import (
+    SIZES,
+    Cycle,
+    Ends,
+    Turn,
+    as_turn,
+    last_turn,
+    turn_events,
+    turn_of,
+    unstable_cycle,
+)
 from .equilibria import equilibria
 from .oscillator import Oscillator, check_oscillator
 from .results import EventKind, Status, of_one_turn
@@ -145,13 +157,14 @@ def edges_touched(path: "Path", values: np.ndarray) -> tuple[BifurcationPoint, .
     points, intervals = [], changes(values) if path.edged else []
     while intervals:
         a, b = intervals.pop()
-        guesses = [
-            Guess((a, b), value, GrazingEdge(belt, unstable=True))
-            for belt in path.edged
+        solved = (
+            refined(path.osc, path.index, value, GrazingEdge(belt, unstable=True), turn)
             for value in (a, b)
-        ]
-        solved = (point for _, point in refined(path.osc, path.index, guesses))
-        point = next((point for point in solved if a < point.value < b), None)
+            for turn in [as_turn(path.unstable(value), ROOM)]
+            for belt in path.edged
+        )
+        points_inside = (point for point in solved if point is not None and a < point.value < b)
+        point = next(points_inside, None)
         middle = 0.5 * (a + b)
         if point is not None:
             points.append(point)
@@ -215,6 +228,7 @@ class Path:
 
     def at(self, value: float) -> Oscillator:
         """The oscillator there."""
+        # Of one type, whichever that of the value: else programs are compiled twice.
         return vary(self.osc, self.index, jnp.asarray(np.array([value])))
 
     def unstable(self, value: float) -> Cycle:
@@ -321,36 +335,37 @@ def _label(seen: _Seen) -> tuple[Label, dict[Signature, Turn]]:
 # --- what makes the difference between two values -------------------------------------------------
 
 
-class Guess(NamedTuple):
-    """A value near which a condition may hold, and the interval in which it is looked for."""
-
-    interval: tuple[float, float]
-    value: float
-    condition: AbstractCondition
-
-
 def _explain(path: Path, intervals) -> dict[tuple[float, float], BifurcationPoint | None]:
     """For every interval a bifurcation point inside it, or None."""
     found: dict[tuple[float, float], BifurcationPoint | None] = dict.fromkeys(intervals)
     # A fold is looked for last: most intervals in which smooth cycles come or go have another
     # point, and its program takes longest to compile.
     for conditions_of in (_local_conditions, _edge_conditions, _fold_conditions):
-        guesses = [
-            Guess((a, b), value, condition)
-            for (a, b), point in found.items()
-            if point is None
-            for condition in conditions_of(path, path.label(a), path.label(b))
-            for value in (a, b)
-        ]
-        for guess, point in refined(path.osc, path.index, guesses):
-            a, b = guess.interval
-            low, high = a, b
-            if isinstance(point.condition, FoldOfCycles):
-                # Beyond a fold orbits pass the place of the cycles slowly, as if they were there.
-                low, high = path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]
-            if low <= point.value <= high and found[a, b] is None:
-                found[a, b] = point
+        for a, b in intervals:
+            if found[a, b] is None:
+                conditions = conditions_of(path, path.label(a), path.label(b))
+                found[a, b] = _explained(path, a, b, conditions)
     return found
+
+
+def _explained(path: Path, a: float, b: float, conditions) -> BifurcationPoint | None:
+    """The first of the conditions that holds within an interval."""
+    for condition in conditions:
+        low, high = a, b
+        if isinstance(condition, FoldOfCycles):
+            # Beyond a fold orbits pass the place of the cycles slowly, as if they were there.
+            low, high = path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]
+        for value in (a, b):
+            for turn in _turns(path, value, condition):
+                point = refined(path.osc, path.index, value, condition, turn)
+                if point is not None and low <= point.value <= high:
+                    return point
+    return None
+
+
+def _turns(path: Path, value: float, condition: AbstractCondition) -> Sequence[Turn | None]:
+    """Those of the attracting cycles there, for what needs one; else one None."""
+    return list(path.turns[value].values()) if solver_of(condition) is at_edge else [None]
 
 
 def _local_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
@@ -385,11 +400,12 @@ def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
         if other != belt and float(its.velocity) == value:
             conditions.append(SlidingExchange((min(belt, other), max(belt, other))))
     interval = path.beside(value)
-    guesses = [
-        Guess(interval, value + offset, one) for one in conditions for offset in (1e-2, -1e-2)
-    ]
-    solved = refined(path.osc, path.index, guesses)
-    found = {guess.condition: point for guess, point in solved}
+    found = {}
+    for condition in conditions:
+        for offset in (1e-2, -1e-2):
+            point = refined(path.osc, path.index, value + offset, condition)
+            if point is not None:
+                found[condition] = point
     path.look(interval)
     before, after = map(path.label, interval)
     if not found and before != after:
@@ -398,23 +414,28 @@ def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
 
 
 def refined(
-    osc: Oscillator, index: Array, guesses: Sequence[Guess]
-) -> list[tuple[Guess, BifurcationPoint]]:
-    """The guesses from which a point was found, those of one kind after those of another, with it.
+    osc: Oscillator,
+    index: Array,
+    value: float,
+    condition: AbstractCondition,
+    turn: Turn | None = None,
+) -> BifurcationPoint | None:
+    """The point that is found from that value of the parameter, or None.
 
     A tangency, or an end of an arc on an edge, of whichever kind it is looked for, is returned as
-    what it is.
+    what it is. turn: of the cycle that may touch an edge, where it is known, with ROOM arcs.
     """
-    out = []
-    for solve in dict.fromkeys(solver_of(guess.condition) for guess in guesses):
-        own = [guess for guess in guesses if solver_of(guess.condition) == solve]
-        for guess in own:
-            data = [guess.value], _belts(guess.condition), 0.0
-            p, belts, either = (jnp.asarray(np.array(one)) for one in data)
-            point = solve(vary(osc, index, p), index, belts, either, room_for(solve))
-            if int(point.status) == Status.OK:
-                out.append((guess, replace(point, condition=_kind_found(guess.condition, point))))
-    return out
+    p, belts, either = (jnp.asarray(np.array(x)) for x in ([value], _belts(condition), 0.0))
+    at = vary(osc, index, p)
+    if turn is None:
+        solve = solver_of(condition)
+        point = solve(at, index, belts, either, room_for(solve))
+    else:
+        known, repels = jnp.asarray(Status.OK.value), solver_of(condition) is at_edge_unstable
+        point = edge_contact(at, index, belts, either, turn, known, repels=repels)
+    if int(point.status) != Status.OK:
+        return None
+    return replace(point, condition=_kind_found(condition, point))
 
 
 def _kind_found(condition: AbstractCondition, point: BifurcationPoint) -> AbstractCondition:

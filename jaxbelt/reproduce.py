@@ -29,7 +29,7 @@ from .bifurcations import (
     leaf_index,
 )
 from .cycles import Cycle, unstable_cycle
-from .detection import Guess, refined
+from .detection import refined
 from .diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
 from .equilibria import Equilibria, equilibria
 from .oscillator import Belt, Oscillator
@@ -107,13 +107,9 @@ def critical_values() -> tuple[CriticalValue, ...]:
         rows = [published for published in PUBLISHED if published.system == system]
         osc = _with_two_belts(paper_oscillator(system, rows[0].printed))
         wanted = {row: CONDITIONS[system, row.point] for row in rows}
-        guesses = []
+        index = jnp.asarray(np.array(leaf_index(osc, _velocity)))
         for row in rows:
-            guess = row.printed + AWAY
-            guesses.append(Guess((row.printed - AWAY, guess), guess, wanted[row]))
-        points = dict(refined(osc, jnp.asarray(np.array(leaf_index(osc, _velocity))), guesses))
-        for row, guess in zip(rows, guesses, strict=True):
-            point = points.get(guess)
+            point = refined(osc, index, row.printed + AWAY, wanted[row])
             if point is None or point.condition != wanted[row]:
                 values[row] = CriticalValue(*row, math.nan, math.nan, 0, None)
                 continue

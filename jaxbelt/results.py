@@ -64,7 +64,8 @@ ADVICE = {
     ),
     Status.TOO_MANY_ARCS: "A turn has more arcs than there is room for: pass a larger max_arcs.",
     Status.NO_CONVERGENCE: (
-        "Newton's method did not converge from this guess; there may be no such solution near it."
+        "Newton's method did not converge from this guess; there may be no such solution near it, "
+        "or none that this side of it leads to: try a guess on the other side."
     ),
     Status.NOT_ADMISSIBLE: (
         "The solution of the equations leaves its modes (an arc passes a boundary, or ends before "
@@ -75,8 +76,9 @@ ADVICE = {
         "equilibrium is stable, or everything comes to rest there."
     ),
     Status.NOT_TOUCHED: (
-        "No cycle comes near the boundary or an edge of that belt here, so no such point is near; "
-        "try another belt or another value of the parameter."
+        "No cycle comes near the boundary or an edge of that belt here, so no such point is near, "
+        "or the cycle ends in it and exists on its other side only; try another belt or another "
+        "value of the parameter."
     ),
     Status.OTHER_KIND: (
         "The cycle does touch the boundary at a point near here, but the point is of another kind: "

@@ -137,9 +137,9 @@ def test_a_guess_that_fits_no_such_point_is_told_so(condition, nu, status):
     assert jnp.isnan(point.value) and jb.describe(status) in repr(point)
 
 
-@pytest.mark.parametrize("nu", [0.483, 0.52])
+@pytest.mark.parametrize("nu", [0.483, 0.4867, 0.52])
 def test_fold_of_cycles(nu):
-    """Two cycles that do not stick meet; from guesses on either side, 0.015 and 0.02 away."""
+    """Two cycles that do not stick meet; from guesses on either side, up to 0.02 away."""
     point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.4, (jb.Belt(nu, BELL),)), where=nu0)
 
     def make(nu):
@@ -151,6 +151,31 @@ def test_fold_of_cycles(nu):
     assert point.residual < 1e-11 and point.iterations <= 8
     assert point.cycle.multiplier == pytest.approx(1, abs=1e-10)
     assert point.cycle.signature == ()
+
+
+@pytest.mark.parametrize("short", [1e-2, 1e-3])
+def test_fold_of_small_cycles(short):
+    """For damping 0.5 and nu 0.4 the Hopf point is degenerate. For less damping the fold
+    is at 1.44 times the square of the difference from the Hopf point, the amplitude like its root.
+    """
+    osc = jb.Oscillator(0.5 - short, (jb.Belt(0.4 + 0.8 * short, BELL),))
+    hopf = jb.refine(jb.Hopf(), osc, where=nu0).oscillator
+
+    def make(nu):
+        return oracle.Oscillator(0.5 - short, (oracle.Belt(nu, bell, 1.0, 1.0),), 1.0)
+
+    start, away = nu0(hopf), 1.44 * short**2
+    amplitude = 0.88 * np.sqrt(short)
+    expected = oracle_cycles.fold_of_cycles(
+        make, (start + 0.9 * away, start + 1.1 * away), (0.5 * amplitude, 2 * amplitude)
+    )
+    for offset in (-1.0, 0.0, 0.3, 2.0, 3.0):
+        osc = jb.Oscillator(0.5 - short, (jb.Belt(start + offset * away, BELL),))
+        point = jb.refine(jb.FoldOfCycles(), osc, where=nu0)
+        # The oracle's turns are good to 1e-13, relative to the amplitude.
+        assert point.value == pytest.approx(expected, abs=1e-11) and point.error < 1e-11
+        assert point.residual < 1e-11
+        assert point.cycle.x1_max - point.cycle.x1_min == pytest.approx(2 * amplitude, rel=0.05)
 
 
 def test_a_hopf_point_is_no_fold_of_cycles():

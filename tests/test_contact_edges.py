@@ -1,5 +1,6 @@
 """Bifurcations at contact edges: against the oracle and closed forms, found, refined, followed."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -193,6 +194,31 @@ def test_refined_from_either_side(diagram, condition, number, offset):
     assert point.status == Status.OK and point.condition == condition
     assert point.value == pytest.approx(exact, abs=1e-12)
     assert point.iterations <= 7 and point.residual < 1e-11 and point.error < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("osc", "where", "exact", "offset", "status"),
+    [
+        # Slip onset in the corner: on one side the stick phase is ended by it, on the other by the
+        # edge, where the mass is torn off.
+        (overlapping(0.9), sigma1, 0.9, -0.01, Status.OK),
+        (overlapping(0.9), sigma1, 0.9, 0.01, Status.NO_CONVERGENCE),
+        (overlapping(1.66), sigma1, 1.66, 0.01, Status.OK),
+        (overlapping(1.66), sigma1, 1.66, -0.01, Status.NO_CONVERGENCE),
+        # The phase begins and ends in the corner, and there is no cycle beyond.
+        (jb.presets.class_c(0.0, -0.25, 0.4), nu0, 0.233547455622, -0.01, Status.OK),
+        (jb.presets.class_c(0.0, -0.25, 0.4), nu0, 0.233547455622, 0.01, Status.NOT_TOUCHED),
+    ],
+)
+def test_a_corner_from_the_side_that_does_not_lead_there(osc, where, exact, offset, status):
+    guess = eqx.tree_at(where, osc, jnp.asarray(exact + offset))
+    point = jb.refine(jb.CornerCollision(0), guess, where=where)
+    assert point.status == status
+    if status == Status.OK:
+        assert point.value == pytest.approx(exact, abs=1e-11)
+    else:
+        assert jnp.isnan(point.value) and jnp.isnan(point.residual)
+        assert "other side" in repr(point)
 
 
 def test_what_fits_no_such_point_is_told_so():

@@ -11,7 +11,8 @@ from scipy.optimize import brentq
 import jaxbelt as jb
 from jaxbelt.bifurcations import leaf_index, vary
 from jaxbelt.continuation import End
-from jaxbelt.detection import Guess, refined
+from jaxbelt.curves import _departure
+from jaxbelt.detection import refined
 
 
 def nu0(osc):
@@ -59,10 +60,11 @@ def errors(curve, osc, where, condition, rows):
         values, chord = curve.values[row], curve.values[row + 1] - curve.values[row - 1]
         free = int(np.argmin(np.abs(chord)))
         held = vary(osc, indices[1 - free], jnp.asarray(values[1 - free])[None])
-        guesses = [
-            Guess((-1.0, 1.0), float(values[free]) + offset, condition) for offset in (-1e-3, 1e-3)
+        solved = [
+            refined(held, indices[free], float(values[free]) + offset, condition)
+            for offset in (-1e-3, 1e-3)
         ]
-        points = [point for _, point in refined(held, indices[free], guesses)]
+        points = [point for point in solved if point is not None]
         assert curve.kinds[row] in {point.kind for point in points}
         found.append(np.nanmin([abs(float(point.value) - values[free]) for point in points]))
     return found
@@ -275,3 +277,29 @@ def test_an_exchange_ends_where_the_cycle_does(points):
 def test_impossible_arguments_are_named(points, where, span, message):
     with pytest.raises(ValueError, match=message):
         jb.bifurcation_curve(points[0], where, span)
+
+
+def test_nothing_departs_from_a_belt_at_rest_in_a_focus():
+    """The cycle there shrinks with the velocity of the belt, in a ratio that is known."""
+    law = jb.Conti(1.0, 0.6, 2.0)
+
+    def gentle(nu):
+        return jb.Oscillator(0.3, (jb.Belt(-0.2, law), jb.Belt(nu, law)))
+
+    codes, resting = jnp.array([-1.0, 1.0]), jnp.asarray(1)
+    assert np.all(np.isnan(_departure(gentle(0.0), codes, resting)))
+    a = 0.5 * (0.8 + 0.8 / 1.4**2 - 0.3)  # half the trace; the determinant is one
+    for nu in (1e-4, 1e-5):
+        cycle = jb.find_cycle(gentle(nu), (0.32, nu))
+        assert [belt for _, belt in cycle.signature] == [1, 1]
+        # Where the law bends counts in first order.
+        expected = -np.exp(np.pi * a / np.sqrt(1 - a**2))
+        assert cycle.x2_min / nu == pytest.approx(expected, rel=20 * nu)
+
+    # With real eigenvalues the orbit is followed backwards to the equilibrium, along their line.
+    osc = jb.presets.class_b(-0.3, 0.0)
+    y = np.asarray(_departure(osc, codes, resting))
+    rest = 1 - 0.6 - 0.4 / 4
+    trace = 4 + 4 / 4**2 - 0.5
+    strong = 0.5 * trace + np.sqrt(0.25 * trace**2 - 1)
+    assert y[1] < 0 and (y[0] - rest) / y[1] == pytest.approx(1 / strong, rel=1e-3)
