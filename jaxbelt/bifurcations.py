@@ -409,6 +409,8 @@ def _solved_point(osc, index, system, z0, status, judge) -> BifurcationPoint:
     gives the status and the multiplier to be told. It carries its data with it, as `eqx.Partial`:
     one program serves a kind of system."""
     p0 = lax.stop_gradient(parameter(osc, index)[None])
+    # Without a guess Newton's method ends at once.
+    z0 = jnp.where(status == Status.OK, z0, jnp.nan)
     z, p, steps, matrix = _solve_system(osc, index, system, z0, p0)
     iterations = jnp.sum(~jnp.isnan(steps))
     at_point = vary(osc, index, p)

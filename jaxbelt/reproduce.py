@@ -539,7 +539,7 @@ FIGURES = sorted([*PORTRAITS, "fig01", "fig02", "fig03", "fig06", "fig07", "form
 
 def steps() -> int:
     """How many times `reproduce` reports progress."""
-    return len(FIGURES) + 3
+    return len(FIGURES) + 2
 
 
 def reproduce(
@@ -550,9 +550,9 @@ def reproduce(
     folder: made where it is not there. progress: called `steps()` times, with what comes next.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    # From a cold start nearly all the time goes into compiling. Two threads use two cores: this one
-    # finds bifurcations, with programs that follow from one another, and the other one does the
-    # rest, and all the drawing.
+    # From a cold start most of the time goes into compiling. Two threads use two cores: this one
+    # goes the longest way, to the region map; the other one does the rest, and all the drawing. The
+    # diagrams come last, because the map needs most of their programs before.
     with ThreadPoolExecutor(1) as beside:
         drawings: list[Future] = []
 
@@ -572,12 +572,11 @@ def reproduce(
         text = json.dumps(as_json(values), indent=2)
         (folder / "critical_values.json").write_text(text + "\n", encoding="utf-8")
 
-        progress("bifurcation diagrams")
         panels = {name: figure.panels(values) for name, figure in PORTRAITS.items()}
         for name, own in panels.items():
             draw(name, draw_portraits, PORTRAITS[name], own)
-        draw("fig03", draw_diagram, diagram_a(), MISPRINT)
-        draw("fig07", draw_diagram, diagram_b(), MISSING_REGION)
+        draw("fig03", lambda: draw_diagram(diagram_a(), MISPRINT))
+        draw("fig07", lambda: draw_diagram(diagram_b(), MISSING_REGION))
         progress("region map")
         draw("fig06", draw_map, map_b())
         for drawing in drawings:
