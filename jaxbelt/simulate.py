@@ -13,7 +13,7 @@ monotone, so the sign at the end of a step tells all. Between two zeros of x2' l
 since x2'' = -x2 there: more than one turn in a step would take a turn of the phase within it, which
 `MAX_ARC` and `MAX_STEP` exclude.
 
-Samples at given times are taken from the arcs afterwards, all in parallel.
+Samples at given times are taken from the arcs afterwards, in parallel.
 """
 
 import functools
@@ -57,11 +57,11 @@ MAX_STEP, FIRST_STEP = 0.5, 0.2
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
 #: because near-grazing events amplify them.
 SAFETY = 0.03
-#: Longest slip arc, well below half a turn; longer ones are cut. Samples start near their time so.
+#: Longest slip arc, well below half a turn; longer ones are cut.
 MAX_ARC = 1.0
 #: Segments are run in blocks of so many; the budget is rounded up to whole blocks.
 BLOCK = 32
-#: Samples computed at once.
+#: Lanes in which samples are computed.
 SAMPLED = 32
 #: Steps that one segment may take before it is given up.
 MAX_STEPS = 100_000
@@ -186,15 +186,17 @@ def _integrate(osc, mode, y, span, rtol, atol, left=None):
         # A lane that has nothing to do, and may be NaN, must not keep a batch waiting.
         return jnp.where(span > 0, jnp.maximum(*(jnp.abs(part) for part in y)), 0.0)
 
+    # Where no event is looked for, a step may be as long as its error allows.
+    first, longest = (1.0, 1.0) if left is None else (FIRST_STEP, MAX_STEP)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
         _Extrapolation(),
         t0=0.0,
         t1=1.0,
-        dt0=FIRST_STEP,
+        dt0=first,
         y0=y,
         saveat=diffrax.SaveAt(solver_state=True),
-        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol, dtmax=MAX_STEP, norm=norm),
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol, dtmax=longest, norm=norm),
         event=None if left is None else diffrax.Event(left),
         adjoint=diffrax.ForwardMode(),
         max_steps=MAX_STEPS,
@@ -544,21 +546,31 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     since = jnp.where(beyond, 0.0, ts - arcs.t)
     stuck = jnp.any(arcs.mode == 0, axis=1)
 
-    def at(osc, rtol, atol, arc, since, stuck):
+    def at(osc, rtol, atol, arc, since, stuck, goes_on, before, y):
         mode = Mode(tuple(arc.mode[j].astype(float) for j in range(len(osc.belts))))
-        flown = _flow(osc, mode, (arc.y[0], arc.y[1]), jnp.where(stuck, 0.0, since), rtol, atol)
+        start = select(goes_on, (y[0], y[1]), (arc.y[0], arc.y[1]))
+        duration = jnp.where(stuck, 0.0, since - jnp.where(goes_on, before, 0.0))
+        flown = _flow(osc, mode, start, duration, rtol, atol)
         v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
         carried = arc.y[0] + v * since, v
         return jnp.stack(select(stuck, carried, flown))
 
-    # A few at a time, and those together that are as far from where their arc begins.
-    order = jnp.argsort(lax.stop_gradient(jnp.where(stuck, 0.0, since)))
+    # As many pieces of the times as lanes. Each lane goes from one of its samples to the next, or
+    # from where the next one's arc begins.
+    first = jnp.arange(ts.size) % max(ts.size // SAMPLED, 1) == 0
+    goes_on = (numbers == jnp.roll(numbers, 1)) & ~beyond & ~first
     rows = jax.tree.map(
-        lambda leaf: leaf[order].reshape(-1, SAMPLED, *leaf.shape[1:]), (arcs, since, stuck)
+        lambda leaf: jnp.swapaxes(leaf.reshape(SAMPLED, -1, *leaf.shape[1:]), 0, 1),
+        (arcs, since, stuck, goes_on, jnp.roll(since, 1)),
     )
-    some = one_kernel(jax.vmap(at, (None, None, None, 0, 0, 0)))
-    ys = lax.map(lambda row: some(osc, rtol, atol, *row), rows)
-    ys = ys.reshape(-1, 2)[jnp.argsort(order)]
+    some = one_kernel(jax.vmap(at, (None, None, None, 0, 0, 0, 0, 0, 0)))
+
+    def advance(y, row):
+        y = some(osc, rtol, atol, *row, y)
+        return y, y
+
+    _, ys = lax.scan(advance, jnp.zeros((SAMPLED, 2)), rows)
+    ys = jnp.swapaxes(ys, 0, 1).reshape(-1, 2)
     afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
     ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)
     return jnp.where(beyond[:, None], afterwards, ys)[:wanted], arcs.mode[:wanted]
