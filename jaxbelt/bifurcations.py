@@ -135,7 +135,7 @@ class FoldOfCycles(AbstractCondition):
 
 
 class SlidingExchange(AbstractCondition):
-    """Two belts run at one velocity: the cycle changes from sticking to one to the other."""
+    """Two belts run at one velocity: where both touch, the cycle changes from one to the other."""
 
     belts: tuple[int, int] = eqx.field(static=True)
 
@@ -565,12 +565,13 @@ def _touching(osc: Oscillator, orbit: Orbit, belts: Array, wanted: Array, size: 
     orbit = jax.tree.map(lambda a, b: jnp.where(repeated, a, b), orbit, first_turn)
     _, count = last_turn(orbit)
     turn = turn_of(orbit, size, n)
-    sticks_to = [jnp.any(turn.used & (turn.codes[:, k] == 0)) for k in (belt, other)]
+    sticks = jnp.any(turn.codes[:, belts] == 0, axis=-1)
+    exchanges = jnp.any(turn.used & sticks & _both_touch(turn.codes, belts))
     touching, row, found = _with_stick(still, turn, belt)
     turn = jax.tree.map(lambda a, b: jnp.where(exchange, a, b), turn, touching)
     chain, z = meshed(still, turn)
 
-    usable = jnp.where(exchange, repeated & (sticks_to[0] != sticks_to[1]), found)
+    usable = jnp.where(exchange, repeated & exchanges, found)
     usable = usable & (repeated | returns)
     status = jnp.where(usable, Status.OK.value, Status.NOT_TOUCHED.value)
     fits = count < jnp.where(exchange, size + 1, size)  # a tangency may need one arc more
@@ -585,15 +586,23 @@ def _touching(osc: Oscillator, orbit: Orbit, belts: Array, wanted: Array, size: 
     return system, z, status, eqx.Partial(_judge_encounter, belts, wanted, row)
 
 
+def _both_touch(codes: Array, belts: Array) -> Array:
+    """Whether two belts both touch, by the contact codes of each arc."""
+    return jnp.all(jnp.abs(codes[:, belts]) < 1.5, axis=-1)
+
+
 def _judge_encounter(belts, wanted, row, osc: Oscillator, z, cycle: Cycle, slope):
     belt, other = belts[0], belts[1]
     exchange, chain = belt != other, cycle.chain
     others = jnp.any(chain.codes == 0, axis=-1) & chain.used & (jnp.arange(chain.ends.size) != row)
     slope = jnp.where(z[row, 2] > 1e-6, jnp.inf, slope)  # a square root of rounding is no phase
     slope = jnp.where(jnp.any(others), 0.0, slope)
+    # An exchange needs the same cycle with the belts swapped where both touch; a tangency is of one
+    # kind.
     swap = jnp.arange(len(osc.belts)).at[belt].set(other).at[other].set(belt)
-    swapped = Chain(chain.codes[:, swap], chain.ends, chain.mesh)
-    # An exchange needs the same cycle with the belts swapped; a tangency is of one kind.
+    both = _both_touch(chain.codes, belts)[:, None]
+    codes = jnp.where(both, chain.codes[:, swap], chain.codes)
+    swapped = Chain(codes, chain.ends, chain.mesh)
     is_wanted = (wanted == 0) | (wanted * (slope - 1) >= 0)  # the slope may be infinite
     fits = jnp.where(exchange, admissible(osc, swapped, z), is_wanted)
     slope = jnp.where(exchange, jnp.nan, slope)

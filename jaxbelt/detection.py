@@ -62,6 +62,8 @@ from .cycles import (
     Turn,
     as_turn,
     last_turn,
+    polish,
+    room_of,
     turn_events,
     turn_of,
     unstable_cycle,
@@ -114,24 +116,24 @@ def search(path: "Path", resolution: int = 96) -> tuple[BifurcationPoint, ...]:
         if b > a:
             stretches.append(np.linspace(a, b, 1 + max(1, round((b - a) / width))))
     path.look(np.concatenate(stretches))
-    intervals = [pair for stretch in stretches for pair in pairwise(stretch)]
-    while intervals := [(a, b) for a, b in intervals if path.label(a) != path.label(b)]:
-        near = [(a, b) for a, b in intervals if b - a <= NEAR * path.length]
-        found = _explain(path, near)
-        points += [point for point in found.values() if point is not None]
-        cut = []
+    settled = [path.beside(at) for at in path.breaks]
+    while intervals := path.changes(settled):
+        found = _explain(path, [(a, b) for a, b in intervals if b - a <= NEAR * path.length])
+        values: list[float] = []
         for a, b in intervals:
             point = found.get((a, b))
             if point is not None:
+                points.append(point)
                 slow = isinstance(point.condition, FoldOfCycles)
                 before, after = path.beside(float(point.value), slow=slow)
-                cut += [[a, max(a, before)], [min(b, after), b]]
+                settled.append((before, after))
+                values += [max(a, before), min(b, after)]
             elif b - a <= 1e-9 * path.length:
                 points.append(unexplained_point(path.osc, int(path.index), 0.5 * (a + b), b - a))
+                settled.append((a, b))
             else:
-                cut.append(list(np.linspace(a, b, 3 if b - a <= NEAR * path.length else 9)))
-        path.look([value for values in cut for value in values])
-        intervals = [pair for values in cut for pair in pairwise(values) if pair[0] < pair[1]]
+                values += np.linspace(a, b, 3 if b - a <= NEAR * path.length else 9).tolist()
+        path.look(values)
     return by_value(points)
 
 
@@ -224,6 +226,7 @@ class Path:
         self.labels: dict[float, Label] = {}
         self.turns: dict[float, dict[Signature, Turn]] = {}
         self.unstable_cycles: dict[float, Cycle] = {}
+        self._missing: set[tuple[float, float, Signature]] = set()
         self.breaks = self._coincidences()
 
     def at(self, value: float) -> Oscillator:
@@ -283,6 +286,43 @@ class Path:
             for lane, value in enumerate(batch):
                 at_value = jax.tree.map(lambda x, i=lane: x[i], seen)
                 self.labels[float(value)], self.turns[float(value)] = _label(at_value)
+        self._share()
+
+    def changes(self, settled: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        """The intervals between values looked at that differ, but for those that are settled."""
+        return [
+            (a, b)
+            for a, b in pairwise(sorted(self.labels))
+            if self.labels[a] != self.labels[b]
+            and not any(low <= a and b <= high for low, high in settled)
+        ]
+
+    def _share(self) -> None:
+        """Let values know cycles that attract at the ones beside them.
+
+        A cycle that sticks is always reached, from slip onset. One that does not may be missed.
+        """
+        values = sorted(self.labels)
+        for pairs in (pairwise(values), pairwise(values[::-1])):
+            for known, value in pairs:
+                for signature in self.labels[known].cycles - self.labels[value].cycles:
+                    sticks = any(kind == EventKind.STICK for kind, _ in signature)
+                    if not sticks and (known, value, signature) not in self._missing:
+                        self._carry(known, value, signature)
+
+    def _carry(self, known: float, value: float, signature: Signature) -> None:
+        """Look for a cycle that attracts at one value at another one."""
+        turn = self.turns[known][signature]
+        room = slice(room_of(int(np.sum(turn.ends != Ends(len(self.osc.belts)).unused))))
+        turn = jax.tree.map(lambda leaf: leaf[room], turn)
+        cycle = polish(self.at(value), turn, jnp.asarray(Status.OK.value))
+        found = int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1
+        if found and of_one_turn(cycle.signature) == signature:
+            self.turns[value][signature] = jax.tree.map(np.asarray, as_turn(cycle, ROOM))
+            before = self.labels[value]
+            self.labels[value] = Label(before.equilibria, before.cycles | {signature})
+        else:
+            self._missing.add((known, value, signature))
 
     def label(self, value: float) -> Label:
         """The label there, which `look` has found."""
@@ -409,7 +449,9 @@ def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
     path.look(interval)
     before, after = map(path.label, interval)
     if not found and before != after:
-        return [unexplained_point(path.osc, int(path.index), value, 0.0)]
+        # Something else may happen just there.
+        point = _explain(path, [interval])[interval]
+        return [point or unexplained_point(path.osc, int(path.index), value, 0.0)]
     return list(found.values())
 
 
