@@ -805,12 +805,12 @@ def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) 
     to 2 pi rate/frequency, and it has an extremum there that is no more than an effect of where
     turns begin: it differs from that limit by a term of second order in the rate.
     """
-    return _solved_point(osc, index, *_extremal_turn(osc, candidates(osc), size))
+    return fold_near(osc, index, *_extremal_turn(osc, candidates(osc), size))
 
 
 @jit
 def _extremal_turn(osc: Oscillator, rests: Equilibria, size: int):
-    """The system of `at_fold_of_cycles` with a guess of its unknowns, a status, and the judge."""
+    """The turn of `at_fold_of_cycles`, and a status."""
     still, rests = lax.stop_gradient((osc, rests))
     eligible = (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
     row = jnp.argmax(eligible)
@@ -838,8 +838,19 @@ def _extremal_turn(osc: Oscillator, rests: Equilibria, size: int):
 
     _, (orbits, found) = lax.scan(narrow, jnp.array([1e-3, 10.0]), None, length=2)
     orbit, found = jax.tree.map(lambda leaf: leaf[-1], (orbits, found))
-    chain, z = meshed(still, turn_of(orbit, size, len(osc.belts)))
     status = jnp.where(jnp.any(eligible) & found, Status.OK.value, Status.NO_FOLD.value)
+    return turn_of(orbit, size, len(osc.belts)), status
+
+
+def fold_near(osc: Oscillator, index: int | Array, turn: Turn, status: Array) -> BifurcationPoint:
+    """The cycle near a turn that is to have multiplier one; status: of the turn."""
+    return _solved_point(osc, index, *_closing(osc, turn, status))
+
+
+@jit
+def _closing(osc: Oscillator, turn: Turn, status: Array):
+    """The system of `fold_near` with a guess of its unknowns, a status, and the judge."""
+    chain, z = meshed(lax.stop_gradient(osc), turn)
     return UnitMultiplier(chain), z, status, eqx.Partial(_judge_fold, jnp.ptp(z[:, 0]))
 
 

@@ -46,6 +46,7 @@ from .bifurcations import (
     at_edge_unstable,
     edge_contact,
     end_near_edge,
+    fold_near,
     leaf_index,
     room_for,
     solver_of,
@@ -61,8 +62,8 @@ from .cycles import (
     Ends,
     Turn,
     as_turn,
+    find_cycle,
     last_turn,
-    polish,
     room_of,
     turn_events,
     turn_of,
@@ -204,7 +205,7 @@ class Label(NamedTuple):
     @property
     def smooth(self) -> int:
         """How many cycles stick to no belt."""
-        return sum(all(kind != EventKind.STICK for kind, _ in cycle) for cycle in self.cycles)
+        return sum(not _sticks(cycle) for cycle in self.cycles)
 
 
 class Path:
@@ -306,18 +307,18 @@ class Path:
         for pairs in (pairwise(values), pairwise(values[::-1])):
             for known, value in pairs:
                 for signature in self.labels[known].cycles - self.labels[value].cycles:
-                    sticks = any(kind == EventKind.STICK for kind, _ in signature)
-                    if not sticks and (known, value, signature) not in self._missing:
+                    if not _sticks(signature) and (known, value, signature) not in self._missing:
                         self._carry(known, value, signature)
 
     def _carry(self, known: float, value: float, signature: Signature) -> None:
         """Look for a cycle that attracts at one value at another one."""
         turn = self.turns[known][signature]
-        room = slice(room_of(int(np.sum(turn.ends != Ends(len(self.osc.belts)).unused))))
-        turn = jax.tree.map(lambda leaf: leaf[room], turn)
-        cycle = polish(self.at(value), turn, jnp.asarray(Status.OK.value))
-        found = int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1
-        if found and of_one_turn(cycle.signature) == signature:
+        # Followed, not only solved for: its turns may be others, though its events are not.
+        cycle = find_cycle(self.at(value), turn.entries[0])
+        attracts = int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1
+        # Not the equilibrium, to which a cycle may shrink.
+        same = np.ptp(np.asarray(cycle.unknowns)[:, 0]) > 0.5 * np.ptp(turn.entries[:, 0])
+        if attracts and same and of_one_turn(cycle.signature) == signature:
             self.turns[value][signature] = jax.tree.map(np.asarray, as_turn(cycle, ROOM))
             before = self.labels[value]
             self.labels[value] = Label(before.equilibria, before.cycles | {signature})
@@ -327,6 +328,16 @@ class Path:
     def label(self, value: float) -> Label:
         """The label there, which `look` has found."""
         return self.labels[float(value)]
+
+
+def _sticks(signature: Signature) -> bool:
+    return any(kind == EventKind.STICK for kind, _ in signature)
+
+
+def _cut(turn: Turn) -> Turn:
+    """The turn with no more room for its arcs than it needs."""
+    used = np.asarray(turn.ends) != Ends(turn.codes.shape[-1]).unused
+    return jax.tree.map(lambda leaf: leaf[: room_of(int(np.sum(used)))], turn)
 
 
 class _Seen(NamedTuple):
@@ -404,8 +415,11 @@ def _explained(path: Path, a: float, b: float, conditions) -> BifurcationPoint |
 
 
 def _turns(path: Path, value: float, condition: AbstractCondition) -> Sequence[Turn | None]:
-    """Those of the attracting cycles there, for what needs one; else one None."""
-    return list(path.turns[value].values()) if solver_of(condition) is at_edge else [None]
+    """Those of the attracting cycles there, for what needs one; None for what finds its own."""
+    turns = path.turns[value]
+    if isinstance(condition, FoldOfCycles):
+        return [*(turn for cycle, turn in turns.items() if not _sticks(cycle)), None]
+    return list(turns.values()) if solver_of(condition) is at_edge else [None]
 
 
 def _local_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
@@ -465,15 +479,18 @@ def refined(
     """The point that is found from that value of the parameter, or None.
 
     A tangency, or an end of an arc on an edge, of whichever kind it is looked for, is returned as
-    what it is. turn: of the cycle that may touch an edge, where it is known, with ROOM arcs.
+    what it is. turn: of the cycle that may touch an edge or fold, where it is known, with ROOM
+    arcs.
     """
     p, belts, either = (jnp.asarray(np.array(x)) for x in ([value], _belts(condition), 0.0))
-    at = vary(osc, index, p)
+    at, known = vary(osc, index, p), jnp.asarray(Status.OK.value)
     if turn is None:
         solve = solver_of(condition)
         point = solve(at, index, belts, either, room_for(solve))
+    elif isinstance(condition, FoldOfCycles):
+        point = fold_near(at, index, _cut(turn), known)
     else:
-        known, repels = jnp.asarray(Status.OK.value), solver_of(condition) is at_edge_unstable
+        repels = solver_of(condition) is at_edge_unstable
         point = edge_contact(at, index, belts, either, turn, known, repels=repels)
     if int(point.status) != Status.OK:
         return None

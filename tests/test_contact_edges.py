@@ -7,6 +7,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from scipy.optimize import brentq
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
@@ -238,6 +239,39 @@ def test_the_end_of_a_segment_on_an_edge():
     point = jb.refine(jb.BoundaryEquilibrium(1), osc, where=lambda osc: osc.belts[1].lower)
     pull = 0.6 + 0.4 / 4.5
     assert point.value == pytest.approx(pull - 1, abs=1e-14) and point.status == Status.OK
+
+
+def test_an_exchange_where_the_edge_of_one_belt_is_passed():
+    """Below, the mass sticks to belt 0, loses it at its edge, and sticks to belt 1; above, to belt
+    1 all the way. In the limit the orbit is the same."""
+    osc = jb.presets.class_d(0.24, 0.25, 0.0, 0.7)
+    (point,) = jb.scan(osc, nu0, (0.23, 0.27))
+    assert point.condition == jb.SlidingExchange((0, 1))
+    assert point.value == pytest.approx(0.25, abs=1e-14) and point.residual < 1e-11
+    below, above = (
+        oracle_cycles.sticking_cycle(oracle.class_d(nu, 0.25, 0.0, 0.7)) for nu in (0.2499, 0.2501)
+    )
+    for value, cycle in ((0.2499, below), (0.2501, above)):
+        ours = jb.find_cycle(jb.presets.class_d(value, 0.25, 0.0, 0.7), (3.0, 0.0))
+        assert ours.period == pytest.approx(cycle.period, abs=1e-9)
+        sticks = {belt for kind, belt in ours.signature if kind == EventKind.STICK}
+        assert sticks == ({0, 1} if value < 0.25 else {1})
+    at_point = float(point.cycle.period)
+    assert below.period < at_point < above.period or above.period < at_point < below.period
+
+
+@pytest.mark.slow
+def test_a_cycle_that_no_start_leads_to_is_followed():
+    """A small cycle passes the edge; it attracts little, and the starts of the search miss it. It
+    ends where it meets the unstable one of belt 1 alone, which touches the edge there."""
+    points = jb.scan(jb.presets.class_c(0.3, 0.25, 0.7), nu1, (0.165, 0.2))
+    assert [p.condition for p in points] == [jb.FoldOfCycles(), jb.Hopf(), jb.GrazingEdge(0)]
+
+    def overlap(nu):
+        return oracle_cycles.unstable_cycle(oracle.class_a(nu)).x1_min - 0.7
+
+    expected = brentq(overlap, 0.1845, 0.186, xtol=1e-14)
+    assert points[2].value == pytest.approx(expected, abs=1e-11)
 
 
 @pytest.mark.slow
