@@ -128,9 +128,9 @@ class SuddenSliding(_BeltCondition):
 class FoldOfCycles(AbstractCondition):
     """Two cycles that do not stick, a stable and an unstable one, meet and vanish.
 
-    Near a degenerate Hopf point, where both shrink to the equilibrium, those with x1_max - x1_min
-    above 0.005 are found. A guess may be some two times as far from the point as that is from the
-    Hopf point.
+    Near a degenerate Hopf point, where both shrink to the equilibrium, small ones are not found. In
+    the case of the tests, those with x1_max - x1_min above 0.006 are, from guesses some two times
+    as far from the point as that is from the Hopf point.
     """
 
 

@@ -62,9 +62,9 @@ from .cycles import (
     Ends,
     Turn,
     as_turn,
+    cut,
     find_cycle,
     last_turn,
-    room_of,
     turn_events,
     turn_of,
     unstable_cycle,
@@ -334,12 +334,6 @@ def _sticks(signature: Signature) -> bool:
     return any(kind == EventKind.STICK for kind, _ in signature)
 
 
-def _cut(turn: Turn) -> Turn:
-    """The turn with no more room for its arcs than it needs."""
-    used = np.asarray(turn.ends) != Ends(turn.codes.shape[-1]).unused
-    return jax.tree.map(lambda leaf: leaf[: room_of(int(np.sum(used)))], turn)
-
-
 class _Seen(NamedTuple):
     """Equilibria, [rows], and of every orbit its status and last turn, [starts, ROOM]."""
 
@@ -488,7 +482,7 @@ def refined(
         solve = solver_of(condition)
         point = solve(at, index, belts, either, room_for(solve))
     elif isinstance(condition, FoldOfCycles):
-        point = fold_near(at, index, _cut(turn), known)
+        point = fold_near(at, index, cut([turn])[0], known)
     else:
         repels = solver_of(condition) is at_edge_unstable
         point = edge_contact(at, index, belts, either, turn, known, repels=repels)

@@ -36,7 +36,7 @@ from .bifurcations import (
 from .checks import as_array, require
 from .compiling import jit
 from .curves import BifurcationCurve, bifurcation_curve
-from .cycles import Cycle, Ends, Turn, find_cycle, polish, room_of, unstable_cycle
+from .cycles import Cycle, Turn, cut, find_cycle, polish, unstable_cycle
 from .detection import Label, Path, by_value, edges_touched, search
 from .equilibria import candidates, equilibria
 from .oscillator import Oscillator
@@ -548,11 +548,8 @@ def _stacked(program, items: Iterable[Any]) -> Any:
 
 
 def _attracting(path: Path, values: np.ndarray, turns: Sequence[Turn]) -> _Rows:
-    unused = Ends(len(path.osc.belts)).unused
-    room = slice(room_of(max(int(np.sum(turn.ends != unused)) for turn in turns)))
-    turns = [jax.tree.map(lambda leaf: leaf[room], turn) for turn in turns]
     ok = jnp.asarray(Status.OK.value)
-    pairs = zip(values, turns, strict=True)
+    pairs = zip(values, cut(turns), strict=True)
     return _stacked(_row, (polish(path.at(value), turn, ok) for value, turn in pairs))
 
 

@@ -25,6 +25,7 @@ import matplotlib
 import matplotlib.colors
 import numpy as np
 import xarray as xr
+from jaxtyping import Array
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, Polygon, Rectangle
@@ -758,6 +759,11 @@ def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle], name: str) 
 # --- the model ----------------------------------------------------------------------------------
 
 
+@jit
+def _coefficient(friction: AbstractFriction, speed: Array) -> Array:
+    return friction.mu(speed)
+
+
 def plot_friction_law(
     friction: AbstractFriction, ax: Axes | None = None, *, speed: float = 1.0
 ) -> Axes:
@@ -767,7 +773,7 @@ def plot_friction_law(
     """
     ax = _new_axes() if ax is None else ax
     r = jnp.linspace(0.0, speed, 401)
-    mu, static = np.asarray(jit(type(friction).mu)(friction, r)), float(friction.static)
+    mu, static = np.asarray(_coefficient(friction, r)), float(friction.static)
     ax.axhline(0, color="0.7", linewidth=0.6)
     ax.axvline(0, color="0.7", linewidth=0.6)
     for sign in (1, -1):

@@ -556,12 +556,13 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
         return jnp.stack(select(stuck, carried, flown))
 
     # As many pieces of the times as lanes. Each lane goes from one of its samples to the next, or
-    # from where the next one's arc begins.
+    # from where the next one's arc begins; so, too, where under a trace the times do not increase.
     first = jnp.arange(ts.size) % max(ts.size // SAMPLED, 1) == 0
-    goes_on = (numbers == jnp.roll(numbers, 1)) & ~beyond & ~first
+    before = jnp.roll(since, 1)
+    goes_on = (numbers == jnp.roll(numbers, 1)) & (before <= since) & ~beyond & ~first
     rows = jax.tree.map(
         lambda leaf: jnp.swapaxes(leaf.reshape(SAMPLED, -1, *leaf.shape[1:]), 0, 1),
-        (arcs, since, stuck, goes_on, jnp.roll(since, 1)),
+        (arcs, since, stuck, goes_on, before),
     )
     some = one_kernel(jax.vmap(at, (None, None, None, 0, 0, 0, 0, 0, 0)))
 

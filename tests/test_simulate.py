@@ -611,3 +611,14 @@ def test_float32_is_refused_with_the_remedy():
             jb.presets.class_a(0.3)
     finally:
         jax.config.update("jax_enable_x64", True)
+
+
+def test_times_that_do_not_increase_under_a_trace():
+    """Outside they are refused; inside nobody can know, and the samples are right all the same."""
+    ts = np.random.default_rng(0).uniform(0.0, 40.0, 100)
+
+    def states(ts):
+        return jb.simulate(jb.presets.class_b(0.45, 0.35), (3.0, 0.0), 40.0, ts=ts).ys
+
+    order = np.argsort(ts)
+    np.testing.assert_allclose(jax.jit(states)(ts)[order], states(ts[order]), rtol=0, atol=1e-9)
