@@ -61,8 +61,10 @@ from .cycles import (
     admissible,
     closure,
     cycle_of,
+    end_guard,
     first_turn,
     follow,
+    following_codes,
     jacobian,
     last_turn,
     meshed,
@@ -84,7 +86,9 @@ from .modes import (
     edge_guards,
     edges,
     mode_acceleration,
+    mode_of,
     mode_of_state,
+    onset_position,
     push_and_trace,
     select,
 )
@@ -439,38 +443,40 @@ def _velocity(osc: Oscillator, belt: int | Array) -> Array:
     return jnp.stack([one.velocity for one in osc.belts])[belt]
 
 
-def before_onset(osc: Oscillator, belt: int | Array) -> Array:
-    """A state stuck to a belt shortly before slip onset.
+def before_stick_ends(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
+    """States stuck to a belt where stick phases end, one for each zone between contact edges.
 
-    Which belts touch there depends on x1, which depends on them: three rounds settle it.
+    Shortly before slip onset; or, where the zone ends first, on the edge. NaN where neither is, or
+    the belt does not touch. Returns them, [zones, 2], and whether it is slip onset, [zones].
     """
-    velocity = _velocity(osc, belt)
-    v = velocity / osc.omega
-    x1 = jnp.zeros(())
-    for _ in range(3):
-        mode = mode_of_state(osc, x1, v)
-        held = tuple(
-            jnp.where((jnp.abs(code) < 1.5) & (other.velocity == velocity), STUCK, code)
-            for code, other in zip(mode.codes, osc.belts, strict=True)
-        )
-        mode = Mode(held)
-        rest = mode_acceleration(osc, mode, jnp.zeros(()), v)
-        x1 = rest + 0.99 * jnp.sign(v) * capacity(osc, mode)
-    return jnp.stack([x1, v])
+    v = _velocity(osc, belt) / osc.omega
+    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
+    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    mode = contact(osc, lower, v, rightward=True)
+    onset, held = onset_position(osc, mode), capacity(osc, mode)
+    before, ahead = select(v > 0, (lower, upper), (upper, lower))
+    slips = (lower < onset) & (onset < upper)
+    # It holds between onset - 2 sgn(v) held and onset.
+    meets = jnp.isfinite(ahead) & ~slips & (jnp.abs(onset - held * jnp.sign(v) - ahead) <= held)
+    near = jnp.minimum(0.01 * held, 0.5 * jnp.abs(onset - before))
+    exists = (jnp.stack(mode.codes)[belt] == STUCK) & (lower < upper)
+    x1 = jnp.where(slips, onset - near * jnp.sign(v), jnp.where(meets, ahead, jnp.nan))
+    states = jnp.stack([x1, jnp.full_like(x1, v)], axis=1)
+    return jnp.where(exists[:, None], states, jnp.nan), slips & exists
 
 
 def starts(osc: Oscillator, rests: Equilibria) -> Array:
     """Where the orbits start that find the cycles, [starts, 2].
 
-    Before slip onset on each belt, and at several distances from an equilibrium.
+    Where stick phases end, and at several distances from an equilibrium. NaN: no such start.
     """
     exists = rests.kind > 0
     repels = exists & ~rests.stable
     row = jnp.where(jnp.any(repels), jnp.argmax(repels), jnp.maximum(jnp.sum(exists) - 1, 0))
     centre = jnp.where(jnp.any(exists), rests.x1[row], 0.0)
-    onsets = [before_onset(osc, belt) for belt in range(len(osc.belts))]
-    others = [jnp.stack([centre + distance, jnp.zeros(())]) for distance in DISTANCES]
-    return jnp.stack([*onsets, *others])
+    ends = [before_stick_ends(osc, belt)[0] for belt in range(len(osc.belts))]
+    others = [jnp.stack([centre + distance, jnp.zeros(())])[None] for distance in DISTANCES]
+    return jnp.concatenate([*ends, *others])
 
 
 def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
@@ -520,7 +526,9 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
 def _onset_orbit(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array, Orbit]:
     """The orbit from slip onset on the first of the belts, its start, and the oscillator.
 
-    This is the one given but for the velocity of that belt: where it is at rest, no orbit leaves.
+    Of several the one of which the stick phase on that belt is shortest in the turn that repeats;
+    if none sticks to it, the one that comes back nearest to its boundary. The oscillator is the one
+    given but for the velocity of that belt: where it is at rest, no orbit leaves.
     """
     velocities = [
         jnp.where((belts[0] == i) & (one.velocity == 0), 1e-2, one.velocity)
@@ -528,8 +536,34 @@ def _onset_orbit(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array, Orbi
     ]
     moving = eqx.tree_at(lambda o: [one.velocity for one in o.belts], osc, velocities)
     moving = lax.stop_gradient(moving)
-    start = before_onset(moving, belts[0])
-    return moving, start, follow(moving, start, HINT_BUDGET)
+    velocity, names = _velocity(moving, belts[0]), Ends(len(osc.belts))
+    states, slips = before_stick_ends(moving, belts[0])
+    states = jnp.where(slips[:, None], states, jnp.nan)[jnp.argsort(~slips)]
+    rows = jnp.arange(HINT_BUDGET)
+
+    def attempt(tried):
+        number, best, kept = tried
+        orbit = follow(moving, states[number], HINT_BUDGET)
+        settled = (orbit.status == Status.OK) & (rows > orbit.repeats) & (rows < orbit.count)
+        sticks = settled & (orbit.codes[:, belts[0]] == 0)
+        shortest = jnp.min(jnp.where(sticks, orbit.durations, jnp.inf))
+        x2 = jnp.roll(orbit.entries[:, 1], -1).at[orbit.count - 1].set(orbit.y[1])
+        turns = (orbit.ends == names.turn_x2) & (x2 * velocity > 0) & (rows > 0)
+        gap = jnp.min(jnp.where(turns, jnp.abs(velocity - osc.omega * x2), jnp.inf))
+        size = jnp.where(jnp.any(sticks), shortest, 1e6 + gap)
+        better = (number == 0) | (size < best)
+        new = (size, (states[number], orbit))
+        best, kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, (best, kept))
+        return number + 1, best, kept
+
+    empty = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(lambda y: (y, follow(moving, y, HINT_BUDGET)), states[0]),
+    )
+    none = jnp.asarray(0), jnp.asarray(jnp.inf), empty
+    several = jnp.maximum(jnp.sum(slips), 1)
+    _, _, (start, orbit) = lax.while_loop(lambda tried: tried[0] < several, attempt, none)
+    return moving, start, orbit
 
 
 def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
@@ -617,11 +651,11 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
     """
     velocity = _velocity(osc, belt)
     rows = jnp.arange(turn.ends.size)
-    own = turn.used & (turn.codes[:, belt] == 0)
+    names = Ends(len(osc.belts))
+    own = (turn.ends == names.onset) & (turn.codes[:, belt] == 0)
     shortest = jnp.argmin(jnp.where(own, turn.durations, jnp.inf))
 
     following = turn.exits
-    names = Ends(len(osc.belts))
     turns = turn.used & (turn.ends == names.turn_x2)
     turns = turns & (turn.codes[:, belt] == jnp.sign(velocity))
     turns = turns & (following[:, 1] * jnp.sign(velocity) > 0)
@@ -649,45 +683,101 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
 
 
 class EdgeContact(System):
-    """A cycle, and x1 at the end of the arc `row` is that of an edge, by its number."""
+    """A cycle of which an arc, `row`, ends on an edge and in something else at once.
+
+    One of the two ends the arc; of the other one, `end`, the guard vanishes there in the mode of
+    `codes`.
+    """
 
     chain: Chain
     row: Array
-    edge: Array
+    end: Array
+    codes: Array
 
     def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
         following = (self.row + 1) % z.shape[0]  # unused arcs hand the state on
-        return z[following, 0] - jnp.stack(edges(osc))[self.edge]
+        return end_guard(osc, self.codes, self.end, z[following, :2])
 
 
-def end_near_edge(
-    osc: Oscillator, turn: Turn, belt: Array, wanted: Array
-) -> tuple[Array, Array, Array]:
-    """Of the arcs that no edge ends the one whose end is nearest to an edge of the belt.
+class EdgeEnd(eqx.Module):
+    """The end of an arc that comes nearest to an edge and something else at once.
 
-    wanted: 1 of the arcs that a turn of x1 ends, -1 of those that a boundary or slip onset ends, 0
-    of both. Returns the distance (inf: there is none), the row of the arc, the number of the edge.
+    distance: from that, inf if there is none; row, end, codes: as for `EdgeContact`; grazes:
+    whether the orbit would be tangent to the edge, else it would run into a corner.
+    """
+
+    distance: Array
+    row: Array
+    end: Array
+    codes: Array
+    grazes: Array
+
+
+@jit
+def end_near_edge(osc: Oscillator, turn: Turn, belt: Array, wanted: Array) -> EdgeEnd:
+    """Of the ends of the arcs of a turn that nearest to an edge of the belt and something else.
+
+    wanted: 1 tangent to the edge, -1 in a corner, 0 either.
     """
     n = len(osc.belts)
     names = Ends(n)
     positions = jnp.stack(edges(osc))
-    own = jnp.stack([positions[belt], positions[n + belt]])
-    grazes, meets = turn.ends == names.turn_x1, (turn.ends < n) | (turn.ends == names.onset)
-    eligible = turn.used & (grazes & (wanted >= 0) | meets & (wanted <= 0))
-    distance = jnp.abs(turn.exits[:, :1] - own[None])
-    distance = jnp.where(eligible[:, None] & jnp.isfinite(distance), distance, jnp.inf)
-    at = jnp.argmin(distance)
-    return distance.reshape(-1)[at], at // 2, belt + n * (at % 2)
+    lower, upper = positions[belt], positions[n + belt]
+    following = following_codes(turn)
+
+    def distances(codes, end, entry, after, at):
+        """From every end that this arc might have as well; those of stick phases in two modes."""
+        x1, x2 = at
+        on_edge = (end >= n) & (end < 3 * n)
+        edge = positions[jnp.clip(end - n, 0, 2 * n - 1)]
+        on_edge = on_edge & ((edge == lower) | (edge == upper))
+        stuck = jnp.any(codes == 0)
+        # What ends it is something else: how far it is to an edge.
+        turns, meets = end == names.turn_x1, (end < n) | (end == names.onset)
+        to_edges = [jnp.where(turns | meets, jnp.abs(x1 - e), jnp.inf) for e in (lower, upper)]
+        # An edge ends it. It is a turn if that pushes away to both sides: how high it is passed.
+        push = [jnp.sign(x2) * mode_acceleration(osc, mode_of(c), x1, x2) for c in (codes, after)]
+        passes = on_edge & ~stuck & (push[0] < 0) & (push[1] > 0)
+        to_turn = jnp.where(passes, 0.5 * x2**2, jnp.inf)
+        # A boundary may be near that the arc did not begin at: x2 is monotone on it.
+        to_boundaries = []
+        for i, one in enumerate(osc.belts):
+            r, began = (one.velocity - osc.omega * v for v in (x2, entry[1]))
+            touches = (jnp.abs(codes[i]) < 1.5) | (jnp.abs(after[i]) < 1.5)
+            near = on_edge & ~stuck & touches & (jnp.abs(began) > 1e-9)
+            to_boundaries.append(jnp.where(near, jnp.abs(r), jnp.inf))
+        # Slip onset may be: in the mode before the edge, or, if it is left by it, in that after.
+        held = jnp.where((codes == 0) & (jnp.abs(after) < 1.5), 0.0, after)
+        to_onsets = []
+        for one in (codes, held):
+            may = on_edge & stuck & jnp.any(one == 0)
+            away = jnp.abs(x1 - onset_position(osc, mode_of(one)))
+            to_onsets.append(jnp.where(may, away, jnp.inf))
+        found = jnp.stack([*to_edges, to_turn, *to_boundaries, *to_onsets])
+        grazes = jnp.stack([turns, turns, True, *[False] * (n + 2)])
+        usable = (end != names.unused) & jnp.where(grazes, wanted >= 0, wanted <= 0)
+        return jnp.where(usable & jnp.isfinite(found), found, jnp.inf), grazes, held
+
+    rows = turn.codes, turn.ends, turn.entries, following, turn.exits
+    found, grazes, held = jax.vmap(distances)(*rows)
+    row, which = jnp.divmod(jnp.argmin(found), found.shape[1])
+    own = jnp.stack([n + belt, 2 * n + belt])
+    others = jnp.array([names.turn_x1, *range(n), names.onset, names.onset])
+    end = jnp.concatenate([own, others])[which]
+    codes = jnp.where(which == found.shape[1] - 1, held[row], turn.codes[row])
+    return EdgeEnd(found[row, which], row, end, codes, grazes[row, which])
 
 
-def _without_excursion(osc: Oscillator, turn: Turn, row: Array, edge: Array) -> tuple[Turn, Array]:
+def _without_excursion(osc: Oscillator, turn: Turn, near: EdgeEnd) -> tuple[Turn, Array]:
     """The turn without what lies beyond the edge, if all of it is the turn of x1 that ends a row;
     and the row that then ends in that turn of x1."""
+    row = near.row
     n = len(osc.belts)
     names = Ends(n)
     rows, count = jnp.arange(turn.ends.size), jnp.maximum(jnp.sum(turn.used), 1)
     passes = (turn.ends >= n) & (turn.ends < 3 * n)
-    passes = passes & (turn.exits[:, 0] == jnp.stack(edges(osc))[edge])
+    edge = jnp.stack(edges(osc))[jnp.clip(near.end - n, 0, 2 * n - 1)]
+    passes = passes & (turn.exits[:, 0] == edge)
     # The events before and after; turns of x2 are none.
     events = turn.used & (turn.ends != names.turn_x2) & (rows != row)
     before = jnp.argmin(jnp.where(events, (row - rows) % count, rows.size))
@@ -723,7 +813,7 @@ def _turn_near_edge(osc: Oscillator, rests: Equilibria, belts: Array, wanted: Ar
         orbit = approach(still, rests, start)
         turn, (_, count) = turn_of(orbit, size, n), last_turn(orbit)
         found = orbit.status == Status.OK
-        distance, _, _ = end_near_edge(still, turn, belts[0], wanted)
+        distance = end_near_edge(still, turn, belts[0], wanted).distance
         distance = jnp.where(found & (count <= size), distance, jnp.inf)
         return turn, distance, found & (count > size)
 
@@ -756,12 +846,12 @@ def edge_contact(
 def _touching_edge(osc: Oscillator, belts: Array, wanted, turn: Turn, status: Array, repels):
     """The system of `edge_contact` with a guess of its unknowns, a status, and the judge."""
     still = lax.stop_gradient(osc)
-    distance, row, edge = end_near_edge(still, turn, belts[0], wanted)
-    near = (status != Status.OK) | jnp.isfinite(distance)
-    status = jnp.where(near, status, Status.NOT_TOUCHED.value)
-    turn, row = _without_excursion(still, turn, row, edge)
+    near = end_near_edge(still, turn, belts[0], wanted)
+    exists = (status != Status.OK) | jnp.isfinite(near.distance)
+    status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
+    turn, row = _without_excursion(still, turn, near)
     chain, z = meshed(still, turn)
-    system = EdgeContact(chain=chain, row=row, edge=edge)
+    system = EdgeContact(chain, row, near.end, near.codes)
     return system, z, status, eqx.Partial(_judge_contact, row, repels)
 
 
@@ -941,7 +1031,7 @@ def _hopf_point(osc: Oscillator, index: int | Array, rests: Equilibria) -> Bifur
     fixed = rests.kind == EquilibriumKind.FIXED_POINT
     row = jnp.argmin(jnp.where(fixed, jnp.abs(rests.rate), jnp.inf))
     codes = rests.modes[row].astype(float)
-    mode = Mode(tuple(codes[i] for i in range(len(osc.belts))))
+    mode = mode_of(codes)
     rest = jnp.zeros(())
 
     def equations(osc, u):
@@ -974,13 +1064,13 @@ class EdgeRest(eqx.Module):
     codes: Array
 
     def __call__(self, osc: Oscillator) -> Array:
-        at, mode = jnp.stack(edges(osc))[self.edge], Mode(tuple(self.codes))
+        at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
         needed = mode_acceleration(osc, mode, at, jnp.zeros(()))
         return needed + self.limit * capacity(osc, mode)
 
     def meets_hopf(self, osc: Oscillator) -> Array:
         """What vanishes where the curve of this meets that of a Hopf point; NaN for a segment."""
-        mode = Mode(tuple(self.codes))
+        mode = mode_of(self.codes)
         _, trace = push_and_trace(osc, mode, jnp.stack(edges(osc))[self.edge])
         return jnp.where(mode.any_stuck, jnp.nan, trace)
 

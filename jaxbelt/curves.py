@@ -66,7 +66,7 @@ from .cycles import (
 )
 from .detection import refined
 from .equilibria import EquilibriumKind, equilibria
-from .modes import Mode, boundary_guards, edge_guards, mode_acceleration
+from .modes import boundary_guards, edge_guards, mode_acceleration, mode_of
 from .oscillator import Oscillator
 from .results import Status
 
@@ -535,7 +535,7 @@ def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
     Where the law of the belt jumps, slip onset is not at that equilibrium, and the state is one
     shortly after it: x2' is the jump.
     """
-    mode, zero = Mode(tuple(codes[i] for i in range(len(osc.belts)))), jnp.zeros(())
+    mode, zero = mode_of(codes), jnp.zeros(())
     rest = mode_acceleration(osc, mode, zero, zero)
     trace, twice_bend = jax.jvp(lambda x2: trace_of(osc, mode, rest, x2)[0], (zero,), (zero + 1,))
     strong = 0.5 * trace + jnp.sqrt(0.25 * trace**2 - 1)
@@ -653,7 +653,7 @@ class _HopfSystem(_System):
 
 def _rest_equations(u: Array, args) -> Array:
     osc, indices, codes = args
-    osc, mode = vary(osc, indices, u[-2:]), Mode(tuple(codes))
+    osc, mode = vary(osc, indices, u[-2:]), mode_of(codes)
     rest = jnp.zeros(())
     return jnp.append(
         mode_acceleration(osc, mode, u[0], rest)[None], trace_of(osc, mode, u[0], rest)
@@ -663,7 +663,7 @@ def _rest_equations(u: Array, args) -> Array:
 def _third_derivative(u: Array, args) -> Array:
     """That of x2' by x2 at the fixed point: 16 times the first Lyapunov coefficient."""
     osc, indices, codes = args
-    osc, mode = vary(osc, indices, u[-2:]), Mode(tuple(codes))
+    osc, mode = vary(osc, indices, u[-2:]), mode_of(codes)
 
     def derivative(fn):
         return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
@@ -688,7 +688,7 @@ def _degenerate_hopf(args, guess: Array) -> tuple[Array, Array]:
 @jit
 def _look_at_rest(args, u: Array):
     osc, indices, codes = args
-    osc, mode = vary(osc, indices, u[-2:]), Mode(tuple(codes))
+    osc, mode = vary(osc, indices, u[-2:]), mode_of(codes)
     tests = {**_velocity_tests(osc), ("DegenerateHopf", ()): _third_derivative(u, args)}
     rest = jnp.zeros(())
     nearest = jnp.min(jnp.stack(edge_guards(osc, mode, u[0])))
@@ -784,10 +784,10 @@ class _CycleSystem(_System):
             z = point.cycle.unknowns
             turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
             belt, either = jnp.asarray(condition.belt), jnp.zeros(())
-            _, end, edge = end_near_edge(point.oscillator, turn, belt, either)
+            near = end_near_edge(point.oscillator, turn, belt, either)
             # In a corner a stick phase that begins or ends there may have no duration.
-            row = (int(end) + 1) % int(np.sum(ends != names.unused))
-            system = EdgeContact(chain=chain, row=end, edge=edge)
+            row = (int(near.row) + 1) % int(np.sum(ends != names.unused))
+            system = EdgeContact(chain, near.row, near.end, near.codes)
         else:
             system = Encounter(chain, jnp.asarray(np.array(belts)))
         weights = _weights(np.asarray(point.cycle.unknowns))

@@ -46,6 +46,7 @@ from .modes import (
     leave_slip,
     leave_stick,
     mode_acceleration,
+    mode_of,
     mode_of_state,
     onset_position,
     select,
@@ -91,12 +92,8 @@ def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -
     return y + jnp.stack(change)
 
 
-def _mode(codes: Array) -> Mode:
-    return Mode(tuple(codes[i] for i in range(codes.shape[0])))
-
-
 def _field(osc: Oscillator, codes: Array, y: Array) -> Array:
-    return jnp.stack([y[1], mode_acceleration(osc, _mode(codes), y[0], y[1])])
+    return jnp.stack([y[1], mode_acceleration(osc, mode_of(codes), y[0], y[1])])
 
 
 def density(osc: Oscillator, codes: Array, y: Array) -> Array:
@@ -104,7 +101,7 @@ def density(osc: Oscillator, codes: Array, y: Array) -> Array:
 
     The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0.
     """
-    a = mode_acceleration(osc, _mode(codes), y[0], y[1])
+    a = mode_acceleration(osc, mode_of(codes), y[0], y[1])
     bend = jnp.zeros(())
     for i, belt in enumerate(osc.belts):
         speed = jnp.maximum(jnp.sign(codes[i]) * (belt.velocity - osc.omega * y[1]), 0.0)
@@ -168,7 +165,7 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
 
     A stick arc is a straight line; Simpson's rule is exact there for what is at most cubic.
     """
-    mode = _mode(codes)
+    mode = mode_of(codes)
     stuck = mode.any_stuck
     n_extra = 0 if extra is None else extra(osc, mode, y[0], y[1]).size
 
@@ -196,9 +193,9 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     return jnp.where(stuck, stuck_end, slipped)
 
 
-def _guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
-    """What vanishes at the end y of an arc; zero for an unused one."""
-    mode = _mode(codes)
+def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
+    """What vanishes at y if an arc ends there by `end`; zero for an unused one."""
+    mode = mode_of(codes)
     values = [
         *[belt.velocity - osc.omega * y[1] for belt in osc.belts],
         *[jnp.where(jnp.isfinite(edge), y[0] - edge, 1.0) for edge in edges(osc)],
@@ -230,12 +227,12 @@ def _followed(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
     velocity = jnp.zeros(())
     for i, belt in enumerate(osc.belts):
         velocity = velocity + jnp.where(end == names.tangent + i, belt.velocity / osc.omega, 0.0)
-    x1 = mode_acceleration(osc, _mode(codes), jnp.zeros(()), velocity)
+    x1 = mode_acceleration(osc, mode_of(codes), jnp.zeros(()), velocity)
     point = jnp.stack([x1, velocity])
     start = jnp.where(is_tangent, point, unknown[:2])
     duration = jnp.where(is_tangent, -unknown[2], unknown[2])
     after = flow(osc, codes, jnp.where(is_tangent, jnp.flip(mesh), mesh), start, duration)
-    guard = _guard(osc, codes, end, after)
+    guard = end_guard(osc, codes, end, after)
     ordinary = jnp.concatenate([after, guard[None], jnp.zeros(1)])
     return jnp.where(is_tangent, jnp.concatenate([point, after - unknown[:2]]), ordinary)
 
@@ -400,14 +397,14 @@ class Orbit(eqx.Module):
 
 def _after(osc: Oscillator, codes: Array, y: Array):
     """Sign of x2' and x2 just after y; where x2' = 0, x2'' = -x2 decides."""
-    a = mode_acceleration(osc, _mode(codes), y[0], y[1])
+    a = mode_acceleration(osc, mode_of(codes), y[0], y[1])
     still, moving = jnp.abs(a) < 1e-9 * (1 + jnp.abs(y[0])), jnp.abs(y[1]) >= 1e-9
     return jnp.sign(jnp.where(still, -y[1], a)), jnp.sign(jnp.where(moving, y[1], a))
 
 
 def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
     """Follow a slip arc to the first of its guards: duration, end state, index of the guard."""
-    mode = _mode(codes)
+    mode = mode_of(codes)
     a_sign, v_sign = _after(osc, codes, y)
     field = functools.partial(_field, osc, codes)
 
@@ -470,7 +467,7 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     n = len(osc.belts)
     names = Ends(n)
     y, codes = orbit.y, orbit.code
-    mode = _mode(codes)
+    mode = mode_of(codes)
     stuck = mode.any_stuck
 
     phase = stick_phase(osc, mode, y[0])
@@ -785,9 +782,9 @@ def _errors_and_factors(osc: Oscillator, chain: Chain, following: Array, z: Arra
 
 def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, entry):
     after = flow(osc, codes, mesh, unknown[:2], unknown[2], trace_of)
-    guard = _guard(osc, codes, end, after[:2])
-    before_crossing = mode_acceleration(osc, _mode(codes), after[0], after[1])
-    after_crossing = mode_acceleration(osc, _mode(following), entry[0], entry[1])
+    guard = end_guard(osc, codes, end, after[:2])
+    before_crossing = mode_acceleration(osc, mode_of(codes), after[0], after[1])
+    after_crossing = mode_acceleration(osc, mode_of(following), entry[0], entry[1])
     slips = jnp.all(codes != 0) & (unknown[2] != 0)
     crosses = (end < len(osc.belts)) & jnp.all(following != 0)
     ratio = after_crossing / jnp.where(crosses, before_crossing, 1.0)
@@ -834,7 +831,7 @@ def _factors_and_slopes(osc, along: Oscillator, chain: Chain, following, z: Arra
     return lax.map(one, (chain.codes, chain.ends, chain.mesh, following, z, entries))
 
 
-def following_codes(chain: Chain) -> Array:
+def following_codes(chain: Chain | Turn) -> Array:
     """Contact codes of the arc after each; after the last used one comes the first."""
     following = jnp.roll(chain.codes, -1, axis=0)
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
@@ -849,7 +846,7 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
     slack = 1e-9
 
     def one(codes, unknown, following):
-        mode = _mode(codes)
+        mode = mode_of(codes)
         fine = unknown[2] >= -slack
         for y in (unknown, following):
             inside = jnp.stack([*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])])

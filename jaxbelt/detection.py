@@ -3,8 +3,8 @@
 What the oscillator does at one value of the parameter is summed up in a label: the kind and the
 stability of every equilibrium, and the signature of every attracting cycle, that is, which belts
 it sticks to, slips from and crosses and which contact edges it passes, in the order of one turn. A
-cycle that sticks mostly comes by a slip onset, so it is found by following the orbits from there; a
-few starts beside the equilibria find the rest.
+cycle that sticks comes by a place where a stick phase ends, in slip onset or on a contact edge, so
+it is found by following the orbits from there; a few starts beside the equilibria find the rest.
 
 Between two values with one label nothing is taken to happen. Where labels differ the interval is
 narrowed until Newton's method converges from its ends. The conditions that could make this
@@ -59,7 +59,6 @@ from .compiling import each, jit
 from .cycles import (
     SIZES,
     Cycle,
-    Ends,
     Turn,
     as_turn,
     cut,
@@ -498,9 +497,8 @@ def _kind_found(condition: AbstractCondition, point: BifurcationPoint) -> Abstra
         chain, z = point.cycle.chain, point.cycle.unknowns
         turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
         belt, either = jnp.asarray(condition.belt), jnp.zeros(())
-        _, row, _ = end_near_edge(point.oscillator, turn, belt, either)
-        is_turn = chain.ends[int(row)] == Ends(chain.codes.shape[-1]).turn_x1
-        return (GrazingEdge if is_turn else CornerCollision)(condition.belt)
+        near = end_near_edge(point.oscillator, turn, belt, either)
+        return (GrazingEdge if near.grazes else CornerCollision)(condition.belt)
     return condition
 
 

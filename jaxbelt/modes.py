@@ -83,6 +83,11 @@ def select(condition: Array, on_true: Tree, on_false: Tree) -> Tree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), on_true, on_false)
 
 
+def mode_of(codes: Array) -> Mode:
+    """The mode with these contact codes, [belts]."""
+    return Mode(tuple(codes[i] for i in range(codes.shape[0])))
+
+
 def mode_acceleration(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     """x2' of a slip mode; of a mode with stuck belts, the force `needed` that they have to hold."""
     return acceleration(osc, mode.signs, x1, x2)
