@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from . import presets
 from .basins import Basins, BasinStability, basin_stability, basins
 from .bifurcations import (
+    BeltAtRest,
     BifurcationPoint,
     BoundaryEquilibrium,
     CornerCollision,
@@ -68,6 +69,7 @@ __all__ = [
     "BasinStability",
     "Basins",
     "Belt",
+    "BeltAtRest",
     "BifurcationCurve",
     "BifurcationDiagram",
     "BifurcationPoint",

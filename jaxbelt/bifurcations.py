@@ -20,6 +20,7 @@ unknowns of fixed-signature shooting (see `cycles`) the same equation is harmles
 - `SuddenSliding`: nu_k = 0, with the mass at rest on the belt, x2' = x2 = 0: an equilibrium lies on
   the boundary. No cycle can be an unknown here: as nu_k goes to zero the stick phase lasts ever
   longer, the slip arc takes ever longer to leave the equilibrium, and in the limit there is none.
+- `BeltAtRest`: the same, if no cycle sticks to the belt: an equilibrium jumps.
 - `Hopf`: trace zero at a fixed point (its determinant is always one).
 - `FoldOfCycles`: the multiplier of a cycle that does not stick is one. There the equations of the
   cycle alone are singular; with this one, and the parameter, they are not. (A cycle that sticks
@@ -87,7 +88,6 @@ from .modes import (
     edges,
     mode_acceleration,
     mode_of,
-    mode_of_state,
     onset_position,
     push_and_trace,
     select,
@@ -127,6 +127,13 @@ class GrazingSliding(_BeltCondition):
 
 class SuddenSliding(_BeltCondition):
     """A belt comes to rest: the time that the mass sticks to it in each turn goes to infinity."""
+
+
+class BeltAtRest(_BeltCondition):
+    """A belt comes to rest where the mass is at rest on it, too, and no cycle sticks to it.
+
+    On the other side its friction pulls the other way: the equilibrium jumps, or there is none.
+    """
 
 
 class FoldOfCycles(AbstractCondition):
@@ -228,11 +235,11 @@ def refine(
     """The bifurcation point near an oscillator, by Newton's method with exact derivatives.
 
     condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`, `SlidingExchange(belts)`,
-    `SuddenSliding(belt)`, `FoldOfCycles()`, or of a belt with a contact edge `GrazingEdge(belt)`,
-    `CornerCollision(belt)`, `BoundaryEquilibrium(belt)` or `PseudoHopf(belt)`. osc: a rough guess,
-    on either side of the point. where: selects the parameter that is varied, such as
-    `lambda osc: osc.belts[0].velocity`. max_arcs: room for the arcs of one turn (default 16; where
-    edges are passed 32).
+    `SuddenSliding(belt)`, `BeltAtRest(belt)`, `FoldOfCycles()`, or of a belt with a contact edge
+    `GrazingEdge(belt)`, `CornerCollision(belt)`, `BoundaryEquilibrium(belt)` or `PseudoHopf(belt)`.
+    osc: a rough guess, on either side of the point. where: selects the parameter that is varied,
+    such as `lambda osc: osc.belts[0].velocity`. max_arcs: room for the arcs of one turn (default
+    16; where edges are passed 32).
 
     Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`; `value` and
     `cycle` are differentiable with respect to the other parameters. A guess that leads to no such
@@ -566,8 +573,8 @@ def _onset_orbit(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array, Orbi
     return moving, start, orbit
 
 
-def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
-    """A cycle tangent to the boundary of a belt, given twice, or at the exchange of two belts.
+def at_tangency(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
+    """A cycle tangent to the boundary of the first belt.
 
     wanted: 1 a fold, -1 grazing, 0 either; its multiplier tells which it is.
     """
@@ -577,9 +584,8 @@ def at_cycle(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, s
 
 @jit
 def _touching(osc: Oscillator, orbit: Orbit, belts: Array, wanted: Array, size: int):
-    """The system of `at_cycle` with a guess of its unknowns, a status, and the judge."""
-    belt, other = belts[0], belts[1]
-    exchange = belt != other
+    """The system of `at_tangency` with a guess of its unknowns, a status, and the judge."""
+    belt = belts[0]
     n = len(osc.belts)
     names = Ends(n)
     still = lax.stop_gradient(osc)
@@ -598,26 +604,52 @@ def _touching(osc: Oscillator, orbit: Orbit, belts: Array, wanted: Array, size: 
     )
     orbit = jax.tree.map(lambda a, b: jnp.where(repeated, a, b), orbit, first_turn)
     _, count = last_turn(orbit)
-    turn = turn_of(orbit, size, n)
-    sticks = jnp.any(turn.codes[:, belts] == 0, axis=-1)
-    exchanges = jnp.any(turn.used & sticks & _both_touch(turn.codes, belts))
-    touching, row, found = _with_stick(still, turn, belt)
-    turn = jax.tree.map(lambda a, b: jnp.where(exchange, a, b), turn, touching)
+    turn, row, found = _with_stick(still, turn_of(orbit, size, n), belt)
     chain, z = meshed(still, turn)
 
-    usable = jnp.where(exchange, repeated & exchanges, found)
-    usable = usable & (repeated | returns)
+    usable = found & (repeated | returns)
     status = jnp.where(usable, Status.OK.value, Status.NOT_TOUCHED.value)
-    fits = count < jnp.where(exchange, size + 1, size)  # a tangency may need one arc more
-    status = jnp.where(usable & ~fits, Status.TOO_MANY_ARCS.value, status)
+    # It may need one arc more.
+    status = jnp.where(usable & (count >= size), Status.TOO_MANY_ARCS.value, status)
     status = jnp.where(velocity == 0, Status.STUCK_FOREVER.value, status)
 
     # The arc before the stick arc is the one that becomes tangent.
     before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
-    tangent = chain.ends.at[before].set(names.tangent + belt)
-    ends = jnp.where(exchange, chain.ends, tangent)
-    system = Encounter(chain=Chain(chain.codes, ends, chain.mesh), belts=belts)
+    ends = chain.ends.at[before].set(names.tangent + belt)
+    system = Encounter(Chain(chain.codes, ends, chain.mesh), jnp.stack([belt, belt]))
     return system, z, status, eqx.Partial(_judge_encounter, belts, wanted, row)
+
+
+def at_exchange(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
+    """A cycle that sticks to one of two belts which run at one velocity, and touches both."""
+    _, _, orbit = _onset_orbit(osc, belts)
+    return exchange_near(osc, index, belts, *_repeated_turn(orbit, size, len(osc.belts)))
+
+
+@jit
+def _repeated_turn(orbit: Orbit, size: int, n: int) -> tuple[Turn, Array]:
+    """The turn that an orbit repeats, and a status."""
+    _, count = last_turn(orbit)
+    status = jnp.where(count <= size, Status.OK.value, Status.TOO_MANY_ARCS.value)
+    status = jnp.where(orbit.status == Status.OK, status, Status.NOT_TOUCHED.value)
+    return turn_of(orbit, size, n), status
+
+
+def exchange_near(osc: Oscillator, index: int | Array, belts: Array, turn: Turn, status: Array):
+    """The exchange of two belts by the cycle near a turn; status: of the turn."""
+    return _solved_point(osc, index, *_exchanging(osc, belts, turn, status))
+
+
+@jit
+def _exchanging(osc: Oscillator, belts: Array, turn: Turn, status: Array):
+    """The system of `exchange_near` with a guess of its unknowns, a status, and the judge."""
+    chain, z = meshed(lax.stop_gradient(osc), turn)
+    sticks = jnp.any(turn.codes[:, belts] == 0, axis=-1)
+    exchanges = jnp.any(turn.used & sticks & _both_touch(turn.codes, belts))
+    meant = (status != Status.OK) | exchanges
+    status = jnp.where(meant, status, Status.NOT_TOUCHED.value)
+    either, row = jnp.zeros(()), jnp.asarray(0)
+    return Encounter(chain, belts), z, status, eqx.Partial(_judge_encounter, belts, either, row)
 
 
 def _both_touch(codes: Array, belts: Array) -> Array:
@@ -1201,10 +1233,37 @@ def _belt_at_rest(osc, index, belts, moving: Oscillator, start: Array, orbit: Or
     return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.STUCK_FOREVER)
 
 
-#: What solves for a condition, if not `at_cycle`; and which of two kinds that one finds is meant.
+def at_reversal(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
+    """The first of the belts comes to rest, and the mass is at rest on it."""
+    return _reversed_belt(osc, index, belts, candidates(osc))
+
+
+@jit
+def _reversed_belt(osc, index, belts, rests: Equilibria) -> BifurcationPoint:
+    belt = belts[0]
+    touches = (rests.kind > 0) & (jnp.abs(rests.modes[:, belt]) < 2)
+    row, load = jnp.argmax(touches), jnp.stack([one.load for one in osc.belts])[belt]
+    mode, rest = mode_of(rests.modes[row].astype(float)), jnp.zeros(())
+
+    def equations(osc, u):
+        osc = vary(osc, index, u[1:])
+        needed = mode_acceleration(osc, mode, u[0], rest)
+        return jnp.stack([needed, _velocity(osc, belt)])
+
+    guess = jnp.stack([jnp.where(touches[row], rests.x1[row], jnp.nan), parameter(osc, index)])
+    u, steps, size, error = small_newton(equations, osc, guess)
+    exists = touches[row] & (load > 0)
+    status = jnp.where(exists, Status.OK.value, Status.NOT_TOUCHED.value)
+    status = jnp.where(exists & ~(size < 1e-9), Status.NO_CONVERGENCE.value, status)
+    return _point_without_cycle(osc, index, u[1], steps, size, error, status, Status.EQUILIBRIUM)
+
+
+#: What solves for a condition, if not `at_tangency`; and which of two kinds that finds is meant.
 _SOLVERS = {
     Hopf: at_hopf,
+    SlidingExchange: at_exchange,
     SuddenSliding: at_rest,
+    BeltAtRest: at_reversal,
     FoldOfCycles: at_fold_of_cycles,
     GrazingEdge: at_edge,
     CornerCollision: at_edge,
@@ -1218,4 +1277,4 @@ def solver_of(condition: AbstractCondition) -> Callable:
     """What solves for a condition."""
     if isinstance(condition, GrazingEdge) and condition.unstable:
         return at_edge_unstable
-    return _SOLVERS.get(type(condition), at_cycle)
+    return _SOLVERS.get(type(condition), at_tangency)

@@ -27,6 +27,7 @@ from jaxtyping import Array
 from .bifurcations import (
     HINT_BUDGET,
     AbstractCondition,
+    BeltAtRest,
     BifurcationPoint,
     BoundaryEquilibrium,
     CornerCollision,
@@ -346,9 +347,14 @@ def _steps(problem: _Problem, system: "_System", u: np.ndarray, direction: np.nd
 
 
 def _row(problem: _Problem, at: CurvePoint, seen: "_Seen") -> _Row:
-    kind = type(problem.condition).__name__
+    kind = type(problem.condition)
     if isinstance(problem.condition, NonsmoothFold | GrazingSliding):
-        kind = (NonsmoothFold if seen.multiplier > 1 else GrazingSliding).__name__
+        kind = NonsmoothFold if seen.multiplier > 1 else GrazingSliding
+    elif isinstance(problem.condition, SuddenSliding | BeltAtRest):
+        kind = _kind_at_rest(
+            vary(problem.osc, problem.indices, jnp.asarray(at.u[-2:])), problem.condition.belt
+        )
+    kind = kind.__name__
     return _Row(at.u[-2:], kind, seen.multiplier, seen.residual)
 
 
@@ -602,7 +608,7 @@ def _system_of(problem: _Problem, point: BifurcationPoint) -> _System:
     kind = type(point.condition)
     if kind is Hopf:
         return _HopfSystem(problem, point)
-    if kind is SuddenSliding:
+    if kind in (SuddenSliding, BeltAtRest):
         return _RestSystem(problem, point)
     if kind in (BoundaryEquilibrium, PseudoHopf):
         return _EdgeSystem(problem, point)
@@ -703,7 +709,7 @@ class _RestSystem(_System):
 
     def __init__(self, problem: _Problem, point: BifurcationPoint):
         self.residual = _velocity_equation
-        belt = point.condition.belt if isinstance(point.condition, SuddenSliding) else 0
+        belt = getattr(point.condition, "belt", 0)
         self.args = (point.oscillator, problem.indices, jnp.asarray(belt))
         self._indices = problem.indices
 
@@ -715,6 +721,13 @@ class _RestSystem(_System):
         tests = _velocity_tests(jax.tree.map(np.asarray, vary(osc, indices, jnp.asarray(u))))
         tests = {name: float(v) for name, v in tests.items() if name[1] != (int(belt),)}
         return _Seen(tests, True, np.nan, 0.0)
+
+
+def _kind_at_rest(osc: Oscillator, belt: int) -> type[AbstractCondition]:
+    """Whether a cycle sticks to a belt before or after it is at rest."""
+    index = jnp.asarray(np.array(leaf_index(osc, lambda osc: osc.belts[belt].velocity)))
+    found = (refined(osc, index, nu, SuddenSliding(belt)) for nu in (1e-2, -1e-2))
+    return SuddenSliding if any(point is not None for point in found) else BeltAtRest
 
 
 def _velocity_equation(u: Array, args) -> Array:

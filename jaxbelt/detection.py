@@ -30,6 +30,7 @@ from jaxtyping import Array
 
 from .bifurcations import (
     AbstractCondition,
+    BeltAtRest,
     BifurcationPoint,
     BoundaryEquilibrium,
     CornerCollision,
@@ -44,8 +45,10 @@ from .bifurcations import (
     approach,
     at_edge,
     at_edge_unstable,
+    at_exchange,
     edge_contact,
     end_near_edge,
+    exchange_near,
     fold_near,
     leaf_index,
     room_for,
@@ -300,7 +303,8 @@ class Path:
     def _share(self) -> None:
         """Let values know cycles that attract at the ones beside them.
 
-        A cycle that sticks is always reached, from slip onset. One that does not may be missed.
+        A cycle that sticks is always reached, from where that ends. One that does not may be
+        missed.
         """
         values = sorted(self.labels)
         for pairs in (pairwise(values), pairwise(values[::-1])):
@@ -412,7 +416,7 @@ def _turns(path: Path, value: float, condition: AbstractCondition) -> Sequence[T
     turns = path.turns[value]
     if isinstance(condition, FoldOfCycles):
         return [*(turn for cycle, turn in turns.items() if not _sticks(cycle)), None]
-    return list(turns.values()) if solver_of(condition) is at_edge else [None]
+    return list(turns.values()) if solver_of(condition) in (at_edge, at_exchange) else [None]
 
 
 def _local_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
@@ -441,25 +445,27 @@ def _fold_conditions(path: Path, before: Label, after: Label) -> list[AbstractCo
 
 def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
     """The points where the varied belt is at rest or runs with another one."""
-    belt = path.belt
-    conditions: list[AbstractCondition] = [SuddenSliding(belt)] if value == 0 else []
+    belt, interval = path.belt, path.beside(value)
+    path.look(interval)
+    found: list[BifurcationPoint | None] = []
     for other, its in enumerate(path.osc.belts):
         if other != belt and float(its.velocity) == value:
-            conditions.append(SlidingExchange((min(belt, other), max(belt, other))))
-    interval = path.beside(value)
-    found = {}
-    for condition in conditions:
-        for offset in (1e-2, -1e-2):
-            point = refined(path.osc, path.index, value + offset, condition)
-            if point is not None:
-                found[condition] = point
-    path.look(interval)
-    before, after = map(path.label, interval)
-    if not found and before != after:
+            pair = SlidingExchange((min(belt, other), max(belt, other)))
+            found.append(_explained(path, *interval, [pair]))
+    if value == 0:
+        beside = [
+            (value + offset, kind(belt))
+            for kind in (SuddenSliding, BeltAtRest)
+            for offset in (1e-2, -1e-2)
+        ]
+        tried = (refined(path.osc, path.index, at, condition) for at, condition in beside)
+        found.append(next((point for point in tried if point is not None), None))
+    points = [point for point in found if point is not None]
+    if not points and path.label(interval[0]) != path.label(interval[1]):
         # Something else may happen just there.
         point = _explain(path, [interval])[interval]
-        return [point or unexplained_point(path.osc, int(path.index), value, 0.0)]
-    return list(found.values())
+        points = [point or unexplained_point(path.osc, int(path.index), value, 0.0)]
+    return points
 
 
 def refined(
@@ -482,6 +488,8 @@ def refined(
         point = solve(at, index, belts, either, room_for(solve))
     elif isinstance(condition, FoldOfCycles):
         point = fold_near(at, index, cut([turn])[0], known)
+    elif isinstance(condition, SlidingExchange):
+        point = exchange_near(at, index, belts, cut([turn])[0], known)
     else:
         repels = solver_of(condition) is at_edge_unstable
         point = edge_contact(at, index, belts, either, turn, known, repels=repels)

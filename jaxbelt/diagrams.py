@@ -28,6 +28,7 @@ from jaxtyping import Array, ArrayLike
 
 from .bifurcations import (
     AbstractCondition,
+    BeltAtRest,
     BifurcationPoint,
     GrazingSliding,
     NonsmoothFold,
@@ -426,8 +427,12 @@ def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, s
 
 def kind_of(condition: AbstractCondition) -> tuple[str, Any]:
     """What stays the same along a curve: a tangency to a belt is a fold here and grazing there."""
-    tangency = isinstance(condition, NonsmoothFold | GrazingSliding)
-    name = "tangency" if tangency else type(condition).__name__
+    name = type(condition).__name__
+    for common, kinds in (
+        ("tangency", NonsmoothFold | GrazingSliding),
+        ("rest", SuddenSliding | BeltAtRest),
+    ):
+        name = common if isinstance(condition, kinds) else name
     return name, getattr(condition, "belt", getattr(condition, "belts", None))
 
 
@@ -572,7 +577,7 @@ def _joined(pieces: Sequence[_Piece], points: Sequence[BifurcationPoint]) -> lis
     """Branches through the points: two ends of pieces that are one place there belong together."""
     partner: dict[tuple[int, bool], tuple[int, bool]] = {}
     for at, point in enumerate(points):
-        if isinstance(point.condition, SuddenSliding):
+        if isinstance(point.condition, SuddenSliding | BeltAtRest):
             continue
         ends = [
             _end(i, piece, right=piece.stretch == at)
