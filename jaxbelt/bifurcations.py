@@ -15,6 +15,10 @@ unknowns of fixed-signature shooting (see `cycles`) the same equation is harmles
   cycle with another stick phase has m = 0. Where the law jumps, static > mu(0+), the stick phase
   that begins at the tangency lasts, and without it the orbit is another one: the return map jumps,
   m = inf, and the cycle ends there.
+- `CrossingSliding`: the cycle arrives at a boundary r_k = 0 just at an end of the stretch of it on
+  which the mass sticks. To one side of it the mass sticks, to the other the boundary is crossed:
+  a crossing-sliding bifurcation (M. di Bernardo, C. Budd, A. Champneys, P. Kowalczyk,
+  Piecewise-smooth Dynamical Systems, 2008). Linear in the unknowns, x1 = rest +- capacity.
 - `SlidingExchange`: nu_i = nu_j, and a cycle that sticks to i or j. The friction of each mode keeps
   its sign, so the cycle with its signature fixed goes smoothly through the point.
 - `SuddenSliding`: nu_k = 0, with the mass at rest on the belt, x2' = x2 = 0: an equilibrium lies on
@@ -91,6 +95,7 @@ from .modes import (
     onset_position,
     push_and_trace,
     select,
+    stick_velocity,
 )
 from .oscillator import Oscillator, check_oscillator
 from .results import Status, describe
@@ -123,6 +128,14 @@ class NonsmoothFold(_BeltCondition):
 
 class GrazingSliding(_BeltCondition):
     """The cycle touches the boundary of a belt and begins to stick to it there, but goes on."""
+
+
+class CrossingSliding(_BeltCondition):
+    """The cycle crosses the boundary of a belt, and begins to stick to it where it did.
+
+    It arrives at one end of where the mass sticks: that of slip onset, at which a stick phase
+    begins with no duration, or the other one, from which it then sticks all the way.
+    """
 
 
 class SuddenSliding(_BeltCondition):
@@ -235,10 +248,11 @@ def refine(
     """The bifurcation point near an oscillator, by Newton's method with exact derivatives.
 
     condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`, `SlidingExchange(belts)`,
-    `SuddenSliding(belt)`, `BeltAtRest(belt)`, `FoldOfCycles()`, or of a belt with a contact edge
-    `GrazingEdge(belt)`, `CornerCollision(belt)`, `BoundaryEquilibrium(belt)` or `PseudoHopf(belt)`.
-    osc: a rough guess, on either side of the point. where: selects the parameter that is varied,
-    such as `lambda osc: osc.belts[0].velocity`. max_arcs: room for the arcs of one turn (default
+    `CrossingSliding(belt)`, `SuddenSliding(belt)`, `BeltAtRest(belt)`, `FoldOfCycles()`, or of a
+    belt with a contact edge `GrazingEdge(belt)`, `CornerCollision(belt)`,
+    `BoundaryEquilibrium(belt)` or `PseudoHopf(belt)`. osc: a rough guess, on either side of the
+    point. where: selects the parameter that is varied, such as
+    `lambda osc: osc.belts[0].velocity`. max_arcs: room for the arcs of one turn (default
     16; where edges are passed 32).
 
     Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`; `value` and
@@ -266,7 +280,7 @@ def refine(
 
 def room_for(solve: Callable) -> int:
     """Room for the arcs of one turn: passing edges takes more of them."""
-    return SIZES[1] if solve is at_edge else SIZES[0]
+    return SIZES[1] if solve in (at_edge, at_crossing) else SIZES[0]
 
 
 def leaf_index(osc: Oscillator, where: Callable[[Oscillator], Any]) -> int:
@@ -425,8 +439,8 @@ def _solved_point(osc, index, system, z0, status, judge) -> BifurcationPoint:
     z, p, steps, matrix = _solve_system(osc, index, system, z0, p0)
     iterations = jnp.sum(~jnp.isnan(steps))
     at_point = vary(osc, index, p)
-    cycle, slope = cycle_of(at_point, system.ordinary, z, iterations, status)
     size, error = _accuracy(*lax.stop_gradient((at_point, system, z, matrix)))
+    cycle, slope = cycle_of(at_point, system.ordinary, z, iterations, status, size)
     status, multiplier = judge(at_point, z, cycle, slope)
     known = functools.partial(jnp.where, status == Status.OK)
     return BifurcationPoint(
@@ -527,6 +541,32 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
         (last[1], last[2] + 1, jnp.asarray(Status.OK.value)),
     )
     return jax.tree.map(lambda a, b: jnp.where(is_cycle, a, b), ended, orbit)
+
+
+@jit
+def settled_turns(osc: Oscillator, rests: Equilibria, size: int) -> tuple[Turn, Array]:
+    """The turns that the orbits from `starts` repeat, in `size` arcs each, and their status."""
+
+    def run(start):
+        orbit = approach(osc, rests, start)
+        _, count = last_turn(orbit)
+        fits = (orbit.status != Status.OK) | (count <= size)
+        status = jnp.where(fits, orbit.status, Status.TOO_MANY_ARCS.value)
+        return turn_of(orbit, size, len(osc.belts)), status
+
+    osc, rests = lax.stop_gradient((osc, rests))
+    return each(run)(starts(osc, rests))
+
+
+@jit
+def _nearest(osc: Oscillator, turns: Turn, status: Array, distance: Callable) -> tuple[Turn, Array]:
+    """Of the turns that were found the one for which distance(osc, turn) is least, and a status."""
+    distances = jax.vmap(functools.partial(distance, lax.stop_gradient(osc)))(turns)
+    distances = jnp.where(status == Status.OK, distances, jnp.inf)
+    at, large = jnp.argmin(distances), jnp.any(status == Status.TOO_MANY_ARCS)
+    none = jnp.where(large, Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
+    found = jnp.isfinite(distances[at])
+    return jax.tree.map(lambda x: x[at], turns), jnp.where(found, Status.OK.value, none)
 
 
 @jit
@@ -711,6 +751,103 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
     return turn, jnp.where(has_own, shortest, at + 1), has_own | jnp.any(turns)
 
 
+# --- crossing a boundary, or sticking to it -------------------------------------------------------
+
+
+class StickLimit(System):
+    """A cycle of which the arc `row` arrives at a boundary at an end of where the mass sticks.
+
+    codes: of the mode in which it sticks there; side: 1 the end on the right, -1 on the left.
+    """
+
+    chain: Chain
+    row: Array
+    codes: Array
+    side: Array
+
+    def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
+        x1 = z[(self.row + 1) % z.shape[0], 0]
+        return x1 - stick_limit(osc, self.codes, self.side)
+
+
+def stick_limit(osc: Oscillator, codes: Array, side: Array) -> Array:
+    """x1 where the needed force is as large as the stuck belts can hold."""
+    mode = mode_of(codes)
+    v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
+    return mode_acceleration(osc, mode, jnp.zeros(()), v) + side * capacity(osc, mode)
+
+
+class Arrival(eqx.Module):
+    """An arc that arrives at a boundary: how far from an end of where the mass sticks, its row, and
+    the rest of a `StickLimit`."""
+
+    distance: Array
+    row: Array
+    codes: Array
+    side: Array
+
+
+def arrival_near_limit(osc: Oscillator, turn: Turn, belt: Array) -> Arrival:
+    """Of the arcs of a turn that arrive at the boundary of a belt that nearest to such an end.
+
+    At the other end the orbit would arrive tangentially, with the other sign of r.
+    """
+    velocities = jnp.stack([one.velocity for one in osc.belts])
+    same = velocities == velocities[belt]
+
+    def one(codes, end, x1):
+        held = jnp.where(same & (jnp.abs(codes) < 1.5), 0.0, codes)
+        side = -codes[belt]
+        arrives = (end < len(osc.belts)) & same[jnp.clip(end, 0, len(osc.belts) - 1)]
+        distance = jnp.abs(x1 - stick_limit(osc, held, side))
+        arrives = arrives & (jnp.abs(codes[belt]) == 1)
+        return jnp.where(arrives, distance, jnp.inf), held, side
+
+    distance, held, side = jax.vmap(one)(turn.codes, turn.ends, turn.exits[:, 0])
+    row = jnp.argmin(distance)
+    return Arrival(distance[row], row, held[row], side[row])
+
+
+def at_crossing(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
+    """An attracting cycle that arrives at the boundary of the first belt at such an end."""
+    distance = eqx.Partial(_distance_to_limit, belts)
+    turn, status = _nearest(osc, *settled_turns(osc, candidates(osc), size), distance)
+    return crossing_near(osc, index, belts, turn, status)
+
+
+def _distance_to_limit(belts, osc: Oscillator, turn: Turn) -> Array:
+    return arrival_near_limit(osc, turn, belts[0]).distance
+
+
+def crossing_near(osc: Oscillator, index: int | Array, belts: Array, turn: Turn, status: Array):
+    """The cycle near a turn that arrives at such an end; status: of the turn."""
+    return _solved_point(osc, index, *_arriving(osc, belts, turn, status))
+
+
+@jit
+def _arriving(osc: Oscillator, belts: Array, turn: Turn, status: Array):
+    """The system of `crossing_near` with a guess of its unknowns, a status, and the judge."""
+    still = lax.stop_gradient(osc)
+    near = arrival_near_limit(still, turn, belts[0])
+    exists = (status != Status.OK) | jnp.isfinite(near.distance)
+    status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
+    # Having crossed, the orbit may come back to the boundary soon and stick. The equations of that
+    # excursion are of second order, and it is left out.
+    count = jnp.maximum(jnp.sum(turn.used), 1)
+    after = (near.row + 1 + jnp.arange(3)) % count
+    returns = (turn.ends[after[0]] == Ends(len(osc.belts)).turn_x2) & (count > 3)
+    returns = returns & (turn.ends[after[1]] == turn.ends[near.row])
+    returns = returns & (turn.codes[after[2], belts[0]] == 0)
+    shorter = _without(turn, near.row, jnp.asarray(2))
+    turn, row = jax.tree.map(lambda a, b: jnp.where(returns, a, b), shorter, (turn, near.row))
+    chain, z = meshed(still, turn)
+    return StickLimit(chain, row, near.codes, near.side), z, status, eqx.Partial(_judge_arrival)
+
+
+def _judge_arrival(osc: Oscillator, z, cycle: Cycle, slope):
+    return cycle.status, jnp.asarray(jnp.nan)
+
+
 # --- touching a contact edge ----------------------------------------------------------------------
 
 
@@ -816,13 +953,20 @@ def _without_excursion(osc: Oscillator, turn: Turn, near: EdgeEnd) -> tuple[Turn
     after = jnp.argmin(jnp.where(events, (rows - row) % count, rows.size))
     is_excursion = (turn.ends[row] == names.turn_x1) & passes[before] & passes[after]
     is_excursion = is_excursion & (before != after)
-    left = count - (after - before) % count
-    source = jnp.where(rows < left, (after + 1 + rows) % count, (after + 1) % count)
-    ends = jnp.where(rows < left, turn.ends[source], names.unused).at[left - 1].set(names.turn_x1)
-    durations = jnp.where(rows < left, turn.durations[source], 0.0)
-    without = Turn(turn.codes[source], ends, turn.entries[source], durations)
+    without, last = _without(turn, before, (after - before) % count)
+    without = eqx.tree_at(lambda t: t.ends, without, without.ends.at[last].set(names.turn_x1))
     turn = jax.tree.map(lambda a, b: jnp.where(is_excursion, a, b), without, turn)
-    return turn, jnp.where(is_excursion, left - 1, row)
+    return turn, jnp.where(is_excursion, last, row)
+
+
+def _without(turn: Turn, row: Array, removed: Array) -> tuple[Turn, Array]:
+    """The turn without so many arcs after a row; and that row, which is its last one then."""
+    rows, count = jnp.arange(turn.ends.size), jnp.maximum(jnp.sum(turn.used), 1)
+    left, first = count - removed, row + removed + 1
+    source = jnp.where(rows < left, first + rows, first) % count
+    ends = jnp.where(rows < left, turn.ends[source], Ends(turn.codes.shape[-1]).unused)
+    durations = jnp.where(rows < left, turn.durations[source], 0.0)
+    return Turn(turn.codes[source], ends, turn.entries[source], durations), left - 1
 
 
 def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
@@ -831,30 +975,13 @@ def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, si
     wanted: 1 a turn ends it (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
     these cycles that which comes nearest to this is taken.
     """
-    turn, status = _turn_near_edge(osc, candidates(osc), belts, wanted, size)
+    distance = eqx.Partial(_distance_to_edge, belts, wanted)
+    turn, status = _nearest(osc, *settled_turns(osc, candidates(osc), size), distance)
     return edge_contact(osc, index, belts, wanted, turn, status, repels=False)
 
 
-@jit
-def _turn_near_edge(osc: Oscillator, rests: Equilibria, belts: Array, wanted: Array, size: int):
-    """The turn of `at_edge` and a status."""
-    n = len(osc.belts)
-    still, rests = lax.stop_gradient((osc, rests))
-
-    def run(start):
-        orbit = approach(still, rests, start)
-        turn, (_, count) = turn_of(orbit, size, n), last_turn(orbit)
-        found = orbit.status == Status.OK
-        distance = end_near_edge(still, turn, belts[0], wanted).distance
-        distance = jnp.where(found & (count <= size), distance, jnp.inf)
-        return turn, distance, found & (count > size)
-
-    turns, distances, large = each(run)(starts(still, rests))
-    at = jnp.argmin(distances)
-    turn = jax.tree.map(lambda x: x[at], turns)
-    none = jnp.where(jnp.any(large), Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
-    status = jnp.where(jnp.isfinite(distances[at]), Status.OK.value, none)
-    return turn, status
+def _distance_to_edge(belts, wanted, osc: Oscillator, turn: Turn) -> Array:
+    return end_near_edge(osc, turn, belts[0], wanted).distance
 
 
 def at_edge_unstable(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
@@ -1262,6 +1389,7 @@ def _reversed_belt(osc, index, belts, rests: Equilibria) -> BifurcationPoint:
 _SOLVERS = {
     Hopf: at_hopf,
     SlidingExchange: at_exchange,
+    CrossingSliding: at_crossing,
     SuddenSliding: at_rest,
     BeltAtRest: at_reversal,
     FoldOfCycles: at_fold_of_cycles,

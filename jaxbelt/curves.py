@@ -31,6 +31,7 @@ from .bifurcations import (
     BifurcationPoint,
     BoundaryEquilibrium,
     CornerCollision,
+    CrossingSliding,
     EdgeContact,
     Encounter,
     FoldOfCycles,
@@ -40,8 +41,10 @@ from .bifurcations import (
     NonsmoothFold,
     PseudoHopf,
     SlidingExchange,
+    StickLimit,
     SuddenSliding,
     UnitMultiplier,
+    arrival_near_limit,
     edge_balance,
     edge_rest,
     end_near_edge,
@@ -619,6 +622,7 @@ def _system_of(problem: _Problem, point: BifurcationPoint) -> _System:
         FoldOfCycles,
         GrazingEdge,
         CornerCollision,
+        CrossingSliding,
     ):
         return _CycleSystem.begun(problem, point)
     raise ValueError(f"point must be of a kind that has curves, got {point.condition!r}")
@@ -793,6 +797,12 @@ class _CycleSystem(_System):
         chain = Chain(chain.codes, jnp.asarray(ends), chain.mesh)
         if isinstance(condition, FoldOfCycles):
             system = UnitMultiplier(chain)
+        elif isinstance(condition, CrossingSliding):
+            z = point.cycle.unknowns
+            turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
+            near = arrival_near_limit(point.oscillator, turn, jnp.asarray(condition.belt))
+            row = (int(near.row) + 1) % int(np.sum(ends != names.unused))
+            system = StickLimit(chain, near.row, near.codes, near.side)
         elif isinstance(condition, GrazingEdge | CornerCollision):
             z = point.cycle.unknowns
             turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
@@ -849,14 +859,18 @@ def _look_at_cycle(args, u: Array):
     osc, row = osc_of(p), args[3]
     chain = system.ordinary
     ok = jnp.asarray(Status.OK.value)
-    cycle, slope = cycle_of(osc, chain, z, jnp.asarray(0), ok)
+    residual = jnp.max(jnp.abs(_cycle_equations(u, args)))
+    cycle, slope = cycle_of(osc, chain, z, jnp.asarray(0), ok, residual)
     n = len(osc.belts)
     names = Ends(n)
     rows = jnp.arange(chain.ends.size)
-    is_fold, on_edge = isinstance(system, UnitMultiplier), isinstance(system, EdgeContact)
-    touches = (row >= 0) & (not on_edge)
+    is_fold, at_end = (
+        isinstance(system, UnitMultiplier),
+        isinstance(system, EdgeContact | StickLimit),
+    )
+    touches = (row >= 0) & (not at_end)
     others = chain.used & (rows != row)
-    if on_edge:
+    if at_end:
         others = others & (rows != system.row)
     sticks = others & jnp.any(chain.codes == 0, axis=-1)
     slope = jnp.where(jnp.any(sticks), 0.0, slope)
@@ -877,11 +891,10 @@ def _look_at_cycle(args, u: Array):
         gap = jnp.min(jnp.where(slips, chain.codes[:, belt] * r, jnp.inf))
         nearest = jnp.where(jnp.any(own), shortest, gap)
         # An exchange ends where the phase of sticking vanishes.
-        watched = (touches | is_fold | on_edge | jnp.any(own)) & jnp.isfinite(nearest)
+        watched = (touches | is_fold | at_end | jnp.any(own)) & jnp.isfinite(nearest)
         name = "FoldGrazing" if is_fold else "DoubleSliding"
         tests[name, (belt,)] = jnp.where(watched, nearest, jnp.nan)
     valid = (cycle.status == Status.OK) & ((size > 0) | (not is_fold))
-    residual = jnp.max(jnp.abs(_cycle_equations(u, args)))
     return tests, valid, jnp.where(touches | is_fold, slope, jnp.nan), residual
 
 

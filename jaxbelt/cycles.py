@@ -860,11 +860,21 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
 
 
 def cycle_of(
-    osc: Oscillator, chain: Chain, z: Array, iterations: Array, status: Array
+    osc: Oscillator,
+    chain: Chain,
+    z: Array,
+    iterations: Array,
+    status: Array,
+    error: Array | None = None,
 ) -> tuple[Cycle, Array]:
     """The `Cycle` of a solution z, NaN with a status where it is none; and its multiplier with
-    stick phases left out."""
-    error, slope = closure(osc, chain, z)
+    stick phases left out.
+
+    error: the largest in its equations, where these are not those of the chain: an arc that was
+    solved for backwards may magnify what is followed forwards a hundred thousand times.
+    """
+    forwards, slope = closure(osc, chain, z)
+    error = forwards if error is None else error
     status = _first_failure(status, error < 1e-9, Status.NO_CONVERGENCE)
     status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))

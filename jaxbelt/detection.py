@@ -34,6 +34,7 @@ from .bifurcations import (
     BifurcationPoint,
     BoundaryEquilibrium,
     CornerCollision,
+    CrossingSliding,
     FoldOfCycles,
     GrazingEdge,
     GrazingSliding,
@@ -42,18 +43,19 @@ from .bifurcations import (
     PseudoHopf,
     SlidingExchange,
     SuddenSliding,
-    approach,
+    at_crossing,
     at_edge,
     at_edge_unstable,
     at_exchange,
+    crossing_near,
     edge_contact,
     end_near_edge,
     exchange_near,
     fold_near,
     leaf_index,
     room_for,
+    settled_turns,
     solver_of,
-    starts,
     unexplained_point,
     vary,
 )
@@ -66,9 +68,7 @@ from .cycles import (
     as_turn,
     cut,
     find_cycle,
-    last_turn,
     turn_events,
-    turn_of,
     unstable_cycle,
 )
 from .equilibria import equilibria
@@ -197,12 +197,9 @@ class Label(NamedTuple):
     equilibria: tuple[tuple[int, bool], ...]
     cycles: frozenset[Signature]
 
-    @property
-    def sticks(self) -> Counter[int]:
-        """How often the cycles stick to each belt, together."""
-        return Counter(
-            belt for cycle in self.cycles for kind, belt in cycle if kind == EventKind.STICK
-        )
+    def events(self, kind: EventKind) -> Counter[int]:
+        """How often there is an event of a kind in the cycles, by its belt."""
+        return Counter(belt for cycle in self.cycles for one, belt in cycle if one == kind)
 
     @property
     def smooth(self) -> int:
@@ -353,15 +350,7 @@ def _look(osc: Oscillator, index: Array, values: Array) -> _Seen:
 
 def _look_at(osc: Oscillator) -> _Seen:
     rests = equilibria(osc)
-
-    def run(start):
-        orbit = approach(osc, rests, start)
-        _, count = last_turn(orbit)
-        fits = (orbit.status != Status.OK) | (count <= ROOM)
-        status = jnp.where(fits, orbit.status, Status.TOO_MANY_ARCS.value)
-        return status, turn_of(orbit, ROOM, len(osc.belts))
-
-    status, turn = each(run)(starts(osc, rests))
+    turn, status = settled_turns(osc, rests, ROOM)
     return _Seen(rests.kind, rests.stable, status, turn)
 
 
@@ -416,16 +405,19 @@ def _turns(path: Path, value: float, condition: AbstractCondition) -> Sequence[T
     turns = path.turns[value]
     if isinstance(condition, FoldOfCycles):
         return [*(turn for cycle, turn in turns.items() if not _sticks(cycle)), None]
-    return list(turns.values()) if solver_of(condition) in (at_edge, at_exchange) else [None]
+    own = solver_of(condition) in (at_edge, at_exchange, at_crossing)
+    return list(turns.values()) if own else [None]
 
 
 def _local_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
     conditions: list[AbstractCondition] = []
     if before.equilibria != after.equilibria:
         conditions.append(Hopf())
-    changed = (before.sticks - after.sticks) + (after.sticks - before.sticks)
     # Whether a tangency is a fold or grazing is seen when it is found.
-    return conditions + [GrazingSliding(belt) for belt in changed]
+    for event, kind in ((EventKind.STICK, GrazingSliding), (EventKind.CROSS, CrossingSliding)):
+        one, other = before.events(event), after.events(event)
+        conditions += [kind(belt) for belt in (one - other) + (other - one)]
+    return conditions
 
 
 def _edge_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
@@ -490,6 +482,8 @@ def refined(
         point = fold_near(at, index, cut([turn])[0], known)
     elif isinstance(condition, SlidingExchange):
         point = exchange_near(at, index, belts, cut([turn])[0], known)
+    elif isinstance(condition, CrossingSliding):
+        point = crossing_near(at, index, belts, cut([turn])[0], known)
     else:
         repels = solver_of(condition) is at_edge_unstable
         point = edge_contact(at, index, belts, either, turn, known, repels=repels)
