@@ -63,7 +63,6 @@ from .cycles import (
     Ends,
     Orbit,
     Turn,
-    admissible,
     closure,
     cycle_of,
     end_guard,
@@ -464,11 +463,11 @@ def _velocity(osc: Oscillator, belt: int | Array) -> Array:
     return jnp.stack([one.velocity for one in osc.belts])[belt]
 
 
-def before_stick_ends(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
+def before_stick_ends(osc: Oscillator, belt: int | Array) -> Array:
     """States stuck to a belt where stick phases end, one for each zone between contact edges.
 
     Shortly before slip onset; or, where the zone ends first, on the edge. NaN where neither is, or
-    the belt does not touch. Returns them, [zones, 2], and whether it is slip onset, [zones].
+    the belt does not touch. [zones, 2].
     """
     v = _velocity(osc, belt) / osc.omega
     positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
@@ -483,7 +482,7 @@ def before_stick_ends(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]
     exists = (jnp.stack(mode.codes)[belt] == STUCK) & (lower < upper)
     x1 = jnp.where(slips, onset - near * jnp.sign(v), jnp.where(meets, ahead, jnp.nan))
     states = jnp.stack([x1, jnp.full_like(x1, v)], axis=1)
-    return jnp.where(exists[:, None], states, jnp.nan), slips & exists
+    return jnp.where(exists[:, None], states, jnp.nan)
 
 
 def starts(osc: Oscillator, rests: Equilibria) -> Array:
@@ -495,7 +494,7 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
     repels = exists & ~rests.stable
     row = jnp.where(jnp.any(repels), jnp.argmax(repels), jnp.maximum(jnp.sum(exists) - 1, 0))
     centre = jnp.where(jnp.any(exists), rests.x1[row], 0.0)
-    ends = [before_stick_ends(osc, belt)[0] for belt in range(len(osc.belts))]
+    ends = [before_stick_ends(osc, belt) for belt in range(len(osc.belts))]
     others = [jnp.stack([centre + distance, jnp.zeros(())])[None] for distance in DISTANCES]
     return jnp.concatenate([*ends, *others])
 
@@ -570,12 +569,12 @@ def _nearest(osc: Oscillator, turns: Turn, status: Array, distance: Callable) ->
 
 
 @jit
-def _onset_orbit(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array, Orbit]:
-    """The orbit from slip onset on the first of the belts, its start, and the oscillator.
+def _orbit_after_stick(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array, Orbit]:
+    """The orbit from where a stick phase on the first of the belts ends, its start, the oscillator.
 
-    Of several the one of which the stick phase on that belt is shortest in the turn that repeats;
-    if none sticks to it, the one that comes back nearest to its boundary. The oscillator is the one
-    given but for the velocity of that belt: where it is at rest, no orbit leaves.
+    Of several the one that comes back most nearly tangent to its boundary to stick there; if none
+    does, the one that comes nearest to it. The oscillator is the one given but for the velocity of
+    that belt: where it is at rest, no orbit leaves.
     """
     velocities = [
         jnp.where((belts[0] == i) & (one.velocity == 0), 1e-2, one.velocity)
@@ -583,21 +582,21 @@ def _onset_orbit(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array, Orbi
     ]
     moving = eqx.tree_at(lambda o: [one.velocity for one in o.belts], osc, velocities)
     moving = lax.stop_gradient(moving)
-    velocity, names = _velocity(moving, belts[0]), Ends(len(osc.belts))
-    states, slips = before_stick_ends(moving, belts[0])
-    states = jnp.where(slips[:, None], states, jnp.nan)[jnp.argsort(~slips)]
-    rows = jnp.arange(HINT_BUDGET)
+    n = len(osc.belts)
+    velocity, turn_x2 = _velocity(moving, belts[0]), Ends(n).turn_x2
+    states = before_stick_ends(moving, belts[0])
+    exists = jnp.isfinite(states[:, 0])
+    states = states[jnp.argsort(~exists)]
 
     def attempt(tried):
         number, best, kept = tried
         orbit = follow(moving, states[number], HINT_BUDGET)
-        settled = (orbit.status == Status.OK) & (rows > orbit.repeats) & (rows < orbit.count)
-        sticks = settled & (orbit.codes[:, belts[0]] == 0)
-        shortest = jnp.min(jnp.where(sticks, orbit.durations, jnp.inf))
+        _, push = least_push(moving, turn_of(orbit, HINT_BUDGET, n), belts[0])
         x2 = jnp.roll(orbit.entries[:, 1], -1).at[orbit.count - 1].set(orbit.y[1])
-        turns = (orbit.ends == names.turn_x2) & (x2 * velocity > 0) & (rows > 0)
+        turns = (orbit.ends == turn_x2) & (x2 * velocity > 0) & (jnp.arange(HINT_BUDGET) > 0)
         gap = jnp.min(jnp.where(turns, jnp.abs(velocity - osc.omega * x2), jnp.inf))
-        size = jnp.where(jnp.any(sticks), shortest, 1e6 + gap)
+        sticks = (orbit.status == Status.OK) & jnp.isfinite(push)
+        size = jnp.where(sticks, push, 1e6 + gap)
         better = (number == 0) | (size < best)
         new = (size, (states[number], orbit))
         best, kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, (best, kept))
@@ -608,7 +607,7 @@ def _onset_orbit(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array, Orbi
         jax.eval_shape(lambda y: (y, follow(moving, y, HINT_BUDGET)), states[0]),
     )
     none = jnp.asarray(0), jnp.asarray(jnp.inf), empty
-    several = jnp.maximum(jnp.sum(slips), 1)
+    several = jnp.maximum(jnp.sum(exists), 1)
     _, _, (start, orbit) = lax.while_loop(lambda tried: tried[0] < several, attempt, none)
     return moving, start, orbit
 
@@ -618,7 +617,7 @@ def at_tangency(osc: Oscillator, index: int | Array, belts: Array, wanted: Array
 
     wanted: 1 a fold, -1 grazing, 0 either; its multiplier tells which it is.
     """
-    _, _, orbit = _onset_orbit(osc, belts)
+    _, _, orbit = _orbit_after_stick(osc, belts)
     return _solved_point(osc, index, *_touching(osc, orbit, belts, wanted, size))
 
 
@@ -662,7 +661,7 @@ def _touching(osc: Oscillator, orbit: Orbit, belts: Array, wanted: Array, size: 
 
 def at_exchange(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
     """A cycle that sticks to one of two belts which run at one velocity, and touches both."""
-    _, _, orbit = _onset_orbit(osc, belts)
+    _, _, orbit = _orbit_after_stick(osc, belts)
     return exchange_near(osc, index, belts, *_repeated_turn(orbit, size, len(osc.belts)))
 
 
@@ -700,32 +699,56 @@ def _both_touch(codes: Array, belts: Array) -> Array:
 def _judge_encounter(belts, wanted, row, osc: Oscillator, z, cycle: Cycle, slope):
     belt, other = belts[0], belts[1]
     exchange, chain = belt != other, cycle.chain
-    others = jnp.any(chain.codes == 0, axis=-1) & chain.used & (jnp.arange(chain.ends.size) != row)
+    stuck = jnp.any(chain.codes == 0, axis=-1) & chain.used
+    phase = stick_phase_from(osc, chain, row)
     slope = jnp.where(z[row, 2] > 1e-6, jnp.inf, slope)  # a square root of rounding is no phase
-    slope = jnp.where(jnp.any(others), 0.0, slope)
-    # An exchange needs the same cycle with the belts swapped where both touch; a tangency is of one
-    # kind.
-    swap = jnp.arange(len(osc.belts)).at[belt].set(other).at[other].set(belt)
-    both = _both_touch(chain.codes, belts)[:, None]
-    codes = jnp.where(both, chain.codes[:, swap], chain.codes)
-    swapped = Chain(codes, chain.ends, chain.mesh)
+    slope = jnp.where(jnp.any(stuck & ~phase), 0.0, slope)
+    # A tangency is of one kind.
     is_wanted = (wanted == 0) | (wanted * (slope - 1) >= 0)  # the slope may be infinite
-    fits = jnp.where(exchange, admissible(osc, swapped, z), is_wanted)
+    fits = exchange | is_wanted
     slope = jnp.where(exchange, jnp.nan, slope)
     other_kind = (cycle.status == Status.OK) & ~fits
     return jnp.where(other_kind, Status.OTHER_KIND.value, cycle.status), slope
 
 
+def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
+    """The arcs of the stick phase that begins with a row; there are more where it passes edges."""
+    stuck = chain.used & jnp.any(chain.codes == 0, axis=-1)
+    rows = jnp.arange(stuck.size)
+    before = (rows - 1) % jnp.maximum(jnp.sum(chain.used), 1)
+    phase = rows == row
+    for _ in range(2 * len(osc.belts)):
+        phase = phase | (stuck & phase[before])
+    return phase
+
+
+def least_push(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Array, Array]:
+    """The arc that arrives to stick to a belt with the least x2': its row, and the size of that.
+
+    From the side on which that vanishes where the orbit is tangent to the boundary; inf: none.
+    """
+    side = jnp.sign(_velocity(osc, belt))
+    arrives = turn.used & (following_codes(turn)[:, belt] == 0) & (turn.codes[:, belt] == side)
+
+    def push(codes, y):
+        return jnp.abs(mode_acceleration(osc, mode_of(codes), y[0], y[1]))
+
+    pushes = jnp.where(arrives, jax.vmap(push)(turn.codes, turn.exits), jnp.inf)
+    return jnp.argmin(pushes), jnp.min(pushes)
+
+
 def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, Array]:
     """A turn with a stick arc on the belt, its row, whether there is one.
 
-    Its own shortest, or one of duration zero where x2 comes closest to the boundary from inside.
+    Its own that begins most nearly by a tangency, or one of duration zero where x2 comes closest to
+    the boundary from inside.
     """
     velocity = _velocity(osc, belt)
     rows = jnp.arange(turn.ends.size)
     names = Ends(len(osc.belts))
-    own = (turn.ends == names.onset) & (turn.codes[:, belt] == 0)
-    shortest = jnp.argmin(jnp.where(own, turn.durations, jnp.inf))
+    arrival, push = least_push(osc, turn, belt)
+    has_own = jnp.isfinite(push)
+    own = (arrival + 1) % jnp.maximum(jnp.sum(turn.used), 1)
 
     following = turn.exits
     turns = turn.used & (turn.ends == names.turn_x2)
@@ -746,9 +769,8 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
         entries=inserted(turn.entries, jnp.stack([following[at, 0], velocity / osc.omega])),
         durations=inserted(turn.durations, jnp.zeros(())),
     )
-    has_own = jnp.any(own)
     turn = jax.tree.map(lambda a, b: jnp.where(has_own, a, b), turn, new)
-    return turn, jnp.where(has_own, shortest, at + 1), has_own | jnp.any(turns)
+    return turn, jnp.where(has_own, own, at + 1), has_own | jnp.any(turns)
 
 
 # --- crossing a boundary, or sticking to it -------------------------------------------------------
@@ -1334,7 +1356,7 @@ def _rest_on_edge(osc, index, equation: EdgeRest | EdgeBalance) -> BifurcationPo
 
 def at_rest(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
     """The first of the belts comes to rest, and a cycle sticks to it."""
-    return _belt_at_rest(osc, index, belts, *_onset_orbit(osc, belts))
+    return _belt_at_rest(osc, index, belts, *_orbit_after_stick(osc, belts))
 
 
 @jit

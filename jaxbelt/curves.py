@@ -49,8 +49,10 @@ from .bifurcations import (
     edge_rest,
     end_near_edge,
     leaf_index,
+    least_push,
     parameter,
     small_newton,
+    stick_phase_from,
     vary,
 )
 from .checks import as_array, check_finite, require
@@ -781,31 +783,26 @@ class _CycleSystem(_System):
 
     @classmethod
     def begun(cls, problem: _Problem, point: BifurcationPoint) -> "_CycleSystem":
-        chain, condition = point.cycle.chain, point.condition
+        chain, z, condition = point.cycle.chain, point.cycle.unknowns, point.condition
+        turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
         codes, ends = np.asarray(chain.codes), np.array(chain.ends)
         names = Ends(codes.shape[1])
         row, belts = -1, (0, 0)
         if isinstance(condition, NonsmoothFold | GrazingSliding):
             belts = (condition.belt, condition.belt)
-            # Its stick phase is the one of no duration; the arc before it is tangent.
-            own = (codes[:, condition.belt] == 0) & (ends != names.unused)
-            durations = np.abs(np.asarray(point.cycle.unknowns)[:, 2])
-            row = int(np.argmin(np.where(own, durations, np.inf)))
-            ends[(row - 1) % int(np.sum(ends != names.unused))] = names.tangent + condition.belt
+            arrival, _ = least_push(point.oscillator, turn, jnp.asarray(condition.belt))
+            ends[int(arrival)] = names.tangent + condition.belt
+            row = (int(arrival) + 1) % int(np.sum(ends != names.unused))
         elif isinstance(condition, SlidingExchange):
             belts = condition.belts
         chain = Chain(chain.codes, jnp.asarray(ends), chain.mesh)
         if isinstance(condition, FoldOfCycles):
             system = UnitMultiplier(chain)
         elif isinstance(condition, CrossingSliding):
-            z = point.cycle.unknowns
-            turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
             near = arrival_near_limit(point.oscillator, turn, jnp.asarray(condition.belt))
             row = (int(near.row) + 1) % int(np.sum(ends != names.unused))
             system = StickLimit(chain, near.row, near.codes, near.side)
         elif isinstance(condition, GrazingEdge | CornerCollision):
-            z = point.cycle.unknowns
-            turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
             belt, either = jnp.asarray(condition.belt), jnp.zeros(())
             near = end_near_edge(point.oscillator, turn, belt, either)
             # In a corner a stick phase that begins or ends there may have no duration.
@@ -869,7 +866,7 @@ def _look_at_cycle(args, u: Array):
         isinstance(system, EdgeContact | StickLimit),
     )
     touches = (row >= 0) & (not at_end)
-    others = chain.used & (rows != row)
+    others = chain.used & ~stick_phase_from(osc, chain, row)
     if at_end:
         others = others & (rows != system.row)
     sticks = others & jnp.any(chain.codes == 0, axis=-1)
