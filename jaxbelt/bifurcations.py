@@ -712,13 +712,13 @@ def _judge_encounter(belts, wanted, row, osc: Oscillator, z, cycle: Cycle, slope
 
 
 def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
-    """The arcs of the stick phase that begins with a row; there are more where it passes edges."""
+    """A row, and the arcs after it in the stick phase that it begins: one that passes edges."""
     stuck = chain.used & jnp.any(chain.codes == 0, axis=-1)
     rows = jnp.arange(stuck.size)
     before = (rows - 1) % jnp.maximum(jnp.sum(chain.used), 1)
-    phase = rows == row
+    phase, goes_on = rows == row, stuck & stuck[before]
     for _ in range(2 * len(osc.belts)):
-        phase = phase | (stuck & phase[before])
+        phase = phase | (goes_on & phase[before])
     return phase
 
 

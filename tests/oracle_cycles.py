@@ -25,6 +25,7 @@ from oracle import (
     advance,
     capacity,
     mates,
+    needed_and_capacity,
     start_mode,
     touches,
 )
@@ -387,6 +388,31 @@ def grazing(make, bracket, belt, y0=(3.0, 0.0)):
     else:
         raise ValueError(f"the cycle sticks to belt {belt} at both ends of {bracket}")
     return _solve(lambda p: gap(make(p), onset_belt, belt), bracket)
+
+
+def crossing_sliding(make, bracket, onset_belt, belt, arrivals):
+    """Parameter at which the needed force is just the capacity where an orbit meets a boundary.
+
+    The orbit is that from a slip onset; it may cross or stick there. arrivals: which of its
+    arrivals at the boundary it is.
+    """
+
+    def excess(p):
+        osc = make(p)
+        y, mode = slip_onset(osc, onset_belt)
+        found = []
+
+        def until(item):
+            if isinstance(item, Event) and item.belt == belt and item.kind in ("STICK", "CROSS"):
+                found.append(item)
+            return len(found) == arrivals
+
+        run = advance(osc, y, mode, 100.0, until=until)
+        group = mates(osc, run.arcs[-1].mode, osc.belts[belt].velocity)
+        needed, cap = needed_and_capacity(osc, run.arcs[-1].mode, group, found[-1].x1)
+        return abs(needed) - cap
+
+    return _solve(excess, bracket)
 
 
 def edge_grazing(make, bracket, edge, y0=(3.0, 0.0)):

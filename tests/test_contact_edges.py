@@ -1,6 +1,5 @@
 """Bifurcations at contact edges: against the oracle and closed forms, found, refined, followed."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from scipy.optimize import brentq
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
 from jaxbelt.continuation import End
+from jaxbelt.detection import Path
 
 EDGE = EventKind.EDGE
 
@@ -197,29 +197,92 @@ def test_refined_from_either_side(diagram, condition, number, offset):
     assert point.iterations <= 7 and point.residual < 1e-11 and point.error < 1e-11
 
 
-@pytest.mark.parametrize(
-    ("osc", "where", "exact", "offset", "status"),
-    [
-        # Slip onset in the corner: on one side the stick phase is ended by it, on the other by the
-        # edge, where the mass is torn off.
-        (overlapping(0.9), sigma1, 0.9, -0.01, Status.OK),
-        (overlapping(0.9), sigma1, 0.9, 0.01, Status.NO_CONVERGENCE),
-        (overlapping(1.66), sigma1, 1.66, 0.01, Status.OK),
-        (overlapping(1.66), sigma1, 1.66, -0.01, Status.NO_CONVERGENCE),
-        # The phase begins and ends in the corner, and there is no cycle beyond.
-        (jb.presets.class_c(0.0, -0.25, 0.4), nu0, 0.233547455622, -0.01, Status.OK),
-        (jb.presets.class_c(0.0, -0.25, 0.4), nu0, 0.233547455622, 0.01, Status.NOT_TOUCHED),
-    ],
-)
-def test_a_corner_from_the_side_that_does_not_lead_there(osc, where, exact, offset, status):
-    guess = eqx.tree_at(where, osc, jnp.asarray(exact + offset))
-    point = jb.refine(jb.CornerCollision(0), guess, where=where)
-    assert point.status == status
-    if status == Status.OK:
-        assert point.value == pytest.approx(exact, abs=1e-11)
-    else:
-        assert jnp.isnan(point.value) and jnp.isnan(point.residual)
-        assert "other side" in repr(point)
+@pytest.mark.parametrize("offset", [-0.01, 0.01])
+@pytest.mark.parametrize("exact", [0.9, 1.66])
+def test_slip_onset_in_a_corner(exact, offset):
+    """To one side of it the stick phase is ended by it, to the other by the edge, where the mass is
+    torn off. It is at 1 - 0.5 nu1, belt 0 being left, or that and the pull of belt 0."""
+    point = jb.refine(jb.CornerCollision(0), overlapping(exact + offset), where=sigma1)
+    assert point.value == pytest.approx(exact, abs=1e-11) and point.iterations <= 5
+    assert point.residual < 1e-12 and point.error < 1e-12
+
+
+def test_a_corner_in_which_the_cycle_ends():
+    """The phase begins and ends in the corner, and there is no cycle beyond."""
+    inside, beyond = (jb.presets.class_c(0.233547455622 + d, -0.25, 0.4) for d in (-0.01, 0.01))
+    point = jb.refine(jb.CornerCollision(0), inside, where=nu0)
+    assert point.value == pytest.approx(0.233547455622, abs=1e-11)
+    point = jb.refine(jb.CornerCollision(0), beyond, where=nu0)
+    assert point.status == Status.NOT_TOUCHED and "other side" in repr(point)
+    assert jnp.isnan(point.value) and jnp.isnan(point.residual)
+
+
+@pytest.mark.slow
+def test_the_passage_of_an_edge_becomes_tangent():
+    """The edge pushes away to both sides, and the cycle that passes it ends there."""
+    points = jb.scan(jb.presets.class_c(0.31, 0.25, 0.7), nu1, (0.16, 0.2))
+    kinds = [jb.FoldOfCycles(), jb.Hopf(), jb.GrazingEdge(0)]
+    assert [point.condition for point in points] == kinds
+
+    def miss(nu):
+        """How far from the edge the orbit turns back that left it at rest, to the right, came round
+        and passed it: by the left belt alone, at the second turn."""
+        right = oracle.class_c(0.31, nu, 0.7)
+        passes = oracle.advance(
+            right, (0.7, 0.0), (oracle.ABOVE, 1), 100.0, until=lambda i: isinstance(i, oracle.Event)
+        )
+        turns = []
+
+        def until(item):
+            turns.extend([item.x1] if isinstance(item, oracle.Turn) and item.axis == 0 else [])
+            return len(turns) == 2
+
+        oracle.advance(oracle.class_a(0.31), tuple(passes.y_end), (1,), 100.0, until=until)
+        return turns[1] - 0.7
+
+    expected = brentq(miss, 0.1846, 0.18475, xtol=1e-14)
+    assert points[2].value == pytest.approx(expected, abs=1e-11)
+    assert points[2].residual < 1e-12 and points[2].error < 1e-11
+
+
+def test_a_belt_at_rest_that_no_cycle_sticks_to():
+    """To the left of nu1 = 0 its pull, -1, would be balanced where it does not touch."""
+    points = jb.scan(jb.presets.class_d(-0.47, 0.16, 0.14, 1.18), nu1, (-0.6, 0.6))
+    assert [point.condition for point in points] == [jb.BeltAtRest(1), jb.BoundaryEquilibrium(1)]
+    assert points[0].value == 0 and points[0].cycle.status == Status.EQUILIBRIUM
+    pull = -0.6 - 0.4 / 5.7
+    exact = (0.4 / (0.14 - pull - 0.6) - 1) / 10
+    assert points[1].value == pytest.approx(exact, abs=1e-14)
+    for nu, rests in ((-1e-3, [pull]), (1e-3, [pull, pull + 0.6 + 0.4 / 1.01])):
+        found = jb.equilibria(jb.presets.class_d(-0.47, nu, 0.14, 1.18))
+        np.testing.assert_allclose(found.x1, rests, rtol=0, atol=1e-14)
+    point = jb.refine(jb.BeltAtRest(1), jb.presets.class_c(0.3, 0.2, 9.0), where=nu1)
+    assert point.status == Status.NOT_TOUCHED and jnp.isnan(point.value)
+
+
+def test_a_small_cycle_that_sticks_until_the_edge():
+    """It never comes to slip onset, beside one that does; both exchange their belts."""
+    osc = jb.presets.class_d(-0.6, 0.175, 1.16, 1.5)
+    points = jb.scan(osc, nu0, (0.165, 0.18), resolution=8)
+    assert [point.condition for point in points] == [jb.SlidingExchange((0, 1))]
+    path = Path(osc, nu0, (0.165, 0.18))
+    path.look([0.17, 0.178])
+    for nu, belt in ((0.17, 0), (0.178, 1)):
+        cycles = path.label(nu).cycles
+        own = [(kind, of) for cycle in cycles for kind, of in cycle if kind == EventKind.STICK]
+        assert len(cycles) == 2 and (EventKind.STICK, belt) in own
+        small = oracle_cycles.sticking_cycle(
+            oracle.class_d(nu, 0.175, 1.16, 1.5), (1.5, min(nu, 0.175))
+        )
+        (turn,) = (turn for turn in path.turns[nu].values() if np.ptp(turn.entries[:, 0]) < 0.2)
+        assert np.sum(turn.durations) == pytest.approx(small.period, abs=1e-6)
+
+
+def test_the_onset_of_a_belt_that_touches_on_the_right_only():
+    """Beside the cycle on belt 0: that on belt 1 alone ends in its fold, the paper's class (a)."""
+    points = jb.scan(jb.presets.class_c(-0.246, 0.3225, 0.3141), nu1, (0.23, 0.3), resolution=8)
+    assert [point.condition for point in points] == [jb.NonsmoothFold(1)]
+    assert points[0].value == pytest.approx(0.267134534361, abs=1e-11)
 
 
 def test_what_fits_no_such_point_is_told_so():

@@ -1,5 +1,6 @@
 """The points that `scan` finds by itself, against the exact table, simulation and the oracle."""
 
+from collections import Counter
 from itertools import pairwise
 
 import jax
@@ -95,6 +96,87 @@ def test_folds_of_a_law_that_jumps():
         bracket = (float(point.value) - 0.01, float(point.value) + 0.01)
         expected = oracle_cycles.nonsmooth_fold(make, bracket, 0)
         assert point.value == pytest.approx(expected, abs=1e-11) and point.multiplier == np.inf
+
+
+def load1(osc):
+    return osc.belts[1].load
+
+
+def pair(damping, *belts):
+    """Two belts, (velocity, residual, steepness, load) each; and the same for the oracle."""
+    own = [
+        jb.Belt(nu, jb.Conti(1.0, residual, steepness), load=load)
+        for nu, residual, steepness, load in belts
+    ]
+    laws = [oracle.conti(1.0, residual, steepness) for _, residual, steepness, _ in belts]
+    others = [
+        oracle.Belt(nu, *law, load) for law, (nu, _, _, load) in zip(laws, belts, strict=True)
+    ]
+    return jb.Oscillator(damping, own), oracle.Oscillator(damping, tuple(others), 1.0)
+
+
+def held_by(load):
+    """The cycle arrives twice at the boundary of belt 1, which can hold little."""
+    return pair(0.45, (-0.1, 0.4, 12.0, 1.1), (0.035, 0.3, 4.0, load))
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    return jb.scan(held_by(0.3)[0], load1, (0.1, 0.5), resolution=48)
+
+
+def test_crossing_sliding(crossing):
+    """At the end of slip onset, where a phase of no duration begins, and at the other end."""
+    assert [point.condition for point in crossing] == [jb.CrossingSliding(1)] * 2
+    for point, arrivals, width in zip(crossing, (2, 1), (0.01, 0.02), strict=True):
+        bracket = (float(point.value) - width, float(point.value) + width)
+        expected = oracle_cycles.crossing_sliding(
+            lambda load: held_by(load)[1], bracket, 0, 1, arrivals
+        )
+        assert point.value == pytest.approx(expected, abs=1e-11)
+        assert point.residual < 1e-12 and point.error < 1e-11
+    cross, stick, slip = EventKind.CROSS, EventKind.STICK, EventKind.SLIP
+    expected = [
+        {(cross, 1): 2, (stick, 0): 1, (slip, 0): 1},
+        {(cross, 1): 1, (stick, 1): 1, (slip, 1): 1, (stick, 0): 1, (slip, 0): 1},
+        {(stick, 1): 1, (slip, 1): 1, (stick, 0): 1, (slip, 0): 1},
+    ]
+    for load, events in zip((0.12, 0.18, 0.3), expected, strict=True):
+        assert Counter(jb.find_cycle(held_by(load)[0], (3.0, 0.0)).signature) == events
+
+
+@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("offset", [-0.01, 0.01])
+def test_crossing_sliding_from_either_side(crossing, number, offset):
+    exact = crossing[number].value
+    point = jb.refine(jb.CrossingSliding(1), held_by(exact + offset)[0], where=load1)
+    assert point.value == pytest.approx(float(exact), abs=1e-12) and point.iterations <= 6
+
+
+def test_a_curve_of_crossing_sliding(crossing):
+    """Rows of it are what is refined near them."""
+    where, span = (load1, lambda osc: osc.belts[1].velocity), ((0.1, 0.5), (0.02, 0.06))
+    curve = jb.bifurcation_curve(crossing[1], where, span, step=0.004)
+    assert set(curve.kinds) == {"CrossingSliding"} and len(curve) > 8
+    assert np.max(curve.residual) < 1e-12
+    for load, nu in curve.values[1:-1:3].tolist():
+        guess = pair(0.45, (-0.1, 0.4, 12.0, 1.1), (nu, 0.3, 4.0, load + 1e-3))[0]
+        point = jb.refine(jb.CrossingSliding(1), guess, where=load1)
+        assert point.value == pytest.approx(load, abs=1e-10)
+
+
+def test_a_fold_of_an_orbit_that_repels_strongly():
+    """What is followed forwards to the tangency grows by more than a thousand in one turn."""
+
+    def make(load):
+        return pair(0.82, (0.47, 0.64, 9.5, 0.67), (0.235, 0.54, 15.0, load))
+
+    (point,) = jb.scan(make(1.0)[0], load1, (1.1, 1.3), resolution=16)
+    assert point.condition == jb.NonsmoothFold(1) and point.multiplier > 1e3
+    bracket = (float(point.value) - 0.01, float(point.value) + 0.01)
+    expected = oracle_cycles.nonsmooth_fold(lambda load: make(load)[1], bracket, 1)
+    # Steps halved change it by less than the bound, 4e-11.
+    assert point.value == pytest.approx(expected, abs=1e-10) and point.error < 1e-10
 
 
 def bell_oracle(nu):
