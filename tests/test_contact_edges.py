@@ -261,7 +261,7 @@ def test_a_belt_at_rest_that_no_cycle_sticks_to():
 
 
 def test_a_small_cycle_that_sticks_until_the_edge():
-    """It never comes to slip onset, beside one that does; both exchange their belts."""
+    """It never comes to slip onset. Beside it there is one that does, and touches belt 0 alone."""
     osc = jb.presets.class_d(-0.6, 0.175, 1.16, 1.5)
     points = jb.scan(osc, nu0, (0.165, 0.18), resolution=8)
     assert [point.condition for point in points] == [jb.SlidingExchange((0, 1))]
@@ -274,7 +274,7 @@ def test_a_small_cycle_that_sticks_until_the_edge():
         small = oracle_cycles.sticking_cycle(
             oracle.class_d(nu, 0.175, 1.16, 1.5), (1.5, min(nu, 0.175))
         )
-        (turn,) = (turn for turn in path.turns[nu].values() if np.ptp(turn.entries[:, 0]) < 0.2)
+        (turn,) = (turn for turn in path.turns[nu].values() if np.ptp(turn.entries[:, 0]) < 0.3)
         assert np.sum(turn.durations) == pytest.approx(small.period, abs=1e-6)
 
 
