@@ -438,6 +438,10 @@ def _solved_point(osc, index, system, z0, status, judge) -> BifurcationPoint:
     z, p, steps, matrix = _solve_system(osc, index, system, z0, p0)
     iterations = jnp.sum(~jnp.isnan(steps))
     at_point = vary(osc, index, p)
+    # By the last steps: the residual costs an integration more, and who asks for it gets it.
+    last, before = steps[jnp.maximum(iterations - 1, 0)], steps[jnp.maximum(iterations - 2, 0)]
+    converged = (status != Status.OK) | (last * jnp.minimum(last / before, 1.0) < 1e-9)
+    status = jnp.where(converged, status, Status.NO_CONVERGENCE.value)
     size, error = _accuracy(*lax.stop_gradient((at_point, system, z, matrix)))
     cycle, slope = cycle_of(at_point, system.ordinary, z, iterations, status, size)
     status, multiplier = judge(at_point, z, cycle, slope)

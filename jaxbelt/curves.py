@@ -891,7 +891,7 @@ def _look_at_cycle(args, u: Array):
         watched = (touches | is_fold | at_end | jnp.any(own)) & jnp.isfinite(nearest)
         name = "FoldGrazing" if is_fold else "DoubleSliding"
         tests[name, (belt,)] = jnp.where(watched, nearest, jnp.nan)
-    valid = (cycle.status == Status.OK) & ((size > 0) | (not is_fold))
+    valid = (cycle.status == Status.OK) & (residual < 1e-9) & ((size > 0) | (not is_fold))
     return tests, valid, jnp.where(touches | is_fold, slope, jnp.nan), residual
 
 

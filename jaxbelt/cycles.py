@@ -870,12 +870,14 @@ def cycle_of(
     """The `Cycle` of a solution z, NaN with a status where it is none; and its multiplier with
     stick phases left out.
 
-    error: the largest in its equations, where these are not those of the chain: an arc that was
-    solved for backwards may magnify what is followed forwards a hundred thousand times.
+    error: the largest in its equations, where these are not those of the chain and it is known that
+    they hold: an arc that was solved for backwards may magnify what is followed forwards a hundred
+    thousand times.
     """
     forwards, slope = closure(osc, chain, z)
-    error = forwards if error is None else error
-    status = _first_failure(status, error < 1e-9, Status.NO_CONVERGENCE)
+    if error is None:
+        error = forwards
+        status = _first_failure(status, error < 1e-9, Status.NO_CONVERGENCE)
     status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
     known = functools.partial(jnp.where, status == Status.OK)
