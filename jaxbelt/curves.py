@@ -65,6 +65,7 @@ from .cycles import (
     Turn,
     admissible,
     cycle_of,
+    end_guard,
     follow,
     meshed,
     newton,
@@ -424,23 +425,32 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
 
 def _limit(problem: _Problem, system, rows: list[_Row], u, end: End) -> SpecialPoint | None:
     """What the curve of a cycle ends in where there is no cycle, if that is near its point u."""
-    if isinstance(problem.condition, FoldOfCycles):
+    if isinstance(problem.condition, FoldOfCycles | GrazingEdge):
         return _limit_at_hopf(problem, system, u) if end is not End.POINT_COUNT else None
     return _limit_at_rest(problem, system, rows)
 
 
 def _limit_at_hopf(problem: _Problem, system, u: np.ndarray) -> SpecialPoint | None:
-    """Where the cycle of a fold has shrunk to an equilibrium.
+    """Where the cycle of a fold, or one that touches an edge, has shrunk to an equilibrium.
 
-    The fold's own equations are singular there, those of the equilibrium are not.
+    Its own equations are singular there, those of the equilibrium are not.
     """
-    osc, indices, codes = problem.osc, problem.indices, system.args[2].chain.codes[0]
-    guess = jnp.asarray([u[0] / float(system.args[4][0]), *u[-2:]])
-    found, residual = _degenerate_hopf((osc, indices, codes), guess)
+    cycle, weights = system.args[2], np.asarray(system.args[4])
+    x1 = (u[:-2] / weights).reshape(-1, 3)[:, 0]
+    if np.ptp(x1) > 5 * problem.step:
+        return None
+    given, guess = (
+        (problem.osc, problem.indices, cycle.chain.codes[0]),
+        jnp.asarray([x1[0], *u[-2:]]),
+    )
+    if isinstance(problem.condition, FoldOfCycles):
+        kind, (found, residual) = "DegenerateHopf", _degenerate_hopf(given, guess)
+    else:
+        kind, (found, residual) = "BoundaryHopf", _boundary_hopf(given, guess, cycle.end)
     values = np.asarray(found[1:])
     if not (residual < 1e-9 and np.linalg.norm(values - u[-2:]) < 2 * problem.step):
         return None
-    return SpecialPoint("DegenerateHopf", (), (float(values[0]), float(values[1])), float(residual))
+    return SpecialPoint(kind, (), (float(values[0]), float(values[1])), float(residual))
 
 
 def _limit_at_rest(problem: _Problem, system, rows: list[_Row]) -> SpecialPoint | None:
@@ -686,12 +696,29 @@ def _third_derivative(u: Array, args) -> Array:
 
 @jit
 def _degenerate_hopf(args, guess: Array) -> tuple[Array, Array]:
-    """(x1, both parameters) where all three vanish, and the largest error."""
+    """(x1, both parameters) of a Hopf point with a third derivative of zero, and the error."""
+    return _special_hopf(args, guess, _third_derivative)
+
+
+@jit
+def _boundary_hopf(args, guess: Array, edge: Array) -> tuple[Array, Array]:
+    """The same of a Hopf point on an edge; by its number among what ends an arc."""
+
+    def from_edge(u, args):
+        osc, indices, codes = args
+        at = jnp.stack([u[0], jnp.zeros(())])
+        return end_guard(vary(osc, indices, u[-2:]), codes, edge, at)
+
+    return _special_hopf(args, guess, from_edge)
+
+
+def _special_hopf(args, guess: Array, condition: Callable) -> tuple[Array, Array]:
+    """The Hopf point where condition(u, args) is zero, too."""
     osc, indices, codes = args
 
     def equations(osc, u):
         given = (osc, indices, codes)
-        return jnp.append(_rest_equations(u, given), _third_derivative(u, given))
+        return jnp.append(_rest_equations(u, given), condition(u, given))
 
     u, _, residual, _ = small_newton(equations, osc, guess)
     return u, residual

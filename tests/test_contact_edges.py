@@ -379,12 +379,12 @@ def test_curve_of_an_unstable_cycle_that_touches_the_edge(diagram):
     for sigma, nu in grazing.values[1:-4:3].tolist():
         alone = oracle_cycles.unstable_cycle(its_oracle(0.05, nu))
         assert sigma == pytest.approx(alone.x1_min, abs=1e-9)
-    (fold,) = grazing.special
+    shrunk, fold = sorted(grazing.special, key=lambda point: point.values[1])
+    assert (fold.kind, shrunk.kind) == ("DoubleSliding", "BoundaryHopf")
     assert fold.values[1] == pytest.approx(0.267134534361, abs=1e-11)
     hopf = (np.sqrt(8) - 1) / 10
-    shrunk = grazing.values[np.argmax(grazing.values[:, 0])]
-    # The radius goes like the root of the distance from the Hopf point.
-    assert shrunk == pytest.approx([0.6 + 0.4 / (1 + 10 * hopf), hopf], abs=1e-3)
+    assert shrunk.values == pytest.approx((0.6 + 0.4 / (1 + 10 * hopf), hopf), abs=1e-13)
+    assert End.STOPPED in grazing.ends
 
 
 def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
