@@ -1044,12 +1044,12 @@ def _judge_contact(row, repels, osc: Oscillator, z, cycle: Cycle, slope):
     # A turn at once after the edge is passed solves the equations, too, but they are singular;
     # and a cycle that has shrunk to a pseudo-focus meets everything there.
     turns = cycle.chain.ends[row] == Ends(len(osc.belts)).turn_x1
-    shrunk = cycle.x1_max - cycle.x1_min < AT_REST
+    shrunk = jnp.ptp(z[:, 0]) < AT_REST
     fails = turns & (z[row, 2] < 1e-6) | shrunk
     solved = cycle.status == Status.OK
     status = jnp.where(solved & fails, Status.NO_CONVERGENCE.value, cycle.status)
-    attracts = solved & repels & ~(slope > 1)
-    return jnp.where(attracts, Status.NO_UNSTABLE_CYCLE.value, status), jnp.asarray(jnp.nan)
+    none = repels & (solved & ~(slope > 1) | shrunk & (status == Status.NO_CONVERGENCE))
+    return jnp.where(none, Status.NO_UNSTABLE_CYCLE.value, status), jnp.asarray(jnp.nan)
 
 
 # --- the fold of cycles ---------------------------------------------------------------------------

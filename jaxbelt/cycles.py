@@ -963,20 +963,23 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
 STARTS, REFINEMENTS = 32, 3
 
 
-def unstable_cycle(osc: Oscillator, *, max_arcs: int | None = None) -> Cycle:
+def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = None) -> Cycle:
     """The unstable cycle around a stable equilibrium, that touches no boundary (no sliding).
 
     It separates the starts that come to rest from those that go on to the motion outside of it. It
-    may pass contact edges. osc: `Oscillator`; max_arcs as for `find_cycle`. Differentiable like
-    any `Cycle`. Where there is none, or none of this sort, the status is NO_UNSTABLE_CYCLE.
+    may pass contact edges. osc: `Oscillator`; around: the number of the equilibrium, counted from
+    the left among the stable ones but for segments; max_arcs as for `find_cycle`. Differentiable
+    like any `Cycle`. Where there is none, or none of this sort, the status is NO_UNSTABLE_CYCLE.
+    `ValueError` names an impossible argument.
 
     Starts to the right of the equilibrium at different distances are followed for one turn. The
     first one that does not come nearer, or that touches a boundary, lies outside of the cycle;
-    between it and its neighbour the search is repeated, and Newton's method does the rest. With
-    several stable equilibria the leftmost is taken.
+    between it and its neighbour the search is repeated, and Newton's method does the rest.
     """
     check_oscillator(osc)
-    turn, status, distance = separating_turn(osc, max_arcs or SIZES[0])
+    whole = isinstance(around, int) and around >= 0
+    require(whole, "around", "the number of an equilibrium, 0 or more", repr(around))
+    turn, status, distance = separating_turn(osc, max_arcs or SIZES[0], around)
     return _if_meant(polish(osc, turn, status), turn, distance)
 
 
@@ -994,17 +997,18 @@ def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
     return eqx.tree_at(lambda o: (o.repeats, o.count), orbit, closed), meets, top
 
 
-def separating_turn(osc: Oscillator, size: int) -> tuple[Turn, Array, Array]:
+def separating_turn(osc: Oscillator, size: int, around: int = 0) -> tuple[Turn, Array, Array]:
     """A turn near the unstable cycle, a status, and how far from the equilibrium it begins."""
-    return _separating_turn(osc, candidates(osc), size)
+    return _separating_turn(osc, candidates(osc), jnp.asarray(np.array(around)), size)
 
 
 @jit
-def _separating_turn(osc: Oscillator, rests: Equilibria, size: int):
+def _separating_turn(osc: Oscillator, rests: Equilibria, around: Array, size: int):
     still, rests = lax.stop_gradient((osc, rests))
     eligible = rests.stable & (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
-    exists = jnp.any(eligible)
-    x1 = jnp.where(exists, rests.x1[jnp.argmax(eligible)], 0.0)
+    meant = eligible & (jnp.cumsum(eligible) - 1 == around)
+    exists = jnp.any(meant)
+    x1 = jnp.where(exists, rests.x1[jnp.argmax(meant)], 0.0)
 
     def turn(distance):
         orbit, touches, top = first_turn(still, x1, distance, size)

@@ -71,7 +71,7 @@ from .cycles import (
     turn_events,
     unstable_cycle,
 )
-from .equilibria import equilibria
+from .equilibria import EquilibriumKind, equilibria
 from .oscillator import Oscillator, check_oscillator
 from .results import EventKind, Status, of_one_turn
 
@@ -145,18 +145,21 @@ def by_value(points: Sequence[BifurcationPoint]) -> tuple[BifurcationPoint, ...]
     return tuple(sorted(points, key=lambda point: float(point.value)))
 
 
-def edges_touched(path: "Path", values: np.ndarray) -> tuple[BifurcationPoint, ...]:
+def edges_touched(path: "Path", values: np.ndarray, around: int) -> tuple[BifurcationPoint, ...]:
     """Where the unstable cycle begins or ceases to pass a contact edge.
 
     values: in order, in a stretch in which nothing else happens. Those at which no such cycle is
-    found are passed over.
+    found are passed over. around: the number of the equilibrium, see `unstable_cycle`.
     """
 
+    def unstable(value):
+        return path.unstable(value, around)
+
     def signature(value):
-        return of_one_turn(path.unstable(value).signature)
+        return of_one_turn(unstable(value).signature)
 
     def changes(values):
-        known = [v for v in map(float, values) if path.unstable(v).status == Status.OK]
+        known = [v for v in map(float, values) if unstable(v).status == Status.OK]
         return [(a, b) for a, b in pairwise(known) if a < b and signature(a) != signature(b)]
 
     points, intervals = [], changes(values) if path.edged else []
@@ -165,7 +168,7 @@ def edges_touched(path: "Path", values: np.ndarray) -> tuple[BifurcationPoint, .
         solved = (
             refined(path.osc, path.index, value, GrazingEdge(belt, unstable=True), turn)
             for value in (a, b)
-            for turn in [as_turn(path.unstable(value), ROOM)]
+            for turn in [as_turn(unstable(value), ROOM)]
             for belt in path.edged
         )
         points_inside = (point for point in solved if point is not None and a < point.value < b)
@@ -173,10 +176,10 @@ def edges_touched(path: "Path", values: np.ndarray) -> tuple[BifurcationPoint, .
         middle = 0.5 * (a + b)
         if point is not None:
             points.append(point)
-            path.unstable_cycles[float(point.value)] = point.cycle
+            path.unstable_cycles[float(point.value), around] = point.cycle
             before, after = path.beside(float(point.value))
             intervals += changes([a, max(a, before)]) + changes([min(b, after), b])
-        elif path.unstable(middle).status == Status.OK and b - a > 1e-9 * path.length:
+        elif unstable(middle).status == Status.OK and b - a > 1e-9 * path.length:
             intervals += changes([a, middle, b])
         else:
             points.append(unexplained_point(path.osc, int(path.index), middle, b - a))
@@ -202,6 +205,11 @@ class Label(NamedTuple):
         return Counter(belt for cycle in self.cycles for one, belt in cycle if one == kind)
 
     @property
+    def foci(self) -> int:
+        """How many equilibria attract, but for segments."""
+        return sum(stable and kind != EquilibriumKind.SEGMENT for kind, stable in self.equilibria)
+
+    @property
     def smooth(self) -> int:
         """How many cycles stick to no belt."""
         return sum(not _sticks(cycle) for cycle in self.cycles)
@@ -225,7 +233,7 @@ class Path:
         self.name = jax.tree_util.keystr(paths[int(self.index)]).removeprefix(".")
         self.labels: dict[float, Label] = {}
         self.turns: dict[float, dict[Signature, Turn]] = {}
-        self.unstable_cycles: dict[float, Cycle] = {}
+        self.unstable_cycles: dict[tuple[float, int], Cycle] = {}
         self._missing: set[tuple[float, float, Signature]] = set()
         self.breaks = self._coincidences()
 
@@ -234,11 +242,11 @@ class Path:
         # Of one type, whichever that of the value: else programs are compiled twice.
         return vary(self.osc, self.index, jnp.asarray(np.array([value])))
 
-    def unstable(self, value: float) -> Cycle:
-        """The unstable cycle there, or why there is none; computed once."""
-        if value not in self.unstable_cycles:
-            self.unstable_cycles[value] = unstable_cycle(self.at(value))
-        return self.unstable_cycles[value]
+    def unstable(self, value: float, around: int) -> Cycle:
+        """The unstable cycle there around an equilibrium, or why there is none; computed once."""
+        if (value, around) not in self.unstable_cycles:
+            self.unstable_cycles[value, around] = unstable_cycle(self.at(value), around=around)
+        return self.unstable_cycles[value, around]
 
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
         """The values just below and just above; farther off where motions are slow to settle."""

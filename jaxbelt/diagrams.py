@@ -39,7 +39,7 @@ from .compiling import jit
 from .curves import BifurcationCurve, bifurcation_curve
 from .cycles import Cycle, Turn, cut, find_cycle, polish, unstable_cycle
 from .detection import Label, Path, by_value, edges_touched, search
-from .equilibria import candidates, equilibria
+from .equilibria import EquilibriumKind, candidates, equilibria
 from .oscillator import Oscillator
 from .results import EventKind, Status
 from .sweep import sweep
@@ -137,8 +137,8 @@ def bifurcation_diagram(
     path.look(np.concatenate(nodes))
     middles = [float(values[len(values) // 2]) for values in nodes]
     labels = [path.label(value) for value in middles]
-    for stretch in _separated(labels):
-        found = edges_touched(path, nodes[stretch])
+    for stretch, around in _separated(labels):
+        found = edges_touched(path, nodes[stretch], around)
         points = by_value([*points, *found])
         at = [float(point.value) for point in found if point.status == Status.OK]
         nodes[stretch] = np.sort(np.append(nodes[stretch], at))
@@ -163,12 +163,14 @@ def _nodes(path: Path, a: float, b: float, rows: int) -> np.ndarray:
     return first + (last - first) * inner
 
 
-def _separated(labels: Sequence[Label]) -> list[int]:
-    """The stretches with an unstable cycle, between an equilibrium and a cycle that attract."""
+def _separated(labels: Sequence[Label]) -> list[tuple[int, int]]:
+    """The stretches with unstable cycles, between equilibria and cycles that attract, and the
+    number of each such equilibrium."""
     return [
-        stretch
+        (stretch, around)
         for stretch, label in enumerate(labels)
-        if label.cycles and any(stable for _, stable in label.equilibria)
+        if label.cycles
+        for around in range(label.foci)
     ]
 
 
@@ -314,9 +316,12 @@ def _example(values, inside: np.ndarray) -> tuple[float, float]:
 
 
 def _cycles(osc: Oscillator, starts) -> tuple[Cycle, ...]:
-    """The cycles that the starts lead to, each once, and the unstable one."""
+    """The cycles that the starts lead to, and the unstable ones, each once."""
     found: dict[tuple[float, ...], Cycle] = {}
-    for cycle in [*(find_cycle(osc, start) for start in starts), unstable_cycle(osc)]:
+    rests = equilibria(osc)
+    foci = int(np.sum(rests.stable & (rests.kind != EquilibriumKind.SEGMENT)))
+    repelling = (unstable_cycle(osc, around=number) for number in range(foci))
+    for cycle in [*(find_cycle(osc, start) for start in starts), *repelling]:
         if cycle.status == Status.OK:
             size = (cycle.x1_min, cycle.x1_max, cycle.period)
             found.setdefault(tuple(round(float(value), 6) for value in size), cycle)
@@ -486,9 +491,10 @@ def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Labe
         pieces += _as_pieces(path, cycles, groups, [stretch for stretch, _, _ in wanted])
     both = _separated(labels)
     if both:
-        groups = [nodes[stretch] for stretch in both]
-        cycles = _repelling(path, np.concatenate(groups))
-        pieces += _as_pieces(path, cycles, groups, both)
+        groups = [nodes[stretch] for stretch, _ in both]
+        arounds = np.repeat([around for _, around in both], [len(group) for group in groups])
+        cycles = _repelling(path, np.concatenate(groups), arounds)
+        pieces += _as_pieces(path, cycles, groups, [stretch for stretch, _ in both])
     return pieces
 
 
@@ -558,8 +564,9 @@ def _attracting(path: Path, values: np.ndarray, turns: Sequence[Turn]) -> _Rows:
     return _stacked(_row, (polish(path.at(value), turn, ok) for value, turn in pairs))
 
 
-def _repelling(path: Path, values: np.ndarray) -> _Rows:
-    return _stacked(_row, (path.unstable(float(value)) for value in values))
+def _repelling(path: Path, values: np.ndarray, arounds: np.ndarray) -> _Rows:
+    pairs = zip(values.tolist(), arounds.tolist(), strict=True)
+    return _stacked(_row, (path.unstable(value, around) for value, around in pairs))
 
 
 # --- from pieces to branches ----------------------------------------------------------------------

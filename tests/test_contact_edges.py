@@ -285,6 +285,23 @@ def test_the_onset_of_a_belt_that_touches_on_the_right_only():
     assert points[0].value == pytest.approx(0.267134534361, abs=1e-11)
 
 
+def test_unstable_cycles_around_two_equilibria():
+    """Each belt has its own, that of the paper's class (a), as neither reaches the edge."""
+    osc = jb.presets.class_c(-0.246, 0.22, 0.3141)
+    for around, nu, at in ((0, -0.246, -1), (1, 0.22, 1)):
+        cycle = jb.unstable_cycle(osc, around=around)
+        alone = oracle_cycles.unstable_cycle(oracle.class_a(nu))
+        assert cycle.period == pytest.approx(alone.period, rel=1e-9)
+        assert cycle.multiplier == pytest.approx(alone.multiplier, rel=1e-7)
+        assert np.sign(cycle.x1_max) == at
+    assert jb.unstable_cycle(osc, around=2).status == Status.NO_UNSTABLE_CYCLE
+    with pytest.raises(ValueError, match="around must be the number of an equilibrium"):
+        jb.unstable_cycle(osc, around=-1)
+    diagram = jb.bifurcation_diagram(osc, nu1, (0.2, 0.26), rows=9, resolution=8)
+    repelling = [b for b in diagram.branches if b.kind == "cycle" and not np.any(b.stable)]
+    assert sorted(np.sign(branch.x1_max[0]) for branch in repelling) == [-1, 1]
+
+
 def test_what_fits_no_such_point_is_told_so():
     # Everything comes to rest.
     point = jb.refine(jb.GrazingEdge(0), jb.presets.class_d(0.35, 0.6, 0.0, 0.6), where=sigma1)
