@@ -453,11 +453,9 @@ def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
             pair = SlidingExchange((min(belt, other), max(belt, other)))
             found.append(_explained(path, *interval, [pair]))
     if value == 0:
-        beside = [
-            (value + offset, kind(belt))
-            for kind in (SuddenSliding, BeltAtRest)
-            for offset in (1e-2, -1e-2)
-        ]
+        # Orbits that settle soon first; other points may be nearer than where they do.
+        beside = [(at, SuddenSliding(belt)) for at in (1e-2, -1e-2, 1e-4, -1e-4)]
+        beside += [(at, BeltAtRest(belt)) for at in interval]
         tried = (refined(path.osc, path.index, at, condition) for at, condition in beside)
         found.append(next((point for point in tried if point is not None), None))
     points = [point for point in found if point is not None]
