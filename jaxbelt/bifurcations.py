@@ -29,11 +29,12 @@ unknowns of fixed-signature shooting (see `cycles`) the same equation is harmles
 - `FoldOfCycles`: the multiplier of a cycle that does not stick is one. There the equations of the
   cycle alone are singular; with this one, and the parameter, they are not. (A cycle that sticks
   has the multiplier zero and takes part in nonsmooth folds only.)
-- `GrazingEdge`, `CornerCollision`: an arc of a cycle ends on a contact edge, though it is not the
-  edge that ends it. Where a turn of x1 ends it, the orbit is tangent to the edge, x2 = 0; where a
-  boundary r_k = 0 or slip onset does, it runs into the corner of that boundary and the edge. Both
-  are one equation, linear in the unknowns. A cycle that passes the edge and turns soon after has
-  that excursion left out: with it the equation is of second order in the velocity at the edge.
+- `GrazingEdge`, `CornerCollision`: an arc of a cycle ends on a contact edge and in something else
+  at once. With a turn of x1, the orbit is tangent to the edge, x2 = 0; with a boundary r_k = 0 or
+  slip onset, it runs into the corner of that and the edge. To one side of the point the edge ends
+  the arc, to the other that does: the equation is that the other's guard vanishes, which is linear
+  in the unknowns. A cycle that passes the edge and turns soon after has that excursion left out:
+  with it the equation is of second order in the velocity at the edge.
 - `BoundaryEquilibrium`: at rest on an edge, the force on one of its sides is zero, or as large as
   belts at rest there can hold: a fixed point, or the end of a segment, comes to lie on the edge.
 - `PseudoHopf`: at a pseudo-focus the leading term by which turns grow or shrink is zero.
@@ -158,15 +159,19 @@ class FoldOfCycles(AbstractCondition):
 
 
 class SlidingExchange(AbstractCondition):
-    """Two belts run at one velocity: where both touch, the cycle changes from one to the other."""
+    """Two belts run at one velocity: where both touch, the cycle changes from one to the other.
+
+    With laws that jump, or belts that hold differently, there may be another cycle beyond, or none.
+    """
 
     belts: tuple[int, int] = eqx.field(static=True)
 
 
 class GrazingEdge(_BeltCondition):
-    """A turn of the cycle, an extremum of x1, touches a contact edge of a belt.
+    """The cycle is tangent to a contact edge of a belt: a turn, an extremum of x1, touches it.
 
-    Beyond, the cycle passes the edge, or there is none: where the edge pushes away to both sides.
+    Beyond, the cycle passes the edge; or there is none, where the edge pushes away to both sides.
+    There, too, a cycle that passes the edge ends, with the velocity zero on it.
     unstable: of the cycle from `unstable_cycle`, not of an attracting one.
     """
 
@@ -178,8 +183,7 @@ class CornerCollision(_BeltCondition):
 
     It begins, or ceases, to stick to a belt there, or crosses its boundary: beyond, these come in
     another order, or another event comes instead; or, like at a nonsmooth fold, there is no cycle.
-    A guess has to lie on a side where that event is one of the cycle's. On the other side the
-    status is NOT_TOUCHED where there is no cycle, else mostly NO_CONVERGENCE; `scan` tries both.
+    A guess has to lie on a side where there is a cycle; `scan` tries both.
     """
 
 
