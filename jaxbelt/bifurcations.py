@@ -934,10 +934,11 @@ def end_near_edge(osc: Oscillator, turn: Turn, belt: Array, wanted: Array) -> Ed
         # What ends it is something else: how far it is to an edge.
         turns, meets = end == names.turn_x1, (end < n) | (end == names.onset)
         to_edges = [jnp.where(turns | meets, jnp.abs(x1 - e), jnp.inf) for e in (lower, upper)]
-        # An edge ends it. It is a turn if that pushes away to both sides: how high it is passed.
+        # An edge ends it. If that pushes away to both sides: how much further on the orbit would
+        # turn as it was.
         push = [jnp.sign(x2) * mode_acceleration(osc, mode_of(c), x1, x2) for c in (codes, after)]
         passes = on_edge & ~stuck & (push[0] < 0) & (push[1] > 0)
-        to_turn = jnp.where(passes, 0.5 * x2**2, jnp.inf)
+        to_turn = jnp.where(passes, 0.5 * x2**2 / jnp.where(passes, -push[0], 1.0), jnp.inf)
         # A boundary may be near that the arc did not begin at: x2 is monotone on it.
         to_boundaries = []
         for i, one in enumerate(osc.belts):
