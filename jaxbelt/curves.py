@@ -273,6 +273,7 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
         special += found
         last = points[-1][0].u if points else u
         if end is not End.LEFT_SPAN and (limit := _limit(problem, system, rows, last, end)):
+            rows += _towards(problem, rows[-1].values, limit)
             return _Side(rows, [*special, limit], End.STOPPED)
         if len(rows) >= problem.max_points or not points:
             return _Side(rows, special, End.POINT_COUNT if points else End.STEP_TOO_SMALL)
@@ -428,6 +429,25 @@ def _limit(problem: _Problem, system, rows: list[_Row], u, end: End) -> SpecialP
     if isinstance(problem.condition, FoldOfCycles | GrazingEdge):
         return _limit_at_hopf(problem, system, u) if end is not End.POINT_COUNT else None
     return _limit_at_rest(problem, system, rows)
+
+
+def _towards(problem: _Problem, last: np.ndarray, limit: SpecialPoint) -> list[_Row]:
+    """Rows between the last one and a belt at rest, where the curve of a tangency bends: each half
+    as far from there as the one before."""
+    condition, end = problem.condition, np.array(limit.values)
+    if not isinstance(condition, NonsmoothFold | GrazingSliding):
+        return []
+    rows = []
+    held = int(np.argmin(np.abs(end)))
+    for part in 0.5 ** np.arange(1, 6):
+        guess = end + part * (last - end)
+        osc = vary(problem.osc, problem.indices[held], jnp.asarray(guess[held])[None])
+        point = refined(osc, problem.indices[1 - held], float(guess[1 - held]), _sought(condition))
+        if point is None or abs(float(point.value) - guess[1 - held]) > problem.step:
+            break
+        guess[1 - held] = float(point.value)
+        rows.append(_Row(guess, point.kind, float(point.multiplier), float(point.residual)))
+    return rows
 
 
 def _limit_at_hopf(problem: _Problem, system, u: np.ndarray) -> SpecialPoint | None:

@@ -202,6 +202,13 @@ def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     )
     # The oracle's start is good to 1e-11.
     assert rest.values == pytest.approx((0.0, expected), abs=1e-10) and rest.residual < 1e-12
+    # The curve bends on its way there, and rows follow it.
+    bend = fold.values[np.abs(fold.values[:, 0]) < 0.02]
+    assert len(bend) >= 4 and np.min(np.abs(bend[:, 0])) < 0.04 / 2**5
+    for nu, value in bend[:3].tolist():
+        bracket = (value - 0.003, value + 0.003)
+        expected = oracle_cycles.grazing(lambda nu1, nu=nu: oracle.class_b(nu, nu1), bracket, 1)
+        assert value == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.slow
