@@ -238,8 +238,10 @@ def test_a_table_has_rows_and_special_points_in_order(fold):
     assert np.array_equal(values, fold.path) and len(table) == len(fold) + 2
     named = [row["special"] for row in table if row["special"]]
     assert named == ["DoubleSliding 0", "BeltAtRest 0"]
-    # They stand where they belong: no step is longer than one between rows, 0.02, but the last.
-    assert np.max(np.hypot(*np.diff(values[:-1], axis=0).T)) < 0.0201
+    # They stand where they belong: no step is longer than one between rows, 0.02, but for those
+    # that go on to the belt at rest, each half as far from there.
+    steps = np.hypot(*np.diff(values, axis=0).T)
+    assert np.max(steps[:-6]) < 0.0201 and np.all(np.diff(steps[-6:]) < 0) and steps[-6] < 0.03
     assert {row["belts"] for row in table} == {"1"}
     assert [row["condition"] for row in table if not row["special"]] == list(fold.kinds)
     assert "belts[0].velocity" in fold.table()[0]
