@@ -241,7 +241,7 @@ def test_a_table_has_rows_and_special_points_in_order(fold):
     # They stand where they belong: no step is longer than one between rows, 0.02, but for those
     # that go on to the belt at rest, each half as far from there.
     steps = np.hypot(*np.diff(values, axis=0).T)
-    assert np.max(steps[:-6]) < 0.0201 and np.all(np.diff(steps[-6:]) < 0) and steps[-6] < 0.03
+    assert np.max(steps[:-6]) < 0.0201 and np.all(np.diff(steps[-6:-1]) < 0) and steps[-6] < 0.03
     assert {row["belts"] for row in table} == {"1"}
     assert [row["condition"] for row in table if not row["special"]] == list(fold.kinds)
     assert "belts[0].velocity" in fold.table()[0]
