@@ -95,7 +95,7 @@ from .modes import (
     onset_position,
     push_and_trace,
     select,
-    stick_velocity,
+    stick_limit,
 )
 from .oscillator import Oscillator, check_oscillator
 from .results import Status, describe
@@ -797,14 +797,7 @@ class StickLimit(System):
 
     def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
         x1 = z[(self.row + 1) % z.shape[0], 0]
-        return x1 - stick_limit(osc, self.codes, self.side)
-
-
-def stick_limit(osc: Oscillator, codes: Array, side: Array) -> Array:
-    """x1 where the needed force is as large as the stuck belts can hold."""
-    mode = mode_of(codes)
-    v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
-    return mode_acceleration(osc, mode, jnp.zeros(()), v) + side * capacity(osc, mode)
+        return x1 - stick_limit(osc, mode_of(self.codes), self.side)
 
 
 class Arrival(eqx.Module):
@@ -829,7 +822,7 @@ def arrival_near_limit(osc: Oscillator, turn: Turn, belt: Array) -> Arrival:
         held = jnp.where(same & (jnp.abs(codes) < 1.5), 0.0, codes)
         side = -codes[belt]
         arrives = (end < len(osc.belts)) & same[jnp.clip(end, 0, len(osc.belts) - 1)]
-        distance = jnp.abs(x1 - stick_limit(osc, held, side))
+        distance = jnp.abs(x1 - stick_limit(osc, mode_of(held), side))
         arrives = arrives & (jnp.abs(codes[belt]) == 1)
         return jnp.where(arrives, distance, jnp.inf), held, side
 

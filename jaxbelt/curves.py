@@ -71,7 +71,7 @@ from .cycles import (
     newton,
     trace_of,
 )
-from .detection import refined
+from .detection import refined, sudden_sliding
 from .equilibria import EquilibriumKind, equilibria
 from .modes import boundary_guards, edge_guards, mode_acceleration, mode_of
 from .oscillator import Oscillator
@@ -459,10 +459,8 @@ def _limit_at_hopf(problem: _Problem, system, u: np.ndarray) -> SpecialPoint | N
     x1 = (u[:-2] / weights).reshape(-1, 3)[:, 0]
     if np.ptp(x1) > 5 * problem.step:
         return None
-    given, guess = (
-        (problem.osc, problem.indices, cycle.chain.codes[0]),
-        jnp.asarray([x1[0], *u[-2:]]),
-    )
+    given = problem.osc, problem.indices, cycle.chain.codes[0]
+    guess = jnp.asarray([x1[0], *u[-2:]])
     if isinstance(problem.condition, FoldOfCycles):
         kind, (found, residual) = "DegenerateHopf", _degenerate_hopf(given, guess)
     else:
@@ -779,8 +777,7 @@ class _RestSystem(_System):
 def _kind_at_rest(osc: Oscillator, belt: int) -> type[AbstractCondition]:
     """Whether a cycle sticks to a belt before or after it is at rest."""
     index = jnp.asarray(np.array(leaf_index(osc, lambda osc: osc.belts[belt].velocity)))
-    found = (refined(osc, index, nu, SuddenSliding(belt)) for nu in (1e-2, -1e-2))
-    return SuddenSliding if any(point is not None for point in found) else BeltAtRest
+    return BeltAtRest if sudden_sliding(osc, index, belt) is None else SuddenSliding
 
 
 def _velocity_equation(u: Array, args) -> Array:
@@ -908,10 +905,8 @@ def _look_at_cycle(args, u: Array):
     n = len(osc.belts)
     names = Ends(n)
     rows = jnp.arange(chain.ends.size)
-    is_fold, at_end = (
-        isinstance(system, UnitMultiplier),
-        isinstance(system, EdgeContact | StickLimit),
-    )
+    is_fold = isinstance(system, UnitMultiplier)
+    at_end = isinstance(system, EdgeContact | StickLimit)
     touches = (row >= 0) & (not at_end)
     others = chain.used & ~stick_phase_from(osc, chain, row)
     if at_end:

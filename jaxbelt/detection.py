@@ -453,17 +453,23 @@ def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
             pair = SlidingExchange((min(belt, other), max(belt, other)))
             found.append(_explained(path, *interval, [pair]))
     if value == 0:
-        # Orbits that settle soon first; other points may be nearer than where they do.
-        beside = [(at, SuddenSliding(belt)) for at in (1e-2, -1e-2, 1e-4, -1e-4)]
-        beside += [(at, BeltAtRest(belt)) for at in interval]
-        tried = (refined(path.osc, path.index, at, condition) for at, condition in beside)
-        found.append(next((point for point in tried if point is not None), None))
+        rests = (refined(path.osc, path.index, at, BeltAtRest(belt)) for at in interval)
+        sudden = sudden_sliding(path.osc, path.index, belt)
+        found += [sudden] if sudden else [next(filter(None, rests), None)]
     points = [point for point in found if point is not None]
     if not points and path.label(interval[0]) != path.label(interval[1]):
         # Something else may happen just there.
         point = _explain(path, [interval])[interval]
         points = [point or unexplained_point(path.osc, int(path.index), value, 0.0)]
     return points
+
+
+def sudden_sliding(osc: Oscillator, index: Array, belt: int) -> BifurcationPoint | None:
+    """Sudden sliding where a belt is at rest, whose velocity has that number, or None."""
+    # Orbits that settle soon first; other points may be nearer than where they do.
+    beside = (1e-2, -1e-2, 1e-4, -1e-4)
+    found = (refined(osc, index, at, SuddenSliding(belt)) for at in beside)
+    return next(filter(None, found), None)
 
 
 def refined(

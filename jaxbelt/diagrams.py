@@ -433,11 +433,10 @@ def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, s
 def kind_of(condition: AbstractCondition) -> tuple[str, Any]:
     """What stays the same along a curve: a tangency to a belt is a fold here and grazing there."""
     name = type(condition).__name__
-    for common, kinds in (
-        ("tangency", NonsmoothFold | GrazingSliding),
-        ("rest", SuddenSliding | BeltAtRest),
-    ):
-        name = common if isinstance(condition, kinds) else name
+    if isinstance(condition, NonsmoothFold | GrazingSliding):
+        name = "tangency"
+    elif isinstance(condition, SuddenSliding | BeltAtRest):
+        name = "rest"
     return name, getattr(condition, "belt", getattr(condition, "belts", None))
 
 

@@ -229,9 +229,16 @@ def onset_position(osc: Oscillator, mode: Mode) -> Array:
 
     The needed force is linear in x1, needed = rest - x1; it reaches the capacity there.
     """
+    return stick_limit(osc, mode, jnp.sign(stick_velocity(osc, mode, jnp.zeros(()))))
+
+
+def stick_limit(osc: Oscillator, mode: Mode, side: Array) -> Array:
+    """x1 where the needed force is as large as the stuck belts of the mode can hold.
+
+    side: 1 the end on the right of where the mass sticks, -1 that on the left.
+    """
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
-    rest = mode_acceleration(osc, mode, jnp.zeros(()), v)
-    return rest + jnp.sign(v) * capacity(osc, mode)
+    return mode_acceleration(osc, mode, jnp.zeros(()), v) + side * capacity(osc, mode)
 
 
 def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
