@@ -38,6 +38,8 @@ from .equilibria import Equilibria, EquilibriumKind, candidates
 from .extrapolation import Scheme, increments, scheme
 from .modes import (
     Mode,
+    at_focus,
+    begins_at_rest,
     boundary_guards,
     capacity,
     edge_guards,
@@ -536,6 +538,10 @@ def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
     osc, y0 = lax.stop_gradient((osc, y0))
     n = len(osc.belts)
     mode = mode_of_state(osc, y0[0], y0[1])
+    rests = begins_at_rest(osc, y0[0], y0[1])
+    focus = at_focus(osc, y0[0], y0[1])
+    status = jnp.where(rests, Status.EQUILIBRIUM.value, Status.OK.value)
+    status = jnp.where(focus, Status.PSEUDO_FOCUS.value, status)
     start = Orbit(
         entries=jnp.zeros((budget, 2)),
         durations=jnp.zeros(budget),
@@ -547,8 +553,8 @@ def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
         code=jnp.stack([jnp.asarray(c, dtype=y0.dtype) for c in mode.codes]),
         low=y0[0],
         repeats=jnp.asarray(-1),
-        status=jnp.asarray(Status.OK.value),
-        done=jnp.asarray(False),
+        status=status,
+        done=status != Status.OK,
     )
     orbit = _follow_from(osc, start)
     status = jnp.where(orbit.done, orbit.status, Status.NOT_SETTLED.value)

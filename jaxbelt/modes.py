@@ -16,6 +16,7 @@ Everything here is elementwise: codes and states may be scalars (the trajectorie
 or arrays of lanes (the kernel of `batch`), belts are unrolled.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -160,6 +161,12 @@ def bounds_leftward(mode: Mode) -> list[Array]:
     return list(mode.touching) + upper
 
 
+def edges_ahead(mode: Mode, v: Array) -> list[Array]:
+    """For each of `edge_guards`, whether a mass with the velocity v (or its sign) moves to it."""
+    sides = zip(bounds_rightward(mode), bounds_leftward(mode), strict=True)
+    return [(v > 0) & on_right | (v < 0) & on_left for on_right, on_left in sides]
+
+
 def edges(osc: Oscillator) -> list[Array]:
     """Positions of the contact edges in the order of `edge_guards`."""
     return [belt.lower for belt in osc.belts] + [belt.upper for belt in osc.belts]
@@ -174,6 +181,44 @@ def has_edges(osc: Oscillator) -> bool:
 
 
 # --- transitions ----------------------------------------------------------------------------------
+
+#: Rounding: a guard this small, over 1 + |nu| or 1 + |x1|, and an x2' this small, over 1 + |x1|,
+#: are 0.
+ON_GUARD, TANGENT = 1e-12, 1e-12
+
+
+def directions(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
+    """Signs of x2' and of x2 just after (x1, x2) in a slip mode.
+
+    Where x2' = 0, as at slip onset, x2'' = -x2 decides; where x2 = 0, x2' does. Both are 0 at an
+    equilibrium only.
+    """
+    a = mode_acceleration(osc, mode, x1, x2)
+    tangent = jnp.abs(a) < TANGENT * (1 + jnp.abs(x1))
+    a_sign = jnp.sign(jnp.where(tangent, -x2, a))
+    return a_sign, jnp.where(x2 == 0, a_sign, jnp.sign(x2))
+
+
+def guard_passed(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """The number of the guard through which an orbit leaves a slip mode at (x1, x2), or -1.
+
+    The guard has to vanish there, and to fall: one that vanishes and rises bounds what the orbit
+    has just entered. Numbered as in `leave_slip`; of several the first.
+    """
+    a_sign, v_sign = directions(osc, mode, x1, x2)
+    guards = boundary_guards(osc, mode, x2)
+    passed = [
+        (guard <= ON_GUARD * (1 + jnp.abs(belt.velocity))) & (code * a_sign > 0)
+        for belt, code, guard in zip(osc.belts, mode.codes, guards, strict=True)
+    ]
+    if has_edges(osc):
+        guards, ahead = edge_guards(osc, mode, x1), edges_ahead(mode, v_sign)
+        passed += [
+            (guard <= ON_GUARD * (1 + jnp.abs(x1))) & is_ahead
+            for guard, is_ahead in zip(guards, ahead, strict=True)
+        ]
+    numbers = [jnp.asarray(i) for i in range(len(passed))]
+    return first_of(passed, numbers, jnp.asarray(-1))
 
 
 def reach_boundary(
@@ -253,13 +298,8 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
     onset_distance = jnp.where(moves, jnp.sign(v) * (x1_onset - x1), jnp.inf)
 
     edge_distances = [
-        jnp.where((v > 0) & on_right | (v < 0) & on_left, guard, jnp.inf)
-        for on_right, on_left, guard in zip(
-            bounds_rightward(mode),
-            bounds_leftward(mode),
-            edge_guards(osc, mode, x1),
-            strict=True,
-        )
+        jnp.where(is_ahead, guard, jnp.inf)
+        for is_ahead, guard in zip(edges_ahead(mode, v), edge_guards(osc, mode, x1), strict=True)
     ]
     distance = onset_distance
     for edge_distance in edge_distances:
@@ -340,13 +380,45 @@ def leave_slip(osc: Oscillator, mode: Mode, fired: Array, x1: Array, x2: Array) 
 def mode_of_state(osc: Oscillator, x1: Array, x2: Array) -> Mode:
     """The mode in which an orbit goes on from the state (x1, x2), on a boundary or an edge too.
 
-    On an edge the velocity decides which side; at rest there, the acceleration on the right-hand
-    side does: the mass goes right if that is positive, else left.
+    On an edge the velocity decides which side. At rest there the mass stays on the side that holds
+    it, where the field or the needed force lets it rest; else it goes right if the acceleration on
+    the right-hand side is positive, and left if not. (At a pseudo-focus it does neither, see
+    `at_focus`.)
     """
-    right = settle(osc, contact(osc, x1, x2, rightward=True), x1, x2)
-    left = settle(osc, contact(osc, x1, x2, rightward=False), x1, x2)
-    push = jnp.where(right.any_stuck, 0.0, mode_acceleration(osc, right, x1, x2))
-    return select((x2 > 0) | ((x2 == 0) & (push > 0)), right, left)
+    right, left = _sides(osc, x1, x2)
+    a_right, a_left = (_pull_at_rest(osc, mode, x1) for mode in (right, left))
+    goes_right = (a_right == 0) | (a_right > 0) & (a_left != 0)
+    return select((x2 > 0) | (x2 == 0) & goes_right, right, left)
+
+
+def at_focus(osc: Oscillator, x1: Array, x2: Array) -> Array:
+    """Whether the state (x1, x2) is a pseudo-focus: at rest on an edge, pushed back by both sides.
+
+    Stable or not, it is an equilibrium: an orbit that starts there stays there.
+    """
+    right, left = _sides(osc, x1, x2)
+    pushed = (_pull_at_rest(osc, left, x1) > 0) & (_pull_at_rest(osc, right, x1) < 0)
+    return (x2 == 0) & pushed
+
+
+def begins_at_rest(osc: Oscillator, x1: Array, x2: Array) -> Array:
+    """Whether a start (x1, x2) is a fixed point or a pseudo-focus, up to rounding."""
+    mode = mode_of_state(osc, x1, x2)
+    fixed = (x2 == 0) & ~mode.any_stuck & (_pull_at_rest(osc, mode, x1) == 0)
+    return fixed | at_focus(osc, x1, x2)
+
+
+def _sides(osc: Oscillator, x1: Array, x2: Array) -> tuple[Mode, Mode]:
+    """The modes just right and just left of a state; where it is on no edge they are the same."""
+    sides = (contact(osc, x1, x2, rightward=side) for side in (True, False))
+    right, left = (settle(osc, mode, x1, x2) for mode in sides)
+    return right, left
+
+
+def _pull_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> Array:
+    """x2' at rest, (x1, 0): 0 where a belt holds the mass, and where it is but rounding."""
+    a = mode_acceleration(osc, mode, x1, jnp.zeros_like(x1))
+    return jnp.where(mode.any_stuck | (jnp.abs(a) < TANGENT * (1 + jnp.abs(x1))), 0.0, a)
 
 
 def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
@@ -364,6 +436,30 @@ def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
         sign = jnp.where(on_boundary, STUCK, jnp.sign(belt.velocity - speed))
         codes.append(jnp.where(is_below, BELOW, jnp.where(is_above, ABOVE, sign)))
     return Mode(tuple(codes))
+
+
+# --- orbits that come to rest -------------------------------------------------------------------
+
+#: Speeds, as fractions of the radius, at which an attracting disc is checked.
+DISC = tuple(sign * j / 8 for j in range(1, 9) for sign in (1, -1))
+
+
+def disc_margin(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> Array:
+    """Positive where all orbits in the disc around the fixed point (x1_rest, 0) come to rest there.
+
+    In a slip mode x1'' = -(x1 - x1_rest) + f(x2) with f(0) = 0, so E = (x1 - x1_rest)^2 + x2^2
+    obeys E' = 2 x2 f(x2). If v f(v) < 0 for all 0 < |v| <= radius, and the disc lies within the
+    mode's boundaries and edges, E falls until the orbit is at rest. The sign is checked at 16
+    speeds; a law that wiggles on a scale below radius/8 could deceive that.
+    """
+    margins = []
+    for fraction in DISC:
+        v = fraction * radius
+        margins.append(-v * mode_acceleration(osc, mode, x1_rest, v))
+    for v in (radius, -radius):
+        margins += boundary_guards(osc, mode, v)
+        margins += edge_guards(osc, mode, x1_rest + v)
+    return functools.reduce(jnp.minimum, margins)
 
 
 # --- the pseudo-focus at a contact edge -----------------------------------------------------------
@@ -416,8 +512,9 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     size = jnp.abs(x2)
     nearest = jnp.inf
     for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
-        touches = is_left | is_right
-        nearest = jnp.minimum(nearest, jnp.where(touches, jnp.abs(belt.velocity), jnp.inf))
+        # The field is smooth across the boundary of a belt that can exert no force there.
+        rubs = (is_left | is_right) & (belt.load * belt.friction.static > 0)
+        nearest = jnp.minimum(nearest, jnp.where(rubs, jnp.abs(belt.velocity), jnp.inf))
     captured = (
         (focus.contraction < 0)
         & (10 * size * focus.nonlinearity < -focus.contraction)
