@@ -380,25 +380,26 @@ def leave_slip(osc: Oscillator, mode: Mode, fired: Array, x1: Array, x2: Array) 
 def mode_of_state(osc: Oscillator, x1: Array, x2: Array) -> Mode:
     """The mode in which an orbit goes on from the state (x1, x2), on a boundary or an edge too.
 
-    On an edge the velocity decides which side. At rest there the mass stays on the side that holds
-    it, where the field or the needed force lets it rest; else it goes right if the acceleration on
-    the right-hand side is positive, and left if not. (At a pseudo-focus it does neither, see
-    `at_focus`.)
+    On an edge the velocity decides which side; at rest there, the acceleration on the right-hand
+    side does: the mass goes right if that is positive, else left. Where the left-hand side pushes
+    it back it stays: on the right if it can rest there, else at a pseudo-focus, see `at_focus`.
     """
     right, left = _sides(osc, x1, x2)
     a_right, a_left = (_pull_at_rest(osc, mode, x1) for mode in (right, left))
-    goes_right = (a_right == 0) | (a_right > 0) & (a_left != 0)
+    goes_right = (a_right > 0) | (a_right == 0) & (a_left > 0)
     return select((x2 > 0) | (x2 == 0) & goes_right, right, left)
 
 
 def at_focus(osc: Oscillator, x1: Array, x2: Array) -> Array:
-    """Whether the state (x1, x2) is a pseudo-focus: at rest on an edge, pushed back by both sides.
+    """Whether the state (x1, x2) is a pseudo-focus: at rest on an edge, pushed back by both sides,
+    or by one of them where the other lets it rest.
 
     Stable or not, it is an equilibrium: an orbit that starts there stays there.
     """
     right, left = _sides(osc, x1, x2)
-    pushed = (_pull_at_rest(osc, left, x1) > 0) & (_pull_at_rest(osc, right, x1) < 0)
-    return (x2 == 0) & pushed
+    a_right, a_left = (_pull_at_rest(osc, mode, x1) for mode in (right, left))
+    slips = ~right.any_stuck & ~left.any_stuck
+    return (x2 == 0) & slips & (a_left >= 0) & (a_right <= 0) & (a_left > a_right)
 
 
 def begins_at_rest(osc: Oscillator, x1: Array, x2: Array) -> Array:
@@ -506,7 +507,7 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
 
     The leading term of a turn must outweigh the next one by ten, and no boundary may be near. With
-    a belt at rest the turns shrink to rounding in finite time.
+    a belt at rest, or with a fixed point on the edge, the turns shrink to rounding.
     """
     focus = edge_focus(osc, left, right, edge)
     size = jnp.abs(x2)
@@ -516,10 +517,17 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
         rubs = (is_left | is_right) & (belt.load * belt.friction.static > 0)
         nearest = jnp.minimum(nearest, jnp.where(rubs, jnp.abs(belt.velocity), jnp.inf))
     captured = (
-        (focus.contraction < 0)
+        focus.exists
+        & (focus.contraction < 0)
         & (10 * size * focus.nonlinearity < -focus.contraction)
         & (size < FOCUS_RADIUS)
         & (2 * osc.omega * size < nearest)
     )
-    slips = ~left.any_stuck & ~right.any_stuck
-    return focus.exists & slips & (captured | (size < FOCUS_ROUNDING))
+    (a_left, trace_left), (a_right, trace_right) = (
+        push_and_trace(osc, mode, edge) for mode in (left, right)
+    )
+    rounding = TANGENT * (1 + jnp.abs(edge))
+    pushed = (a_left > -rounding) & (a_right < rounding) & (a_left - a_right > rounding)
+    shrinks = trace_right * jnp.maximum(a_left, 0) - trace_left * jnp.minimum(a_right, 0) < 0
+    captured = captured | pushed & (shrinks | (nearest == 0)) & (size < FOCUS_ROUNDING)
+    return captured & ~left.any_stuck & ~right.any_stuck
