@@ -47,6 +47,7 @@ from .compiling import one_kernel
 from .modes import (
     ABOVE,
     BELOW,
+    SMALLEST_DISC,
     Mode,
     at_focus,
     begins_at_rest,
@@ -1203,7 +1204,7 @@ class Attractor(Observer):
         turn: _Turn = lanes.memory
         zero = jnp.zeros_like(lanes.t)
         x1_rest = mode_acceleration(osc, lanes.mode, zero, zero)
-        radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), 1e-6)
+        radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), SMALLEST_DISC)
         margin = disc_margin(osc, lanes.mode, x1_rest, radius)
         margin = jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin) / one
         found = margin > 0

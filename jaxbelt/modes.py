@@ -108,12 +108,15 @@ def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
     They slip with sign -sgn(needed): friction opposed the needed force until the limit. That one
     rule serves arrivals at a boundary (not held: the orbit crosses), contact edges met while
     sticking (not held: torn off) and starts on a boundary. Belts of equal velocity are stuck
-    together, their capacities add and their signs flip together.
+    together, their capacities add and their signs flip together. What can hold nothing never
+    sticks; where no force is needed either, r'' = omega^2 x2 gives the sign.
     """
     needed = mode_acceleration(osc, mode, x1, x2)
-    slips = jnp.abs(needed) > capacity(osc, mode)
+    held = capacity(osc, mode)
+    slips = (jnp.abs(needed) > held) | (held == 0)
+    sign = jnp.where(needed == 0, jnp.where(x2 < 0, -1.0, 1.0), -jnp.sign(needed))
     codes = tuple(
-        jnp.where(stuck & slips, -jnp.sign(needed), code)
+        jnp.where(stuck & slips, sign, code)
         for code, stuck in zip(mode.codes, mode.stuck, strict=True)
     )
     return Mode(codes)
@@ -441,8 +444,18 @@ def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
 
 # --- orbits that come to rest -------------------------------------------------------------------
 
+#: Radius below which a disc is not made smaller: rounding of x1 counts there.
+SMALLEST_DISC = 1e-6
 #: Speeds, as fractions of the radius, at which an attracting disc is checked.
 DISC = tuple(sign * j / 8 for j in range(1, 9) for sign in (1, -1))
+
+
+def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """Whether an orbit of a slip mode has entered a disc that is attracted by a fixed point."""
+    zero = jnp.zeros_like(x1)
+    x1_rest = mode_acceleration(osc, mode, zero, zero)
+    radius = jnp.maximum(jnp.hypot(x1 - x1_rest, x2), SMALLEST_DISC)
+    return ~mode.any_stuck & (disc_margin(osc, mode, x1_rest, radius) > 0)
 
 
 def disc_margin(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> Array:
@@ -457,9 +470,13 @@ def disc_margin(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> A
     for fraction in DISC:
         v = fraction * radius
         margins.append(-v * mode_acceleration(osc, mode, x1_rest, v))
+    pulls = [belt.load > 0 for belt in osc.belts]  # no other belt is an obstacle
     for v in (radius, -radius):
-        margins += boundary_guards(osc, mode, v)
-        margins += edge_guards(osc, mode, x1_rest + v)
+        bounds = boundary_guards(osc, mode, v) + edge_guards(osc, mode, x1_rest + v)
+        margins += [
+            jnp.where(matters, bound, jnp.inf)
+            for matters, bound in zip(pulls * 3, bounds, strict=True)
+        ]
     return functools.reduce(jnp.minimum, margins)
 
 
@@ -513,8 +530,7 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     size = jnp.abs(x2)
     nearest = jnp.inf
     for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
-        # The field is smooth across the boundary of a belt that can exert no force there.
-        rubs = (is_left | is_right) & (belt.load * belt.friction.static > 0)
+        rubs = (is_left | is_right) & (belt.load > 0)
         nearest = jnp.minimum(nearest, jnp.where(rubs, jnp.abs(belt.velocity), jnp.inf))
     captured = (
         focus.exists
