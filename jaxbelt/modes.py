@@ -488,43 +488,59 @@ class EdgeFocus(eqx.Module):
 
     exists: a_L > 0 > a_R, so that the mass at rest there is pushed back from both sides. The
     velocity at successive crossings behaves like exp(rate t); a turn takes turn_time * |x2|.
+    With u = 1/|x2| at the crossings a turn leads from u to u - contraction - bend/u^2 + O(1/u^3);
+    bend is a bound of that coefficient's size.
     """
 
     exists: Array
     rate: Array
     turn_time: Array
     contraction: Array
-    nonlinearity: Array
+    bend: Array
 
 
-def push_and_trace(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array]:
-    """x2' of a slip mode at rest, (x1, 0), and its derivative by x2."""
+def field_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array, Array, Array]:
+    """Taylor coefficients of x2' of a slip mode in x2, from (x1, 0): of order 0 to 3."""
     rest = jnp.zeros_like(x1)
-    return jax.jvp(lambda x2: mode_acceleration(osc, mode, x1, x2), (rest,), (jnp.ones_like(rest),))
+
+    def derivative(fn):
+        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
+
+    def a(x2):
+        return mode_acceleration(osc, mode, x1, x2)
+
+    first = derivative(a)
+    second = derivative(first)
+    return a(rest), first(rest), second(rest) / 2, derivative(second)(rest) / 6
 
 
 def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFocus:
     """The pseudo-focus at x1 = edge between the slip modes to its left and right.
 
-    contraction S = tr_L/a_L + tr_R/|a_R|: a turn multiplies x2 by 1 + (2/3) S |x2| + O(x2^2),
-    where nonlinearity bounds the size of the coefficient of that last term. rate is S over
-    3 (1/a_L + 1/|a_R|) and turn_time is 2/a_L + 2/|a_R|.
+    Of the half-turn on one side, from (edge, v) to (edge, -w), with x2' = -a - (x1 - edge) +
+    b x2 + c x2^2 + d x2^3 there: 1/w = 1/v - k - e v^2 + O(v^3), where k = 2 b / (3 a) and
+    e = 2 d/(5 a) + 2 b c/(15 a^2) + 4 b^3/(135 a^3) - 2 b/(15 a^3), with -c for c on the left, by
+    inserting the series into the orbit x1(x2). Both sides add up. rate is the sum of k over
+    2/a_L + 2/|a_R|, which is turn_time.
     """
-    a_left, trace_left = push_and_trace(osc, left, edge)
-    a_right, trace_right = push_and_trace(osc, right, edge)
-    exists = (a_left > 0) & (a_right < 0)
-    a_l, a_r = jnp.where(exists, a_left, 1.0), jnp.where(exists, -a_right, 1.0)
-    contraction = trace_left / a_l + trace_right / a_r
-    slowness = 1 / a_l + 1 / a_r
-    nonlinearity = 1 / a_l**2 + 1 / a_r**2 + (trace_left / a_l) ** 2 + (trace_right / a_r) ** 2
-    return EdgeFocus(exists, contraction / (3 * slowness), 2 * slowness, contraction, nonlinearity)
+    sides = [field_at_rest(osc, mode, edge) for mode in (left, right)]
+    exists = (sides[0][0] > 0) & (sides[1][0] < 0)
+    contraction, slowness, bend = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
+    for a, b, c, d in sides:
+        a = jnp.where(exists, jnp.abs(a), 1.0)
+        contraction = contraction + 2 * b / (3 * a)
+        slowness = slowness + 1 / a
+        terms = (2 * d / (5 * a), 2 * b * c / (15 * a**2), 4 * (b / a) ** 3 / 135, b / (7.5 * a**3))
+        bend = bend + sum(map(jnp.abs, terms))
+    return EdgeFocus(exists, contraction / (2 * slowness), 2 * slowness, contraction, bend)
 
 
 def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array) -> Array:
     """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
 
-    The leading term of a turn must outweigh the next one by ten, and no boundary may be near. With
-    a belt at rest, or with a fixed point on the edge, the turns shrink to rounding.
+    The leading term of a turn must outweigh the next one by ten (see `EdgeFocus`), and no boundary
+    may be near. With a belt at rest, or with a fixed point on the edge, the turns shrink to
+    rounding.
     """
     focus = edge_focus(osc, left, right, edge)
     size = jnp.abs(x2)
@@ -535,13 +551,12 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     captured = (
         focus.exists
         & (focus.contraction < 0)
-        & (10 * size * focus.nonlinearity < -focus.contraction)
+        & (10 * size**2 * focus.bend < -focus.contraction)
         & (size < FOCUS_RADIUS)
         & (2 * osc.omega * size < nearest)
     )
-    (a_left, trace_left), (a_right, trace_right) = (
-        push_and_trace(osc, mode, edge) for mode in (left, right)
-    )
+    a_left, trace_left, *_ = field_at_rest(osc, left, edge)
+    a_right, trace_right, *_ = field_at_rest(osc, right, edge)
     rounding = TANGENT * (1 + jnp.abs(edge))
     pushed = (a_left > -rounding) & (a_right < rounding) & (a_left - a_right > rounding)
     shrinks = trace_right * jnp.maximum(a_left, 0) - trace_left * jnp.minimum(a_right, 0) < 0
