@@ -464,7 +464,7 @@ def _first_root(poly, g_start, end, g_end):
 
 
 def _pass_events(
-    osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array, *, edges: bool
+    program: "Program", osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array
 ) -> tuple[Lanes, Passage]:
     """Lanes that stand on a guard go on; stick phases are passed to their end, or to t1."""
     landed = (lanes.h < 0) & ~lanes.done
@@ -472,7 +472,7 @@ def _pass_events(
     number = guard_passed(osc, lanes.mode, lanes.x1, lanes.x2)
     fired = landed & (number >= 0)
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
-    captured = fired & after.captured
+    captured = fired & after.captured & program.captures
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
 
     stuck = after.mode.any_stuck & ~captured & ~lanes.done
@@ -491,7 +491,7 @@ def _pass_events(
     a = jnp.where(jnp.abs(a) < 1e-12 * (1 + jnp.abs(new_x1)), 0.0, a)
     moved = landed | stuck
     h = jnp.where(fired, _first_step(rtol), jnp.abs(lanes.h))
-    if edges:
+    if program.edges:
         # In a corner one event follows the other at once: a lane that stands on the next guard,
         # and goes on through it, has landed there.
         corner = (fired | released) & ~mode.any_stuck & (guard_passed(osc, mode, new_x1, x2) >= 0)
@@ -545,6 +545,8 @@ class Program(eqx.Module):
     mapped: tuple[bool, ...] = eqx.field(static=True)
     observer: Observer = eqx.field(static=True)
     edges: bool = eqx.field(static=True)
+    #: Whether a run that a pseudo-focus captures ends there.
+    captures: bool = eqx.field(static=True, default=True)
 
 
 def _oscillator(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator:
@@ -687,7 +689,7 @@ def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> 
     osc, observer = _oscillator(program, shared, rows), program.observer
 
     def round_(_, lanes):
-        lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
+        lanes, passage = _pass_events(program, osc, lanes, t1, rtol)
         lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
         window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
 
@@ -825,6 +827,16 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
+def by_name(layout: dict[str, tuple[int, ...]], columns: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns [..., columns, runs] as results by name, [..., runs] and the shape of each."""
+    results, first = {}, 0
+    for name, shape in layout.items():
+        part = np.moveaxis(columns[..., first : first + math.prod(shape), :], -2, -1)
+        results[name] = part.reshape(*part.shape[:-1], *shape)
+        first += math.prod(shape)
+    return results
+
+
 @functools.lru_cache(maxsize=1)
 def _options() -> tuple[tuple[str, Any], ...]:
     """Compiler options of the kernel: wide vectors where the processor has them."""
@@ -862,15 +874,17 @@ def run(
     rtol: float,
     atol: float,
     derivatives: int = 0,
+    budget: float = 1.0,
 ) -> None:
     """Do all runs: rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]:
     the starts and the parameters that vary, and their derivatives in so many directions;
-    put(numbers, results) takes results [1 + derivatives, columns, runs] in any order.
+    put(numbers, results) takes results [1 + derivatives, columns, runs] in any order. budget: the
+    share of `MAX_STEPS` that a run may take.
 
     Every thread feeds chunks to one compiled kernel (which lets go of Python's lock) on its own
     lanes. Long runs stay in their lanes while the next chunk is worked on.
     """
-    limit = int(MAX_STEPS * max(1.0, t1 / 100)) // (STEPS * ROUNDS)
+    limit = int(budget * MAX_STEPS * max(1.0, t1 / 100)) // (STEPS * ROUNDS)
     settings = (t1, rtol, atol, np.int32(limit))
     kernel = functools.partial(_kernel(program, derivatives), shared, *settings)
     columns = 2 + sum(program.mapped)

@@ -32,6 +32,7 @@ LADDER = (
     "smoothing",
     "simulate",
     "batch",
+    "audit",
     "equilibria",
     "cycles",
     "functionals",
