@@ -26,8 +26,8 @@ interval. Kinds of events: 1 STICK, 2 SLIP, 3 CROSS, 4 EDGE; and, where asked fo
 and 6 an extremum of x2.
 """
 
-from dataclasses import dataclass, field
-from math import inf
+from dataclasses import dataclass, field, replace
+from math import inf, nan
 
 import numpy as np
 from numba import njit
@@ -131,7 +131,7 @@ def simulate(
 
     mode: contact codes to go on with, None: those of the state. noise: every step of length h is
     disturbed by noise h, the state after every event by noise, at random. turns, extrema: record
-    the zeros of x2, the extrema of x2.
+    the zeros of x2 (belt 0: a maximum of x1, 1: a minimum), the extrema of x2.
     """
     n = len(osc.belts)
     given = np.full(n, 9, np.int64) if mode is None else np.array(mode, np.int64)
@@ -499,22 +499,28 @@ def _velocity_at(w, B, x1, x2):
 
 @njit(nogil=True, cache=True)
 def _begin(z, w, B, x1, x2, s):
-    """The mode of a state, into s; returns (stuck, status)."""
+    """The mode of a state, into s; returns (stuck, status, distance from another mode)."""
     n = B.shape[0]
     on = _velocity_at(w, B, x1, x2)
     none = np.full(n, 9, np.int64)
     if x2 != 0:
         _contacts(w, B, x1, x2, on, x2 > 0, none, s)
-        stuck, _, _ = _balance(z, w, B, s, x1, x2)
-        return stuck, OK
+        stuck, gap, _ = _balance(z, w, B, s, x1, x2)
+        return stuck, OK, gap
     left, right = np.empty(n, np.int64), np.empty(n, np.int64)
     _contacts(w, B, x1, x2, on, False, none, left)
     _contacts(w, B, x1, x2, on, True, none, right)
     same = True
     for i in range(n):
         same = same and left[i] == right[i]
-    stuck_l, _, a_l = _balance(z, w, B, left, x1, x2)
-    stuck_r, _, a_r = _balance(z, w, B, right, x1, x2)
+    stuck_l, gap_l, a_l = _balance(z, w, B, left, x1, x2)
+    stuck_r, gap_r, a_r = _balance(z, w, B, right, x1, x2)
+    gap = min(gap_l, gap_r)
+    if not same:
+        if a_l <= 0 <= a_r:  # both ways are solutions
+            gap = 0.0
+        for side in (left, right):
+            gap = min(gap, abs(_force(z, w, B, side, x1, x2)))
     go_right = a_r > 0
     for i in range(n):
         s[i] = right[i] if go_right else left[i]
@@ -524,9 +530,9 @@ def _begin(z, w, B, x1, x2, s):
         if stuck_r:
             for i in range(n):
                 s[i] = right[i]
-            return True, OK
-        return False, PSEUDO_FOCUS
-    return stuck, OK
+            return True, OK, 0.0
+        return False, PSEUDO_FOCUS, gap
+    return stuck, OK, gap
 
 
 @njit(nogil=True, cache=True)
@@ -585,7 +591,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
     passed_edge, speed_right, speed_left = np.nan, np.inf, np.inf
     stuck = False
     if given[0] == 9:
-        stuck, status = _begin(z, w, B, x1, x2, s)
+        stuck, status, margin = _begin(z, w, B, x1, x2, s)
         on = _velocity_at(w, B, x1, x2)
         if stuck:
             x2 = on / w
@@ -745,7 +751,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
                     if s[i] == sign and B[i, 0] / w == x2 and belt < 0:
                         on, belt = B[i, 0], i
                 if belt < 0:
-                    kind = TURN
+                    kind, belt = TURN, 0 if hit == 2 else 1
                 else:
                     # Which side of an edge does not matter, for x1 is on none.
                     _contacts(w, B, x1, x2, on, x2 > 0, old, s)
@@ -820,3 +826,90 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         _bounds(w, B, s, L)
         margin = min(margin, _nearest(L, x1, x2) if not stuck else np.inf)
     return count, t, x1, x2, status, margin, s, steps
+
+
+# ---------------------------------------------------------------- attractors
+
+
+@dataclass(frozen=True)
+class Attractor:
+    """kind: "equilibrium", "cycle", "stuck" or "undecided"; turn: the events of one period, (kind,
+    belt) each, from where their order is least; sticks: time stuck to each belt in one period."""
+
+    kind: str
+    period: float = nan
+    turn: tuple = ()
+    x1: tuple = (nan, nan)
+    x2: tuple = (nan, nan)
+    sticks: tuple = ()
+    margin: float = inf
+    status: int = OK
+
+
+def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=2e-11, at_rest=1e-6, periods=24):
+    """Where a run leads, by running it: no shortcut of any kind.
+
+    It is a cycle where all of the maxima of x1 have repeated, as whole states, for the last three
+    periods, to `same`; an equilibrium where the motion has shrunk below `at_rest` and does shrink.
+    """
+    x1, x2, mode, margin, t = *y0, None, inf, 0.0
+    size = inf
+    while t < t_max:
+        run = simulate(
+            osc, (x1, x2), chunk, mode=mode, turns=True, extrema=True, max_events=200_000
+        )
+        (x1, x2), mode = run.y_end, run.mode_end
+        margin = min(margin, run.margin) if t == 0 else margin
+        t += chunk
+        if run.status == STUCK_FOREVER:
+            return Attractor("stuck", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
+        if run.status == PSEUDO_FOCUS:
+            return Attractor("equilibrium", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
+        if run.status != OK:
+            return Attractor("undecided", margin=margin, status=run.status)
+        crossed_at_rest = (run.kind == CROSS) & (run.y[:, 1] == 0)
+        downward = np.array(
+            [
+                any(osc.belts[k].velocity == 0 and c == 1 for k, c in enumerate(codes))
+                for codes in run.codes
+            ],
+            bool,
+        )
+        tops = np.flatnonzero((run.kind == TURN) & (run.belt == 0) | crossed_at_rest & downward)
+        last = run.t > chunk - 30.0
+        seen = run.y[last] if np.any(last) else np.array([[x1, x2]])
+        old, size = size, float(np.max(np.ptp(np.vstack([seen, [x1, x2]]), axis=0)))
+        if size < at_rest and (size <= 0.999 * old or size < 1e-12) and abs(x2) < at_rest:
+            return Attractor("equilibrium", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
+        found = _repeats(run, tops, same, periods)
+        if found:
+            cycle = _cycle(osc, run, *found)
+            if max(np.ptp(cycle.x1), np.ptp(cycle.x2)) > at_rest:
+                return replace(cycle, margin=margin)
+    return Attractor("undecided", margin=margin)
+
+
+def _repeats(run, tops, same, periods):
+    """First and last event of one period, where the tops repeat."""
+    for p in range(1, min(periods, len(tops) // 4) + 1):
+        now, then = tops[-3 * p :], tops[-4 * p : -p]
+        alike = np.all(np.abs(run.y[now] - run.y[then]) <= same)
+        if alike and np.array_equal(run.codes[now], run.codes[then]):
+            return tops[-1 - p], tops[-1]
+    return None
+
+
+def _cycle(osc, run, first, last):
+    rows = slice(first, last + 1)
+    t, y, codes = run.t[rows], run.y[rows], run.codes[rows]
+    stuck = np.where(codes[:-1] == 0, np.diff(t)[:, None], 0.0).sum(axis=0)
+    turn = [(int(k), int(b)) for k, b in zip(run.kind[rows][1:], run.belt[rows][1:]) if k <= EDGE]
+    turn = min((turn[i:] + turn[:i] for i in range(len(turn))), default=[])
+    return Attractor(
+        "cycle",
+        float(t[-1] - t[0]),
+        tuple(turn),
+        (float(y[:, 0].min()), float(y[:, 0].max())),
+        (float(y[:, 1].min()), float(y[:, 1].max())),
+        tuple(stuck.tolist()),
+    )
