@@ -48,8 +48,9 @@ _E5 = np.ascontiguousarray(_dop853.E5)
 _LONGEST, _SHORTEST = 0.5, 1e-10
 #: Distances above this one need no closer look; below it the margin of a run is exact.
 _CLOSE = 1e-6
-#: Velocity at an edge below which turns around a pseudo-focus that shrink are over.
-_FOCUS_SPEED = 1e-4
+#: Velocity at an edge below which turns around a pseudo-focus are over that shrink as they should,
+#: to this fraction of it.
+_FOCUS_SPEED, _FOCUS_MATCH = 1e-2, 0.1
 
 
 # ---------------------------------------------------------------- problems
@@ -125,18 +126,20 @@ def simulate(
     mode=None,
     turns=False,
     extrema=False,
+    capture=True,
     max_events=20_000,
 ):
     """The run from y0 over [0, T].
 
     mode: contact codes to go on with, None: those of the state. noise: every step of length h is
     disturbed by noise h, the state after every event by noise, at random. turns, extrema: record
-    the zeros of x2 (belt 0: a maximum of x1, 1: a minimum), the extrema of x2.
+    the zeros of x2 (belt 0: a maximum of x1, 1: a minimum), the extrema of x2. capture: end, at
+    rest, where the run converges to a pseudo-focus.
     """
     n = len(osc.belts)
     given = np.full(n, 9, np.int64) if mode is None else np.array(mode, np.int64)
     out = np.empty((max_events, 5 + n))
-    flags = (1 if turns else 0) + (2 if extrema else 0)
+    flags = (1 if turns else 0) + (2 if extrema else 0) + (0 if capture else 4)
     count, t, x1, x2, status, margin, codes, steps = _run(
         osc.damping,
         osc.omega,
@@ -564,16 +567,18 @@ def _nearest(L, x1, x2):
 
 
 @njit(nogil=True, cache=True)
-def _contracts(z, w, B, left, right, edge):
-    """Whether turns around the rest on an edge shrink, to leading order; and if a belt at rest
-    that touches makes them end."""
+def _contraction(z, w, B, left, right, edge):
+    """To leading order a turn around the rest on an edge multiplies x2 there by 1 + (this) |x2|.
+
+    Also the least speed of a belt that touches: turns have to be well below it.
+    """
     a_l, a_r = _force(z, w, B, left, edge, 0.0), _force(z, w, B, right, edge, 0.0)
-    rests = False
+    least = np.inf
     for i in range(B.shape[0]):
-        touches = abs(left[i]) < 2 or abs(right[i]) < 2
-        rests = rests or (B[i, 0] == 0 and touches and B[i, 1] * B[i, 4] > 0)
+        if abs(left[i]) < 2 or abs(right[i]) < 2:
+            least = min(least, abs(B[i, 0]) / w)
     s = _trace(z, w, B, left, 0.0) / a_l - _trace(z, w, B, right, 0.0) / a_r
-    return a_l > 0 > a_r and s < 0, rests
+    return 2 / 3 * s, least
 
 
 # ---------------------------------------------------------------- runs
@@ -582,7 +587,7 @@ def _contracts(z, w, B, left, right, edge):
 @njit(nogil=True, cache=True)
 def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
     n = B.shape[0]
-    turns, extrema = flags % 2 == 1, flags >= 2
+    turns, extrema, capture = flags % 2 == 1, flags // 2 % 2 == 1, flags < 4
     s, old = given.copy(), given.copy()
     before, L, box = given.copy(), np.empty(4), np.empty(8)
     V, K, V2, K2 = np.empty(_N + 1), np.empty(_N + 1), np.empty(_N + 1), np.empty(_N + 1)
@@ -785,12 +790,14 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
                 else:
                     speed_left = abs(x2)
                 after = _force(z, w, B, s, x1, x2)
-                if not stuck and a * d > 0 > after * d and abs(x2) < _FOCUS_SPEED:
+                if capture and not stuck and a * d > 0 > after * d and abs(x2) < _FOCUS_SPEED:
                     if rightward:
-                        shrinks, rests = _contracts(z, w, B, old, s, x1)
+                        rate, least = _contraction(z, w, B, old, s, x1)
                     else:
-                        shrinks, rests = _contracts(z, w, B, s, old, x1)
-                    if abs(x2) < 1e-9 or (shrinks and not rests and abs(x2) < speed < np.inf):
+                        rate, least = _contraction(z, w, B, s, old, x1)
+                    small = abs(x2) < speed < min(np.inf, 0.5 * least)
+                    shrunk = (abs(x2) - speed) / (speed * speed)
+                    if abs(x2) < 1e-9 or (small and abs(shrunk - rate) <= -_FOCUS_MATCH * rate):
                         status = PSEUDO_FOCUS
                         x2 = 0.0
         # ---------------- an event
@@ -847,10 +854,10 @@ class Attractor:
 
 
 def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=2e-11, at_rest=1e-6, periods=24):
-    """Where a run leads, by running it: no shortcut of any kind.
+    """Where a run leads, by running it on, in longer and longer pieces.
 
-    It is a cycle where all of the maxima of x1 have repeated, as whole states, for the last three
-    periods, to `same`; an equilibrium where the motion has shrunk below `at_rest` and does shrink.
+    It is a cycle where all of the maxima of x1 in the second half of a piece repeat, as whole
+    states, to `same`; an equilibrium where the motion has shrunk below `at_rest` and does shrink.
     """
     x1, x2, mode, margin, t = *y0, None, inf, 0.0
     size = inf
@@ -886,15 +893,21 @@ def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=2e-11, at_rest=1e-6,
             cycle = _cycle(osc, run, *found)
             if max(np.ptp(cycle.x1), np.ptp(cycle.x2)) > at_rest:
                 return replace(cycle, margin=margin)
+        chunk = min(2 * chunk, 1600.0)
     return Attractor("undecided", margin=margin)
 
 
 def _repeats(run, tops, same, periods):
     """First and last event of one period, where the tops repeat."""
+    y, codes = run.y[tops], run.codes[tops]
+    half = len(tops) // 2
     for p in range(1, min(periods, len(tops) // 4) + 1):
-        now, then = tops[-3 * p :], tops[-4 * p : -p]
-        alike = np.all(np.abs(run.y[now] - run.y[then]) <= same)
-        if alike and np.array_equal(run.codes[now], run.codes[then]):
+        # One period apart and, against what creeps, as many as there are.
+        for lag in (p, half // p * p):
+            alike = np.all(np.abs(y[half:] - y[half - lag : -lag]) <= same)
+            if not (alike and np.array_equal(codes[half:], codes[half - lag : -lag])):
+                break
+        else:
             return tops[-1 - p], tops[-1]
     return None
 
