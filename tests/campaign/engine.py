@@ -51,6 +51,8 @@ _CLOSE = 1e-6
 #: Velocity at an edge below which turns around a pseudo-focus are over that shrink as they should,
 #: to this fraction of it.
 _FOCUS_SPEED, _FOCUS_MATCH = 1e-2, 0.1
+#: A turn with a smaller velocity is smaller than the rounding of x1.
+_ROUNDING = 1e-7
 
 
 # ---------------------------------------------------------------- problems
@@ -173,13 +175,13 @@ def simulate(
 # ---------------------------------------------------------------- field
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _mu(row, r):
     f = np.exp(-row[7] * r) if row[5] == 1 else 1 / (1 + row[7] * r)
     return row[6] * f + row[8] + row[9] * r * r
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _mu_slope(row, r):
     if row[5] == 1:
         f = -row[7] * np.exp(-row[7] * r)
@@ -188,7 +190,7 @@ def _mu_slope(row, r):
     return row[6] * f + 2 * row[9] * r
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _force(z, w, B, s, x1, x2):
     """x2' in the mode s; of stuck belts nothing. NaN where a law is far beyond its boundary."""
     f = -x1 - z * x2
@@ -201,7 +203,7 @@ def _force(z, w, B, s, x1, x2):
     return f
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _trace(z, w, B, s, x2):
     """d x2' / d x2 in the mode s."""
     f = -z
@@ -211,7 +213,7 @@ def _trace(z, w, B, s, x2):
     return f
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _advance(z, w, B, s, x1, x2, a, h, V, K):
     """One step of DOP853; V, K: room for the stages' x2 and x2'."""
     V[0], K[0] = x2, a
@@ -233,7 +235,7 @@ def _advance(z, w, B, s, x1, x2, a, h, V, K):
     return y1, y2
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _error(x1, x2, y1, y2, h, tol, V, K):
     """The error of the step over the tolerance, as Hairer, Norsett and Wanner combine it."""
     c1 = tol * (1 + max(abs(x1), abs(y1)))
@@ -259,13 +261,13 @@ def mu(row, r):
 # ---------------------------------------------------------------- enclosures
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _product(a, b, c, d):
     p, q, r, t = a * c, a * d, b * c, b * d
     return min(min(p, q), min(r, t)), max(max(p, q), max(r, t))
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _force_interval(z, w, B, s, l1, u1, l2, u2):
     """Bounds of x2' and of d x2'/d x2 over a box; NaN where a law is far beyond its boundary."""
     p, q = _product(-z, -z, l2, u2)
@@ -296,7 +298,7 @@ def _force_interval(z, w, B, s, l1, u1, l2, u2):
     return low, high, t_low, t_high
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _enclose(z, w, B, s, x1, x2, a, y1, y2, b, h, box):
     """Bounds of x1, x2, x2', x2'' over the step, into `box`; False where none were found.
 
@@ -341,7 +343,7 @@ def _enclose(z, w, B, s, x1, x2, a, y1, y2, b, h, box):
 # ---------------------------------------------------------------- roots within a step
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _root(z, w, B, s, x1, x2, a, what, level, left, right, f_left, f_right, V, K):
     """The step length in [left, right] at which a quantity takes the value `level`.
 
@@ -377,7 +379,7 @@ def _root(z, w, B, s, x1, x2, a, what, level, left, right, f_left, f_right, V, K
     return h, y1, y2
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _look(z, w, B, s, x1, x2, a, y1, y2, b, h, axis, level, side, box, V, K):
     """Whether side (x_axis - level), positive at first, is negative within the step.
 
@@ -449,7 +451,7 @@ def _look(z, w, B, s, x1, x2, a, y1, y2, b, h, axis, level, side, box, V, K):
 # ---------------------------------------------------------------- transitions
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _contacts(w, B, x1, x2, on, right, old, new):
     """The contacts at a point, into `new`: 0 where a touching belt runs at the velocity `on`.
 
@@ -469,7 +471,7 @@ def _contacts(w, B, x1, x2, on, right, old, new):
             new[i] = 1 if B[i, 0] > w * x2 else -1
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _balance(z, w, B, s, x1, x2):
     """Sticks, or goes to one side: sets the zeros in s. Returns (sticks, distance from doing the
     other, sign of x2' after)."""
@@ -490,7 +492,7 @@ def _balance(z, w, B, s, x1, x2):
     return False, abs(rest) - held, np.sign(rest)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _velocity_at(w, B, x1, x2):
     """The velocity of a belt that may touch at x1 and at which x2 is, else NaN."""
     for i in range(B.shape[0]):
@@ -500,7 +502,7 @@ def _velocity_at(w, B, x1, x2):
     return np.nan
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _begin(z, w, B, x1, x2, s):
     """The mode of a state, into s; returns (stuck, status, distance from another mode)."""
     n = B.shape[0]
@@ -538,7 +540,7 @@ def _begin(z, w, B, x1, x2, s):
     return stuck, OK, gap
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _bounds(w, B, s, L):
     """The box of a slip mode, into L: left, right, lower and upper bound."""
     L[0], L[1], L[2], L[3] = -np.inf, np.inf, -np.inf, np.inf
@@ -555,7 +557,7 @@ def _bounds(w, B, s, L):
                 L[2] = max(L[2], B[i, 0] / w)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _nearest(L, x1, x2):
     """Distance of a state from the lines that it is not on."""
     d = np.inf
@@ -566,7 +568,7 @@ def _nearest(L, x1, x2):
     return d
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _contraction(z, w, B, left, right, edge):
     """To leading order a turn around the rest on an edge multiplies x2 there by 1 + (this) |x2|.
 
@@ -584,7 +586,7 @@ def _contraction(z, w, B, left, right, edge):
 # ---------------------------------------------------------------- runs
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
     n = B.shape[0]
     turns, extrema, capture = flags % 2 == 1, flags // 2 % 2 == 1, flags < 4
@@ -797,7 +799,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
                         rate, least = _contraction(z, w, B, s, old, x1)
                     small = abs(x2) < speed < min(np.inf, 0.5 * least)
                     shrunk = (abs(x2) - speed) / (speed * speed)
-                    if abs(x2) < 1e-9 or (small and abs(shrunk - rate) <= -_FOCUS_MATCH * rate):
+                    if abs(x2) < _ROUNDING or (small and abs(shrunk - rate) <= -_FOCUS_MATCH * rate):
                         status = PSEUDO_FOCUS
                         x2 = 0.0
         # ---------------- an event
