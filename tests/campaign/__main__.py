@@ -100,7 +100,7 @@ class _Defaults:
 def _batches(cases, rng, options):
     """Lists of cases, one structure each."""
     if options.what == "grazing":
-        yield from cases.grazing_batches(rng, options.runs, options.batch)
+        yield from cases.grazing_batches(rng, options)
         return
     structures = cases.structures(rng, options.programs)
     if options.structure is not None:

@@ -799,7 +799,9 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
                         rate, least = _contraction(z, w, B, s, old, x1)
                     small = abs(x2) < speed < min(np.inf, 0.5 * least)
                     shrunk = (abs(x2) - speed) / (speed * speed)
-                    if abs(x2) < _ROUNDING or (small and abs(shrunk - rate) <= -_FOCUS_MATCH * rate):
+                    if abs(x2) < _ROUNDING or (
+                        small and abs(shrunk - rate) <= -_FOCUS_MATCH * rate
+                    ):
                         status = PSEUDO_FOCUS
                         x2 = 0.0
         # ---------------- an event
@@ -835,6 +837,29 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         _bounds(w, B, s, L)
         margin = min(margin, _nearest(L, x1, x2) if not stuck else np.inf)
     return count, t, x1, x2, status, margin, s, steps
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _flow(z, w, B, s, x1, x2, duration, steps):
+    V, K = np.empty(_N + 1), np.empty(_N + 1)
+    h = duration / steps
+    for _ in range(steps):
+        x1, x2 = _advance(z, w, B, s, x1, x2, _force(z, w, B, s, x1, x2), h, V, K)
+    return x1, x2
+
+
+def flow(osc, mode, y, duration, step=0.01):
+    """The state after a time, negative too, in the field of a slip mode; no events are looked
+    for. NaN where the field ends."""
+    steps = max(1, round(abs(duration) / step))
+    mode = np.array(mode, np.int64)
+    return _flow(osc.damping, osc.omega, osc.table(), mode, *map(float, y), duration, steps)
+
+
+def force(osc, mode, x1, x2):
+    """x2' in the field of a slip mode."""
+    mode = np.array(mode, np.int64)
+    return _force(osc.damping, osc.omega, osc.table(), mode, float(x1), float(x2))
 
 
 # ---------------------------------------------------------------- attractors
