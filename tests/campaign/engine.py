@@ -660,6 +660,9 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         else:
             # ---------------- a slip arc
             a = _force(z, w, B, s, x1, x2)
+            if turns and abs(x2) + abs(a) < 1e-14:  # at rest, but for rounding
+                t = T
+                break
             if turns:
                 if x2 > 0 or (x2 == 0 and a > 0):
                     L[2] = max(L[2], 0.0)
@@ -880,7 +883,7 @@ class Attractor:
     status: int = OK
 
 
-def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=2e-11, at_rest=1e-6, periods=24):
+def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=1e-9, at_rest=1e-6, periods=24):
     """Where a run leads, by running it on, in longer and longer pieces.
 
     It is a cycle where all of the maxima of x1 in the second half of a piece repeat, as whole
@@ -915,7 +918,7 @@ def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=2e-11, at_rest=1e-6,
         old, size = size, float(np.max(np.ptp(np.vstack([seen, [x1, x2]]), axis=0)))
         if size < at_rest and (size <= 0.999 * old or size < 1e-12) and abs(x2) < at_rest:
             return Attractor("equilibrium", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
-        found = _repeats(run, tops, same, periods)
+        found = _repeats(run, tops, same, periods) if t > chunk else None
         if found:
             cycle = _cycle(osc, run, *found)
             if max(np.ptp(cycle.x1), np.ptp(cycle.x2)) > at_rest:
@@ -928,14 +931,15 @@ def _repeats(run, tops, same, periods):
     """First and last event of one period, where the tops repeat."""
     y, codes = run.y[tops], run.codes[tops]
     half = len(tops) // 2
-    for p in range(1, min(periods, len(tops) // 4) + 1):
-        # One period apart and, against what creeps, as many as there are.
-        for lag in (p, half // p * p):
-            alike = np.all(np.abs(y[half:] - y[half - lag : -lag]) <= same)
-            if not (alike and np.array_equal(codes[half:], codes[half - lag : -lag])):
-                break
-        else:
-            return tops[-1 - p], tops[-1]
+
+    def alike(lag):
+        close = np.abs(y[half:] - y[half - lag : -lag]) <= same
+        return np.all(close) and np.array_equal(codes[half:], codes[half - lag : -lag])
+
+    for p in range(1, min(periods, half // 4) + 1):
+        if alike(p):
+            # And against what creeps as many periods apart as there are.
+            return (tops[-1 - p], tops[-1]) if alike(half // p * p) else None
     return None
 
 
