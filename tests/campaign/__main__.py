@@ -54,7 +54,14 @@ def main(arguments=None):
                 bad = sum(n for (_, v), n in verdicts.items() if v not in compare.GOOD)
                 seconds = time.monotonic() - began
                 print(f"{done:,} runs, {bad} wrong, {seconds:.0f} s", file=sys.stderr, flush=True)
-    print(_rows(verdicts, compare.GOOD, options, time.monotonic() - began))
+    rows = _rows(verdicts, compare.GOOD, options)
+    print("\n".join(rows))
+    print(f"seed {options.seed}, {time.monotonic() - began:.0f} s")
+    for (kind, verdict), n in verdicts.most_common():
+        if verdict not in compare.GOOD:
+            print(f"{n} {kind}: {verdict}")
+    if options.table:
+        _put_rows(options.table, rows)
     if options.show:
         shown = Counter()
         for line in disagreements:
@@ -71,6 +78,9 @@ def _parser():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=int, default=2000)
     parser.add_argument("--rational-share", type=float, default=0.5)
+    parser.add_argument(
+        "--by", choices=("simulate", "sweep"), default="simulate", help="who is asked to graze"
+    )
     parser.add_argument("--programs", type=int, default=9, help="structures of laws and edges")
     parser.add_argument("--structure", type=int, help="only this one of them")
     parser.add_argument("--span", type=float, default=50.0, help="time that a run takes")
@@ -78,6 +88,7 @@ def _parser():
     parser.add_argument("--batch", type=int, default=4096, help="runs in one call")
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--report", type=Path, help="file for JSON lines, one a disagreement")
+    parser.add_argument("--table", type=Path, help="page to put the results' rows in")
     parser.add_argument("--corners", action="store_true", help="report excused corners, too")
     parser.add_argument("--show", type=int, default=0, help="print so many of each kind")
     parser.add_argument("--verbose", action="store_true")
@@ -121,7 +132,7 @@ def _batches(cases, rng, options):
 
 
 def _ask(package, batch, options):
-    if options.what == "final":
+    if options.what == "final" or options.by == "sweep":
         return package.finals(batch, options.tol)
     if options.what == "attractors":
         return package.labels(batch, options.tol)
@@ -142,19 +153,32 @@ def _plain(value):
     return out
 
 
-def _rows(verdicts, good, options, seconds):
+def _rows(verdicts, good, options):
     """The rows of the table in `docs/checked.md`."""
-    lines = []
+    what = options.what + (f", {options.by}" if options.what == "grazing" else "")
+    rows = []
     for kind in sorted({kind for kind, _ in verdicts}):
         counts = {v: n for (k, v), n in verdicts.items() if k == kind}
-        wrong = {v: n for v, n in counts.items() if v not in good}
-        lines.append(
-            f"| {options.what} | {kind} | {sum(counts.values()):,} | {options.tol:g} "
-            f"| {counts.get('tolerance', 0)} | {counts.get('corner', 0)} "
-            f"| {sum(wrong.values())} |"
+        wrong = sum(n for v, n in counts.items() if v not in good)
+        numbers = (sum(counts.values()), counts.get("tolerance", 0), counts.get("corner", 0), wrong)
+        runs, tolerance, corner, wrong = (f"{n:,}" for n in numbers)
+        rows.append(
+            f"| {what} | {kind} | {runs} | {options.tol:g} | {tolerance} | {corner} | {wrong} |"
         )
-        lines += [f"<!-- {n} {v} -->" for v, n in sorted(wrong.items(), key=lambda x: -x[1])]
-    return "\n".join([*lines, f"<!-- seed {options.seed}, {seconds:.0f} s -->"])
+    return rows
+
+
+def _put_rows(path, rows):
+    """Put rows before the mark in the page, in place of those of the same campaign."""
+
+    def key(row):
+        cells = row.split(" | ")
+        return (cells[0], cells[1], cells[3]) if len(cells) == 7 else row
+
+    new = {key(row) for row in rows}
+    lines = [x for x in path.read_text(encoding="utf-8").splitlines() if key(x) not in new]
+    place = lines.index("<!-- campaigns -->")
+    path.write_text("\n".join([*lines[:place], *rows, *lines[place:], ""]), encoding="utf-8")
 
 
 if __name__ == "__main__":
