@@ -602,6 +602,8 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         on = _velocity_at(w, B, x1, x2)
         if stuck:
             x2 = on / w
+        else:
+            margin = min(margin, max(abs(x2), abs(_force(z, w, B, s, x1, x2))))
     else:
         for i in range(n):
             stuck = stuck or s[i] == 0
@@ -824,7 +826,9 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         count += 1
         still = still + 1 if t == t_before else 0
         if still > 20:
-            status = CORNER
+            # Turns around a point on an edge that are lost in rounding are over, too.
+            status = PSEUDO_FOCUS if kind == EDGE and abs(x2) < _ROUNDING else CORNER
+            x2 = 0.0 if status == PSEUDO_FOCUS else x2
         if noise > 0:
             random ^= random << np.uint64(13)
             random ^= random >> np.uint64(7)
