@@ -21,7 +21,7 @@ def main(arguments=None):
 
     rng = np.random.default_rng(options.seed)
     began = time.monotonic()
-    verdicts, disagreements, done = Counter(), [], 0
+    verdicts, disagreements, graze, done = Counter(), [], [], 0
     report = open(options.report, "a", encoding="utf-8") if options.report else None
     with ThreadPoolExecutor(options.threads) as pool:
         for batch in _batches(cases, rng, options):
@@ -33,6 +33,8 @@ def main(arguments=None):
 
             for case, answer, (verdict, mine) in zip(batch, told, pool.map(one, zip(batch, told))):
                 verdicts[case.kind, verdict] += 1
+                if verdict == "same" and case.distance is not None:
+                    graze.append((case, mine))
                 if verdict in ("same", "tolerance") or (
                     verdict == "corner" and not options.corners
                 ):
@@ -49,6 +51,9 @@ def main(arguments=None):
                 disagreements.append(line)
                 if report:
                     print(json.dumps(line), file=report, flush=True)
+            if options.what == "grazing":
+                _differentiate(graze, verdicts, disagreements, rng, options)
+                graze.clear()
             done += len(batch)
             if options.verbose:
                 bad = sum(n for (_, v), n in verdicts.items() if v not in compare.GOOD)
@@ -137,6 +142,33 @@ def _ask(package, batch, options):
     if options.what == "attractors":
         return package.labels(batch, options.tol)
     return package.simulated(batch, options.tol)
+
+
+def _differentiate(graze, verdicts, disagreements, rng, options):
+    """Derivatives of the runs that were right, each along a direction of its own."""
+    from . import compare, derivatives, package
+
+    cases = [case for case, _ in graze]
+    along = [derivatives.directions(case, rng) for case in cases]
+    told = package.derivatives(cases, along, options.tol, options.by)
+    for (case, mine), direction, answer in zip(graze, along, told):
+        verdict, right = compare.judge_derivative(case, answer, mine, direction, options.tol)
+        verdicts[f"{case.kind}, derivative", verdict] += 1
+        if verdict != "same":
+            line = dict(
+                what="derivative",
+                verdict=verdict,
+                tol=options.tol,
+                told=answer.tolist(),
+                engine=right.tolist(),
+                direction=direction,
+                case=case.to_json(),
+                code=package.as_code(case),
+            )
+            disagreements.append(line)
+            if options.report:
+                with open(options.report, "a", encoding="utf-8") as file:
+                    print(json.dumps(line), file=file)
 
 
 def _plain(value):

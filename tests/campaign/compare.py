@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from . import engine
+from . import derivatives, engine
 
 #: A run that comes this near to another outcome is at a corner, and its neighbours are this far.
 CORNER, NEIGHBOUR = 1e-9, 1e-7
@@ -201,6 +201,24 @@ def _rests_unstably(case):
         return False
     h = 1e-6
     return engine.force(osc, mode, x1, h) > engine.force(osc, mode, x1, -h)
+
+
+def judge_derivative(case, told, mine, direction, tol):
+    """The verdict on d(final state) along a direction; mine: the engine's run of the case.
+
+    What the tolerance lets them err is that of disturbed runs, as for states.
+    """
+    right = derivatives.derivative(case, mine, direction)
+    size = 1 + np.max(np.abs(right))
+    if np.all(np.abs(told - right) <= 1e-8 * size):
+        return "same", right
+    runs = [run(case, noise=noise, seed=i) for i in range(DISTURBED) for noise in (tol, 10 * tol)]
+    others = [
+        derivatives.derivative(case, r, direction) for r in runs if r.sequence == mine.sequence
+    ]
+    far = np.max(np.abs(np.array(others) - right)) if others else 0.0
+    good = np.all(np.abs(told - right) <= STEPS * far + 1e-8 * size)
+    return ("same" if good else "derivative"), right
 
 
 # ---------------------------------------------------------------- attractors

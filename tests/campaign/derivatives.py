@@ -55,9 +55,10 @@ def moved(osc, direction, by):
     )
 
 
-def _difference(f):
-    """The derivative of f at 0, by Richardson."""
-    one, half = ((f(h) - f(-h)) / (2 * h) for h in (_STEP, 0.5 * _STEP))
+def _difference(f, size=1.0):
+    """The derivative of f at 0, by Richardson; size: of the disturbance by one."""
+    step = _STEP / max(size, 1.0)
+    one, half = ((f(h) - f(-h)) / (2 * h) for h in (step, 0.5 * step))
     return (4 * half - one) / 3
 
 
@@ -76,9 +77,17 @@ def derivative(case, run, direction):
     mode = engine.simulate(osc, case.y0, 1e-12).mode_end
 
     def along(mode, y, delta, duration):
-        return _difference(
-            lambda h: np.array(engine.flow(moved(osc, direction, h), mode, y + h * delta, duration))
-        )
+        # In pieces, each with a step that suits what the disturbance has grown to.
+        pieces = int(np.ceil(duration / 0.1))
+        for _ in range(pieces):
+            delta = _difference(
+                lambda h, y=y, delta=delta: np.array(
+                    engine.flow(moved(osc, direction, h), mode, y + h * delta, duration / pieces)
+                ),
+                np.max(np.abs(delta)),
+            )
+            y = np.array(engine.flow(osc, mode, y, duration / pieces))
+        return delta
 
     def field(mode, y):
         return np.array([y[1], engine.force(osc, mode, *y)])

@@ -60,6 +60,17 @@ def numbers(case):
     return [float(v) for v in row]
 
 
+def tangent(case, direction):
+    """A direction of `derivatives.directions` in the order of `numbers`, and that of the start."""
+    start, damping, belts = direction
+    _, edges = case.structure
+    row = [damping, 0.0]
+    for (velocity, load, lower, upper), b in zip(belts, case.oscillator.belts):
+        row += [velocity, load, *[0.0] * _SIZES[b.law[0]]]
+        row += [lower, upper] if edges else []
+    return row, list(start)
+
+
 def _from_numbers(structure, row):
     laws, edges = structure
     numbers = iter(row)
@@ -76,20 +87,36 @@ def _from_numbers(structure, row):
 # ---------------------------------------------------------------- sweep
 
 
-def swept(cases, observe, **options):
+def _leaves(structure, table):
+    """Rows of numbers in the order of the oscillator's leaves."""
+
+    def leaves(row):
+        osc = _from_numbers(structure, row)
+        return jnp.stack([jnp.asarray(leaf, float) for leaf in jax.tree.leaves(osc)])
+
+    return np.asarray(jax.vmap(leaves)(jnp.asarray(table)))
+
+
+def swept(cases, observe, directions=None, **options):
     """The variables of `jb.sweep` over cases of one structure and one T.
 
     The sweep's own axes vary the start of all runs or of none; here every case has its own.
+    directions: to differentiate along, one a case; the derivatives are those by "case".
     """
     structure = cases[0].structure
     table = np.array([numbers(case) for case in cases])
     starts = np.array([case.y0 for case in cases], dtype=float)
-    every = jax.vmap(lambda row: tuple(jax.tree.leaves(_from_numbers(structure, row))))(table)
+    tables = [np.column_stack([starts, _leaves(structure, table)])]
+    if directions:
+        options["derivatives"] = "case"
+        pairs = [tangent(case, direction) for case, direction in zip(cases, directions)]
+        rows, moves = (np.array(part) for part in zip(*pairs))
+        tables.append(np.column_stack([moves, _leaves(structure, rows)]))
 
     class Cases(_SWEEP._Grid):
         def rows(self, runs, derivatives=()):
-            varying = [np.asarray(v)[runs] for v, varies in zip(every, self.mapped) if varies]
-            return np.stack([*starts[runs].T, *varying])[None]
+            varying = [True, True, *self.mapped]
+            return np.stack([t[runs][:, varying].T for t in tables[: 1 + len(derivatives)]])
 
     def make(case):
         # Every number depends on the axis, so that every one varies.
@@ -222,3 +249,38 @@ def simulated(cases, tol, max_segments=None):
                 )
             )
     return out
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+@functools.cache
+def _pushed(structure, T, tol):
+    def end(row, y0):
+        found = jb.simulate(
+            _from_numbers(structure, row), y0, T, ts=jnp.array([T]), rtol=tol, atol=tol
+        )
+        return found.ys[-1]
+
+    return jax.jit(jax.vmap(lambda row, y0, d: jax.jvp(end, (row, y0), d)[1]))
+
+
+def derivatives(cases, directions, tol, by):
+    """d(x1, x2 at T) along a direction a case, by "simulate" or by the "sweep"."""
+    if by == "sweep":
+        found = swept(cases, "final", directions, t1=cases[0].T, rtol=tol, atol=tol)
+        return np.column_stack([found.d_x1_end_d_case.values, found.d_x2_end_d_case.values])
+    run, out = _pushed(cases[0].structure, cases[0].T, tol), []
+    for first in range(0, len(cases), CHUNK):
+        some = cases[first : first + CHUNK]
+        padding = CHUNK - len(some)
+        rows, moves = zip(*map(tangent, some, directions[first : first + CHUNK]))
+        table = [numbers(case) for case in some]
+        starts = [case.y0 for case in some]
+        parts = (
+            jnp.array(list(part) + [part[0]] * padding, dtype=float)
+            for part in (table, starts, rows, moves)
+        )
+        table, starts, rows, moves = parts
+        out.append(np.asarray(run(table, starts, (rows, moves)))[: len(some)])
+    return np.concatenate(out)
