@@ -210,14 +210,14 @@ def judge_derivative(case, told, mine, direction, tol):
     """
     right = derivatives.derivative(case, mine, direction)
     size = 1 + np.max(np.abs(right))
-    if np.all(np.abs(told - right) <= 1e-8 * size):
+    if np.all(np.abs(told - right) <= 1e-7 * size):
         return "same", right
     runs = [run(case, noise=noise, seed=i) for i in range(DISTURBED) for noise in (tol, 10 * tol)]
     others = [
         derivatives.derivative(case, r, direction) for r in runs if r.sequence == mine.sequence
     ]
     far = np.max(np.abs(np.array(others) - right)) if others else 0.0
-    good = np.all(np.abs(told - right) <= STEPS * far + 1e-8 * size)
+    good = np.all(np.abs(told - right) <= STEPS * far + 1e-7 * size)
     return ("same" if good else "derivative"), right
 
 
