@@ -887,7 +887,7 @@ class Attractor:
     status: int = OK
 
 
-def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=1e-9, at_rest=1e-6, periods=24):
+def attractor(osc, y0, *, chunk=100.0, t_max=200_000.0, same=1e-9, at_rest=1e-6, periods=24):
     """Where a run leads, by running it on, in longer and longer pieces.
 
     It is a cycle where all of the maxima of x1 in the second half of a piece repeat, as whole
@@ -927,7 +927,7 @@ def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=1e-9, at_rest=1e-6, 
             cycle = _cycle(osc, run, *found)
             if max(np.ptp(cycle.x1), np.ptp(cycle.x2)) > at_rest:
                 return replace(cycle, margin=margin)
-        chunk = min(2 * chunk, 1600.0)
+        chunk = 2 * chunk if chunk < 1600.0 or len(tops) < 32 else chunk
     return Attractor("undecided", margin=margin)
 
 
