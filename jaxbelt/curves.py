@@ -48,12 +48,9 @@ from .bifurcations import (
     edge_balance,
     edge_rest,
     end_near_edge,
-    leaf_index,
     least_push,
-    parameter,
     small_newton,
     stick_phase_from,
-    vary,
 )
 from .checks import as_array, check_finite, require
 from .compiling import jit
@@ -75,6 +72,7 @@ from .detection import refined, sudden_sliding
 from .equilibria import EquilibriumKind, equilibria
 from .modes import boundary_guards, edge_guards, mode_acceleration, mode_of
 from .oscillator import Oscillator
+from .parameters import leaf_index, names_of, parameter, vary
 from .results import Status
 
 #: Unknowns of a cycle count this much in the length of a step, beside the two parameters; large
@@ -206,7 +204,8 @@ def bifurcation_curve(
     """
     require(isinstance(point, BifurcationPoint), "point", "a BifurcationPoint", repr(point))
     require(int(point.status) == Status.OK, "point", "one with status OK", repr(point))
-    require(len(where) == 2, "where", "two functions", repr(where))
+    two = isinstance(where, tuple | list) and len(where) == 2
+    require(two, "where", "two functions", repr(where))
     osc = point.oscillator
     numbers = [leaf_index(osc, one) for one in where]
     indices = jnp.asarray(np.array(numbers))
@@ -221,8 +220,7 @@ def bifurcation_curve(
     closed = ahead.end is End.CLOSED
     behind = _Side(ahead.rows[:1], [], End.CLOSED) if closed else _follow(problem, point, -1.0)
     rows = [*reversed(behind.rows[1:]), *ahead.rows]
-    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(osc)]
-    names = [jax.tree_util.keystr(paths[int(i)]).removeprefix(".") for i in indices]
+    names = [names_of(osc)[number] for number in numbers]
     return BifurcationCurve(
         condition=point.condition,
         values=np.array([row.values for row in rows]),
