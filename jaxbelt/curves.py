@@ -85,6 +85,9 @@ REMESH = 10
 DEPARTURE = 1e-5
 #: Integration steps for each arc of that orbit; it takes long to leave.
 STEPS = 48
+#: How often the points on both sides of a singular one are brought nearer to it by half; much
+#: nearer Newton's method fails.
+SHRINKS = 8
 
 
 class SpecialPoint(NamedTuple):
@@ -374,21 +377,72 @@ def _between(problem: _Problem, system: "_System", before, after) -> list[Specia
         end = seen_b.tests.get(name, np.nan)
         if start * end >= 0 or np.isnan(start * end):
             continue
-        solved: list[tuple[np.ndarray, float]] = []
+        solved: list[_Probe] = []
 
         def test(part, name=name, solved=solved):
             at = corrected(*system.problem, a.u, a.tangent, part * length)
             seen = system.look(at.u)
-            solved.append((at.u, max(seen.residual, abs(seen.tests[name]))))
-            return seen.tests[name]
+            value = seen.tests[name]
+            if not at.found or np.isnan(value):
+                raise _SingularError
+            solved.append(_Probe(part, value, at.u[-2:], max(seen.residual, abs(value))))
+            return value
 
-        root: Any = brentq(test, 0.0, 1.0, xtol=1e-14)
-        test(root)
-        u, residual = solved[-1]
-        if np.all((problem.limits[:, 0] <= u[-2:]) & (u[-2:] <= problem.limits[:, 1])):
-            values = (float(u[-2]), float(u[-1]))
-            found.append((root, SpecialPoint(name[0], name[1], values, residual)))
+        try:
+            root: Any = brentq(test, 0.0, 1.0, xtol=1e-14)
+            test(root)
+            special = solved[-1]
+        except _SingularError:
+            ends = _Probe(0.0, start, a.u[-2:], 0.0), _Probe(1.0, end, b.u[-2:], 0.0)
+            special = _from_both_sides(test, solved, *ends)
+        values = special.values
+        if np.all((problem.limits[:, 0] <= values) & (values <= problem.limits[:, 1])):
+            pair = float(values[0]), float(values[1])
+            found.append((special.part, SpecialPoint(name[0], name[1], pair, special.residual)))
     return [point for _, point in sorted(found, key=lambda item: item[0])]
+
+
+class _Probe(NamedTuple):
+    """A part of a step, the watched function and the parameters there, the largest error."""
+
+    part: float
+    test: float
+    values: np.ndarray
+    residual: float
+
+
+class _SingularError(Exception):
+    """Newton's method does not converge there, or the watched function is not defined."""
+
+
+def _from_both_sides(test: Callable[[float], float], solved: list[_Probe], left, right) -> _Probe:
+    """Where a function vanishes that has no value there: extrapolated from what has on both sides.
+
+    So it is where the cycle of a curve shrinks to a point: with all arcs of duration zero its
+    equations are singular.
+    """
+    from scipy.interpolate import KroghInterpolator
+
+    known = [left, right]
+    for _ in range(SHRINKS):
+        low, high = known[-2:]
+        middle = low.part - low.test * (high.part - low.part) / (high.test - low.test)
+        try:
+            for side in (low, high):
+                test(0.5 * (side.part + middle))
+        except _SingularError:
+            break
+        if solved[-2].test * low.test < 0 or solved[-1].test * high.test < 0:
+            break
+        known += solved[-2:]
+
+    def at_zero(probes):
+        numbers = [np.array([probe.part, *probe.values]) for probe in probes]
+        return KroghInterpolator([probe.test for probe in probes], numbers)(0.0)
+
+    best, other = at_zero(known[-6:]), at_zero(known[-4:])
+    residual = float(np.max(np.abs(best - other))) if len(known) > 4 else np.nan
+    return _Probe(float(best[0]), 0.0, best[1:], residual)
 
 
 def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
