@@ -377,24 +377,21 @@ def _between(problem: _Problem, system: "_System", before, after) -> list[Specia
         end = seen_b.tests.get(name, np.nan)
         if start * end >= 0 or np.isnan(start * end):
             continue
-        solved: list[_Probe] = []
 
-        def test(part, name=name, solved=solved):
+        def probe(part, name=name):
             at = corrected(*system.problem, a.u, a.tangent, part * length)
             seen = system.look(at.u)
             value = seen.tests[name]
             if not at.found or np.isnan(value):
                 raise _SingularError
-            solved.append(_Probe(part, value, at.u[-2:], max(seen.residual, abs(value))))
-            return value
+            return _Probe(part, value, at.u[-2:], max(seen.residual, abs(value)))
 
         try:
-            root: Any = brentq(test, 0.0, 1.0, xtol=1e-14)
-            test(root)
-            special = solved[-1]
+            root: Any = brentq(lambda part, probe=probe: probe(part).test, 0.0, 1.0, xtol=1e-14)
+            special = probe(root)
         except _SingularError:
             ends = _Probe(0.0, start, a.u[-2:], 0.0), _Probe(1.0, end, b.u[-2:], 0.0)
-            special = _from_both_sides(test, solved, *ends)
+            special = _from_both_sides(probe, *ends)
         values = special.values
         if np.all((problem.limits[:, 0] <= values) & (values <= problem.limits[:, 1])):
             pair = float(values[0]), float(values[1])
@@ -415,7 +412,7 @@ class _SingularError(Exception):
     """Newton's method does not converge there, or the watched function is not defined."""
 
 
-def _from_both_sides(test: Callable[[float], float], solved: list[_Probe], left, right) -> _Probe:
+def _from_both_sides(probe: Callable[[float], _Probe], low: _Probe, high: _Probe) -> _Probe:
     """Where a function vanishes that has no value there: extrapolated from what has on both sides.
 
     So it is where the cycle of a curve shrinks to a point: with all arcs of duration zero its
@@ -423,18 +420,17 @@ def _from_both_sides(test: Callable[[float], float], solved: list[_Probe], left,
     """
     from scipy.interpolate import KroghInterpolator
 
-    known = [left, right]
+    known = [low, high]
     for _ in range(SHRINKS):
-        low, high = known[-2:]
         middle = low.part - low.test * (high.part - low.part) / (high.test - low.test)
         try:
-            for side in (low, high):
-                test(0.5 * (side.part + middle))
+            nearer = [probe(0.5 * (side.part + middle)) for side in (low, high)]
         except _SingularError:
             break
-        if solved[-2].test * low.test < 0 or solved[-1].test * high.test < 0:
+        if any(new.test * old.test <= 0 for new, old in zip(nearer, (low, high), strict=True)):
             break
-        known += solved[-2:]
+        known += nearer
+        low, high = nearer
 
     def at_zero(probes):
         numbers = [np.array([probe.part, *probe.values]) for probe in probes]
