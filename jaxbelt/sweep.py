@@ -31,7 +31,7 @@ from .checks import (
     check_positive,
     is_concrete,
     require,
-    require_float64,
+    require_usable_jax,
 )
 from .oscillator import Oscillator, check_scalars
 from .results import of_one_turn
@@ -130,7 +130,7 @@ def sweep(
     Uses every core (every device, if JAX has others). `ValueError` names the argument that is
     impossible.
     """
-    require_float64()
+    require_usable_jax()
     grid = _Grid(make, axes, y0)
     observer = _observer(observe)
     if t1 is None:

@@ -20,10 +20,12 @@ PACKAGE = ROOT / "jaxbelt"
 # Read from top to bottom: a module imports only from lines above its own.
 LADDER = (
     "results",
+    "processes",
     "checks",
     "compiling",
     "friction",
     "oscillator",
+    "parameters",
     "modes",
     "presets",
     "continuation",
