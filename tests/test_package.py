@@ -29,6 +29,7 @@ LADDER = (
     "continuation",
     "derivatives",
     "extrapolation",
+    "roots",
     "smoothing",
     "simulate",
     "batch",
