@@ -31,6 +31,7 @@ LADDER = (
     "continuation",
     "derivatives",
     "extrapolation",
+    "roots",
     "smoothing",
     "simulate",
     "batch",
