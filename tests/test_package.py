@@ -34,6 +34,7 @@ LADDER = (
     "batch",
     "equilibria",
     "cycles",
+    "attractors",
     "functionals",
     "sweep",
     "bifurcations",
