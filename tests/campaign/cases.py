@@ -1,0 +1,262 @@
+"""Cases for campaigns: random ones, rational ones, and orbits that graze a boundary or an edge.
+
+A rational case has round numbers everywhere, as users have, and starts on boundaries, edges,
+equilibria and corners on purpose: exact coincidences have probability zero among random numbers.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from math import inf, isfinite
+
+from . import engine
+from .engine import Belt, Oscillator
+
+LAWS = ("conti", "coulomb", "stribeck")
+PAPER = ("conti", 1.0, 0.6, 10.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """An oscillator, a start and how long it runs; kind says where it came from."""
+
+    oscillator: Oscillator
+    y0: tuple
+    T: float = 50.0
+    kind: str = "random"
+
+    @property
+    def structure(self):
+        """What decides the compiled program: the belts' laws, and whether there are edges."""
+        belts = self.oscillator.belts
+        edges = any(isfinite(b.lower) or isfinite(b.upper) for b in belts)
+        return tuple(b.law[0] for b in belts), edges
+
+    def to_json(self):
+        """The complete parameters, every number by its shortest exact digits."""
+        osc = self.oscillator
+        belts = [
+            dict(
+                velocity=b.velocity,
+                law=list(b.law),
+                load=b.load,
+                lower=None if b.lower == -inf else b.lower,
+                upper=None if b.upper == inf else b.upper,
+            )
+            for b in osc.belts
+        ]
+        return dict(
+            damping=osc.damping,
+            omega=osc.omega,
+            belts=belts,
+            y0=list(self.y0),
+            T=self.T,
+            kind=self.kind,
+        )
+
+
+def from_json(text):
+    """The case of a report's line."""
+    d = json.loads(text) if isinstance(text, str) else text
+    belts = tuple(
+        Belt(
+            b["velocity"],
+            tuple(b["law"]),
+            b["load"],
+            -inf if b["lower"] is None else b["lower"],
+            inf if b["upper"] is None else b["upper"],
+        )
+        for b in d["belts"]
+    )
+    return Case(Oscillator(d["damping"], belts, d["omega"]), tuple(d["y0"]), d["T"], d["kind"])
+
+
+def structures(rng, programs):
+    """Some structures: laws of one to three belts, with edges and without. Each is a compilation,
+    so a campaign takes a few, the commonest first."""
+    first = [
+        (("conti", "conti"), True),
+        (("conti", "conti"), False),
+        (("conti",), False),
+        (("conti", "conti", "conti"), True),
+        (("coulomb", "coulomb"), True),
+        (("stribeck", "conti"), True),
+        (("conti",), True),
+        (("coulomb", "stribeck"), False),
+        (("stribeck", "stribeck", "coulomb"), True),
+    ]
+    while len(first) < programs:
+        laws = tuple(str(law) for law in rng.choice(LAWS, size=rng.choice([1, 2, 2, 2, 3, 3])))
+        s = laws, bool(rng.random() < 0.7)
+        if s not in first:
+            first.append(s)
+    return first[:programs]
+
+
+# ---------------------------------------------------------------- random
+
+
+def _random_law(rng, name):
+    static = rng.uniform(0.5, 1.4)
+    if name == "conti":
+        quadratic = rng.uniform(0, 0.3) if rng.random() < 0.3 else 0.0
+        return name, static, static * rng.uniform(0.3, 0.95), rng.uniform(0.5, 15.0), quadratic
+    kinetic = static * rng.uniform(0.4, 1.0)
+    return (name, static, kinetic) + ((rng.uniform(0.05, 1.0),) if name == "stribeck" else ())
+
+
+def _intervals(rng, n, number):
+    """Contact intervals of the classes (b), (c), (d), or any."""
+    style = rng.integers(4) if n > 1 else 3
+    if style == 0:
+        s = number(-1.2, 1.2)
+        cuts = [(-inf, s), (s, inf), (-inf, inf)]
+    elif style == 1:
+        s0, s1 = sorted((number(-1.2, 1.2), number(-1.2, 1.2)))
+        if s0 == s1:
+            s1 = s0 + 0.5
+        cuts = [(-inf, s1), (s0, inf), (s0, s1)]
+    else:
+        cuts = []
+        for _ in range(n):
+            a, b = sorted((number(-1.5, 1.5), number(-1.5, 1.5)))
+            if a == b:
+                b = a + 1.0
+            cuts.append([(a, b), (a, inf), (-inf, b), (-inf, inf)][rng.integers(4)])
+    return [cuts[i] for i in range(n)]
+
+
+def random_case(rng, structure, T=50.0):
+    laws, edges = structure
+    intervals = _intervals(rng, len(laws), rng.uniform) if edges else [(-inf, inf)] * len(laws)
+    if edges and not any(isfinite(v) for pair in intervals for v in pair):
+        intervals[0] = (-inf, rng.uniform(-1.0, 1.0))
+    belts = tuple(
+        Belt(
+            rng.uniform(-1.2, 1.2),
+            _random_law(rng, law),
+            rng.uniform(0.3, 1.8) if rng.random() < 0.95 else 0.0,
+            lower,
+            upper,
+        )
+        for law, (lower, upper) in zip(laws, intervals)
+    )
+    damping = rng.uniform(0.02, 1.0) if rng.random() < 0.95 else rng.uniform(1.0, 3.0)
+    omega = rng.uniform(0.6, 1.6) if rng.random() < 0.4 else 1.0
+    y0 = (rng.uniform(-3, 3), rng.uniform(-2, 2))
+    return Case(Oscillator(damping, belts, omega), y0, T, "random")
+
+
+# ---------------------------------------------------------------- rational
+
+
+def _rational_law(rng, name):
+    def twentieth(a, b):
+        return round(float(rng.integers(round(20 * a), round(20 * b) + 1)) / 20, 2)
+
+    static = float(rng.choice([1.0, 1.0, 0.8, 1.2, 0.5]))
+    if name == "conti":
+        if rng.random() < 0.5:
+            return PAPER
+        residual = float(rng.choice([0.6, 0.5, 0.4])) * static
+        return name, static, residual, float(rng.choice([10, 5, 2, 1])), 0.0
+    kinetic = static * float(rng.choice([1.0, 0.8, 0.6, 0.5]))
+    return (name, static, kinetic) + ((twentieth(0.05, 0.5),) if name == "stribeck" else ())
+
+
+def rational_case(rng, structure, T=50.0):
+    """Every parameter a multiple of 1/20, and what is equal or related more often than not."""
+
+    def number(a, b):
+        return round(float(rng.integers(round(20 * a), round(20 * b) + 1)) / 20, 2)
+
+    laws, edges = structure
+    n = len(laws)
+    velocities = [number(-1.0, 1.0) for _ in range(n)]
+    relation = rng.integers(7)
+    if n > 1:
+        if relation == 0:
+            velocities[1] = velocities[0]
+        elif relation == 1:
+            velocities[1] = -velocities[0]
+        elif relation == 2:  # slip onsets of the paper's belts share x1 and mode
+            velocities[1] = round(velocities[0] - 1.5 * (1 if velocities[0] > 0 else -1), 2)
+        elif relation == 3:
+            velocities[rng.integers(n)] = 0.0
+    elif relation == 3:
+        velocities[0] = 0.0
+    chosen = {name: _rational_law(rng, name) for name in LAWS}
+    same_law = rng.random() < 0.7
+    loads = [float(rng.choice([1, 1, 1, 2, 0.5]))] * n
+    if rng.random() < 0.4:
+        loads = [float(v) for v in rng.choice([1, 1, 2, 0.5, 0.0, 1.5], size=n)]
+    damping = float(rng.choice([0.5, 0.5, 0.25, 0.1, 0.05, 1.0, 0.2, 2.0]))
+    omega = float(rng.choice([1, 1, 1, 0.5, 2]))
+
+    def law_of(name):
+        return chosen[name] if same_law else _rational_law(rng, name)
+
+    belts = tuple(Belt(v, law_of(name), load) for v, name, load in zip(velocities, laws, loads))
+    osc = Oscillator(damping, belts, omega)
+    if edges:
+        special = [x for x in special_positions(osc) if abs(x) < 3]
+
+        def position(a, b):
+            # On a slip onset or an equilibrium, or round.
+            if special and rng.random() < 0.35:
+                return float(rng.choice(special))
+            return number(a, b)
+
+        intervals = _intervals(rng, n, position)
+        if not any(isfinite(v) for pair in intervals for v in pair):
+            intervals[0] = (-inf, number(-1.0, 1.0))
+        osc = replace(
+            osc,
+            belts=tuple(replace(b, lower=lo, upper=up) for b, (lo, up) in zip(belts, intervals)),
+        )
+    return Case(osc, _special_start(rng, osc, number), T, "rational")
+
+
+def special_positions(osc):
+    """x1 of slip onsets and of equilibria, whatever the other belts' signs and contacts are."""
+    found = set()
+    table = osc.table()
+    for i, belt in enumerate(osc.belts):
+        v = belt.velocity / osc.omega
+        others = {0.0}
+        for k, other in enumerate(osc.belts):
+            if k != i:
+                r = abs(other.velocity - belt.velocity)
+                pull = other.load * engine.mu(table[k], r)
+                pull = pull if other.velocity > belt.velocity else -pull
+                others |= {s + pull for s in others}
+        for rest in others:
+            for held in (belt.load * belt.law[1], -belt.load * belt.law[1]):
+                found.add(round(rest - osc.damping * v + held, 14))
+    rests = {0.0}
+    for k, belt in enumerate(osc.belts):
+        if belt.velocity:
+            pull = belt.load * engine.mu(table[k], abs(belt.velocity))
+            rests |= {s + (pull if belt.velocity > 0 else -pull) for s in rests}
+    return sorted(found | {round(x, 14) for x in rests})
+
+
+def _special_start(rng, osc, number):
+    edges = [x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)]
+    levels = [b.velocity / osc.omega for b in osc.belts]
+    x1, x2 = number(-2.0, 3.0), number(-1.5, 1.5)
+    how = rng.integers(8)
+    if how == 0:
+        return 3.0, 0.0
+    if how in (1, 2) and edges:
+        x1 = float(rng.choice(edges))
+    if how in (2, 3):
+        x2 = float(rng.choice(levels))
+    if how == 4:
+        x1, x2 = float(rng.choice(special_positions(osc))), float(rng.choice([*levels, 0.0]))
+    if how == 5:
+        x2 = 0.0
+        if edges and rng.random() < 0.5:
+            x1 = float(rng.choice(edges))
+    if how == 6:
+        return 0.0, 0.0
+    return x1, x2

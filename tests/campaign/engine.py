@@ -1,0 +1,915 @@
+"""Belt-driven dry-friction oscillators once more, quickly and independently, for campaigns.
+
+A mass on a spring is dragged by belts, in scaled time
+
+    x1' = x2
+    x2' = -x1 - zeta x2 + sum over touching belts of  load mu(|r|) sgn(r),    r = nu - omega x2.
+
+Nothing here comes from the package, neither code nor the way events are found. Slip arcs are
+integrated by DOP853 at 1e-13. A step that may come near a boundary or an edge has to show, by
+interval arithmetic over an enclosure of the whole step, that the distance to it is
+
+- positive throughout, or
+- monotone, or convex, or concave over the step,
+
+or it is halved. Of a convex distance the smallest value is sought, so no excursion within a step is
+missed and none is made up, however small. An event is found by shorter and shorter steps from the
+beginning of its own step, so its state is as good as the integration.
+
+What follows an event is decided by Filippov's set of forces at that very point: belts at the
+mass's own velocity give anything up to their static limits, and if that can balance the rest of the
+forces the mass sticks, else it is accelerated to one side. Belts that slipped before and go on
+touching keep their sign. Stick phases are written down.
+
+Codes of contact, a belt each: 1, -1 slips with that sign of r; 0 stuck; -2, 2 mass below, above the
+interval. Kinds of events: 1 STICK, 2 SLIP, 3 CROSS, 4 EDGE; and, where asked for, 5 a zero of x2
+and 6 an extremum of x2.
+"""
+
+from dataclasses import dataclass, field, replace
+from math import inf, nan
+
+import numpy as np
+from numba import njit
+from scipy.integrate._ivp import dop853_coefficients as _dop853
+
+STICK, SLIP, CROSS, EDGE, TURN, EXTREMUM = 1, 2, 3, 4, 5, 6
+OK, STUCK_FOREVER, PSEUDO_FOCUS, NOT_FINITE = 0, 1, 2, 5
+#: The engine's own: the events used up, no progress in a corner, too many steps.
+BUDGET, CORNER, STEPS = 100, 101, 102
+
+_N = _dop853.N_STAGES
+_A = np.ascontiguousarray(_dop853.A[:_N, :_N])
+_B = np.ascontiguousarray(_dop853.B)
+_E3 = np.ascontiguousarray(_dop853.E3)
+_E5 = np.ascontiguousarray(_dop853.E5)
+
+#: Longest step; shortest that is still halved.
+_LONGEST, _SHORTEST = 0.5, 1e-10
+#: Distances above this one need no closer look; below it the margin of a run is exact.
+_CLOSE = 1e-6
+#: Velocity at an edge below which turns around a pseudo-focus that shrink are over.
+_FOCUS_SPEED = 1e-4
+
+
+# ---------------------------------------------------------------- problems
+
+
+@dataclass(frozen=True)
+class Belt:
+    """law: ("conti", mus, p1, p3, p2), ("coulomb", static, kinetic) or ("stribeck", static,
+    kinetic, velocity)."""
+
+    velocity: float
+    law: tuple
+    load: float = 1.0
+    lower: float = -inf
+    upper: float = inf
+
+
+@dataclass(frozen=True)
+class Oscillator:
+    damping: float
+    belts: tuple
+    omega: float = 1.0
+
+    def table(self):
+        """The belts as rows: velocity, load, lower, upper, static, form, c0, c1, c2, c3.
+
+        mu(r) = c0 f(c1 r) + c2 + c3 r^2 with f(x) = 1/(1 + x) (form 0) or exp(-x) (form 1).
+        """
+        rows = []
+        for b in self.belts:
+            name, static, *p = b.law
+            if name == "conti":
+                p1, p3, p2 = (*p, 0.0) if len(p) == 2 else p
+                law = (static, 0, static - p1, p3, p1, p2)
+            elif name == "coulomb":
+                law = (static, 0, 0.0, 0.0, p[0], 0.0)
+            else:
+                law = (static, 1, static - p[0], 1 / p[1], p[0], 0.0)
+            rows.append((b.velocity, b.load, b.lower, b.upper, *law))
+        return np.array(rows, dtype=float)
+
+
+@dataclass(frozen=True)
+class Run:
+    """events: rows (t, kind, belt, x1, x2, codes after it); margin: the smallest distance from
+    another outcome that the run has met."""
+
+    t: np.ndarray
+    kind: np.ndarray
+    belt: np.ndarray
+    y: np.ndarray
+    codes: np.ndarray
+    t_end: float
+    y_end: tuple
+    mode_end: tuple
+    status: int
+    margin: float
+    steps: int = field(default=0, repr=False)
+
+    @property
+    def sequence(self):
+        return tuple(zip(self.kind.tolist(), self.belt.tolist()))
+
+
+def simulate(
+    osc,
+    y0,
+    T,
+    *,
+    tol=1e-13,
+    noise=0.0,
+    seed=0,
+    mode=None,
+    turns=False,
+    extrema=False,
+    max_events=20_000,
+):
+    """The run from y0 over [0, T].
+
+    mode: contact codes to go on with, None: those of the state. noise: every step of length h is
+    disturbed by noise h, the state after every event by noise, at random. turns, extrema: record
+    the zeros of x2 (belt 0: a maximum of x1, 1: a minimum), the extrema of x2.
+    """
+    n = len(osc.belts)
+    given = np.full(n, 9, np.int64) if mode is None else np.array(mode, np.int64)
+    out = np.empty((max_events, 5 + n))
+    flags = (1 if turns else 0) + (2 if extrema else 0)
+    count, t, x1, x2, status, margin, codes, steps = _run(
+        osc.damping,
+        osc.omega,
+        osc.table(),
+        float(y0[0]),
+        float(y0[1]),
+        given,
+        float(T),
+        tol,
+        noise,
+        seed,
+        flags,
+        out,
+    )
+    rows = out[:count]
+    return Run(
+        rows[:, 0],
+        rows[:, 1].astype(int),
+        rows[:, 2].astype(int),
+        rows[:, 3:5],
+        rows[:, 5:].astype(int),
+        t,
+        (x1, x2),
+        tuple(codes.tolist()),
+        status,
+        margin,
+        steps,
+    )
+
+
+# ---------------------------------------------------------------- field
+
+
+@njit(nogil=True, cache=True)
+def _mu(row, r):
+    f = np.exp(-row[7] * r) if row[5] == 1 else 1 / (1 + row[7] * r)
+    return row[6] * f + row[8] + row[9] * r * r
+
+
+@njit(nogil=True, cache=True)
+def _mu_slope(row, r):
+    if row[5] == 1:
+        f = -row[7] * np.exp(-row[7] * r)
+    else:
+        f = -row[7] / (1 + row[7] * r) ** 2
+    return row[6] * f + 2 * row[9] * r
+
+
+@njit(nogil=True, cache=True)
+def _force(z, w, B, s, x1, x2):
+    """x2' in the mode s; of stuck belts nothing. NaN where a law is far beyond its boundary."""
+    f = -x1 - z * x2
+    for i in range(B.shape[0]):
+        if s[i] == 1 or s[i] == -1:
+            r = s[i] * (B[i, 0] - w * x2)
+            if B[i, 7] * r < -0.25:
+                return np.nan
+            f += s[i] * B[i, 1] * _mu(B[i], r)
+    return f
+
+
+@njit(nogil=True, cache=True)
+def _trace(z, w, B, s, x2):
+    """d x2' / d x2 in the mode s."""
+    f = -z
+    for i in range(B.shape[0]):
+        if s[i] == 1 or s[i] == -1:
+            f -= w * B[i, 1] * _mu_slope(B[i], s[i] * (B[i, 0] - w * x2))
+    return f
+
+
+@njit(nogil=True, cache=True)
+def _advance(z, w, B, s, x1, x2, a, h, V, K):
+    """One step of DOP853; V, K: room for the stages' x2 and x2'."""
+    V[0], K[0] = x2, a
+    for i in range(1, _N):
+        d1 = 0.0
+        d2 = 0.0
+        for j in range(i):
+            d1 += _A[i, j] * V[j]
+            d2 += _A[i, j] * K[j]
+        V[i] = x2 + h * d2
+        K[i] = _force(z, w, B, s, x1 + h * d1, V[i])
+    d1 = 0.0
+    d2 = 0.0
+    for j in range(_N):
+        d1 += _B[j] * V[j]
+        d2 += _B[j] * K[j]
+    y1, y2 = x1 + h * d1, x2 + h * d2
+    V[_N], K[_N] = y2, _force(z, w, B, s, y1, y2)
+    return y1, y2
+
+
+@njit(nogil=True, cache=True)
+def _error(x1, x2, y1, y2, h, tol, V, K):
+    """The error of the step over the tolerance, as Hairer, Norsett and Wanner combine it."""
+    c1 = tol * (1 + max(abs(x1), abs(y1)))
+    c2 = tol * (1 + max(abs(x2), abs(y2)))
+    e51 = e52 = e31 = e32 = 0.0
+    for j in range(_N + 1):
+        e51 += _E5[j] * V[j]
+        e52 += _E5[j] * K[j]
+        e31 += _E3[j] * V[j]
+        e32 += _E3[j] * K[j]
+    e5 = (e51 / c1) ** 2 + (e52 / c2) ** 2
+    e3 = (e31 / c1) ** 2 + (e32 / c2) ** 2
+    if e5 == 0 and e3 == 0:
+        return 0.0
+    return abs(h) * e5 / np.sqrt((e5 + 0.01 * e3) * 2)
+
+
+def mu(row, r):
+    """The coefficient of friction of a row of `Oscillator.table` at a sliding speed r."""
+    return float(_mu(row, float(r)))
+
+
+# ---------------------------------------------------------------- enclosures
+
+
+@njit(nogil=True, cache=True)
+def _product(a, b, c, d):
+    p, q, r, t = a * c, a * d, b * c, b * d
+    return min(min(p, q), min(r, t)), max(max(p, q), max(r, t))
+
+
+@njit(nogil=True, cache=True)
+def _force_interval(z, w, B, s, l1, u1, l2, u2):
+    """Bounds of x2' and of d x2'/d x2 over a box; NaN where a law is far beyond its boundary."""
+    p, q = _product(-z, -z, l2, u2)
+    low, high = p - u1, q - l1
+    t_low, t_high = -z, -z
+    for i in range(B.shape[0]):
+        if s[i] != 1 and s[i] != -1:
+            continue
+        ra, rb = s[i] * (B[i, 0] - w * u2), s[i] * (B[i, 0] - w * l2)
+        if ra > rb:
+            ra, rb = rb, ra
+        if B[i, 7] * ra < -0.25:
+            return np.nan, np.nan, np.nan, np.nan
+        # Without its quadratic part a law is monotone, and so is its slope.
+        fa, fb = _mu(B[i], ra) - B[i, 9] * ra * ra, _mu(B[i], rb) - B[i, 9] * rb * rb
+        q_high = max(ra * ra, rb * rb)
+        q_low = 0.0 if ra <= 0 <= rb else min(ra * ra, rb * rb)
+        p, q = _product(B[i, 9], B[i, 9], q_low, q_high)
+        p, q = p + min(fa, fb), q + max(fa, fb)
+        p, q = _product(s[i] * B[i, 1], s[i] * B[i, 1], p, q)
+        low, high = low + p, high + q
+        ga = _mu_slope(B[i], ra) - 2 * B[i, 9] * ra
+        gb = _mu_slope(B[i], rb) - 2 * B[i, 9] * rb
+        p, q = _product(2 * B[i, 9], 2 * B[i, 9], ra, rb)
+        p, q = p + min(ga, gb), q + max(ga, gb)
+        p, q = _product(-w * B[i, 1], -w * B[i, 1], p, q)
+        t_low, t_high = t_low + p, t_high + q
+    return low, high, t_low, t_high
+
+
+@njit(nogil=True, cache=True)
+def _enclose(z, w, B, s, x1, x2, a, y1, y2, b, h, box):
+    """Bounds of x1, x2, x2', x2'' over the step, into `box`; False where none were found.
+
+    A box is one if Picard's iteration maps it into itself.
+    """
+    room = 0.1 * abs(y2 - x2) + 0.05 * h * (abs(a) + abs(b)) + 1e-300
+    l2, u2 = min(x2, y2) - room, max(x2, y2) + room
+    found = False
+    for _ in range(8):
+        l1, u1 = x1 + min(0.0, h * l2), x1 + max(0.0, h * u2)
+        low, high, t_low, t_high = _force_interval(z, w, B, s, l1, u1, l2, u2)
+        if not (low <= high):
+            return False
+        n_l2, n_u2 = x2 + min(0.0, h * low), x2 + max(0.0, h * high)
+        if n_l2 >= l2 and n_u2 <= u2:
+            found = True
+            break
+        room = 0.2 * (n_u2 - n_l2)
+        l2, u2 = min(l2, n_l2 - room), max(u2, n_u2 + room)
+    if not found:
+        return False
+    # Once more from both ends.
+    l2, u2 = max(n_l2, y2 - max(0.0, h * high)), min(n_u2, y2 - min(0.0, h * low))
+    l2, u2 = min(l2, min(x2, y2)), max(u2, max(x2, y2))
+    l1, u1 = (
+        max(x1 + min(0.0, h * l2), y1 - max(0.0, h * u2)),
+        min(x1 + max(0.0, h * u2), y1 - min(0.0, h * l2)),
+    )
+    l1, u1 = min(l1, min(x1, y1)), max(u1, max(x1, y1))
+    low, high, t_low, t_high = _force_interval(z, w, B, s, l1, u1, l2, u2)
+    # x2'' = -x2 + (d x2'/d x2) x2'
+    p, q = _product(t_low, t_high, low, high)
+    j_low, j_high = p - u2, q - l2
+    a_low = max(low, max(a + min(0.0, h * j_low), b - max(0.0, h * j_high)))
+    a_high = min(high, min(a + max(0.0, h * j_high), b - min(0.0, h * j_low)))
+    box[0], box[1], box[2], box[3] = l1, u1, l2, u2
+    box[4], box[5] = min(a_low, min(a, b)), max(a_high, max(a, b))
+    box[6], box[7] = j_low, j_high
+    return True
+
+
+# ---------------------------------------------------------------- roots within a step
+
+
+@njit(nogil=True, cache=True)
+def _root(z, w, B, s, x1, x2, a, what, level, left, right, f_left, f_right, V, K):
+    """The step length in [left, right] at which a quantity takes the value `level`.
+
+    what: 0 x1, 1 x2, 2 x2'. Newton's method, kept within the bracket by bisection. Returns the
+    length and the state.
+    """
+    h = left + (right - left) * min(max(f_left / (f_left - f_right), 0.1), 0.9)
+    y1, y2 = x1, x2
+    size = right - left
+    for i in range(100):
+        y1, y2 = _advance(z, w, B, s, x1, x2, a, h, V, K)
+        b = K[_N]
+        if what == 0:
+            f, slope = y1 - level, y2
+        elif what == 1:
+            f, slope = y2 - level, b
+        else:
+            f, slope = b, -y2 + _trace(z, w, B, s, y2) * b
+        if f == 0:
+            return h, y1, y2
+        if (f > 0) == (f_left > 0):
+            left = h
+        else:
+            right = h
+        new = h - f / slope if slope != 0 else left - 1.0
+        if not (left < new < right) or (i % 4 == 3 and right - left > 0.5 * size):
+            new = 0.5 * (left + right)
+        if i % 4 == 3:
+            size = right - left
+        if abs(new - h) <= 1e-16 or right - left <= 1e-16 or new == left or new == right:
+            return h, y1, y2
+        h = new
+    return h, y1, y2
+
+
+@njit(nogil=True, cache=True)
+def _look(z, w, B, s, x1, x2, a, y1, y2, b, h, axis, level, side, box, V, K):
+    """Whether side (x_axis - level), positive at first, is negative within the step.
+
+    Returns (verdict, length, state, distance): 0 no, 1 at that length, 2 cannot tell; and how far
+    from the line a turn in the step is, on either side of it.
+    """
+    if axis == 0:
+        g0, g1, d0, d1 = side * (x1 - level), side * (y1 - level), side * x2, side * y2
+        low = box[0] - level if side > 0 else level - box[1]
+        rising, falling = (
+            side * box[2] >= 0 and side * box[3] >= 0,
+            side * box[2] <= 0 and side * box[3] <= 0,
+        )
+        c_low, c_high = box[4], box[5]
+    else:
+        g0, g1, d0, d1 = side * (x2 - level), side * (y2 - level), side * a, side * b
+        low = box[2] - level if side > 0 else level - box[3]
+        rising, falling = (
+            side * box[4] >= 0 and side * box[5] >= 0,
+            side * box[4] <= 0 and side * box[5] <= 0,
+        )
+        c_low, c_high = box[6], box[7]
+    if low > _CLOSE:
+        return 0, 0.0, 0.0, 0.0, np.inf
+    nearest = np.inf
+    if rising and g1 >= 0:
+        return 0, 0.0, 0.0, 0.0, nearest
+    if side < 0:
+        c_low, c_high = -c_high, -c_low
+    convex, concave = c_low >= 0, c_high <= 0
+    if not (rising or falling or convex or concave) and h > _SHORTEST:
+        return 2, 0.0, 0.0, 0.0, nearest
+    if g1 >= 0:
+        if not convex or not (d0 < 0 < d1) or g0 == 0:
+            return 0, 0.0, 0.0, 0.0, nearest
+        # Convex: down and up again. How far down?
+        if axis == 0:
+            t, m1, m2 = _root(z, w, B, s, x1, x2, a, 1, 0.0, 0.0, h, x2, y2, V, K)
+            g = side * (m1 - level)
+        else:
+            t, m1, m2 = _root(z, w, B, s, x1, x2, a, 2, 0.0, 0.0, h, a, b, V, K)
+            g = side * (m2 - level)
+        nearest = abs(g)
+        if g >= 0:
+            return 0, 0.0, 0.0, 0.0, nearest
+        right, f_right = t, side * g
+    else:
+        right, f_right = h, side * g1
+    left, f_left = 0.0, side * g0
+    if g0 <= 0:
+        # It began on the line: some way off there is the other side, or it never was left.
+        left = 0.5 * right
+        for _ in range(60):
+            m1, m2 = _advance(z, w, B, s, x1, x2, a, left, V, K)
+            g = side * ((m1 if axis == 0 else m2) - level)
+            if g > 0:
+                f_left = side * g
+                break
+            right, f_right = left, side * g
+            left *= 0.5
+        else:
+            return 1, 0.0, x1, x2, 0.0
+        if f_right == 0:
+            return 1, right, m1, m2, nearest
+    t, m1, m2 = _root(z, w, B, s, x1, x2, a, axis, level, left, right, f_left, f_right, V, K)
+    return 1, t, m1, m2, nearest
+
+
+# ---------------------------------------------------------------- transitions
+
+
+@njit(nogil=True, cache=True)
+def _contacts(w, B, x1, x2, on, right, old, new):
+    """The contacts at a point, into `new`: 0 where a touching belt runs at the velocity `on`.
+
+    right: on which side of an edge it counts that x1 is on. A belt that slipped and goes on
+    touching keeps its sign.
+    """
+    for i in range(B.shape[0]):
+        if x1 < B[i, 2] or (x1 == B[i, 2] and not right):
+            new[i] = -2
+        elif x1 > B[i, 3] or (x1 == B[i, 3] and right):
+            new[i] = 2
+        elif B[i, 0] == on:
+            new[i] = 0
+        elif old[i] == 1 or old[i] == -1:
+            new[i] = old[i]
+        else:
+            new[i] = 1 if B[i, 0] > w * x2 else -1
+
+
+@njit(nogil=True, cache=True)
+def _balance(z, w, B, s, x1, x2):
+    """Sticks, or goes to one side: sets the zeros in s. Returns (sticks, distance from doing the
+    other, sign of x2' after)."""
+    held = 0.0
+    any_zero = False
+    for i in range(B.shape[0]):
+        if s[i] == 0:
+            any_zero = True
+            held += B[i, 1] * B[i, 4]
+    rest = _force(z, w, B, s, x1, x2)
+    if not any_zero:
+        return False, np.inf, np.sign(rest)
+    if abs(rest) <= held:
+        return True, held - abs(rest), 0.0
+    for i in range(B.shape[0]):
+        if s[i] == 0:
+            s[i] = -1 if rest > 0 else 1
+    return False, abs(rest) - held, np.sign(rest)
+
+
+@njit(nogil=True, cache=True)
+def _velocity_at(w, B, x1, x2):
+    """The velocity of a belt that may touch at x1 and at which x2 is, else NaN."""
+    for i in range(B.shape[0]):
+        v = B[i, 0]
+        if B[i, 2] <= x1 <= B[i, 3] and (x2 == v / w or abs(v - w * x2) <= 4e-16 * abs(v)):
+            return v
+    return np.nan
+
+
+@njit(nogil=True, cache=True)
+def _begin(z, w, B, x1, x2, s):
+    """The mode of a state, into s; returns (stuck, status, distance from another mode)."""
+    n = B.shape[0]
+    on = _velocity_at(w, B, x1, x2)
+    none = np.full(n, 9, np.int64)
+    if x2 != 0:
+        _contacts(w, B, x1, x2, on, x2 > 0, none, s)
+        stuck, gap, _ = _balance(z, w, B, s, x1, x2)
+        return stuck, OK, gap
+    left, right = np.empty(n, np.int64), np.empty(n, np.int64)
+    _contacts(w, B, x1, x2, on, False, none, left)
+    _contacts(w, B, x1, x2, on, True, none, right)
+    same = True
+    for i in range(n):
+        same = same and left[i] == right[i]
+    stuck_l, gap_l, a_l = _balance(z, w, B, left, x1, x2)
+    stuck_r, gap_r, a_r = _balance(z, w, B, right, x1, x2)
+    gap = min(gap_l, gap_r)
+    if not same:
+        if a_l <= 0 <= a_r:  # both ways are solutions
+            gap = 0.0
+        for side in (left, right):
+            gap = min(gap, abs(_force(z, w, B, side, x1, x2)))
+    go_right = a_r > 0
+    for i in range(n):
+        s[i] = right[i] if go_right else left[i]
+    stuck = stuck_r if go_right else stuck_l
+    if not same and a_l > 0 and a_r <= 0:
+        # Pushed to the edge from both sides, or held on its other side.
+        if stuck_r:
+            for i in range(n):
+                s[i] = right[i]
+            return True, OK, 0.0
+        return False, PSEUDO_FOCUS, gap
+    return stuck, OK, gap
+
+
+@njit(nogil=True, cache=True)
+def _bounds(w, B, s, L):
+    """The box of a slip mode, into L: left, right, lower and upper bound."""
+    L[0], L[1], L[2], L[3] = -np.inf, np.inf, -np.inf, np.inf
+    for i in range(B.shape[0]):
+        if s[i] == -2:
+            L[1] = min(L[1], B[i, 2])
+        elif s[i] == 2:
+            L[0] = max(L[0], B[i, 3])
+        else:
+            L[0], L[1] = max(L[0], B[i, 2]), min(L[1], B[i, 3])
+            if s[i] == 1:
+                L[3] = min(L[3], B[i, 0] / w)
+            elif s[i] == -1:
+                L[2] = max(L[2], B[i, 0] / w)
+
+
+@njit(nogil=True, cache=True)
+def _nearest(L, x1, x2):
+    """Distance of a state from the lines that it is not on."""
+    d = np.inf
+    for i in range(4):
+        g = abs((x1 if i < 2 else x2) - L[i])
+        if g > 0:
+            d = min(d, g)
+    return d
+
+
+@njit(nogil=True, cache=True)
+def _contracts(z, w, B, left, right, edge):
+    """Whether turns around the rest on an edge shrink, to leading order; and if a belt at rest
+    that touches makes them end."""
+    a_l, a_r = _force(z, w, B, left, edge, 0.0), _force(z, w, B, right, edge, 0.0)
+    rests = False
+    for i in range(B.shape[0]):
+        touches = abs(left[i]) < 2 or abs(right[i]) < 2
+        rests = rests or (B[i, 0] == 0 and touches and B[i, 1] * B[i, 4] > 0)
+    s = _trace(z, w, B, left, 0.0) / a_l - _trace(z, w, B, right, 0.0) / a_r
+    return a_l > 0 > a_r and s < 0, rests
+
+
+# ---------------------------------------------------------------- runs
+
+
+@njit(nogil=True, cache=True)
+def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
+    n = B.shape[0]
+    turns, extrema = flags % 2 == 1, flags >= 2
+    s, old = given.copy(), given.copy()
+    before, L, box = given.copy(), np.empty(4), np.empty(8)
+    V, K, V2, K2 = np.empty(_N + 1), np.empty(_N + 1), np.empty(_N + 1), np.empty(_N + 1)
+    t, status, margin, count, steps, still = 0.0, OK, np.inf, 0, 0, 0
+    random = np.uint64(2 * seed + 88172645463325253)
+    passed_edge, speed_right, speed_left = np.nan, np.inf, np.inf
+    stuck = False
+    if given[0] == 9:
+        stuck, status, margin = _begin(z, w, B, x1, x2, s)
+        on = _velocity_at(w, B, x1, x2)
+        if stuck:
+            x2 = on / w
+    else:
+        for i in range(n):
+            stuck = stuck or s[i] == 0
+    if not (np.isfinite(x1) and np.isfinite(x2)):
+        status = NOT_FINITE
+    while t < T and status == OK:
+        if count >= out.shape[0] - 2:
+            status = BUDGET
+            break
+        if steps > 1000 * T + 1_000_000:
+            status = STEPS
+            break
+        kind = 0
+        t_before = t
+        _bounds(w, B, s, L)
+        for i in range(n):
+            before[i] = s[i]
+        if stuck:
+            # ---------------- a stick phase
+            on, held = 0.0, 0.0
+            for i in range(n):
+                if s[i] == 0:
+                    on = B[i, 0]
+                    held += B[i, 1] * B[i, 4]
+            if on == 0:
+                status = STUCK_FOREVER
+                break
+            ahead = 1.0 if on > 0 else -1.0
+            end = _force(z, w, B, s, 0.0, x2) + ahead * held
+            edge = L[1] if on > 0 else L[0]
+            margin = min(margin, abs(edge - end))
+            is_slip = ahead * (edge - end) >= 0
+            if not is_slip:
+                end = edge
+            duration = max((end - x1) / x2, 0.0)
+            if t + duration >= T:
+                margin = min(margin, t + duration - T)
+                x1, t = x1 + x2 * (T - t), T
+                break
+            t, x1 = t + duration, end
+            if is_slip:
+                kind, belt = SLIP, -1
+                for i in range(n):
+                    if s[i] == 0:
+                        belt = i if belt < 0 else belt
+                        s[i] = 1 if on > 0 else -1
+                stuck = False
+            else:
+                kind = EDGE
+                for i in range(n):
+                    old[i] = s[i]
+                _contacts(w, B, x1, x2, on, on > 0, old, s)
+                stuck, gap, _ = _balance(z, w, B, s, x1, x2)
+                margin = min(margin, gap)
+            passed_edge = np.nan
+        else:
+            # ---------------- a slip arc
+            a = _force(z, w, B, s, x1, x2)
+            if turns:
+                if x2 > 0 or (x2 == 0 and a > 0):
+                    L[2] = max(L[2], 0.0)
+                else:
+                    L[3] = min(L[3], 0.0)
+            h = 0.02
+            hit, h_hit, m1, m2 = -1, 0.0, 0.0, 0.0
+            while t < T:
+                steps += 1
+                if steps > 1000 * T + 1_000_000:
+                    break
+                last = h >= T - t
+                if last:
+                    h = T - t
+                y1, y2 = _advance(z, w, B, s, x1, x2, a, h, V, K)
+                b = K[_N]
+                error = _error(x1, x2, y1, y2, h, tol, V, K)
+                if not (error <= 1.0) and h > 1e-14:
+                    h *= max(0.2, 0.9 * error ** (-0.125)) if np.isfinite(error) else 0.25
+                    continue
+                if abs(y1) + abs(y2) > 1e9:
+                    status = NOT_FINITE
+                    break
+                # What is near enough to be looked at.
+                low2 = high2 = x2
+                for j in range(_N + 1):
+                    low2, high2 = min(low2, V[j]), max(high2, V[j])
+                room = 0.5 * (high2 - low2) + _CLOSE
+                low2, high2 = low2 - room, high2 + room
+                low1, high1 = x1 + min(0.0, h * low2) - _CLOSE, x1 + max(0.0, h * high2) + _CLOSE
+                near = low1 <= L[0] or high1 >= L[1] or low2 <= L[2] or high2 >= L[3]
+                unclear = False
+                hit = -1
+                if near:
+                    good = _enclose(z, w, B, s, x1, x2, a, y1, y2, b, h, box)
+                    if not good and h > _SHORTEST:
+                        unclear = True
+                    else:
+                        if not good:
+                            box[0::2], box[1::2] = -np.inf, np.inf
+                        closest = np.inf
+                        for g in range(4):
+                            if not np.isfinite(L[g]):
+                                continue
+                            side = 1.0 if g % 2 == 0 else -1.0
+                            verdict, length, p1, p2, d = _look(
+                                z, w, B, s, x1, x2, a, y1, y2, b, h, g // 2, L[g], side, box, V2, K2
+                            )
+                            if verdict == 2:
+                                unclear = True
+                                break
+                            if verdict == 1 and (hit < 0 or length < h_hit):
+                                hit, h_hit, m1, m2 = g, length, p1, p2
+                            if verdict == 0 and not (g >= 2 and L[g] == 0 and turns):
+                                closest = min(closest, d)
+                        if not unclear and hit < 0:
+                            margin = min(margin, closest)
+                if unclear:
+                    h *= 0.5
+                    continue
+                if extrema and a * (b if hit < 0 else _force(z, w, B, s, m1, m2)) < 0:
+                    right = h if hit < 0 else h_hit
+                    f = b if hit < 0 else _force(z, w, B, s, m1, m2)
+                    length, p1, p2 = _root(z, w, B, s, x1, x2, a, 2, 0.0, 0.0, right, a, f, V2, K2)
+                    out[count, 0], out[count, 1], out[count, 2] = t + length, EXTREMUM, -1
+                    out[count, 3], out[count, 4] = p1, p2
+                    for i in range(n):
+                        out[count, 5 + i] = s[i]
+                    count += 1
+                if hit >= 0:
+                    t, x1, x2 = t + h_hit, m1, m2
+                    break
+                t = T if last else t + h
+                x1, x2, a = y1, y2, b
+                if noise > 0 and _nearest(L, x1, x2) > 100 * noise:
+                    random ^= random << np.uint64(13)
+                    random ^= random >> np.uint64(7)
+                    random ^= random << np.uint64(17)
+                    x1 += noise * h * (1.0 if random & np.uint64(1) else -1.0)
+                    x2 += noise * h * (1.0 if random & np.uint64(2) else -1.0)
+                    a = _force(z, w, B, s, x1, x2)
+                h *= min(4.0, max(0.3, 0.9 * max(error, 1e-8) ** (-0.125)))
+                h = min(h, _LONGEST)
+                if count >= out.shape[0] - 2:
+                    break
+            if hit < 0:
+                continue
+            # ---------------- what follows
+            on, belt = np.nan, -1
+            for i in range(n):
+                old[i] = s[i]
+            if hit >= 2:
+                x2 = L[hit]
+                for i in range(n):
+                    sign = 1 if hit == 3 else -1
+                    if s[i] == sign and B[i, 0] / w == x2 and belt < 0:
+                        on, belt = B[i, 0], i
+                if belt < 0:
+                    kind, belt = TURN, 0 if hit == 2 else 1
+                else:
+                    # Which side of an edge does not matter, for x1 is on none.
+                    _contacts(w, B, x1, x2, on, x2 > 0, old, s)
+                    stuck, gap, _ = _balance(z, w, B, s, x1, x2)
+                    margin = min(margin, gap)
+                    kind = STICK if stuck else CROSS
+                if stuck or x2 != 0:
+                    passed_edge = np.nan
+            else:
+                x1 = L[hit]
+                kind = EDGE
+                rightward = hit == 1
+                a = _force(z, w, B, s, x1, x2)
+                _contacts(w, B, x1, x2, np.nan, rightward, old, s)
+                arrived = _velocity_at(w, B, x1, x2)
+                fresh = False
+                for i in range(n):
+                    if abs(old[i]) == 2 and abs(s[i]) < 2 and B[i, 0] == arrived:
+                        fresh = True
+                if fresh:
+                    _contacts(w, B, x1, x2, arrived, rightward, old, s)
+                stuck, gap, _ = _balance(z, w, B, s, x1, x2)
+                margin = min(margin, min(gap, abs(x2)))
+                d = 1.0 if rightward else -1.0
+                speed = speed_right if rightward else speed_left
+                if passed_edge != x1:
+                    speed, speed_left, speed_right = np.inf, np.inf, np.inf
+                passed_edge = x1
+                if rightward:
+                    speed_right = abs(x2)
+                else:
+                    speed_left = abs(x2)
+                after = _force(z, w, B, s, x1, x2)
+                if not stuck and a * d > 0 > after * d and abs(x2) < _FOCUS_SPEED:
+                    if rightward:
+                        shrinks, rests = _contracts(z, w, B, old, s, x1)
+                    else:
+                        shrinks, rests = _contracts(z, w, B, s, old, x1)
+                    if abs(x2) < 1e-9 or (shrinks and not rests and abs(x2) < speed < np.inf):
+                        status = PSEUDO_FOCUS
+                        x2 = 0.0
+        # ---------------- an event
+        if kind == 0:
+            continue
+        if kind == EDGE:
+            belt = -1
+            for i in range(n):
+                if (abs(before[i]) == 2) != (abs(s[i]) == 2) and belt < 0:
+                    belt = i
+        if kind != TURN:
+            margin = min(margin, _nearest(L, x1, x2))
+        out[count, 0], out[count, 1], out[count, 2] = t, kind, belt
+        out[count, 3], out[count, 4] = x1, x2
+        for i in range(n):
+            out[count, 5 + i] = s[i]
+        count += 1
+        still = still + 1 if t == t_before else 0
+        if still > 20:
+            status = CORNER
+        if noise > 0:
+            random ^= random << np.uint64(13)
+            random ^= random >> np.uint64(7)
+            random ^= random << np.uint64(17)
+            shift = noise * (1.0 if random & np.uint64(1) else -1.0)
+            _bounds(w, B, s, L)
+            if _nearest(L, x1, x2) > 100 * noise:
+                if kind == EDGE:
+                    x2 += 0.0 if stuck else shift
+                elif kind != TURN:
+                    x1 += shift
+    if status == OK or status == STUCK_FOREVER:
+        _bounds(w, B, s, L)
+        margin = min(margin, _nearest(L, x1, x2) if not stuck else np.inf)
+    return count, t, x1, x2, status, margin, s, steps
+
+
+# ---------------------------------------------------------------- attractors
+
+
+@dataclass(frozen=True)
+class Attractor:
+    """kind: "equilibrium", "cycle", "stuck" or "undecided"; turn: the events of one period, (kind,
+    belt) each, from where their order is least; sticks: time stuck to each belt in one period."""
+
+    kind: str
+    period: float = nan
+    turn: tuple = ()
+    x1: tuple = (nan, nan)
+    x2: tuple = (nan, nan)
+    sticks: tuple = ()
+    margin: float = inf
+    status: int = OK
+
+
+def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=2e-11, at_rest=1e-6, periods=24):
+    """Where a run leads, by running it: no shortcut of any kind.
+
+    It is a cycle where all of the maxima of x1 have repeated, as whole states, for the last three
+    periods, to `same`; an equilibrium where the motion has shrunk below `at_rest` and does shrink.
+    """
+    x1, x2, mode, margin, t = *y0, None, inf, 0.0
+    size = inf
+    while t < t_max:
+        run = simulate(
+            osc, (x1, x2), chunk, mode=mode, turns=True, extrema=True, max_events=200_000
+        )
+        (x1, x2), mode = run.y_end, run.mode_end
+        margin = min(margin, run.margin) if t == 0 else margin
+        t += chunk
+        if run.status == STUCK_FOREVER:
+            return Attractor("stuck", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
+        if run.status == PSEUDO_FOCUS:
+            return Attractor("equilibrium", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
+        if run.status != OK:
+            return Attractor("undecided", margin=margin, status=run.status)
+        crossed_at_rest = (run.kind == CROSS) & (run.y[:, 1] == 0)
+        downward = np.array(
+            [
+                any(osc.belts[k].velocity == 0 and c == 1 for k, c in enumerate(codes))
+                for codes in run.codes
+            ],
+            bool,
+        )
+        tops = np.flatnonzero((run.kind == TURN) & (run.belt == 0) | crossed_at_rest & downward)
+        last = run.t > chunk - 30.0
+        seen = run.y[last] if np.any(last) else np.array([[x1, x2]])
+        old, size = size, float(np.max(np.ptp(np.vstack([seen, [x1, x2]]), axis=0)))
+        if size < at_rest and (size <= 0.999 * old or size < 1e-12) and abs(x2) < at_rest:
+            return Attractor("equilibrium", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
+        found = _repeats(run, tops, same, periods)
+        if found:
+            cycle = _cycle(osc, run, *found)
+            if max(np.ptp(cycle.x1), np.ptp(cycle.x2)) > at_rest:
+                return replace(cycle, margin=margin)
+    return Attractor("undecided", margin=margin)
+
+
+def _repeats(run, tops, same, periods):
+    """First and last event of one period, where the tops repeat."""
+    for p in range(1, min(periods, len(tops) // 4) + 1):
+        now, then = tops[-3 * p :], tops[-4 * p : -p]
+        alike = np.all(np.abs(run.y[now] - run.y[then]) <= same)
+        if alike and np.array_equal(run.codes[now], run.codes[then]):
+            return tops[-1 - p], tops[-1]
+    return None
+
+
+def _cycle(osc, run, first, last):
+    rows = slice(first, last + 1)
+    t, y, codes = run.t[rows], run.y[rows], run.codes[rows]
+    stuck = np.where(codes[:-1] == 0, np.diff(t)[:, None], 0.0).sum(axis=0)
+    turn = [(int(k), int(b)) for k, b in zip(run.kind[rows][1:], run.belt[rows][1:]) if k <= EDGE]
+    turn = min((turn[i:] + turn[:i] for i in range(len(turn))), default=[])
+    return Attractor(
+        "cycle",
+        float(t[-1] - t[0]),
+        tuple(turn),
+        (float(y[:, 0].min()), float(y[:, 0].max())),
+        (float(y[:, 1].min()), float(y[:, 1].max())),
+        tuple(stuck.tolist()),
+    )
