@@ -273,7 +273,8 @@ def test_a_small_cycle_that_sticks_until_the_edge():
         small = oracle_cycles.sticking_cycle(
             oracle.class_d(nu, 0.175, 1.16, 1.5), (1.5, min(nu, 0.175))
         )
-        (turn,) = (turn for turn in path.turns[nu].values() if np.ptp(turn.entries[:, 0]) < 0.3)
+        turns = [one.turn for one in path.cycles[nu]]
+        (turn,) = (turn for turn in turns if np.ptp(turn.entries[:, 0]) < 0.3)
         assert np.sum(turn.durations) == pytest.approx(small.period, abs=1e-6)
 
 
