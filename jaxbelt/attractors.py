@@ -70,7 +70,12 @@ def place_of(cycle: Cycle | Turn) -> np.ndarray:
     else:
         rows = np.column_stack([np.asarray(cycle.entries), np.asarray(cycle.durations)])
         used = np.asarray(cycle.used)
-    x1, x2, durations = rows[used].T
+    return extent(rows[used])
+
+
+def extent(rows: np.ndarray) -> np.ndarray:
+    """The same of (x1, x2, T) of the arcs that are used, [arcs, 3]."""
+    x1, x2, durations = rows.T
     return np.array([x1.min(), x1.max(), x2.min(), x2.max(), durations.sum()])
 
 

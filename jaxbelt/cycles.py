@@ -491,6 +491,7 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     amplitude = top - orbit.low
     rows = jnp.arange(orbit.tops.size)
     same = jnp.abs(orbit.tops - top) < REPEATED * amplitude
+    same = same & jnp.all(orbit.codes == codes[None], axis=-1)
     repeats = jnp.max(jnp.where(same, rows, -1))
     before = jnp.max(jnp.where(jnp.isnan(orbit.tops), -1, rows))
     # An orbit that sticks is on a cycle, however small: it repeats exactly.

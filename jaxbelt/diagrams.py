@@ -37,7 +37,7 @@ from .bifurcations import (
 )
 from .checks import as_array, require
 from .compiling import jit
-from .curves import BifurcationCurve, bifurcation_curve
+from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere, place_at
 from .cycles import Cycle, Turn, cut, find_cycle, polish, unstable_cycle
 from .detection import Label, Path, by_value, edges_touched, search
 from .equilibria import EquilibriumKind, candidates, equilibria
@@ -429,8 +429,13 @@ def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, s
     a, b = curve.values[:-1], curve.values[1:]
     chord = b - a
     along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
-    nearest = a + np.clip(along, 0, 1)[:, None] * chord
-    return bool(np.min(np.hypot(*(at - nearest).T)) < 0.3 * step)
+    along = np.clip(along, 0, 1)[:, None]
+    away = np.hypot(*(at - a - along * chord).T)
+    places = curve.places[:-1] + along * (curve.places[1:] - curve.places[:-1])
+    own = place_at(point)
+    return any(
+        not is_elsewhere(own, places[i], FAR) for i in np.flatnonzero(away < 0.3 * step).tolist()
+    )
 
 
 def kind_of(condition: AbstractCondition) -> tuple[str, Any]:
