@@ -47,10 +47,13 @@ from .compiling import one_kernel
 from .modes import (
     ABOVE,
     BELOW,
+    SMALLEST_DISC,
     Mode,
-    boundary_guards,
-    edge_guards,
+    at_focus,
+    begins_at_rest,
+    disc_margin,
     first_of,
+    guard_passed,
     leave_slip,
     leave_stick,
     mode_acceleration,
@@ -239,10 +242,6 @@ def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | None
 def _once(flag: Array, one: Array) -> Array:
     """A flag that XLA computes once, not again in each place where it is used."""
     return jnp.where(flag, 1.0, 0.0) / one > 0
-
-
-def _lowest(arrays: list[Array]) -> Array:
-    return functools.reduce(jnp.minimum, arrays)
 
 
 def _acceleration(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array) -> Array:
@@ -468,16 +467,10 @@ def _pass_events(
     osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array, *, edges: bool
 ) -> tuple[Lanes, Passage]:
     """Lanes that stand on a guard go on; stick phases are passed to their end, or to t1."""
-    guards = boundary_guards(osc, lanes.mode, lanes.x2)
-    if edges:
-        guards += edge_guards(osc, lanes.mode, lanes.x1)
-    lowest = _lowest(guards)
     landed = (lanes.h < 0) & ~lanes.done
     # A lane may also have landed where x2 = 0, which is no guard.
-    fired = landed & (lowest <= 1e-12)
-    number = first_of(
-        [g <= lowest for g in guards], [jnp.asarray(i) for i in range(len(guards))], jnp.asarray(0)
-    )
+    number = guard_passed(osc, lanes.mode, lanes.x1, lanes.x2)
+    fired = landed & (number >= 0)
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
     captured = fired & after.captured
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
@@ -497,6 +490,12 @@ def _pass_events(
     a = mode_acceleration(osc, mode, new_x1, x2)
     a = jnp.where(jnp.abs(a) < 1e-12 * (1 + jnp.abs(new_x1)), 0.0, a)
     moved = landed | stuck
+    h = jnp.where(fired, _first_step(rtol), jnp.abs(lanes.h))
+    if edges:
+        # In a corner one event follows the other at once: a lane that stands on the next guard,
+        # and goes on through it, has landed there.
+        corner = (fired | released) & ~mode.any_stuck & (guard_passed(osc, mode, new_x1, x2) >= 0)
+        h = jnp.where(corner, -h, h)
     forever = stuck & jnp.isinf(phase.duration)
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
     status = jnp.where(forever, Status.STUCK_FOREVER.value, status)
@@ -525,7 +524,7 @@ def _pass_events(
             x2,
             jnp.where(moved, a, lanes.a),
             # The field is new after an event, and so is the step size.
-            jnp.where(fired, _first_step(rtol), jnp.abs(lanes.h)),
+            h,
             jnp.where(fired, 0.9 / _first_step(rtol), lanes.pace),
             mode,
             lanes.events + jnp.where(fired, 1, 0) + jnp.where(released, 1, 0),
@@ -576,6 +575,9 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
     finite = jnp.isfinite(x1) & jnp.isfinite(x2)
     for leaf in jax.tree.leaves(osc):
         finite = finite & ~jnp.isnan(leaf)
+    rests = at_focus(osc, x1, x2) if program.edges else jnp.zeros_like(finite)
+    status = jnp.where(rests, Status.PSEUDO_FOCUS.value, Status.OK.value)
+    status = jnp.where(finite, status, Status.NOT_FINITE.value)
     zero = jnp.zeros_like(x1)
     lanes = Lanes(
         run=run,
@@ -588,8 +590,8 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
         pace=zero + 0.9 / _first_step(rtol),
         mode=Mode(tuple(code + zero for code in mode.codes)),
         events=jnp.zeros_like(run),
-        status=jnp.where(finite, Status.OK.value, Status.NOT_FINITE.value).astype(run.dtype),
-        done=~finite,
+        status=status.astype(run.dtype),
+        done=~finite | rests,
         lower=x2,
         upper=x2,
         memory=None,
@@ -766,7 +768,8 @@ def _rank(flags: Array) -> Array:
 def _give_up(lanes: Lanes, passes, limit) -> Lanes:
     """End runs that took too many steps, or whose state is not finite."""
     finite = jnp.isfinite(lanes.x1) & jnp.isfinite(lanes.x2) & jnp.isfinite(lanes.a)
-    lost = ~lanes.done & (~finite | (jnp.abs(lanes.h) < 1e-14) | (passes - lanes.begun > limit))
+    stands = (lanes.h > 0) & (lanes.t + lanes.h == lanes.t)
+    lost = ~lanes.done & (~finite | stands | (passes - lanes.begun > limit))
     reason = jnp.where(finite, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
     status = jnp.where(lost, reason.astype(lanes.status.dtype), lanes.status)
     return eqx.tree_at(lambda n: (n.status, n.done), lanes, (status, lanes.done | lost))
@@ -970,6 +973,7 @@ class _Mark(eqx.Module):
     """
 
     x1: Array
+    x2: Array
     code: Array
     t: Array
     events: Array
@@ -979,7 +983,16 @@ class _Mark(eqx.Module):
 
 def _no_mark(lanes: Lanes) -> _Mark:
     zero, count = jnp.zeros_like(lanes.t), jnp.zeros_like(lanes.events)
-    return _Mark(zero + jnp.nan, zero, zero, count, count, count)
+    return _Mark(zero + jnp.nan, zero, zero, zero, count, count, count)
+
+
+def _returned(mark: _Mark, lanes: Lanes, close: Array | float) -> Array:
+    """Whether the lanes are in the marked state again: mode, x2, and x1 to `close`.
+
+    x2 is that of a belt, or 0, on both occasions, and so it is the same to the last bit.
+    """
+    same = (lanes.x2 == mark.x2) & (_code(lanes.mode) == mark.code)
+    return same & (jnp.abs(lanes.x1 - mark.x1) <= close)
 
 
 def _renew(mark: _Mark, lanes: Lanes, at: Array, one: Array) -> tuple[_Mark, Array]:
@@ -988,6 +1001,7 @@ def _renew(mark: _Mark, lanes: Lanes, at: Array, one: Array) -> tuple[_Mark, Arr
     new = _once(at & (age >= mark.limit), one)
     here = _Mark(
         lanes.x1,
+        lanes.x2,
         _code(lanes.mode),
         lanes.t,
         lanes.events,
@@ -1027,7 +1041,7 @@ class Final(Observer):
         mark: _Mark = lanes.memory
         released = passage.released & ~lanes.mode.any_stuck
         period = lanes.t - mark.t
-        repeats = released & (lanes.x1 == mark.x1) & (_code(lanes.mode) == mark.code) & (period > 0)
+        repeats = released & _returned(mark, lanes, 0.0) & (period > 0)
         turns = jnp.floor((t1 - lanes.t) / jnp.where(repeats, period, jnp.inf))
         turns = lax.stop_gradient(jnp.maximum(turns, 0.0))
         per_turn = lanes.events - mark.events
@@ -1051,8 +1065,6 @@ class Final(Observer):
 #: What a run leads to, in the order of their codes.
 KINDS = ("undecided", "equilibrium", "cycle", "stuck")
 UNDECIDED, EQUILIBRIUM, CYCLE, STUCK_FOR_EVER = range(4)
-#: Speeds, as fractions of the radius, at which an attracting disc is checked.
-DISC = np.array([s * j / 8 for j in range(1, 9) for s in (1, -1)])
 
 
 class _Turn(eqx.Module):
@@ -1084,12 +1096,8 @@ class Attractor(Observer):
       the parameters alone, so it does so to the last bits. One that does not stick converges: its
       top (a maximum of x1, where x2 = 0) has repeated when what is left of the way to the limit, by
       the ratio of its last two changes, is below `REPEATED` times the amplitude.
-    - An equilibrium: the orbit has entered a disc that is attracted by a fixed point. In a slip
-      mode x1'' = -(x1 - x1*) + f(x2) with f(0) = 0, so E = (x1 - x1*)^2 + x2^2 obeys
-      E' = 2 x2 f(x2). If v f(v) < 0 for all 0 < |v| <= r, and the disc of radius r lies within the
-      mode's boundaries and edges, E falls until the orbit is at rest. The sign is checked at 16
-      speeds; a law that wiggles on a scale below r/8 could deceive that. A pseudo-focus is
-      recognised by `modes.is_captured`.
+    - An equilibrium: the run begins on one, or the orbit has entered a disc that is attracted by a
+      fixed point, see `modes.disc_margin`. A pseudo-focus is recognised by `modes.is_captured`.
     - Stuck for ever: on a belt at rest.
 
     The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
@@ -1108,20 +1116,20 @@ class Attractor(Observer):
         zero = jnp.zeros_like(lanes.t)
         count = jnp.zeros_like(lanes.events)
         nothing = zero + jnp.nan
-        sticks = tuple(zero for _ in osc.belts)
+        rests = begins_at_rest(osc, lanes.x1, lanes.x2)
         return _Turn(
-            _no_mark(lanes),
-            lanes.x1,
-            lanes.x1,
-            sticks,
-            zero + 1,
-            count,
-            nothing,
-            nothing,
-            count,
-            nothing,
-            nothing,
-            count,
+            mark=_no_mark(lanes),
+            x1_min=lanes.x1,
+            x1_max=lanes.x1,
+            sticks=tuple(zero for _ in osc.belts),
+            word=zero + 1,
+            tops=count,
+            previous=nothing,
+            change=nothing,
+            kind=count + jnp.where(rests, EQUILIBRIUM, UNDECIDED).astype(count.dtype),
+            period=nothing,
+            transient=jnp.where(rests, 0.0, nothing),
+            turn_events=count,
         )
 
     def watch(self, osc, lanes, passage, one, t1, tol):
@@ -1143,15 +1151,16 @@ class Attractor(Observer):
         ratio = jnp.abs(change / jnp.where(turn.change == 0, 1.0, turn.change))
         left = jnp.where(ratio < 1, ratio / jnp.where(ratio < 1, 1 - ratio, 1.0), jnp.inf)
         moved, close = jnp.abs(lanes.x1 - mark.x1), amplitude * self.REPEATED
-        converged = (moved <= close) & ((moved * left <= close) | (moved < 30 * tol * amplitude))
+        converged = (moved * left <= close) | (moved < 30 * tol * amplitude)
         released = _once(passage.released & ~lanes.mode.any_stuck & ~lanes.done, one)
         tops = jnp.where(released, 0, turn.tops + jnp.where(top, 1, 0))
         section = released | (top & (tops > self.SMOOTH))
-        repeats = jnp.where(released, moved <= 1e-9 * amplitude, converged)
-        repeats = section & repeats & (_code(lanes.mode) == mark.code)
+        repeats = section & _returned(mark, lanes, jnp.where(released, 1e-9 * amplitude, close))
+        repeats = repeats & (released | converged)
 
         kind = jnp.where(repeats, CYCLE, UNDECIDED)
-        kind = jnp.where(repeats & (amplitude < self.REPEATED), EQUILIBRIUM, kind)
+        # An orbit that sticks is on a cycle, however small.
+        kind = jnp.where(repeats & ~released & (amplitude < self.REPEATED), EQUILIBRIUM, kind)
         kind = jnp.where(passage.captured, EQUILIBRIUM, kind)
         kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind)
         going_on = (turn.kind == UNDECIDED) & (lanes.run >= 0)
@@ -1186,7 +1195,7 @@ class Attractor(Observer):
             (
                 jnp.where(fresh, lanes.x2, lanes.lower),
                 jnp.where(fresh, lanes.x2, lanes.upper),
-                lanes.done | found,
+                lanes.done | (memory.kind != UNDECIDED),
                 memory,
             ),
         )
@@ -1195,15 +1204,9 @@ class Attractor(Observer):
         turn: _Turn = lanes.memory
         zero = jnp.zeros_like(lanes.t)
         x1_rest = mode_acceleration(osc, lanes.mode, zero, zero)
-        radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), 1e-6)
-        margins = []
-        for fraction in DISC.tolist():
-            v = fraction * radius
-            margins.append(-v * mode_acceleration(osc, lanes.mode, x1_rest, v))
-        for v in (radius, -radius):
-            margins += boundary_guards(osc, lanes.mode, v)
-            margins += edge_guards(osc, lanes.mode, x1_rest + v)
-        margin = jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, _lowest(margins)) / one
+        radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), SMALLEST_DISC)
+        margin = disc_margin(osc, lanes.mode, x1_rest, radius)
+        margin = jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin) / one
         found = margin > 0
         memory = eqx.tree_at(
             lambda m: (m.kind, m.x1_min, m.x1_max, m.sticks, m.transient),

@@ -90,10 +90,10 @@ from .modes import (
     contact,
     edge_guards,
     edges,
+    field_at_rest,
     mode_acceleration,
     mode_of,
     onset_position,
-    push_and_trace,
     select,
     stick_limit,
 )
@@ -1270,7 +1270,7 @@ class EdgeRest(eqx.Module):
     def meets_hopf(self, osc: Oscillator) -> Array:
         """What vanishes where the curve of this meets that of a Hopf point; NaN for a segment."""
         mode = mode_of(self.codes)
-        _, trace = push_and_trace(osc, mode, jnp.stack(edges(osc))[self.edge])
+        _, trace, *_ = field_at_rest(osc, mode, jnp.stack(edges(osc))[self.edge])
         return jnp.where(mode.any_stuck, jnp.nan, trace)
 
     def exists(self, osc: Oscillator) -> Array:
@@ -1289,7 +1289,7 @@ class EdgeBalance(eqx.Module):
 
     def _sides(self, osc: Oscillator):
         at = jnp.stack(edges(osc))[self.edge]
-        return push_and_trace(osc, self.left, at), push_and_trace(osc, self.right, at)
+        return field_at_rest(osc, self.left, at)[:2], field_at_rest(osc, self.right, at)[:2]
 
     def __call__(self, osc: Oscillator) -> Array:
         # The contraction of `modes.edge_focus` times both pushes: regular where one of them is 0.

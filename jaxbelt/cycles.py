@@ -38,6 +38,8 @@ from .equilibria import Equilibria, EquilibriumKind, candidates
 from .extrapolation import Scheme, increments, scheme
 from .modes import (
     Mode,
+    at_focus,
+    begins_at_rest,
     boundary_guards,
     capacity,
     edge_guards,
@@ -50,6 +52,7 @@ from .modes import (
     mode_of_state,
     onset_position,
     select,
+    settles,
     stick_phase,
     stick_velocity,
 )
@@ -378,7 +381,8 @@ class Orbit(eqx.Module):
     """The arcs of an orbit, in rows up to `count`: entry, duration, codes, and what ended each.
 
     tops: x1 where an arc ended in a maximum of x1, else NaN. repeats: row of the top that the last
-    one repeats, else -1. y, code: where it stands now.
+    one repeats, else -1. y, code: where it stands now. low, low_before: the smallest x1 since the
+    last top, and between that and the one before.
     """
 
     entries: Array
@@ -390,6 +394,7 @@ class Orbit(eqx.Module):
     y: Array
     code: Array
     low: Array
+    low_before: Array
     repeats: Array
     status: Array
     done: Array
@@ -496,13 +501,16 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     before = jnp.max(jnp.where(jnp.isnan(orbit.tops), -1, rows))
     # An orbit that sticks is on a cycle, however small: it repeats exactly.
     stuck_since = jnp.any((rows > before) & jnp.any(orbit.codes == 0, axis=-1))
-    resting = is_top & (orbit.count > 8) & (amplitude < AT_REST) & ~stuck_since
+    shrinks = amplitude < orbit.tops[before] - orbit.low_before
+    resting = is_top & shrinks & (amplitude < AT_REST) & ~stuck_since
+    resting = resting | settles(osc, new, y_end[0], y_end[1])
 
     status = jnp.where(stuck & forever, Status.STUCK_FOREVER.value, Status.OK.value)
     status = jnp.where(~stuck & after.captured, Status.PSEUDO_FOCUS.value, status)
     status = jnp.where(resting, Status.EQUILIBRIUM.value, status)
-    bad = ~jnp.all(jnp.isfinite(y_end)) | (~stuck & lost)
-    status = jnp.where(bad, Status.NOT_FINITE.value, status)
+    astray = ~stuck & lost & ~resting
+    status = jnp.where(astray, Status.NOT_SETTLED.value, status)
+    status = jnp.where(jnp.all(jnp.isfinite(y_end)), status, Status.NOT_FINITE.value)
     own = rows == orbit.count
 
     def put(column, value):  # column.at[i].set would be a scatter in batches
@@ -518,6 +526,7 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
         y=y_end,
         code=code,
         low=jnp.where(is_top, y_end[0], jnp.minimum(orbit.low, y_end[0])),
+        low_before=jnp.where(is_top, orbit.low, orbit.low_before),
         repeats=repeats,
         status=status,
         done=(status != Status.OK) | (repeats >= 0),
@@ -537,6 +546,10 @@ def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
     osc, y0 = lax.stop_gradient((osc, y0))
     n = len(osc.belts)
     mode = mode_of_state(osc, y0[0], y0[1])
+    rests = begins_at_rest(osc, y0[0], y0[1])
+    focus = at_focus(osc, y0[0], y0[1])
+    status = jnp.where(rests, Status.EQUILIBRIUM.value, Status.OK.value)
+    status = jnp.where(focus, Status.PSEUDO_FOCUS.value, status)
     start = Orbit(
         entries=jnp.zeros((budget, 2)),
         durations=jnp.zeros(budget),
@@ -547,9 +560,10 @@ def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
         y=y0,
         code=jnp.stack([jnp.asarray(c, dtype=y0.dtype) for c in mode.codes]),
         low=y0[0],
+        low_before=jnp.full_like(y0[0], jnp.inf),
         repeats=jnp.asarray(-1),
-        status=jnp.asarray(Status.OK.value),
-        done=jnp.asarray(False),
+        status=status,
+        done=status != Status.OK,
     )
     orbit = _follow_from(osc, start)
     status = jnp.where(orbit.done, orbit.status, Status.NOT_SETTLED.value)
@@ -1023,8 +1037,8 @@ def _separating_turn(osc: Oscillator, rests: Equilibria, around: Array, size: in
 
     def turn(distance):
         orbit, touches, top = first_turn(still, x1, distance, size)
-        captured = orbit.status == Status.PSEUDO_FOCUS
-        inside = ~touches & jnp.where(jnp.isnan(top), captured, top - x1 < distance)
+        rests = (orbit.status == Status.PSEUDO_FOCUS) | (orbit.status == Status.EQUILIBRIUM)
+        inside = ~touches & jnp.where(jnp.isnan(top), rests, top - x1 < distance)
         return orbit, inside
 
     def narrow(bracket, _):

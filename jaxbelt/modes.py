@@ -16,6 +16,7 @@ Everything here is elementwise: codes and states may be scalars (the trajectorie
 or arrays of lanes (the kernel of `batch`), belts are unrolled.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -107,12 +108,15 @@ def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
     They slip with sign -sgn(needed): friction opposed the needed force until the limit. That one
     rule serves arrivals at a boundary (not held: the orbit crosses), contact edges met while
     sticking (not held: torn off) and starts on a boundary. Belts of equal velocity are stuck
-    together, their capacities add and their signs flip together.
+    together, their capacities add and their signs flip together. What can hold nothing never
+    sticks; where no force is needed either, r'' = omega^2 x2 gives the sign.
     """
     needed = mode_acceleration(osc, mode, x1, x2)
-    slips = jnp.abs(needed) > capacity(osc, mode)
+    held = capacity(osc, mode)
+    slips = (jnp.abs(needed) > held) | (held == 0)
+    sign = jnp.where(needed == 0, jnp.where(x2 < 0, -1.0, 1.0), -jnp.sign(needed))
     codes = tuple(
-        jnp.where(stuck & slips, -jnp.sign(needed), code)
+        jnp.where(stuck & slips, sign, code)
         for code, stuck in zip(mode.codes, mode.stuck, strict=True)
     )
     return Mode(codes)
@@ -160,6 +164,12 @@ def bounds_leftward(mode: Mode) -> list[Array]:
     return list(mode.touching) + upper
 
 
+def edges_ahead(mode: Mode, v: Array) -> list[Array]:
+    """For each of `edge_guards`, whether a mass with the velocity v (or its sign) moves to it."""
+    sides = zip(bounds_rightward(mode), bounds_leftward(mode), strict=True)
+    return [(v > 0) & on_right | (v < 0) & on_left for on_right, on_left in sides]
+
+
 def edges(osc: Oscillator) -> list[Array]:
     """Positions of the contact edges in the order of `edge_guards`."""
     return [belt.lower for belt in osc.belts] + [belt.upper for belt in osc.belts]
@@ -174,6 +184,44 @@ def has_edges(osc: Oscillator) -> bool:
 
 
 # --- transitions ----------------------------------------------------------------------------------
+
+#: Rounding: a guard this small, over 1 + |nu| or 1 + |x1|, and an x2' this small, over 1 + |x1|,
+#: are 0.
+ON_GUARD, TANGENT = 1e-12, 1e-12
+
+
+def directions(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
+    """Signs of x2' and of x2 just after (x1, x2) in a slip mode.
+
+    Where x2' = 0, as at slip onset, x2'' = -x2 decides; where x2 = 0, x2' does. Both are 0 at an
+    equilibrium only.
+    """
+    a = mode_acceleration(osc, mode, x1, x2)
+    tangent = jnp.abs(a) < TANGENT * (1 + jnp.abs(x1))
+    a_sign = jnp.sign(jnp.where(tangent, -x2, a))
+    return a_sign, jnp.where(x2 == 0, a_sign, jnp.sign(x2))
+
+
+def guard_passed(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """The number of the guard through which an orbit leaves a slip mode at (x1, x2), or -1.
+
+    The guard has to vanish there, and to fall: one that vanishes and rises bounds what the orbit
+    has just entered. Numbered as in `leave_slip`; of several the first.
+    """
+    a_sign, v_sign = directions(osc, mode, x1, x2)
+    guards = boundary_guards(osc, mode, x2)
+    passed = [
+        (guard <= ON_GUARD * (1 + jnp.abs(belt.velocity))) & (code * a_sign > 0)
+        for belt, code, guard in zip(osc.belts, mode.codes, guards, strict=True)
+    ]
+    if has_edges(osc):
+        guards, ahead = edge_guards(osc, mode, x1), edges_ahead(mode, v_sign)
+        passed += [
+            (guard <= ON_GUARD * (1 + jnp.abs(x1))) & is_ahead
+            for guard, is_ahead in zip(guards, ahead, strict=True)
+        ]
+    numbers = [jnp.asarray(i) for i in range(len(passed))]
+    return first_of(passed, numbers, jnp.asarray(-1))
 
 
 def reach_boundary(
@@ -253,13 +301,8 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
     onset_distance = jnp.where(moves, jnp.sign(v) * (x1_onset - x1), jnp.inf)
 
     edge_distances = [
-        jnp.where((v > 0) & on_right | (v < 0) & on_left, guard, jnp.inf)
-        for on_right, on_left, guard in zip(
-            bounds_rightward(mode),
-            bounds_leftward(mode),
-            edge_guards(osc, mode, x1),
-            strict=True,
-        )
+        jnp.where(is_ahead, guard, jnp.inf)
+        for is_ahead, guard in zip(edges_ahead(mode, v), edge_guards(osc, mode, x1), strict=True)
     ]
     distance = onset_distance
     for edge_distance in edge_distances:
@@ -341,12 +384,45 @@ def mode_of_state(osc: Oscillator, x1: Array, x2: Array) -> Mode:
     """The mode in which an orbit goes on from the state (x1, x2), on a boundary or an edge too.
 
     On an edge the velocity decides which side; at rest there, the acceleration on the right-hand
-    side does: the mass goes right if that is positive, else left.
+    side does: the mass goes right if that is positive, else left. Where the left-hand side pushes
+    it back it stays: on the right if it can rest there, else at a pseudo-focus, see `at_focus`.
     """
-    right = settle(osc, contact(osc, x1, x2, rightward=True), x1, x2)
-    left = settle(osc, contact(osc, x1, x2, rightward=False), x1, x2)
-    push = jnp.where(right.any_stuck, 0.0, mode_acceleration(osc, right, x1, x2))
-    return select((x2 > 0) | ((x2 == 0) & (push > 0)), right, left)
+    right, left = _sides(osc, x1, x2)
+    a_right, a_left = (_pull_at_rest(osc, mode, x1) for mode in (right, left))
+    goes_right = (a_right > 0) | (a_right == 0) & (a_left > 0)
+    return select((x2 > 0) | (x2 == 0) & goes_right, right, left)
+
+
+def at_focus(osc: Oscillator, x1: Array, x2: Array) -> Array:
+    """Whether the state (x1, x2) is a pseudo-focus: at rest on an edge, pushed back by both sides,
+    or by one of them where the other lets it rest.
+
+    Stable or not, it is an equilibrium: an orbit that starts there stays there.
+    """
+    right, left = _sides(osc, x1, x2)
+    a_right, a_left = (_pull_at_rest(osc, mode, x1) for mode in (right, left))
+    slips = ~right.any_stuck & ~left.any_stuck
+    return (x2 == 0) & slips & (a_left >= 0) & (a_right <= 0) & (a_left > a_right)
+
+
+def begins_at_rest(osc: Oscillator, x1: Array, x2: Array) -> Array:
+    """Whether a start (x1, x2) is a fixed point or a pseudo-focus, up to rounding."""
+    mode = mode_of_state(osc, x1, x2)
+    fixed = (x2 == 0) & ~mode.any_stuck & (_pull_at_rest(osc, mode, x1) == 0)
+    return fixed | at_focus(osc, x1, x2)
+
+
+def _sides(osc: Oscillator, x1: Array, x2: Array) -> tuple[Mode, Mode]:
+    """The modes just right and just left of a state; where it is on no edge they are the same."""
+    sides = (contact(osc, x1, x2, rightward=side) for side in (True, False))
+    right, left = (settle(osc, mode, x1, x2) for mode in sides)
+    return right, left
+
+
+def _pull_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> Array:
+    """x2' at rest, (x1, 0): 0 where a belt holds the mass, and where it is but rounding."""
+    a = mode_acceleration(osc, mode, x1, jnp.zeros_like(x1))
+    return jnp.where(mode.any_stuck | (jnp.abs(a) < TANGENT * (1 + jnp.abs(x1))), 0.0, a)
 
 
 def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
@@ -366,6 +442,44 @@ def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
     return Mode(tuple(codes))
 
 
+# --- orbits that come to rest -------------------------------------------------------------------
+
+#: Radius below which a disc is not made smaller: rounding of x1 counts there.
+SMALLEST_DISC = 1e-6
+#: Speeds, as fractions of the radius, at which an attracting disc is checked.
+DISC = tuple(sign * j / 8 for j in range(1, 9) for sign in (1, -1))
+
+
+def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """Whether an orbit of a slip mode has entered a disc that is attracted by a fixed point."""
+    zero = jnp.zeros_like(x1)
+    x1_rest = mode_acceleration(osc, mode, zero, zero)
+    radius = jnp.maximum(jnp.hypot(x1 - x1_rest, x2), SMALLEST_DISC)
+    return ~mode.any_stuck & (disc_margin(osc, mode, x1_rest, radius) > 0)
+
+
+def disc_margin(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> Array:
+    """Positive where all orbits in the disc around the fixed point (x1_rest, 0) come to rest there.
+
+    In a slip mode x1'' = -(x1 - x1_rest) + f(x2) with f(0) = 0, so E = (x1 - x1_rest)^2 + x2^2
+    obeys E' = 2 x2 f(x2). If v f(v) < 0 for all 0 < |v| <= radius, and the disc lies within the
+    mode's boundaries and edges, E falls until the orbit is at rest. The sign is checked at 16
+    speeds; a law that wiggles on a scale below radius/8 could deceive that.
+    """
+    margins = []
+    for fraction in DISC:
+        v = fraction * radius
+        margins.append(-v * mode_acceleration(osc, mode, x1_rest, v))
+    pulls = [belt.load > 0 for belt in osc.belts]  # no other belt is an obstacle
+    for v in (radius, -radius):
+        bounds = boundary_guards(osc, mode, v) + edge_guards(osc, mode, x1_rest + v)
+        margins += [
+            jnp.where(matters, bound, jnp.inf)
+            for matters, bound in zip(pulls * 3, bounds, strict=True)
+        ]
+    return functools.reduce(jnp.minimum, margins)
+
+
 # --- the pseudo-focus at a contact edge -----------------------------------------------------------
 
 
@@ -374,55 +488,77 @@ class EdgeFocus(eqx.Module):
 
     exists: a_L > 0 > a_R, so that the mass at rest there is pushed back from both sides. The
     velocity at successive crossings behaves like exp(rate t); a turn takes turn_time * |x2|.
+    With u = 1/|x2| at the crossings a turn leads from u to u - contraction - bend/u^2 + O(1/u^3);
+    bend is a bound of that coefficient's size.
     """
 
     exists: Array
     rate: Array
     turn_time: Array
     contraction: Array
-    nonlinearity: Array
+    bend: Array
 
 
-def push_and_trace(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array]:
-    """x2' of a slip mode at rest, (x1, 0), and its derivative by x2."""
+def field_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array, Array, Array]:
+    """Taylor coefficients of x2' of a slip mode in x2, from (x1, 0): of order 0 to 3."""
     rest = jnp.zeros_like(x1)
-    return jax.jvp(lambda x2: mode_acceleration(osc, mode, x1, x2), (rest,), (jnp.ones_like(rest),))
+
+    def derivative(fn):
+        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
+
+    def a(x2):
+        return mode_acceleration(osc, mode, x1, x2)
+
+    first = derivative(a)
+    second = derivative(first)
+    return a(rest), first(rest), second(rest) / 2, derivative(second)(rest) / 6
 
 
 def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFocus:
     """The pseudo-focus at x1 = edge between the slip modes to its left and right.
 
-    contraction S = tr_L/a_L + tr_R/|a_R|: a turn multiplies x2 by 1 + (2/3) S |x2| + O(x2^2),
-    where nonlinearity bounds the size of the coefficient of that last term. rate is S over
-    3 (1/a_L + 1/|a_R|) and turn_time is 2/a_L + 2/|a_R|.
+    Of the half-turn on one side, from (edge, v) to (edge, -w), with x2' = -a - (x1 - edge) +
+    b x2 + c x2^2 + d x2^3 there: 1/w = 1/v - k - e v^2 + O(v^3), where k = 2 b / (3 a) and
+    e = 2 d/(5 a) + 2 b c/(15 a^2) + 4 b^3/(135 a^3) - 2 b/(15 a^3), with -c for c on the left, by
+    inserting the series into the orbit x1(x2). Both sides add up. rate is the sum of k over
+    2/a_L + 2/|a_R|, which is turn_time.
     """
-    a_left, trace_left = push_and_trace(osc, left, edge)
-    a_right, trace_right = push_and_trace(osc, right, edge)
-    exists = (a_left > 0) & (a_right < 0)
-    a_l, a_r = jnp.where(exists, a_left, 1.0), jnp.where(exists, -a_right, 1.0)
-    contraction = trace_left / a_l + trace_right / a_r
-    slowness = 1 / a_l + 1 / a_r
-    nonlinearity = 1 / a_l**2 + 1 / a_r**2 + (trace_left / a_l) ** 2 + (trace_right / a_r) ** 2
-    return EdgeFocus(exists, contraction / (3 * slowness), 2 * slowness, contraction, nonlinearity)
+    sides = [field_at_rest(osc, mode, edge) for mode in (left, right)]
+    exists = (sides[0][0] > 0) & (sides[1][0] < 0)
+    contraction, slowness, bend = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
+    for a, b, c, d in sides:
+        a = jnp.where(exists, jnp.abs(a), 1.0)
+        contraction = contraction + 2 * b / (3 * a)
+        slowness = slowness + 1 / a
+        terms = (2 * d / (5 * a), 2 * b * c / (15 * a**2), 4 * (b / a) ** 3 / 135, b / (7.5 * a**3))
+        bend = bend + sum(map(jnp.abs, terms))
+    return EdgeFocus(exists, contraction / (2 * slowness), 2 * slowness, contraction, bend)
 
 
 def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array) -> Array:
     """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
 
-    The leading term of a turn must outweigh the next one by ten, and no boundary may be near. With
-    a belt at rest the turns shrink to rounding in finite time.
+    The leading term of a turn must outweigh the next one by ten (see `EdgeFocus`), and no boundary
+    may be near. With a belt at rest, or with a fixed point on the edge, the turns shrink to
+    rounding.
     """
     focus = edge_focus(osc, left, right, edge)
     size = jnp.abs(x2)
     nearest = jnp.inf
     for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
-        touches = is_left | is_right
-        nearest = jnp.minimum(nearest, jnp.where(touches, jnp.abs(belt.velocity), jnp.inf))
+        rubs = (is_left | is_right) & (belt.load > 0)
+        nearest = jnp.minimum(nearest, jnp.where(rubs, jnp.abs(belt.velocity), jnp.inf))
     captured = (
-        (focus.contraction < 0)
-        & (10 * size * focus.nonlinearity < -focus.contraction)
+        focus.exists
+        & (focus.contraction < 0)
+        & (10 * size**2 * focus.bend < -focus.contraction)
         & (size < FOCUS_RADIUS)
         & (2 * osc.omega * size < nearest)
     )
-    slips = ~left.any_stuck & ~right.any_stuck
-    return focus.exists & slips & (captured | (size < FOCUS_ROUNDING))
+    a_left, trace_left, *_ = field_at_rest(osc, left, edge)
+    a_right, trace_right, *_ = field_at_rest(osc, right, edge)
+    rounding = TANGENT * (1 + jnp.abs(edge))
+    pushed = (a_left > -rounding) & (a_right < rounding) & (a_left - a_right > rounding)
+    shrinks = trace_right * jnp.maximum(a_left, 0) - trace_left * jnp.minimum(a_right, 0) < 0
+    captured = captured | pushed & (shrinks | (nearest == 0)) & (size < FOCUS_ROUNDING)
+    return captured & ~left.any_stuck & ~right.any_stuck

@@ -36,6 +36,7 @@ from .derivatives import forward_jacobian
 from .extrapolation import increments, scheme
 from .modes import (
     Mode,
+    at_focus,
     boundary_guards,
     contact,
     edge_guards,
@@ -486,8 +487,9 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
     finite = jnp.all(jnp.isfinite(y0))
     for leaf in jax.tree.leaves(osc):
         finite = finite & jnp.all(~jnp.isnan(leaf))
-    status = jnp.where(finite, Status.OK.value, Status.NOT_FINITE.value)
-    start = _State(t0, y, mode, _turn_signs(osc, mode, y), status, ~finite)
+    status = jnp.where(at_focus(osc, *y), Status.PSEUDO_FOCUS.value, Status.OK.value)
+    status = jnp.where(finite, status, Status.NOT_FINITE.value)
+    start = _State(t0, y, mode, _turn_signs(osc, mode, y), status, status != Status.OK)
 
     def segment(given, state):
         osc, t1, rtol, atol = given
@@ -574,7 +576,8 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     ys = jnp.swapaxes(ys, 0, 1).reshape(-1, 2)
     afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
     ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)
-    return jnp.where(beyond[:, None], afterwards, ys)[:wanted], arcs.mode[:wanted]
+    modes = jnp.where(beyond[:, None], _codes(final.mode), arcs.mode)
+    return jnp.where(beyond[:, None], afterwards, ys)[:wanted], modes[:wanted]
 
 
 @jit
