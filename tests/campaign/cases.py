@@ -8,6 +8,8 @@ import json
 from dataclasses import dataclass, replace
 from math import inf, isfinite
 
+import numpy as np
+
 from . import engine
 from .engine import Belt, Oscillator
 
@@ -23,6 +25,8 @@ class Case:
     y0: tuple
     T: float = 50.0
     kind: str = "random"
+    #: How far a grazing orbit stays from what it grazes; negative: it goes so far beyond.
+    distance: float | None = None
 
     @property
     def structure(self):
@@ -51,6 +55,7 @@ class Case:
             y0=list(self.y0),
             T=self.T,
             kind=self.kind,
+            distance=self.distance,
         )
 
 
@@ -67,7 +72,13 @@ def from_json(text):
         )
         for b in d["belts"]
     )
-    return Case(Oscillator(d["damping"], belts, d["omega"]), tuple(d["y0"]), d["T"], d["kind"])
+    return Case(
+        Oscillator(d["damping"], belts, d["omega"]),
+        tuple(d["y0"]),
+        d["T"],
+        d["kind"],
+        d["distance"],
+    )
 
 
 def structures(rng, programs):
@@ -260,3 +271,86 @@ def _special_start(rng, osc, number):
     if how == 6:
         return 0.0, 0.0
     return x1, x2
+
+
+# ---------------------------------------------------------------- grazing
+
+
+def grazing_case(rng, structure, smallest, largest=1e-3):
+    """An orbit that misses, or goes beyond, a boundary or an edge by a given distance.
+
+    It is built backwards from the touching point, in the field of the mode before, whose friction
+    keeps its sign beyond the boundary.
+    """
+    while True:
+        osc = random_case(rng, structure).oscillator
+        distance = float(np.exp(rng.uniform(np.log(smallest), np.log(largest))))
+        distance *= 1 if rng.random() < 0.5 else -1
+        edges = [x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)]
+        at_edge = bool(edges) and rng.random() < 0.5
+        if at_edge:
+            edge, side = float(rng.choice(edges)), int(rng.choice([-1, 1]))
+            x1, x2 = edge + side * distance, 0.0
+            mode = _mode_beside(osc, edge, side, x2, {})
+            # Outside, on that side, x1 turns back from the edge.
+            if side * engine.force(osc, mode, x1, x2) <= 0:
+                continue
+        else:
+            k = int(rng.integers(len(osc.belts)))
+            if osc.belts[k].load == 0 or osc.belts[k].velocity == 0:
+                continue
+            sign = 1 if osc.belts[k].velocity > 0 else -1
+            x2 = osc.belts[k].velocity / osc.omega - sign * distance
+            x1 = rng.uniform(-2, 2)
+            for _ in range(3):
+                mode = _mode_beside(osc, x1, 1, x2, {k: sign})
+                x1 = engine.force(osc, mode, 0.0, x2)
+            if mode != _mode_beside(osc, x1, 1, x2, {k: sign}) or abs(mode[k]) == 2:
+                continue
+            if any(abs(x1 - edge) < 0.05 for edge in edges):
+                continue
+        before = rng.uniform(0.3, 1.5)
+        y0 = engine.flow(osc, mode, (x1, x2), -before)
+        if not np.all(np.isfinite(y0)):
+            continue
+        case = Case(
+            osc,
+            tuple(y0),
+            4.0,
+            "edge" if at_edge else "boundary",
+            distance,
+        )
+        run = engine.simulate(osc, y0, case.T)
+        first = run.t[0] if len(run.t) else inf
+        # The grazing is the first thing that happens, and nothing else is as near.
+        if distance > 0:
+            good = (
+                first > before + 1e-4 and abs(run.margin / distance - 1) < 0.05 + 1e-15 / distance
+            )
+        else:
+            good = abs(first - before) < 2 * np.sqrt(10 * abs(distance))
+        if good and engine.simulate(osc, y0, before / 2).margin > 1e-4:
+            return case
+
+
+def _mode_beside(osc, x1, side, x2, given):
+    """The slip mode beside an edge, or at x1; given: signs of some belts."""
+    mode = []
+    for i, b in enumerate(osc.belts):
+        if x1 < b.lower or (x1 == b.lower and side < 0):
+            mode.append(-2)
+        elif x1 > b.upper or (x1 == b.upper and side > 0):
+            mode.append(2)
+        else:
+            mode.append(given.get(i, 1 if b.velocity > osc.omega * x2 else -1))
+    return tuple(mode)
+
+
+def grazing_batches(rng, options):
+    """Lists of grazing cases, one structure each; T is the same for all of a list."""
+    smallest = 1e-11 if options.tol <= 1e-12 else 1e-8
+    chosen = structures(rng, options.programs)
+    for structure in chosen:
+        yield [
+            grazing_case(rng, structure, smallest) for _ in range(-(-options.runs // len(chosen)))
+        ]

@@ -48,8 +48,11 @@ _E5 = np.ascontiguousarray(_dop853.E5)
 _LONGEST, _SHORTEST = 0.5, 1e-10
 #: Distances above this one need no closer look; below it the margin of a run is exact.
 _CLOSE = 1e-6
-#: Velocity at an edge below which turns around a pseudo-focus that shrink are over.
-_FOCUS_SPEED = 1e-4
+#: Velocity at an edge below which turns around a pseudo-focus are over that shrink as they should,
+#: to this fraction of it.
+_FOCUS_SPEED, _FOCUS_MATCH = 1e-2, 0.1
+#: A turn with a smaller velocity is smaller than the rounding of x1.
+_ROUNDING = 1e-7
 
 
 # ---------------------------------------------------------------- problems
@@ -125,18 +128,20 @@ def simulate(
     mode=None,
     turns=False,
     extrema=False,
+    capture=True,
     max_events=20_000,
 ):
     """The run from y0 over [0, T].
 
     mode: contact codes to go on with, None: those of the state. noise: every step of length h is
     disturbed by noise h, the state after every event by noise, at random. turns, extrema: record
-    the zeros of x2 (belt 0: a maximum of x1, 1: a minimum), the extrema of x2.
+    the zeros of x2 (belt 0: a maximum of x1, 1: a minimum), the extrema of x2. capture: end, at
+    rest, where the run converges to a pseudo-focus.
     """
     n = len(osc.belts)
     given = np.full(n, 9, np.int64) if mode is None else np.array(mode, np.int64)
     out = np.empty((max_events, 5 + n))
-    flags = (1 if turns else 0) + (2 if extrema else 0)
+    flags = (1 if turns else 0) + (2 if extrema else 0) + (0 if capture else 4)
     count, t, x1, x2, status, margin, codes, steps = _run(
         osc.damping,
         osc.omega,
@@ -170,13 +175,13 @@ def simulate(
 # ---------------------------------------------------------------- field
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _mu(row, r):
     f = np.exp(-row[7] * r) if row[5] == 1 else 1 / (1 + row[7] * r)
     return row[6] * f + row[8] + row[9] * r * r
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _mu_slope(row, r):
     if row[5] == 1:
         f = -row[7] * np.exp(-row[7] * r)
@@ -185,7 +190,7 @@ def _mu_slope(row, r):
     return row[6] * f + 2 * row[9] * r
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _force(z, w, B, s, x1, x2):
     """x2' in the mode s; of stuck belts nothing. NaN where a law is far beyond its boundary."""
     f = -x1 - z * x2
@@ -198,7 +203,7 @@ def _force(z, w, B, s, x1, x2):
     return f
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _trace(z, w, B, s, x2):
     """d x2' / d x2 in the mode s."""
     f = -z
@@ -208,7 +213,7 @@ def _trace(z, w, B, s, x2):
     return f
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _advance(z, w, B, s, x1, x2, a, h, V, K):
     """One step of DOP853; V, K: room for the stages' x2 and x2'."""
     V[0], K[0] = x2, a
@@ -230,7 +235,7 @@ def _advance(z, w, B, s, x1, x2, a, h, V, K):
     return y1, y2
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _error(x1, x2, y1, y2, h, tol, V, K):
     """The error of the step over the tolerance, as Hairer, Norsett and Wanner combine it."""
     c1 = tol * (1 + max(abs(x1), abs(y1)))
@@ -256,13 +261,13 @@ def mu(row, r):
 # ---------------------------------------------------------------- enclosures
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _product(a, b, c, d):
     p, q, r, t = a * c, a * d, b * c, b * d
     return min(min(p, q), min(r, t)), max(max(p, q), max(r, t))
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _force_interval(z, w, B, s, l1, u1, l2, u2):
     """Bounds of x2' and of d x2'/d x2 over a box; NaN where a law is far beyond its boundary."""
     p, q = _product(-z, -z, l2, u2)
@@ -293,7 +298,7 @@ def _force_interval(z, w, B, s, l1, u1, l2, u2):
     return low, high, t_low, t_high
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _enclose(z, w, B, s, x1, x2, a, y1, y2, b, h, box):
     """Bounds of x1, x2, x2', x2'' over the step, into `box`; False where none were found.
 
@@ -338,7 +343,7 @@ def _enclose(z, w, B, s, x1, x2, a, y1, y2, b, h, box):
 # ---------------------------------------------------------------- roots within a step
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _root(z, w, B, s, x1, x2, a, what, level, left, right, f_left, f_right, V, K):
     """The step length in [left, right] at which a quantity takes the value `level`.
 
@@ -374,7 +379,7 @@ def _root(z, w, B, s, x1, x2, a, what, level, left, right, f_left, f_right, V, K
     return h, y1, y2
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _look(z, w, B, s, x1, x2, a, y1, y2, b, h, axis, level, side, box, V, K):
     """Whether side (x_axis - level), positive at first, is negative within the step.
 
@@ -446,7 +451,7 @@ def _look(z, w, B, s, x1, x2, a, y1, y2, b, h, axis, level, side, box, V, K):
 # ---------------------------------------------------------------- transitions
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _contacts(w, B, x1, x2, on, right, old, new):
     """The contacts at a point, into `new`: 0 where a touching belt runs at the velocity `on`.
 
@@ -466,7 +471,7 @@ def _contacts(w, B, x1, x2, on, right, old, new):
             new[i] = 1 if B[i, 0] > w * x2 else -1
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _balance(z, w, B, s, x1, x2):
     """Sticks, or goes to one side: sets the zeros in s. Returns (sticks, distance from doing the
     other, sign of x2' after)."""
@@ -487,7 +492,7 @@ def _balance(z, w, B, s, x1, x2):
     return False, abs(rest) - held, np.sign(rest)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _velocity_at(w, B, x1, x2):
     """The velocity of a belt that may touch at x1 and at which x2 is, else NaN."""
     for i in range(B.shape[0]):
@@ -497,7 +502,7 @@ def _velocity_at(w, B, x1, x2):
     return np.nan
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _begin(z, w, B, x1, x2, s):
     """The mode of a state, into s; returns (stuck, status, distance from another mode)."""
     n = B.shape[0]
@@ -535,7 +540,7 @@ def _begin(z, w, B, x1, x2, s):
     return stuck, OK, gap
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _bounds(w, B, s, L):
     """The box of a slip mode, into L: left, right, lower and upper bound."""
     L[0], L[1], L[2], L[3] = -np.inf, np.inf, -np.inf, np.inf
@@ -552,7 +557,7 @@ def _bounds(w, B, s, L):
                 L[2] = max(L[2], B[i, 0] / w)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _nearest(L, x1, x2):
     """Distance of a state from the lines that it is not on."""
     d = np.inf
@@ -563,26 +568,28 @@ def _nearest(L, x1, x2):
     return d
 
 
-@njit(nogil=True, cache=True)
-def _contracts(z, w, B, left, right, edge):
-    """Whether turns around the rest on an edge shrink, to leading order; and if a belt at rest
-    that touches makes them end."""
+@njit(nogil=True, cache=True, error_model="numpy")
+def _contraction(z, w, B, left, right, edge):
+    """To leading order a turn around the rest on an edge multiplies x2 there by 1 + (this) |x2|.
+
+    Also the least speed of a belt that touches: turns have to be well below it.
+    """
     a_l, a_r = _force(z, w, B, left, edge, 0.0), _force(z, w, B, right, edge, 0.0)
-    rests = False
+    least = np.inf
     for i in range(B.shape[0]):
-        touches = abs(left[i]) < 2 or abs(right[i]) < 2
-        rests = rests or (B[i, 0] == 0 and touches and B[i, 1] * B[i, 4] > 0)
+        if abs(left[i]) < 2 or abs(right[i]) < 2:
+            least = min(least, abs(B[i, 0]) / w)
     s = _trace(z, w, B, left, 0.0) / a_l - _trace(z, w, B, right, 0.0) / a_r
-    return a_l > 0 > a_r and s < 0, rests
+    return 2 / 3 * s, least
 
 
 # ---------------------------------------------------------------- runs
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
     n = B.shape[0]
-    turns, extrema = flags % 2 == 1, flags >= 2
+    turns, extrema, capture = flags % 2 == 1, flags // 2 % 2 == 1, flags < 4
     s, old = given.copy(), given.copy()
     before, L, box = given.copy(), np.empty(4), np.empty(8)
     V, K, V2, K2 = np.empty(_N + 1), np.empty(_N + 1), np.empty(_N + 1), np.empty(_N + 1)
@@ -595,6 +602,8 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         on = _velocity_at(w, B, x1, x2)
         if stuck:
             x2 = on / w
+        else:
+            margin = min(margin, max(abs(x2), abs(_force(z, w, B, s, x1, x2))))
     else:
         for i in range(n):
             stuck = stuck or s[i] == 0
@@ -653,6 +662,9 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         else:
             # ---------------- a slip arc
             a = _force(z, w, B, s, x1, x2)
+            if turns and abs(x2) + abs(a) < 1e-14:  # at rest, but for rounding
+                t = T
+                break
             if turns:
                 if x2 > 0 or (x2 == 0 and a > 0):
                     L[2] = max(L[2], 0.0)
@@ -785,12 +797,16 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
                 else:
                     speed_left = abs(x2)
                 after = _force(z, w, B, s, x1, x2)
-                if not stuck and a * d > 0 > after * d and abs(x2) < _FOCUS_SPEED:
+                if capture and not stuck and a * d > 0 > after * d and abs(x2) < _FOCUS_SPEED:
                     if rightward:
-                        shrinks, rests = _contracts(z, w, B, old, s, x1)
+                        rate, least = _contraction(z, w, B, old, s, x1)
                     else:
-                        shrinks, rests = _contracts(z, w, B, s, old, x1)
-                    if abs(x2) < 1e-9 or (shrinks and not rests and abs(x2) < speed < np.inf):
+                        rate, least = _contraction(z, w, B, s, old, x1)
+                    small = abs(x2) < speed < min(np.inf, 0.5 * least)
+                    shrunk = (abs(x2) - speed) / (speed * speed)
+                    if abs(x2) < _ROUNDING or (
+                        small and abs(shrunk - rate) <= -_FOCUS_MATCH * rate
+                    ):
                         status = PSEUDO_FOCUS
                         x2 = 0.0
         # ---------------- an event
@@ -810,7 +826,9 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         count += 1
         still = still + 1 if t == t_before else 0
         if still > 20:
-            status = CORNER
+            # Turns around a point on an edge that are lost in rounding are over, too.
+            status = PSEUDO_FOCUS if kind == EDGE and abs(x2) < _ROUNDING else CORNER
+            x2 = 0.0 if status == PSEUDO_FOCUS else x2
         if noise > 0:
             random ^= random << np.uint64(13)
             random ^= random >> np.uint64(7)
@@ -826,6 +844,29 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         _bounds(w, B, s, L)
         margin = min(margin, _nearest(L, x1, x2) if not stuck else np.inf)
     return count, t, x1, x2, status, margin, s, steps
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _flow(z, w, B, s, x1, x2, duration, steps):
+    V, K = np.empty(_N + 1), np.empty(_N + 1)
+    h = duration / steps
+    for _ in range(steps):
+        x1, x2 = _advance(z, w, B, s, x1, x2, _force(z, w, B, s, x1, x2), h, V, K)
+    return x1, x2
+
+
+def flow(osc, mode, y, duration, step=0.01):
+    """The state after a time, negative too, in the field of a slip mode; no events are looked
+    for. NaN where the field ends."""
+    steps = max(1, round(abs(duration) / step))
+    mode = np.array(mode, np.int64)
+    return _flow(osc.damping, osc.omega, osc.table(), mode, *map(float, y), duration, steps)
+
+
+def force(osc, mode, x1, x2):
+    """x2' in the field of a slip mode."""
+    mode = np.array(mode, np.int64)
+    return _force(osc.damping, osc.omega, osc.table(), mode, float(x1), float(x2))
 
 
 # ---------------------------------------------------------------- attractors
@@ -846,11 +887,11 @@ class Attractor:
     status: int = OK
 
 
-def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=2e-11, at_rest=1e-6, periods=24):
-    """Where a run leads, by running it: no shortcut of any kind.
+def attractor(osc, y0, *, chunk=100.0, t_max=200_000.0, same=1e-9, at_rest=1e-6, periods=24):
+    """Where a run leads, by running it on, in longer and longer pieces.
 
-    It is a cycle where all of the maxima of x1 have repeated, as whole states, for the last three
-    periods, to `same`; an equilibrium where the motion has shrunk below `at_rest` and does shrink.
+    It is a cycle where all of the maxima of x1 in the second half of a piece repeat, as whole
+    states, to `same`; an equilibrium where the motion has shrunk below `at_rest` and does shrink.
     """
     x1, x2, mode, margin, t = *y0, None, inf, 0.0
     size = inf
@@ -881,21 +922,28 @@ def attractor(osc, y0, *, chunk=100.0, t_max=20_000.0, same=2e-11, at_rest=1e-6,
         old, size = size, float(np.max(np.ptp(np.vstack([seen, [x1, x2]]), axis=0)))
         if size < at_rest and (size <= 0.999 * old or size < 1e-12) and abs(x2) < at_rest:
             return Attractor("equilibrium", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
-        found = _repeats(run, tops, same, periods)
+        found = _repeats(run, tops, same, periods) if t > chunk else None
         if found:
             cycle = _cycle(osc, run, *found)
             if max(np.ptp(cycle.x1), np.ptp(cycle.x2)) > at_rest:
                 return replace(cycle, margin=margin)
+        chunk = 2 * chunk if chunk < 1600.0 or len(tops) < 32 else chunk
     return Attractor("undecided", margin=margin)
 
 
 def _repeats(run, tops, same, periods):
     """First and last event of one period, where the tops repeat."""
-    for p in range(1, min(periods, len(tops) // 4) + 1):
-        now, then = tops[-3 * p :], tops[-4 * p : -p]
-        alike = np.all(np.abs(run.y[now] - run.y[then]) <= same)
-        if alike and np.array_equal(run.codes[now], run.codes[then]):
-            return tops[-1 - p], tops[-1]
+    y, codes = run.y[tops], run.codes[tops]
+    half = len(tops) // 2
+
+    def alike(lag):
+        close = np.abs(y[half:] - y[half - lag : -lag]) <= same
+        return np.all(close) and np.array_equal(codes[half:], codes[half - lag : -lag])
+
+    for p in range(1, min(periods, half // 4) + 1):
+        if alike(p):
+            # And against what creeps as many periods apart as there are.
+            return (tops[-1 - p], tops[-1]) if alike(half // p * p) else None
     return None
 
 

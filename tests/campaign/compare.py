@@ -1,0 +1,257 @@
+"""What the package says of a case against what the engine says.
+
+An answer is right if it is the engine's: sequence of events, final mode, status, and the states
+within the tolerance. How far the errors of a tolerance go is asked of the engine itself, by runs
+that are disturbed at every step and every event by as much. Verdicts:
+
+- "same": it is the engine's answer;
+- "tolerance": not quite, but it is the answer of a run that is disturbed by the tolerance that was
+  asked for, so that the sequence of events is beyond it;
+- "corner": the run comes within 1e-9 of another outcome, where rounding decides, and the answer is
+  that of a neighbour, parameters or start moved by 1e-7;
+- otherwise what is different, in a word or two.
+"""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+
+from . import derivatives, engine
+
+#: A run that comes this near to another outcome is at a corner, and its neighbours are this far.
+CORNER, NEIGHBOUR = 1e-9, 1e-7
+#: Local errors of a step that may add up without being seen in disturbed runs.
+STEPS = 30
+#: Disturbed runs that are asked.
+DISTURBED = 6
+#: Statuses of runs that came to an end.
+ORDINARY = (engine.OK, engine.STUCK_FOREVER, engine.PSEUDO_FOCUS)
+GOOD = ("same", "tolerance", "corner")
+
+
+def run(case, **options):
+    return engine.simulate(case.oscillator, case.y0, case.T, **options)
+
+
+def neighbours(case, by=NEIGHBOUR, joint=24, seed=0):
+    """The case with the start or a parameter moved up or down, then all of them at random."""
+    osc, n = case.oscillator, len(case.oscillator.belts)
+
+    def moved(shifts):
+        """shifts: of x1, x2, damping, omega, and five a belt."""
+        belts = []
+        for i, b in enumerate(osc.belts):
+            velocity, load, static, lower, upper = shifts[4 + 5 * i : 9 + 5 * i]
+            law = (b.law[0], b.law[1] + static, *b.law[2:])
+            belts.append(
+                replace(
+                    b,
+                    velocity=b.velocity + velocity,
+                    law=law,
+                    load=max(b.load + load, 0.0),
+                    lower=b.lower + lower,
+                    upper=b.upper + upper,
+                )
+            )
+        new = replace(
+            osc, damping=osc.damping + shifts[2], omega=osc.omega + shifts[3], belts=tuple(belts)
+        )
+        return replace(case, oscillator=new, y0=(case.y0[0] + shifts[0], case.y0[1] + shifts[1]))
+
+    # Belts that share a number go on sharing it, and so do edges.
+    def tied(shifts):
+        groups = {}
+        for i, b in enumerate(osc.belts):
+            for j, value in ((0, b.velocity), (3, b.lower), (4, b.upper)):
+                kind = "v" if j == 0 else "x"
+                shifts[4 + 5 * i + j] = groups.setdefault((kind, value), shifts[4 + 5 * i + j])
+        return shifts
+
+    size = 4 + 5 * n
+    for i, sign in itertools.product(range(size), (1.0, -1.0)):
+        shifts = np.zeros(size)
+        shifts[i] = sign * by
+        yield moved(shifts)
+    rng = np.random.default_rng(seed)
+    for k in range(joint):
+        shifts = by * rng.uniform(-1, 1, size)
+        yield moved(tied(shifts) if k % 2 else shifts)
+
+
+def spread(case, noise, reference, states):
+    """How far disturbances of a size move states; states(run) gives them, or None for another
+    sequence. Returns the largest distance and the disturbed runs."""
+    runs = [run(case, noise=noise, seed=i) for i in range(DISTURBED)]
+    found = [states(r) for r in runs]
+    far = [np.max(np.abs(f - reference)) for f in found if f is not None and np.size(f)]
+    return max(far, default=0.0), runs
+
+
+# ---------------------------------------------------------------- final states and sequences
+
+
+def difference(case, told, mine, tol):
+    """What differs between the package's answer `told` and a run of the engine, or None."""
+    focus = engine.PSEUDO_FOCUS
+    if told.status != mine.status and focus in (told.status, mine.status):
+        # Both may be right: one tells sooner than the other that a run converges.
+        return _focus_difference(case, told, mine)
+    if told.status != mine.status:
+        return f"status {told.status}, not {mine.status}"
+    if mine.status == engine.NOT_FINITE:
+        return None
+    n = len(mine.kind)
+    if told.status == focus:
+        if told.events is not None:
+            m = min(told.n_events, n)
+            if tuple(e[1:3] for e in told.events[:m]) != mine.sequence[:m]:
+                return "sequence"
+        same = abs(told.x1 - mine.y_end[0]) < 1e-6 and abs(told.x2 - mine.y_end[1]) < 1e-6
+        return None if same else "another focus"
+    if told.n_events != n:
+        return f"{'more' if told.n_events > n else 'fewer'} events"
+    if told.events is not None and tuple(e[1:3] for e in told.events) != mine.sequence:
+        return "sequence"
+    if told.mode != tuple(mine.mode_end):
+        return "mode"
+    return _state_difference(case, told, mine, tol)
+
+
+def _focus_difference(case, told, mine):
+    """One ended in a pseudo-focus and the other did not, or not yet."""
+    longer = replace(case, T=10 * case.T)
+    if told.status == engine.PSEUDO_FOCUS:
+        if mine.status != engine.OK:
+            return f"status {told.status}, not {mine.status}"
+        later = run(longer, max_events=500_000)
+        near = abs(mine.y_end[0] - told.x1) < 1e-2 and abs(mine.y_end[1]) < 5e-2
+        same = later.status == engine.PSEUDO_FOCUS and abs(later.y_end[0] - told.x1) < 1e-6
+        return None if same and near else "focus that is none"
+    if told.status != engine.OK:
+        return f"status {told.status}, not {mine.status}"
+    honest = run(case, capture=False, max_events=2_000_000)
+    if honest.status != engine.OK:
+        honest = mine
+    close = abs(told.x1 - honest.y_end[0]) < 1e-4 and abs(told.x2 - honest.y_end[1]) < 2e-2
+    return None if close else "focus missed"
+
+
+def _state_difference(case, told, mine, tol):
+    far = np.max(np.abs(np.array([told.x1, told.x2]) - mine.y_end))
+    # Not `>`: NaN is far.
+    states = not far <= STEPS * tol
+    if told.events is None or not told.events:
+        if not states:
+            return None
+        d, _ = spread(
+            case, tol, np.array(mine.y_end), lambda r: _same_kind(r, mine, np.array(r.y_end))
+        )
+        return None if far <= STEPS * (tol + d) else "state"
+    rows = np.array([(e[0], e[3], e[4]) for e in told.events])
+    table = np.column_stack([mine.t, mine.y])
+    away = np.abs(rows - table)
+    if not states and np.all(away <= STEPS * tol):
+        return None
+    d, runs = spread(
+        case, tol, np.array(mine.y_end), lambda r: _same_kind(r, mine, np.array(r.y_end))
+    )
+    if not far <= STEPS * (tol + d):
+        return "state"
+    tables = [np.column_stack([r.t, r.y]) for r in runs if r.sequence == mine.sequence]
+    room = np.max([np.abs(t - table) for t in tables], axis=0) if tables else 0.0
+    return None if np.all(away <= STEPS * (tol + room)) else "event"
+
+
+def _same_kind(r, mine, value):
+    return value if r.sequence == mine.sequence and r.status == mine.status else None
+
+
+def judge(case, told, tol):
+    """The verdict on a final state or a trajectory, and the engine's run."""
+    mine = run(case)
+    what = difference(case, told, mine, tol)
+    if what is None:
+        return "same", mine
+    grazing = case.distance is not None  # that is what it is made for: no excuse
+    for seed in () if grazing else range(DISTURBED):
+        for noise in (tol, 10 * tol):
+            disturbed = run(case, noise=noise, seed=seed)
+            if disturbed.sequence != mine.sequence or disturbed.status != mine.status:
+                if difference(case, told, disturbed, 10 * tol) is None:
+                    return "tolerance", mine
+    if not grazing and (mine.margin <= CORNER or mine.status == engine.CORNER):
+        if told.status in ORDINARY and _rests_unstably(case):
+            return "corner", mine
+        for other in neighbours(case):
+            his = run(other)
+            if his.status == engine.CORNER:
+                continue
+            if difference(other, told, his, max(tol, NEIGHBOUR)) is None:
+                return "corner", mine
+        return f"corner: {what}", mine
+    return what, mine
+
+
+def _rests_unstably(case):
+    """Whether it starts on an unstable equilibrium: when it leaves, rounding decides."""
+    osc, (x1, x2) = case.oscillator, case.y0
+    mode = run(replace(case, T=1e-9)).mode_end
+    if x2 != 0 or 0 in mode or abs(engine.force(osc, mode, x1, 0.0)) > CORNER:
+        return False
+    h = 1e-6
+    return engine.force(osc, mode, x1, h) > engine.force(osc, mode, x1, -h)
+
+
+def judge_derivative(case, told, mine, direction, tol):
+    """The verdict on d(final state) along a direction; mine: the engine's run of the case.
+
+    What the tolerance lets them err is that of disturbed runs, as for states.
+    """
+    right = derivatives.derivative(case, mine, direction)
+    size = 1 + np.max(np.abs(right))
+    if np.all(np.abs(told - right) <= 1e-7 * size):
+        return "same", right
+    runs = [run(case, noise=noise, seed=i) for i in range(DISTURBED) for noise in (tol, 10 * tol)]
+    others = [
+        derivatives.derivative(case, r, direction) for r in runs if r.sequence == mine.sequence
+    ]
+    far = np.max(np.abs(np.array(others) - right)) if others else 0.0
+    good = np.all(np.abs(told - right) <= STEPS * far + 1e-7 * size)
+    return ("same" if good else "derivative"), right
+
+
+# ---------------------------------------------------------------- attractors
+
+
+def label_difference(told, mine, tol):
+    """What differs between two labels, or None."""
+    if mine.kind == "undecided":
+        return None if told.kind == "undecided" else "engine undecided"
+    if told.kind == "undecided":
+        return f"undecided, status {told.status}"
+    if told.kind != mine.kind:
+        return f"{told.kind}, not {mine.kind}"
+    room = 1e-5
+    if mine.kind != "cycle":
+        return None if abs(told.x1[0] - mine.x1[0]) <= room else f"another {mine.kind}"
+    if told.turn is not None and told.turn != mine.turn:
+        return "turn"
+    pairs = [(told.period, mine.period), *zip(told.x1, mine.x1), *zip(told.x2, mine.x2)]
+    pairs += list(zip(told.sticks, mine.sticks))
+    return None if all(abs(a - b) <= room for a, b in pairs) else "another cycle"
+
+
+def judge_label(case, told, tol):
+    """The verdict on a label, and the engine's."""
+    mine = engine.attractor(case.oscillator, case.y0)
+    what = label_difference(told, mine, tol)
+    if what is None:
+        return "same", mine
+    if mine.margin <= CORNER or mine.status == engine.CORNER:
+        for other in neighbours(case, joint=12):
+            his = engine.attractor(other.oscillator, other.y0)
+            if his.kind != "undecided" and label_difference(told, his, tol) is None:
+                return "corner", mine
+        return f"corner: {what}", mine
+    return what, mine

@@ -1,0 +1,129 @@
+"""Derivatives of a run's final state, by the engine: arc by arc, with the shift of every event.
+
+Along an arc a derivative is that of the flow of one smooth field for a fixed duration, a central
+difference, extrapolated. At an event the time shifts by as much as the disturbance is off the line
+over the speed towards it. So nothing is differenced across an event, however near to grazing.
+"""
+
+from dataclasses import replace
+from math import isfinite
+
+import numpy as np
+
+from . import engine
+
+_STEP = 1e-4
+
+
+def directions(case, rng):
+    """A direction in which to disturb start and parameters: (of y0, of damping, of belts).
+
+    Of a belt: of its velocity, load, lower and upper edge. What is equal stays equal.
+    """
+    tied = {}
+
+    def of(name, value):
+        return tied.setdefault((name, value), float(rng.uniform(-1, 1))) if isfinite(value) else 0.0
+
+    belts = tuple(
+        (
+            of("velocity", b.velocity),
+            float(rng.uniform(-1, 1)) if b.load else 0.0,
+            of("edge", b.lower),
+            of("edge", b.upper),
+        )
+        for b in case.oscillator.belts
+    )
+    return tuple(rng.uniform(-1, 1, 2).tolist()), float(rng.uniform(-1, 1)), belts
+
+
+def moved(osc, direction, by):
+    _, damping, belts = direction
+    return replace(
+        osc,
+        damping=osc.damping + by * damping,
+        belts=tuple(
+            replace(
+                b,
+                velocity=b.velocity + by * v,
+                load=b.load + by * u,
+                lower=b.lower + by * lo,
+                upper=b.upper + by * up,
+            )
+            for b, (v, u, lo, up) in zip(osc.belts, belts)
+        ),
+    )
+
+
+def _difference(f, size=1.0):
+    """The derivative of f at 0, by Richardson; size: of the disturbance by one."""
+    step = _STEP / max(size, 1.0)
+    one, half = ((f(h) - f(-h)) / (2 * h) for h in (step, 0.5 * step))
+    return (4 * half - one) / 3
+
+
+def _onset(osc, mode):
+    """x1 where a stick phase ends by slip onset, and the velocity in it."""
+    held = sum(b.load * b.law[1] for b, m in zip(osc.belts, mode) if m == 0)
+    nu = next(b.velocity for b, m in zip(osc.belts, mode) if m == 0)
+    v = nu / osc.omega
+    return np.array([engine.force(osc, mode, 0.0, v) + np.sign(v) * held, v])
+
+
+def derivative(case, run, direction):
+    """d(x1, x2 at T) along a direction; run: the engine's run of the case."""
+    osc, delta = case.oscillator, np.array(direction[0])
+    y, t, shift = np.array(case.y0, float), 0.0, 0.0
+    mode = engine.simulate(osc, case.y0, 1e-12).mode_end
+
+    def along(mode, y, delta, duration):
+        # In pieces, each with a step that suits what the disturbance has grown to.
+        pieces = int(np.ceil(duration / 0.1))
+        for _ in range(pieces):
+            delta = _difference(
+                lambda h, y=y, delta=delta: np.array(
+                    engine.flow(moved(osc, direction, h), mode, y + h * delta, duration / pieces)
+                ),
+                np.max(np.abs(delta)),
+            )
+            y = np.array(engine.flow(osc, mode, y, duration / pieces))
+        return delta
+
+    def field(mode, y):
+        return np.array([y[1], engine.force(osc, mode, *y)])
+
+    ends = [*zip(run.t, run.kind, run.belt, run.y, run.codes), (case.T, 0, -1, run.y_end, mode)]
+    for t_end, kind, belt, y_end, codes in ends:
+        y_end, duration = np.array(y_end), t_end - t
+        if 0 in mode:
+            d_onset, d_v = _difference(lambda h, m=mode: _onset(moved(osc, direction, h), m))
+            v = y[1]
+            if kind == 0:
+                return np.array([delta[0] + d_v * duration - v * shift, d_v])
+            d_end = d_onset if kind == engine.SLIP else _edge_shift(osc, direction, y_end[0])
+            shift += (d_end - delta[0] - d_v * duration) / v
+            delta = np.array([d_end, d_v])
+        else:
+            delta = along(mode, y, delta, duration) if duration > 0 else delta
+            f = field(mode, y_end)
+            if kind == 0:
+                return delta - f * shift
+            if kind == engine.EDGE:
+                axis, line = 0, _edge_shift(osc, direction, y_end[0])
+            else:
+                axis, line = 1, direction[2][belt][0] / osc.omega
+            late = (line - delta[axis]) / f[axis]
+            delta = delta + f * late
+            delta[axis] = line
+            shift += late
+        y, t, mode = y_end, t_end, tuple(int(c) for c in codes)
+    raise AssertionError
+
+
+def _edge_shift(osc, direction, x1):
+    for b, (_, _, lower, upper) in zip(osc.belts, direction[2]):
+        if b.lower == x1:
+            return lower
+        if b.upper == x1:
+            return upper
+    raise ValueError(f"no edge at {x1}")

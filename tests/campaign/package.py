@@ -1,0 +1,286 @@
+"""The package on cases: final states and labels by `sweep`, trajectories by vmapped `simulate`.
+
+Cases of one structure (laws, edges or none) are one batch of one compiled program: every number of
+the oscillator and of the start varies from lane to lane.
+"""
+
+import functools
+import sys
+from dataclasses import dataclass
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxbelt as jb
+
+#: The module, whose name in the package is that of its function.
+_SWEEP = sys.modules[jb.sweep.__module__]
+_LAWS = {"conti": jb.Conti, "coulomb": jb.Coulomb, "stribeck": jb.Stribeck}
+_SIZES = {"conti": 4, "coulomb": 2, "stribeck": 3}
+_KINDS = ("equilibrium", "cycle", "stuck")
+
+
+def oscillator(osc):
+    """The same oscillator as the package's."""
+    belts = tuple(
+        jb.Belt(b.velocity, _LAWS[b.law[0]](*b.law[1:]), b.load, b.lower, b.upper)
+        for b in osc.belts
+    )
+    return jb.Oscillator(osc.damping, belts, osc.omega)
+
+
+def as_code(case):
+    """The case as an expression for a notebook."""
+    osc = case.oscillator
+    belts = []
+    for b in osc.belts:
+        law = f"jb.{b.law[0].capitalize()}({', '.join(repr(float(v)) for v in b.law[1:])})"
+        edges = "".join(
+            f", {name}={value!r}"
+            for name, value in (("lower", b.lower), ("upper", b.upper))
+            if np.isfinite(value)
+        )
+        belts.append(f"jb.Belt({b.velocity!r}, {law}, {b.load!r}{edges})")
+    return (
+        f"jb.Oscillator({osc.damping!r}, ({', '.join(belts)},), {osc.omega!r}), "
+        f"y0={tuple(case.y0)!r}, t1={case.T!r}"
+    )
+
+
+def numbers(case):
+    """All numbers of a case in the order that `_from_numbers` takes them in."""
+    osc, (laws, edges) = case.oscillator, case.structure
+    row = [osc.damping, osc.omega]
+    for b, law in zip(osc.belts, laws):
+        p = [float(v) for v in b.law[1:]]
+        row += [b.velocity, b.load, *p, *[0.0] * (_SIZES[law] - len(p))]
+        row += [b.lower, b.upper] if edges else []
+    return [float(v) for v in row]
+
+
+def tangent(case, direction):
+    """A direction of `derivatives.directions` in the order of `numbers`, and that of the start."""
+    start, damping, belts = direction
+    _, edges = case.structure
+    row = [damping, 0.0]
+    for (velocity, load, lower, upper), b in zip(belts, case.oscillator.belts):
+        row += [velocity, load, *[0.0] * _SIZES[b.law[0]]]
+        row += [lower, upper] if edges else []
+    return row, list(start)
+
+
+def _from_numbers(structure, row):
+    laws, edges = structure
+    numbers = iter(row)
+    damping, omega = next(numbers), next(numbers)
+    belts = []
+    for law in laws:
+        velocity, load = next(numbers), next(numbers)
+        friction = _LAWS[law](*(next(numbers) for _ in range(_SIZES[law])))
+        bounds = (next(numbers), next(numbers)) if edges else ()
+        belts.append(jb.Belt(velocity, friction, load, *bounds))
+    return jb.Oscillator(damping, tuple(belts), omega)
+
+
+# ---------------------------------------------------------------- sweep
+
+
+def _leaves(structure, table):
+    """Rows of numbers in the order of the oscillator's leaves."""
+
+    def leaves(row):
+        osc = _from_numbers(structure, row)
+        return jnp.stack([jnp.asarray(leaf, float) for leaf in jax.tree.leaves(osc)])
+
+    return np.asarray(jax.vmap(leaves)(jnp.asarray(table)))
+
+
+def swept(cases, observe, directions=None, **options):
+    """The variables of `jb.sweep` over cases of one structure and one T.
+
+    The sweep's own axes vary the start of all runs or of none; here every case has its own.
+    directions: to differentiate along, one a case; the derivatives are those by "case".
+    """
+    structure = cases[0].structure
+    table = np.array([numbers(case) for case in cases])
+    starts = np.array([case.y0 for case in cases], dtype=float)
+    tables = [np.column_stack([starts, _leaves(structure, table)])]
+    if directions:
+        options["derivatives"] = "case"
+        pairs = [tangent(case, direction) for case, direction in zip(cases, directions)]
+        rows, moves = (np.array(part) for part in zip(*pairs))
+        tables.append(np.column_stack([moves, _leaves(structure, rows)]))
+
+    class Cases(_SWEEP._Grid):
+        def rows(self, runs, derivatives=()):
+            varying = [True, True, *self.mapped]
+            return np.stack([t[runs][:, varying].T for t in tables[: 1 + len(derivatives)]])
+
+    def make(case):
+        # Every number depends on the axis, so that every one varies.
+        return _from_numbers(structure, [value + 0 * case for value in table[0]])
+
+    with mock.patch.object(_SWEEP, "_Grid", Cases):
+        axes = {"case": np.arange(len(cases), dtype=float)}
+        return jb.sweep(make, axes, observe=observe, progress=False, **options)
+
+
+@dataclass(frozen=True)
+class Final:
+    """How a run ended; events: (t, kind, belt, x1, x2) each, where they are known."""
+
+    x1: float
+    x2: float
+    mode: tuple
+    n_events: int
+    status: int
+    events: tuple | None = None
+
+
+def finals(cases, tol):
+    """Final states by the sweep."""
+    found = swept(cases, "final", t1=cases[0].T, rtol=tol, atol=tol)
+    x1, x2, status = found.x1_end.values, found.x2_end.values, found.status.values
+    modes, events = found.mode_end.values, found.n_events.values
+    return [
+        Final(float(a), float(b), tuple(m.tolist()), int(n), int(s))
+        for a, b, m, n, s in zip(x1, x2, modes, events, status)
+    ]
+
+
+@dataclass(frozen=True)
+class Label:
+    kind: str
+    period: float
+    turn: tuple
+    x1: tuple
+    x2: tuple
+    sticks: tuple
+    status: int
+
+
+def labels(cases, tol, **options):
+    """Attractors by the sweep."""
+    found = swept(cases, "attractor", rtol=tol, atol=tol, **options)
+    flags = found.signature.attrs
+    meanings = dict(
+        zip(np.atleast_1d(flags["flag_values"]).tolist(), flags["flag_meanings"].split())
+    )
+    out = []
+    for i in range(len(cases)):
+        row = found.isel(case=i)
+        out.append(
+            Label(
+                str(row.kind.values),
+                float(row.period),
+                _turn(meanings[int(row.signature)]),
+                (float(row.x1_min), float(row.x1_max)),
+                (float(row.x2_min), float(row.x2_max)),
+                tuple(row.stick_duration.values.tolist()),
+                int(row.status),
+            )
+        )
+    return out
+
+
+def _turn(word):
+    """A signature's word as events, (kind, belt) each; None where it was too long."""
+    if word in ("none", "smooth"):
+        return ()
+    if word == "long":
+        return None
+    events = []
+    for part in word.split("-"):
+        name = part.rstrip("0123456789")
+        events.append((int(jb.EventKind[name.upper()]), int(part[len(name) :])))
+    return tuple(events)
+
+
+# ---------------------------------------------------------------- simulate
+
+#: Runs in one vmapped call.
+CHUNK = 64
+
+
+@functools.cache
+def _trajectories(structure, T, tol, max_segments):
+    def one(row, y0):
+        found = jb.simulate(
+            _from_numbers(structure, row),
+            y0,
+            T,
+            ts=jnp.array([T]),
+            rtol=tol,
+            atol=tol,
+            max_segments=max_segments,
+        )
+        return found.ys[-1], found.modes[-1], found.events, found.status
+
+    return jax.jit(jax.vmap(one))
+
+
+def simulated(cases, tol, max_segments=None):
+    """Trajectories by `simulate`, vmapped over cases of one structure and one T."""
+    run = _trajectories(cases[0].structure, cases[0].T, tol, max_segments)
+    out = []
+    for first in range(0, len(cases), CHUNK):
+        some = cases[first : first + CHUNK]
+        padded = some + [some[0]] * (CHUNK - len(some))
+        table = jnp.array([numbers(case) for case in padded])
+        found = run(table, jnp.array([case.y0 for case in padded], dtype=float))
+        ys, modes, events, status = jax.tree.map(np.asarray, found)
+        for i in range(len(some)):
+            known = events.kind[i] > 0
+            rows = zip(
+                events.t[i][known].tolist(),
+                events.kind[i][known].tolist(),
+                events.belt[i][known].tolist(),
+                *events.y[i][known].T.tolist(),
+            )
+            out.append(
+                Final(
+                    *map(float, ys[i]),
+                    tuple(modes[i].tolist()),
+                    int(known.sum()),
+                    int(status[i]),
+                    tuple(rows),
+                )
+            )
+    return out
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+@functools.cache
+def _pushed(structure, T, tol):
+    def end(row, y0):
+        found = jb.simulate(
+            _from_numbers(structure, row), y0, T, ts=jnp.array([T]), rtol=tol, atol=tol
+        )
+        return found.ys[-1]
+
+    return jax.jit(jax.vmap(lambda row, y0, d: jax.jvp(end, (row, y0), d)[1]))
+
+
+def derivatives(cases, directions, tol, by):
+    """d(x1, x2 at T) along a direction a case, by "simulate" or by the "sweep"."""
+    if by == "sweep":
+        found = swept(cases, "final", directions, t1=cases[0].T, rtol=tol, atol=tol)
+        return np.column_stack([found.d_x1_end_d_case.values, found.d_x2_end_d_case.values])
+    run, out = _pushed(cases[0].structure, cases[0].T, tol), []
+    for first in range(0, len(cases), CHUNK):
+        some = cases[first : first + CHUNK]
+        padding = CHUNK - len(some)
+        rows, moves = zip(*map(tangent, some, directions[first : first + CHUNK]))
+        table = [numbers(case) for case in some]
+        starts = [case.y0 for case in some]
+        parts = (
+            jnp.array(list(part) + [part[0]] * padding, dtype=float)
+            for part in (table, starts, rows, moves)
+        )
+        table, starts, rows, moves = parts
+        out.append(np.asarray(run(table, starts, (rows, moves)))[: len(some)])
+    return np.concatenate(out)
