@@ -8,7 +8,7 @@ J. Kurths, How basin stability complements the linear-stability paradigm, Nature
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,17 +16,15 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from . import batch
+from .attractors import Runs, is_same
 from .checks import as_array, check_finite, require
 from .cycles import Cycle, find_cycle, unstable_cycle
-from .equilibria import equilibria
+from .equilibria import EquilibriumKind, equilibria
 from .oscillator import Oscillator, check_oscillator
 from .sweep import LONG_ENOUGH, sweep
 
 if TYPE_CHECKING:
     import xarray
-
-#: Attractors of one kind whose extrema differ by less than this are one.
-SAME = 1e-4
 
 
 class Basins(eqx.Module):
@@ -108,52 +106,82 @@ def basins(
         observe="attractor",
         progress=progress,
     )
-    labels, attractors = _labels(oscillator, dataset)
+    labels, attractors, cycles = _labels(oscillator, dataset)
     dataset["label"] = (
         ("x1", "x2"),
         labels,
         {"long_name": "number of the attractor", "attractors": list(attractors)},
     )
-    cycles = []
-    for i, name in enumerate(attractors):
-        if name.startswith("cycle"):
-            j, k = np.argwhere(labels == i)[0]
-            cycles.append(find_cycle(oscillator, (float(dataset.x1[j]), float(dataset.x2[k]))))
-    return Basins(oscillator, dataset, attractors, tuple(cycles), unstable_cycle(oscillator))
+    return Basins(oscillator, dataset, attractors, cycles, unstable_cycle(oscillator))
 
 
-def _labels(osc: Oscillator, dataset: "xarray.Dataset") -> tuple[np.ndarray, tuple[str, ...]]:
-    """Numbers of the attractors, the most frequent first, and their names."""
+def _labels(
+    osc: Oscillator, dataset: "xarray.Dataset"
+) -> tuple[np.ndarray, tuple[str, ...], tuple[Cycle, ...]]:
+    """Numbers of the attractors, the most frequent first, names, and those that are cycles."""
     kinds = np.asarray(dataset["kind"])
     sticks = np.asarray(dataset["sticks"]).astype(bool)
     low, high = np.asarray(dataset["x1_min"]), np.asarray(dataset["x1_max"])
-    resting = kinds == "equilibrium"
-    rest = _nearest_equilibrium(osc, 0.5 * (low + high))
-    low, high = np.where(resting, rest, low), np.where(resting, rest, high)
-    labels = np.full(kinds.shape, -1)
-    found: list[tuple[int, str, np.ndarray]] = []
+    rest, held = _rest_reached(osc, 0.5 * (low + high))
+    runs = Runs.of(dataset, ("x1", "x2"))
+    found: list[_Attractor] = []
     left = kinds != "undecided"
     while np.any(left):
-        first = np.unravel_index(np.argmax(left), left.shape)
-        same = left & (kinds == kinds[first]) & np.all(sticks == sticks[first], axis=-1)
-        # A mass that is stuck for ever may be so anywhere on a segment.
-        if kinds[first] != "stuck":
-            same &= (np.abs(low - low[first]) < SAME) & (np.abs(high - high[first]) < SAME)
+        first = tuple(int(i) for i in np.unravel_index(np.argmax(left), left.shape))
+        kind, stuck = kinds[first], sticks[first]
+        same, cycle, before = left & (kinds == kind), None, None
+        if kind == "cycle":
+            cycle = find_cycle(osc, (float(dataset.x1[first[0]]), float(dataset.x2[first[1]])))
+            # Runs that differ by what a sweep does not tell exactly may still be of one cycle.
+            before = next((one for one in found if one.is_of(cycle)), None)
+            same &= runs.same(runs.at(first))[0]
+        else:
+            # A mass that is stuck for ever may be so anywhere on a segment.
+            place = rest if kind == "equilibrium" else held
+            same &= np.all(sticks == stuck, axis=-1) & (place == place[first])
         left &= ~same
-        found.append((int(np.sum(same)), _name(kinds[first], sticks[first], low[first]), same))
-    found.sort(key=lambda item: -item[0])
-    for i, (_, _, same) in enumerate(found):
-        labels[same] = i
-    return labels, tuple(name for _, name, _ in found)
+        if before is None:
+            found.append(_Attractor(_name(kind, stuck, rest[first]), same, cycle))
+        else:
+            before.runs[same] = True
+    found.sort(key=lambda one: -int(np.sum(one.runs)))
+    labels = np.full(kinds.shape, -1)
+    for i, one in enumerate(found):
+        labels[one.runs] = i
+    cycles = tuple(one.cycle for one in found if one.cycle is not None)
+    return labels, tuple(one.name for one in found), cycles
 
 
-def _nearest_equilibrium(osc: Oscillator, x1: np.ndarray) -> np.ndarray:
-    """The x1 of the stable equilibrium nearest to each: a run ends in its neighbourhood."""
+class _Attractor(NamedTuple):
+    """Its name, which runs lead to it, and, of a cycle, what shooting finds from one of them."""
+
+    name: str
+    runs: np.ndarray
+    cycle: Cycle | None
+
+    def is_of(self, cycle: Cycle) -> bool:
+        """Whether it is that cycle."""
+        return self.cycle is not None and is_same(self.cycle, cycle)
+
+
+def _rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of an equilibrium that each may have come to: its x1, and the number of its segment.
+
+    A run ends in the neighbourhood of the equilibrium. A segment across an edge is in pieces.
+    """
     found = equilibria(osc)
-    rests = np.asarray(found.x1)[np.asarray(found.stable)]
-    if rests.size == 0:
-        return x1
-    return rests[np.argmin(np.abs(x1[..., None] - rests), axis=-1)]
+    is_segment = np.asarray(found.kind) == EquilibriumKind.SEGMENT
+    is_point = ~is_segment & np.asarray(found.stable)
+    lower, upper = np.asarray(found.x1_lower), np.asarray(found.x1_upper)
+    points, pieces = np.asarray(found.x1)[is_point], np.stack([lower, upper], 1)[is_segment]
+    rest, segment = x1, np.zeros(x1.shape, int)
+    if len(points):
+        rest = points[np.argmin(np.abs(x1[..., None] - points), axis=-1)]
+    if len(pieces):
+        apart = np.append(0, np.cumsum(pieces[1:, 0] > pieces[:-1, 1]))
+        outside = np.maximum(pieces[:, 0] - x1[..., None], x1[..., None] - pieces[:, 1])
+        segment = apart[np.argmin(outside, axis=-1)]
+    return rest, segment
 
 
 def _name(kind: str, sticks: np.ndarray, x1: float) -> str:

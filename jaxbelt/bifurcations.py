@@ -618,18 +618,34 @@ def _touching(osc: Oscillator, orbit: Orbit, belts: Array, wanted: Array, size: 
     )
     orbit = jax.tree.map(lambda a, b: jnp.where(repeated, a, b), orbit, first_turn)
     _, count = last_turn(orbit)
-    turn, row, found = _with_stick(still, turn_of(orbit, size, n), belt)
-    chain, z = meshed(still, turn)
-
-    usable = found & (repeated | returns)
-    status = jnp.where(usable, Status.OK.value, Status.NOT_TOUCHED.value)
+    status = jnp.where(repeated | returns, Status.OK.value, Status.NOT_TOUCHED.value)
     # It may need one arc more.
-    status = jnp.where(usable & (count >= size), Status.TOO_MANY_ARCS.value, status)
-    status = jnp.where(velocity == 0, Status.STUCK_FOREVER.value, status)
+    status = jnp.where((status == Status.OK) & (count >= size), Status.TOO_MANY_ARCS.value, status)
+    return _tangent(still, belts, wanted, turn_of(orbit, size, n), status)
 
+
+def tangency_near(osc: Oscillator, index: int | Array, belts: Array, turn: Turn, status: Array):
+    """The cycle near a turn that is tangent to the boundary of a belt; status: of the turn."""
+    return _solved_point(osc, index, *_tangent_cycle(osc, belts, turn, status))
+
+
+@jit
+def _tangent_cycle(osc: Oscillator, belts: Array, turn: Turn, status: Array):
+    fits = jnp.sum(turn.used) < turn.ends.size
+    status = jnp.where(fits | (status != Status.OK), status, Status.TOO_MANY_ARCS.value)
+    return _tangent(lax.stop_gradient(osc), belts, jnp.zeros(()), turn, status)
+
+
+def _tangent(osc: Oscillator, belts: Array, wanted: Array, turn: Turn, status: Array):
+    """The system of a tangency with a guess of its unknowns, a status, and the judge."""
+    belt = belts[0]
+    turn, row, found = _with_stick(osc, turn, belt)
+    chain, z = meshed(osc, turn)
+    status = jnp.where(found | (status != Status.OK), status, Status.NOT_TOUCHED.value)
+    status = jnp.where(_velocity(osc, belt) == 0, Status.STUCK_FOREVER.value, status)
     # The arc before the stick arc is the one that becomes tangent.
     before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
-    ends = chain.ends.at[before].set(names.tangent + belt)
+    ends = chain.ends.at[before].set(Ends(len(osc.belts)).tangent + belt)
     system = Encounter(Chain(chain.codes, ends, chain.mesh), jnp.stack([belt, belt]))
     return system, z, status, eqx.Partial(_judge_encounter, belts, wanted, row)
 

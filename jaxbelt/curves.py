@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .attractors import extent, place_of
 from .bifurcations import (
     HINT_BUDGET,
     AbstractCondition,
@@ -69,7 +70,7 @@ from .cycles import (
     trace_of,
 )
 from .detection import refined, sudden_sliding
-from .equilibria import EquilibriumKind, equilibria
+from .equilibria import Equilibria, EquilibriumKind, equilibria
 from .modes import boundary_guards, edge_guards, mode_acceleration, mode_of
 from .oscillator import Oscillator
 from .parameters import leaf_index, names_of, parameter, vary
@@ -88,6 +89,12 @@ STEPS = 48
 #: How often the points on both sides of a singular one are brought nearer to it by half; much
 #: nearer Newton's method fails.
 SHRINKS = 8
+
+
+#: The place of nothing.
+NOWHERE = np.full(5, np.nan)
+#: A cycle changes by less in a step, relative to its size; a fixed point by less.
+FAR = 0.2
 
 
 class SpecialPoint(NamedTuple):
@@ -113,7 +120,9 @@ class BifurcationCurve(eqx.Module):
 
     condition: that of the point it began with; values: of the parameters, [rows, 2]; kinds: name of
     the condition that holds there, a row each; multiplier: of the cycle without the stick phase
-    that vanishes, [rows], NaN where there is none; residual: [rows]; special: points of codimension
+    that vanishes, [rows], NaN where there is none; residual: [rows]; places: of the cycle, or of
+    the fixed point, smallest and largest x1, the same of x2, and the period, [rows, 5], NaN where
+    there is none; special: points of codimension
     two, in order; ends: why it ends at the first and the last row; names: of the parameters.
     `path`, `table()` and `plot()` have rows and special points together.
     """
@@ -123,6 +132,7 @@ class BifurcationCurve(eqx.Module):
     kinds: tuple[str, ...] = eqx.field(static=True)
     multiplier: np.ndarray
     residual: np.ndarray
+    places: np.ndarray
     special: tuple[SpecialPoint, ...] = eqx.field(static=True)
     ends: tuple[End, End] = eqx.field(static=True)
     names: tuple[str, str] = eqx.field(static=True)
@@ -230,10 +240,25 @@ def bifurcation_curve(
         kinds=tuple(row.kind for row in rows),
         multiplier=np.array([row.multiplier for row in rows]),
         residual=np.array([row.residual for row in rows]),
+        places=np.array([row.place for row in rows]),
         special=(*reversed(behind.special), *ahead.special),
         ends=(behind.end, ahead.end),
         names=(names[0], names[1]),
     )
+
+
+def place_at(point: BifurcationPoint) -> np.ndarray:
+    """Where the cycle, or the fixed point, of a bifurcation point is; NaN where there is none."""
+    if isinstance(point.condition, Hopf):
+        rests = equilibria(point.oscillator)
+        return _at_rest(float(rests.x1[_row_at_hopf(rests)]))
+    return place_of(point.cycle) if point.cycle.status == Status.OK else NOWHERE
+
+
+def is_elsewhere(place: np.ndarray, other: np.ndarray, far: float) -> bool:
+    """Whether two places a step or less apart are of two cycles, or fixed points, where known."""
+    size = max(np.ptp(place[:4]), np.ptp(other[:4]), far)
+    return bool(np.max(np.abs(place - other)[:4]) > far * size)
 
 
 # --- going along ----------------------------------------------------------------------------------
@@ -253,6 +278,7 @@ class _Row(NamedTuple):
     kind: str
     multiplier: float
     residual: float
+    place: np.ndarray
 
 
 class _Side(NamedTuple):
@@ -287,7 +313,8 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
         # The signature has changed between the last two points.
         centre = np.array(found[-1].values) if found else 0.5 * (last + beyond.u)[-2:]
         is_end = bool(found) and isinstance(problem.condition, FoldOfCycles)
-        further = None if is_end else _beyond(problem, last[-2:], centre)
+        place = points[-1][1].place
+        further = None if is_end else _beyond(problem, last[-2:], centre, place)
         if further is None:
             return _Side(rows, special, End.STOPPED)
         system = _system_of(problem, further)
@@ -363,7 +390,7 @@ def _row(problem: _Problem, at: CurvePoint, seen: "_Seen") -> _Row:
             vary(problem.osc, problem.indices, jnp.asarray(at.u[-2:])), problem.condition.belt
         )
     kind = kind.__name__
-    return _Row(at.u[-2:], kind, seen.multiplier, seen.residual)
+    return _Row(at.u[-2:], kind, seen.multiplier, seen.residual, seen.place)
 
 
 def _between(problem: _Problem, system: "_System", before, after) -> list[SpecialPoint]:
@@ -441,8 +468,10 @@ def _from_both_sides(probe: Callable[[float], _Probe], low: _Probe, high: _Probe
     return _Probe(float(best[0]), 0.0, best[1:], residual)
 
 
-def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
+def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np.ndarray):
     """The point of the same condition just beyond a change of signature, or None.
+
+    It is the same cycle, in much the same place.
 
     The curve may have a corner there. So it is looked for all around the change, less where the
     curve came from.
@@ -457,7 +486,7 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray):
             for offset in (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0):
                 guess = float(values[free]) + offset * problem.step
                 point = refined(held, problem.indices[free], guess, condition)
-                if point is None:
+                if point is None or is_elsewhere(place_at(point), place, FAR):
                     continue
                 if isinstance(condition, GrazingEdge | CornerCollision):
                     if point.condition != condition:
@@ -494,7 +523,8 @@ def _towards(problem: _Problem, last: np.ndarray, limit: SpecialPoint) -> list[_
         if point is None or abs(float(point.value) - guess[1 - held]) > problem.step:
             break
         guess[1 - held] = float(point.value)
-        rows.append(_Row(guess, point.kind, float(point.multiplier), float(point.residual)))
+        numbers = float(point.multiplier), float(point.residual)
+        rows.append(_Row(guess, point.kind, *numbers, place_at(point)))
     return rows
 
 
@@ -647,12 +677,14 @@ def _sought(condition: AbstractCondition) -> AbstractCondition:
 
 
 class _Seen(NamedTuple):
-    """What is watched at a point: functions by (name, belts), whether there is such a motion."""
+    """What is watched at a point: functions by (name, belts), whether there is such a motion; and
+    where it is, see `place_at`."""
 
     tests: dict[tuple[str, tuple[int, ...]], float]
     valid: bool
     multiplier: float
     residual: float
+    place: np.ndarray
 
 
 class _System:
@@ -722,8 +754,7 @@ class _HopfSystem(_System):
     def __init__(self, problem: _Problem, point: BifurcationPoint):
         self._indices = problem.indices
         rests = equilibria(point.oscillator)
-        fixed = np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT
-        row = int(np.argmin(np.where(fixed, np.abs(np.asarray(rests.rate)), np.inf)))
+        row = _row_at_hopf(rests)
         self._x1 = float(rests.x1[row])
         codes = jnp.asarray(rests.modes[row]).astype(float)
         self.residual = _rest_equations
@@ -736,7 +767,17 @@ class _HopfSystem(_System):
     def look(self, u):
         tests, valid, residual = _look_at_rest(self.args, jnp.asarray(u))
         tests = {name: float(value) for name, value in tests.items()}
-        return _Seen(tests, bool(valid), np.nan, float(residual))
+        return _Seen(tests, bool(valid), np.nan, float(residual), _at_rest(u[0]))
+
+
+def _row_at_hopf(rests: Equilibria) -> int:
+    """Of the equilibria at a Hopf point that which it concerns."""
+    fixed = np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT
+    return int(np.argmin(np.where(fixed, np.abs(np.asarray(rests.rate)), np.inf)))
+
+
+def _at_rest(x1: float) -> np.ndarray:
+    return np.array([x1, x1, 0.0, 0.0, 0.0])
 
 
 def _rest_equations(u: Array, args) -> Array:
@@ -819,7 +860,7 @@ class _RestSystem(_System):
         osc, indices, belt = self.args
         tests = _velocity_tests(jax.tree.map(np.asarray, vary(osc, indices, jnp.asarray(u))))
         tests = {name: float(v) for name, v in tests.items() if name[1] != (int(belt),)}
-        return _Seen(tests, True, np.nan, 0.0)
+        return _Seen(tests, True, np.nan, 0.0, NOWHERE)
 
 
 def _kind_at_rest(osc: Oscillator, belt: int) -> type[AbstractCondition]:
@@ -851,7 +892,7 @@ class _EdgeSystem(_System):
     def look(self, u):
         tests, valid, residual = _look_at_edge(self.args, jnp.asarray(u))
         tests = {name: float(value) for name, value in tests.items()}
-        return _Seen(tests, bool(valid), np.nan, float(residual))
+        return _Seen(tests, bool(valid), np.nan, float(residual), NOWHERE)
 
 
 @jit
@@ -913,7 +954,9 @@ class _CycleSystem(_System):
     def look(self, u):
         tests, valid, multiplier, residual = _look_at_cycle(self.args, jnp.asarray(u))
         tests = {name: float(value) for name, value in tests.items()}
-        return _Seen(tests, bool(valid), float(multiplier), float(residual))
+        rows = (u[:-2] / np.asarray(self.args[4])).reshape(-1, 3)
+        place = extent(rows[np.asarray(self.args[2].chain.used)])
+        return _Seen(tests, bool(valid), float(multiplier), float(residual), place)
 
     def renewed(self, u, tangent):
         args = _meshed_anew(self.args, jnp.asarray(u))

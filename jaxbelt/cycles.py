@@ -496,6 +496,7 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     amplitude = top - orbit.low
     rows = jnp.arange(orbit.tops.size)
     same = jnp.abs(orbit.tops - top) < REPEATED * amplitude
+    same = same & jnp.all(orbit.codes == codes[None], axis=-1)
     repeats = jnp.max(jnp.where(same, rows, -1))
     before = jnp.max(jnp.where(jnp.isnan(orbit.tops), -1, rows))
     # An orbit that sticks is on a cycle, however small: it repeats exactly.
@@ -732,24 +733,33 @@ def as_turn(cycle: Cycle, size: int) -> Turn:
     return Turn(chain.codes[source], ends, z[source, :2], jnp.where(own, z[source, 2], 0.0))
 
 
+def modes_of(turn: Chain | Turn) -> np.ndarray:
+    """The contact codes of the arcs of one turn, [arcs, belts], without those that are unused."""
+    codes, ends = np.asarray(turn.codes), np.asarray(turn.ends)
+    return codes[ends != Ends(codes.shape[-1]).unused].astype(int)
+
+
+def event_between(before: Sequence[int], after: Sequence[int]) -> tuple[EventKind, int]:
+    """The event, (kind, belt), that leads from one mode to another one, by their contact codes.
+
+    Of several belts concerned the lowest.
+    """
+    pairs = list(zip(before, after, strict=True))
+    changes = {
+        EventKind.EDGE: [(abs(a) < 2) != (abs(b) < 2) for a, b in pairs],
+        EventKind.STICK: [a != 0 and b == 0 for a, b in pairs],
+        EventKind.SLIP: [a == 0 and b != 0 for a, b in pairs],
+        EventKind.CROSS: [a != b for a, b in pairs],
+    }
+    kind = next(kind for kind, changed in changes.items() if any(changed))
+    return kind, changes[kind].index(True)
+
+
 def turn_events(turn: Chain | Turn) -> tuple[tuple[EventKind, int], ...]:
     """The events of one turn, (kind, belt) each; for EDGE the lowest belt that comes or goes."""
-    codes, ends = np.asarray(turn.codes), np.asarray(turn.ends)
-    n = codes.shape[-1]
-    names = Ends(n)
-    used = ends != names.unused  # not `turn.used`: what is looked at here may be NumPy's
-    codes, ends = codes[used], ends[used].tolist()
-    events = []
-    for end, before, after in zip(ends, codes, np.roll(codes, -1, axis=0), strict=True):
-        if end < n:
-            kind = EventKind.STICK if after[end] == 0 else EventKind.CROSS
-            events.append((kind, end))
-        elif end < 3 * n:
-            changes = (np.abs(before) < 2) != (np.abs(after) < 2)
-            events.append((EventKind.EDGE, int(np.argmax(changes))))
-        elif end == names.onset:
-            events.append((EventKind.SLIP, int(np.argmax(before == 0))))
-    return tuple(events)
+    modes = modes_of(turn).tolist()
+    pairs = zip(modes, modes[1:] + modes[:1], strict=True)
+    return tuple(event_between(before, after) for before, after in pairs if before != after)
 
 
 @jit
@@ -940,10 +950,11 @@ def room_of(arcs: int) -> int:
     return next(size for size in SIZES if size >= arcs)
 
 
-def cut(turns: Sequence[Turn]) -> list[Turn]:
-    """The turns, known ones, with no more room for their arcs than the longest of them needs."""
+def cut(turns: Sequence[Turn], *, more: int = 0) -> list[Turn]:
+    """The turns, known ones, with no more room than the longest of them needs, and some more."""
     unused = Ends(turns[0].codes.shape[-1]).unused
-    room = slice(room_of(max(int(np.sum(np.asarray(turn.ends) != unused)) for turn in turns)))
+    longest = max(int(np.sum(np.asarray(turn.ends) != unused)) for turn in turns)
+    room = slice(room_of(min(longest + more, SIZES[-1])))
     return [jax.tree.map(lambda leaf: leaf[room], turn) for turn in turns]
 
 

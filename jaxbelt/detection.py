@@ -1,12 +1,15 @@
 """Bifurcation points along a path in one parameter, found without a guess: `scan`.
 
 What the oscillator does at one value of the parameter is summed up in a label: the kind and the
-stability of every equilibrium, and the signature of every attracting cycle, that is, which belts
-it sticks to, slips from and crosses and which contact edges it passes, in the order of one turn. A
+stability of every equilibrium, and the itinerary of every attracting cycle, that is, the modes that
+it passes in one turn, see `attractors`. A
 cycle that sticks comes by a place where a stick phase ends, in slip onset or on a contact edge, so
 it is found by following the orbits from there; a few starts beside the equilibria find the rest.
 
-Between two values with one label nothing is taken to happen. Where labels differ the interval is
+Between two values with one label nothing is taken to happen, if each cycle at one of them goes on
+to one at the other. One that sticks does so if they have one itinerary. Of those that do not stick
+several may have it: each is followed to where its derivative by the parameter leads. Where labels
+differ, or cycles do not go on, the interval is
 narrowed until Newton's method converges from its ends. The conditions that could make this
 difference are refined from there, and what is found inside the interval is a bifurcation point. The
 same is then asked of what is left of the interval on either side, so that points are found that lie
@@ -28,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .attractors import SOLVED, Itinerary, apart, events_of, itinerary, place_of, sticks
 from .bifurcations import (
     AbstractCondition,
     BeltAtRest,
@@ -47,6 +51,8 @@ from .bifurcations import (
     at_edge,
     at_edge_unstable,
     at_exchange,
+    at_fold_of_cycles,
+    at_tangency,
     crossing_near,
     edge_contact,
     end_near_edge,
@@ -55,24 +61,26 @@ from .bifurcations import (
     room_for,
     settled_turns,
     solver_of,
+    tangency_near,
     unexplained_point,
 )
 from .checks import as_array, check_finite, require
 from .compiling import each, jit
 from .cycles import (
+    AT_REST,
     SIZES,
     Cycle,
     Turn,
     as_turn,
     cut,
     find_cycle,
-    turn_events,
+    polish,
     unstable_cycle,
 )
 from .equilibria import EquilibriumKind, equilibria
 from .oscillator import Oscillator, check_oscillator
 from .parameters import leaf_index, names_of, vary
-from .results import EventKind, Status, of_one_turn
+from .results import EventKind, Status
 
 #: Values of the parameter in one batch.
 BATCH = 32
@@ -82,6 +90,11 @@ ROOM = SIZES[1]
 NEAR = 1 / 400
 #: Nothing closer than this, and this fraction of the span, is told apart.
 CLOSE = 1e-6
+#: The fraction of a step along the path by which the derivative of a cycle is taken.
+DIFFERENCE = 1e-3
+#: A cycle is where it is expected if it is no further from there, relative to its size, or than
+#: a third of the way that it is expected to go. Nearer to a square root, intervals get smaller.
+EXPECTED = 1e-3
 
 
 def scan(
@@ -154,12 +167,12 @@ def edges_touched(path: "Path", values: np.ndarray, around: int) -> tuple[Bifurc
     def unstable(value):
         return path.unstable(value, around)
 
-    def signature(value):
-        return of_one_turn(unstable(value).signature)
+    def modes(value):
+        return itinerary(unstable(value).chain)
 
     def changes(values):
         known = [v for v in map(float, values) if unstable(v).status == Status.OK]
-        return [(a, b) for a, b in pairwise(known) if a < b and signature(a) != signature(b)]
+        return [(a, b) for a, b in pairwise(known) if a < b and modes(a) != modes(b)]
 
     points, intervals = [], changes(values) if path.edged else []
     while intervals:
@@ -188,30 +201,39 @@ def edges_touched(path: "Path", values: np.ndarray, around: int) -> tuple[Bifurc
 # --- what the oscillator does at one value --------------------------------------------------------
 
 
-#: The events of one turn, (kind, belt) each.
-Signature = tuple[tuple[EventKind, int], ...]
-
-
 class Label(NamedTuple):
-    """What there is at one value: (kind, stable) of the equilibria from left to right, and the
-    signatures of the attracting cycles, each from the same place in the turn."""
+    """What there is at one value: (kind, stable, contact codes) of the equilibria from left to
+    right, and the itineraries of the attracting cycles in order."""
 
-    equilibria: tuple[tuple[int, bool], ...]
-    cycles: frozenset[Signature]
+    equilibria: tuple[tuple[int, bool, tuple[int, ...]], ...]
+    cycles: tuple[Itinerary, ...]
 
     def events(self, kind: EventKind) -> Counter[int]:
         """How often there is an event of a kind in the cycles, by its belt."""
-        return Counter(belt for cycle in self.cycles for one, belt in cycle if one == kind)
+        return Counter(belt for path in self.cycles for one, belt in events_of(path) if one == kind)
 
     @property
     def foci(self) -> int:
         """How many equilibria attract, but for segments."""
-        return sum(stable and kind != EquilibriumKind.SEGMENT for kind, stable in self.equilibria)
+        return sum(
+            stable and kind != EquilibriumKind.SEGMENT for kind, stable, _ in self.equilibria
+        )
 
     @property
     def smooth(self) -> int:
         """How many cycles stick to no belt."""
-        return sum(not _sticks(cycle) for cycle in self.cycles)
+        return sum(not sticks(path) for path in self.cycles)
+
+
+class Found(NamedTuple):
+    """An attracting cycle: its itinerary, and a turn of it, with ROOM arcs.
+
+    The turn of one that does not stick solves the equations of the cycle, but where `approach` did
+    not tell where the orbit settles.
+    """
+
+    path: Itinerary
+    turn: Turn
 
 
 class Path:
@@ -230,9 +252,11 @@ class Path:
         self.length = self.last - self.first
         self.name = names_of(osc)[int(self.index)]
         self.labels: dict[float, Label] = {}
-        self.turns: dict[float, dict[Signature, Turn]] = {}
+        self.cycles: dict[float, list[Found]] = {}
         self.unstable_cycles: dict[tuple[float, int], Cycle] = {}
-        self._missing: set[tuple[float, float, Signature]] = set()
+        # From which value to which other one, from which cycle to which, of those that do not
+        # stick; None where there is none.
+        self._goes_on: dict[tuple[float, float], dict[int, int | None]] = {}
         self.breaks = self._coincidences()
 
     def at(self, value: float) -> Oscillator:
@@ -289,9 +313,8 @@ class Path:
         for batch in (new[i : i + BATCH] for i in range(0, new.size, BATCH)):
             filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
             seen = jax.tree.map(np.asarray, _look(self.osc, self.index, jnp.asarray(filled)))
-            for lane, value in enumerate(batch):
-                at_value = jax.tree.map(lambda x, i=lane: x[i], seen)
-                self.labels[float(value)], self.turns[float(value)] = _label(at_value)
+            for lane, value in enumerate(batch.tolist()):
+                self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen))
         self._share()
 
     def changes(self, settled: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -299,9 +322,50 @@ class Path:
         return [
             (a, b)
             for a, b in pairwise(sorted(self.labels))
-            if self.labels[a] != self.labels[b]
-            and not any(low <= a and b <= high for low, high in settled)
+            if not any(low <= a and b <= high for low, high in settled)
+            and not (self.labels[a] == self.labels[b] and self._all_go_on(a, b))
         ]
+
+    def _take(self, value: float, seen: "_Seen") -> None:
+        """Label a value by what was seen there."""
+        exists = seen.kind > 0
+        modes = map(tuple, seen.modes[exists].tolist())
+        rests = tuple(
+            zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), modes, strict=True)
+        )
+        found: list[Found] = []
+        turns = [jax.tree.map(lambda x, i=i: x[i], seen.turn) for i in range(len(seen.status))]
+        for turn, status in zip(turns, seen.status.tolist(), strict=True):
+            one = self._settled(value, turn) if status == Status.OK else None
+            if one is not None and _number(one, found) is None:
+                found.append(one)
+        if not found and not any(stable for _, stable, _ in rests):
+            # Nothing holds the orbits but a cycle that they approach slowly.
+            found.append(self._settled(value, turns[-1]) or Found((), turns[-1]))
+        self.cycles[value] = found
+        self._name(value, rests)
+
+    def _name(self, value: float, rests) -> None:
+        self.labels[value] = Label(rests, tuple(sorted(one.path for one in self.cycles[value])))
+
+    def _settled(self, value: float, turn: Turn) -> Found | None:
+        """The attracting cycle that a turn is nearly one of, or None.
+
+        A turn that sticks is one of it. Any other may only seem to repeat.
+        """
+        if sticks(path := itinerary(turn)):
+            return Found(path, turn)
+        # Where the cycle has other turns than those from which it is solved for, or meets a
+        # boundary, it is followed.
+        osc, ok = self.at(value), jnp.asarray(Status.OK.value)
+        ways = (lambda: polish(osc, cut([turn])[0], ok), lambda: find_cycle(osc, turn.entries[0]))
+        for cycle in (way() for way in ways):
+            if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
+                # Not the equilibrium, to which a cycle may shrink.
+                if np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST:
+                    turn = jax.tree.map(np.asarray, as_turn(cycle, ROOM))
+                    return Found(itinerary(turn), turn)
+        return None
 
     def _share(self) -> None:
         """Let values know cycles that attract at the ones beside them.
@@ -311,33 +375,96 @@ class Path:
         """
         values = sorted(self.labels)
         for pairs in (pairwise(values), pairwise(values[::-1])):
-            for known, value in pairs:
-                for signature in self.labels[known].cycles - self.labels[value].cycles:
-                    if not _sticks(signature) and (known, value, signature) not in self._missing:
-                        self._carry(known, value, signature)
+            for a, b in pairs:
+                known, come = self._goes_on.setdefault((a, b), {}), self._goes_on.get((b, a), {})
+                known |= {i: j for j, i in come.items() if i is not None}
+                for i, one in enumerate(self.cycles[a]):
+                    if i not in known and one.path and not sticks(one.path):
+                        known[i] = self._followed(a, b, i)
 
-    def _carry(self, known: float, value: float, signature: Signature) -> None:
-        """Look for a cycle that attracts at one value at another one."""
-        turn = self.turns[known][signature]
-        # Followed, not only solved for: its turns may be others, though its events are not.
-        cycle = find_cycle(self.at(value), turn.entries[0])
-        attracts = int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1
-        # Not the equilibrium, to which a cycle may shrink.
-        same = np.ptp(np.asarray(cycle.unknowns)[:, 0]) > 0.5 * np.ptp(turn.entries[:, 0])
-        if attracts and same and of_one_turn(cycle.signature) == signature:
-            self.turns[value][signature] = jax.tree.map(np.asarray, as_turn(cycle, ROOM))
-            before = self.labels[value]
-            self.labels[value] = Label(before.equilibria, before.cycles | {signature})
-        else:
-            self._missing.add((known, value, signature))
+    def _all_go_on(self, a: float, b: float) -> bool:
+        """Whether the cycles at one value that do not stick go on to those at another, one each."""
+        ahead = self._goes_on[a, b] | {
+            i: j for j, i in self._goes_on[b, a].items() if i is not None
+        }
+        reached = [j for j in ahead.values() if j is not None]
+        smooth = [i for i, one in enumerate(self.cycles[a]) if one.path and not sticks(one.path)]
+        return len(set(reached)) == len(smooth) and all(ahead.get(i) is not None for i in smooth)
+
+    def _followed(self, known: float, value: float, number: int) -> int | None:
+        """The number of the cycle at one value to which one at another value goes on, or None.
+
+        It is looked for where that is expected to be, by its derivative.
+        """
+        path, turn = self.cycles[known][number]
+        step = value - known
+        nearby = self._settled(known + DIFFERENCE * step, turn)
+        expected = turn
+        if nearby is not None and nearby.path == path and _fits(nearby.turn, turn):
+            expected = jax.tree.map(lambda a, b: a + (b - a) / DIFFERENCE, turn, nearby.turn)
+            expected = replace(turn, entries=expected.entries, durations=expected.durations)
+        found = self._settled(value, expected)
+        if found is None or found.path != path:
+            return None
+        places = [place_of(one) for one in (turn, expected, found.turn)]
+        if apart(places[1], places[2]) > EXPECTED * (1 + 300 * apart(places[0], places[1])):
+            return None
+        at = _number(found, self.cycles[value])
+        if at is None:
+            at = len(self.cycles[value])
+            self.cycles[value].append(found)
+            self._name(value, self.labels[value].equilibria)
+        return at
+
+    def followed(self, values: Sequence[float]) -> list[dict[float, Turn]]:
+        """The attracting cycles at these values, in order, in which nothing else happens.
+
+        Of each that goes on from value to value its turns, by the value.
+        """
+        strands: list[dict[float, Turn]] = []
+        sticking: dict[Itinerary, dict[float, Turn]] = {}
+        before, smooth = None, {}
+        for value in sorted(v for v in self.labels if values[0] <= v <= values[-1]):
+            here = {}
+            for number, one in enumerate(self.cycles[value]):
+                origin = self._origin(before, value, number)
+                known = sticking.get(one.path) if sticks(one.path) else smooth.get(origin)
+                strand: dict[float, Turn] = {} if known is None else known
+                if known is None:
+                    strands.append(strand)
+                here[number] = strand
+                if sticks(one.path):
+                    sticking[one.path] = strand
+                if value in values:
+                    strand[value] = one.turn
+            before, smooth = value, here
+        return [strand for strand in strands if strand]
+
+    def _origin(self, before: float | None, value: float, number: int) -> int | None:
+        """The number of the cycle at the value before that goes on to one that does not stick."""
+        if before is None:
+            return None
+        back = self._goes_on[value, before].get(number)
+        ahead = self._goes_on[before, value].items()
+        return back if back is not None else next((i for i, j in ahead if j == number), None)
 
     def label(self, value: float) -> Label:
         """The label there, which `look` has found."""
         return self.labels[float(value)]
 
 
-def _sticks(signature: Signature) -> bool:
-    return any(kind == EventKind.STICK for kind, _ in signature)
+def _number(cycle: Found, among: Sequence[Found]) -> int | None:
+    """The number of a cycle among others, or None."""
+    for number, other in enumerate(among):
+        if other.path == cycle.path:
+            if sticks(cycle.path) or apart(place_of(cycle.turn), place_of(other.turn)) < SOLVED:
+                return number
+    return None
+
+
+def _fits(turn: Turn, other: Turn) -> bool:
+    """Whether two turns have the same arcs in the same order."""
+    return np.array_equal(turn.codes, other.codes) and np.array_equal(turn.ends, other.ends)
 
 
 class _Seen(NamedTuple):
@@ -345,6 +472,7 @@ class _Seen(NamedTuple):
 
     kind: Any
     stable: Any
+    modes: Any
     status: Any
     turn: Any
 
@@ -357,22 +485,7 @@ def _look(osc: Oscillator, index: Array, values: Array) -> _Seen:
 def _look_at(osc: Oscillator) -> _Seen:
     rests = equilibria(osc)
     turn, status = settled_turns(osc, rests, ROOM)
-    return _Seen(rests.kind, rests.stable, status, turn)
-
-
-def _label(seen: _Seen) -> tuple[Label, dict[Signature, Turn]]:
-    """The label, and a turn of every cycle in it."""
-    exists = seen.kind > 0
-    rests = tuple(zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), strict=True))
-    cycles: dict[Signature, Turn] = {}
-    for start, status in enumerate(seen.status):
-        turn = jax.tree.map(lambda x, i=start: x[i], seen.turn)
-        if status == Status.OK:
-            cycles.setdefault(of_one_turn(turn_events(turn)), turn)
-        if start == len(seen.status) - 1 and not cycles and not any(stable for _, stable in rests):
-            # Nothing holds the orbits but a cycle that they approach slowly.
-            cycles[()] = turn
-    return Label(rests, frozenset(cycles)), cycles
+    return _Seen(rests.kind, rests.stable, rests.modes, status, turn)
 
 
 # --- what makes the difference between two values -------------------------------------------------
@@ -408,11 +521,13 @@ def _explained(path: Path, a: float, b: float, conditions) -> BifurcationPoint |
 
 def _turns(path: Path, value: float, condition: AbstractCondition) -> Sequence[Turn | None]:
     """Those of the attracting cycles there, for what needs one; None for what finds its own."""
-    turns = path.turns[value]
-    if isinstance(condition, FoldOfCycles):
-        return [*(turn for cycle, turn in turns.items() if not _sticks(cycle)), None]
-    own = solver_of(condition) in (at_edge, at_exchange, at_crossing)
-    return list(turns.values()) if own else [None]
+    cycles, solve = path.cycles[value], solver_of(condition)
+    turns = [one.turn for one in cycles if not sticks(one.path) or solve is not at_fold_of_cycles]
+    if solve is at_tangency:
+        return [None, *turns]
+    if solve is at_fold_of_cycles:
+        return [*turns, None]
+    return turns if solve in (at_edge, at_exchange, at_crossing) else [None]
 
 
 def _local_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
@@ -490,6 +605,8 @@ def refined(
         point = solve(at, index, belts, either, room_for(solve))
     elif isinstance(condition, FoldOfCycles):
         point = fold_near(at, index, cut([turn])[0], known)
+    elif isinstance(condition, NonsmoothFold | GrazingSliding):
+        point = tangency_near(at, index, belts, cut([turn], more=1)[0], known)
     elif isinstance(condition, SlidingExchange):
         point = exchange_near(at, index, belts, cut([turn])[0], known)
     elif isinstance(condition, CrossingSliding):

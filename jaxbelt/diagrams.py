@@ -15,7 +15,7 @@ points are found by `scan` along a few lines across the map, and their curves ar
 """
 
 import importlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple
@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from .attractors import Runs, distinct, lead_to_one_cycle, stuck_belts
 from .bifurcations import (
     AbstractCondition,
     BeltAtRest,
@@ -36,13 +37,13 @@ from .bifurcations import (
 )
 from .checks import as_array, require
 from .compiling import jit
-from .curves import BifurcationCurve, bifurcation_curve
+from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere, place_at
 from .cycles import Cycle, Turn, cut, find_cycle, polish, unstable_cycle
 from .detection import Label, Path, by_value, edges_touched, search
 from .equilibria import EquilibriumKind, candidates, equilibria
 from .oscillator import Oscillator
 from .parameters import set_alone
-from .results import EventKind, Status
+from .results import Status
 from .sweep import sweep
 
 #: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
@@ -184,16 +185,18 @@ def region_name(osc: Oscillator, label: Label) -> str:
     s none. Of several cycles each has its letter.
     """
     velocities = [float(belt.velocity) for belt in osc.belts]
-    return region_of(min(velocities) < 0 < max(velocities), len(velocities), label)
+    opposite = min(velocities) < 0 < max(velocities)
+    rests = any(stable for _, stable, _ in label.equilibria)
+    return region_of(opposite, len(velocities), rests, [stuck_belts(path) for path in label.cycles])
 
 
-def region_of(opposite: bool, belts: int, label: Label) -> str:
-    """The same, where it is known whether belts run in opposite directions, and how many."""
-    rests = any(stable for _, stable in label.equilibria)
-    number = 2 if rests and label.cycles else 3 if label.cycles else 1
+def region_of(opposite: bool, belts: int, rests: bool, cycles: Sequence[Collection[int]]) -> str:
+    """The same, where it is known whether belts run in opposite directions, how many there are,
+    whether an equilibrium is stable, and to which belts each of the cycles sticks."""
+    number = 2 if rests and cycles else 3 if cycles else 1
     letters = []
-    for cycle in label.cycles:
-        code = sum(2**belt for belt in {b for kind, b in cycle if kind == EventKind.STICK})
+    for stuck in cycles:
+        code = sum(2**belt for belt in set(stuck))
         letters.append(chr(ord("a") + code - 1) if code else "s")
     tail = "".join(sorted(letters)) if belts > 1 else "s" * letters.count("s")
     return f"{7 - number if opposite else number}{tail}"
@@ -318,15 +321,10 @@ def _example(values, inside: np.ndarray) -> tuple[float, float]:
 
 def _cycles(osc: Oscillator, starts) -> tuple[Cycle, ...]:
     """The cycles that the starts lead to, and the unstable ones, each once."""
-    found: dict[tuple[float, ...], Cycle] = {}
     rests = equilibria(osc)
     foci = int(np.sum(rests.stable & (rests.kind != EquilibriumKind.SEGMENT)))
     repelling = (unstable_cycle(osc, around=number) for number in range(foci))
-    for cycle in [*(find_cycle(osc, start) for start in starts), *repelling]:
-        if cycle.status == Status.OK:
-            size = (cycle.x1_min, cycle.x1_max, cycle.period)
-            found.setdefault(tuple(round(float(value), 6) for value in size), cycle)
-    return tuple(found.values())
+    return tuple(distinct([*(find_cycle(osc, start) for start in starts), *repelling]))
 
 
 def _cell_names(make, names, values, axes, starts) -> np.ndarray:
@@ -344,17 +342,22 @@ def _cell_names(make, names, values, axes, starts) -> np.ndarray:
         sticks = run.sticks.transpose(*names, "belt").values
         seen[..., i] = np.where(kind == "cycle", 1 + sticks @ 2 ** np.arange(n), 0)
         decided &= kind != "undecided"
+    # Each cycle once.
+    tell = [Runs.of(run, names) for run in runs]
+    for i, j in combinations(range(len(runs)), 2):
+        both = (seen[..., i] > 0) & (seen[..., j] > 0)
+        same, doubtful = tell[i].same(tell[j])
+        for row, column in np.argwhere(both & doubtful):
+            osc = make(**{names[0]: values[0][row], names[1]: values[1][column]})
+            same[row, column] = lead_to_one_cycle(osc, starts[i], starts[j])
+        seen[..., j] = np.where(both & same, 0, seen[..., j])
     opposite = (velocities.min(-1) < 0) & (velocities.max(-1) > 0)
     facts = np.concatenate([stable[..., None], opposite[..., None], decided[..., None], seen], -1)
     kinds, which = np.unique(facts.reshape(-1, facts.shape[-1]), axis=0, return_inverse=True)
     found = []
     for rest, against, known, *codes in kinds.tolist():
-        cycles = frozenset(
-            tuple((EventKind.STICK, b) for b in range(n) if (code - 1) >> b & 1)
-            for code in codes
-            if code
-        )
-        name = region_of(bool(against), n, Label(((1, bool(rest)),), cycles))
+        cycles = [[b for b in range(n) if (code - 1) >> b & 1] for code in codes if code]
+        name = region_of(bool(against), n, bool(rest), cycles)
         found.append(name if known and (rest or cycles) else "")
     return np.array(found)[which.reshape(shape)]
 
@@ -409,8 +412,13 @@ def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, s
     a, b = curve.values[:-1], curve.values[1:]
     chord = b - a
     along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
-    nearest = a + np.clip(along, 0, 1)[:, None] * chord
-    return bool(np.min(np.hypot(*(at - nearest).T)) < 0.3 * step)
+    along = np.clip(along, 0, 1)[:, None]
+    away = np.hypot(*(at - a - along * chord).T)
+    places = curve.places[:-1] + along * (curve.places[1:] - curve.places[:-1])
+    own = place_at(point)
+    return any(
+        not is_elsewhere(own, places[i], FAR) for i in np.flatnonzero(away < 0.3 * step).tolist()
+    )
 
 
 def kind_of(condition: AbstractCondition) -> tuple[str, Any]:
@@ -460,11 +468,9 @@ def _equilibrium_pieces(path: Path, nodes: Sequence[np.ndarray]) -> list[_Piece]
 
 def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Label]) -> list[_Piece]:
     wanted: list[tuple[int, np.ndarray, list[Turn]]] = []
-    for stretch, label in enumerate(labels):
-        for signature in label.cycles:
-            at = [v for v in nodes[stretch] if signature in path.turns[float(v)]]
-            turns = [path.turns[float(v)][signature] for v in at]
-            wanted.append((stretch, np.array(at), turns))
+    for stretch in range(len(labels)):
+        for turns in path.followed(nodes[stretch].tolist()):
+            wanted.append((stretch, np.array(list(turns)), list(turns.values())))
     pieces = []
     if wanted:
         groups = [values for _, values, _ in wanted]

@@ -5,8 +5,11 @@
 
 import enum
 from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
+
+Step = TypeVar("Step")
 
 
 class Status(enum.IntEnum):
@@ -123,7 +126,8 @@ class EventKind(enum.IntEnum):
     EDGE = 4
 
 
-def of_one_turn(events: Sequence[tuple[EventKind, int]]) -> tuple[tuple[EventKind, int], ...]:
-    """The events of a turn, (kind, belt) each, wherever it was begun: the least of the orders."""
-    turn = tuple(events)
-    return min((turn[i:] + turn[:i] for i in range(len(turn))), default=())
+def of_one_turn(steps: Sequence[Step]) -> tuple[Step, ...]:
+    """The steps of a turn, events or modes, wherever it was begun: the least of the orders."""
+    turn = tuple(steps)
+    orders: Any = (turn[i:] + turn[:i] for i in range(len(turn)))
+    return min(orders, default=())

@@ -94,15 +94,37 @@ def test_a_belt_at_rest_holds_what_comes_to_it():
 
 
 def test_labels_tell_attractors_of_one_kind_apart():
-    """Cycles by what they stick to and by size; the most frequent first; undecided is -1."""
+    """Cycles by where they are; the most frequent first; undecided is -1."""
     dataset = jb.sweep(lambda: belt_drive(1.4), {"x1": [0.0] * 5, "x2": [2.0]}, observe="attractor")
     dataset = dataset.load()
-    dataset["kind"][:, 0] = ["cycle", "undecided", "cycle", "cycle", "cycle"]
-    dataset["x1_max"][:, 0] = [1.0, 1.0, 2.0, 2.0 + 1e-6, 2.0]
-    dataset["sticks"][:, 0, 0] = [True, True, True, True, False]
-    labels, names = _labels(belt_drive(1.4), dataset)
-    assert labels[:, 0].tolist() == [1, -1, 0, 0, 2]
-    assert names[2] == "cycle that never sticks"
+    dataset["kind"][:, 0] = ["equilibrium", "undecided", "cycle", "cycle", "cycle"]
+    dataset["x1_max"][:, 0] += [0.0, 0.0, 0.0, 1e-9, 0.0]
+    labels, names, cycles = _labels(belt_drive(1.4), dataset)
+    assert labels[:, 0].tolist() == [1, -1, 0, 0, 0]
+    assert names[0] == "cycle that sticks to belt 0" and len(cycles) == 1
+
+
+def test_two_cycles_with_one_sequence_of_events_are_two():
+    """Both stick to belt 0 once a turn, to the left of where belt 1 begins and to the right."""
+    osc = jb.presets.class_d(-0.06341, 0.5073, -0.49694, 0.61855)
+    found = jb.basins(osc, x1=np.linspace(-2.0, 2.0, 9), x2=np.linspace(-1.0, 1.0, 5))
+    assert len({cycle.signature for cycle in found.cycles}) == 1
+    periods = sorted(float(cycle.period) for cycle in found.cycles)
+    assert periods == pytest.approx([9.9148027860, 10.9019400715], abs=1e-9)
+    assert [name for name in found.attractors if name.startswith("cycle")] == [
+        "cycle that sticks to belt 0"
+    ] * 2
+
+
+def test_two_segments_are_two_attractors():
+    """A belt at rest touches on both sides of a stretch without it."""
+    law = jb.Coulomb(0.3, 0.2)
+    belts = (jb.Belt(0.0, law, upper=-0.1), jb.Belt(0.0, law, lower=0.1))
+    osc = jb.Oscillator(0.5, belts)
+    found = jb.basins(osc, x1=np.linspace(-0.3, 0.3, 7), x2=np.array([-0.1, 0.1]))
+    x1 = np.asarray(found.dataset.x1_min)[np.asarray(found.dataset.kind) == "stuck"]
+    labels = np.asarray(found.label)[np.asarray(found.dataset.kind) == "stuck"]
+    assert len(set(labels[x1 < 0]) & set(labels[x1 > 0])) == 0
 
 
 @pytest.mark.parametrize(

@@ -268,13 +268,13 @@ def test_a_small_cycle_that_sticks_until_the_edge():
     path = Path(osc, nu0, (0.165, 0.18))
     path.look([0.17, 0.178])
     for nu, belt in ((0.17, 0), (0.178, 1)):
-        cycles = path.label(nu).cycles
-        own = [(kind, of) for cycle in cycles for kind, of in cycle if kind == EventKind.STICK]
-        assert len(cycles) == 2 and (EventKind.STICK, belt) in own
+        label = path.label(nu)
+        assert len(label.cycles) == 2 and label.events(EventKind.STICK)[belt] > 0
         small = oracle_cycles.sticking_cycle(
             oracle.class_d(nu, 0.175, 1.16, 1.5), (1.5, min(nu, 0.175))
         )
-        (turn,) = (turn for turn in path.turns[nu].values() if np.ptp(turn.entries[:, 0]) < 0.3)
+        turns = [one.turn for one in path.cycles[nu]]
+        (turn,) = (turn for turn in turns if np.ptp(turn.entries[:, 0]) < 0.3)
         assert np.sum(turn.durations) == pytest.approx(small.period, abs=1e-6)
 
 

@@ -13,7 +13,10 @@ from laws import BELL, bell
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
+from jaxbelt.attractors import distinct
 from jaxbelt.bifurcations import leaf_index, vary
+from jaxbelt.cycles import turn_events
+from jaxbelt.detection import Path, search
 
 
 def nu0(osc):
@@ -177,6 +180,39 @@ def test_a_fold_of_an_orbit_that_repels_strongly():
     expected = oracle_cycles.nonsmooth_fold(lambda load: make(load)[1], bracket, 1)
     # Steps halved change it by less than the bound, 4e-11.
     assert point.value == pytest.approx(expected, abs=1e-10) and point.error < 1e-10
+
+
+def two_cycles(nu):
+    """Class (d): a cycle to either side of where belt 1 begins, both of which stick to belt 0."""
+    return jb.presets.class_d(nu, 0.5073, -0.49694, 0.61855)
+
+
+def test_two_cycles_with_one_sequence_of_events():
+    """One of them begins as it just touches the edge of belt 1, where belt 0 would hold it back."""
+    path = Path(two_cycles(-0.06341), nu0, (-0.3, -0.02))
+    points = search(path)
+    assert [point.condition for point in points] == [jb.GrazingEdge(1), jb.Hopf(), jb.Hopf()]
+    path.look([-0.06341])
+    turns = [one.turn for one in path.cycles[-0.06341]]
+    assert len({turn_events(turn) for turn in turns}) == 1
+    assert sorted(np.sum(turn.durations) for turn in turns) == pytest.approx(
+        [9.9148027860, 10.9019400715], abs=1e-7
+    )
+    # By simulation: how many cycles there are just before and just after.
+    starts = [(x1, -0.1) for x1 in np.linspace(-1.5, 1.5, 13)]
+    for offset, count in ((-1e-5, 1), (1e-5, 2)):
+        osc = two_cycles(float(points[0].value) + offset)
+        assert len(distinct([jb.find_cycle(osc, start) for start in starts])) == count
+
+
+def test_a_corner_where_only_the_sign_of_what_arrives_changes():
+    """Belt 1 begins where the mass sticks to belt 0 before the point, and slips on it after."""
+    law = jb.Conti(1.09, 0.42, 12.8)
+    belts = (jb.Belt(0.4, law, 0.8, upper=0.9), jb.Belt(0.291, law, lower=0.72))
+    points = jb.scan(jb.Oscillator(0.374, belts), nu0, (0.38, 0.44))
+    expected = [jb.CornerCollision(1), jb.CornerCollision(1), jb.GrazingEdge(1)]
+    assert [point.condition for point in points] == expected
+    assert points[1].value == pytest.approx(0.398440689452, abs=1e-11)
 
 
 def bell_oracle(nu):

@@ -10,8 +10,6 @@ from jaxbelt import EventKind
 from jaxbelt.detection import Label
 from jaxbelt.diagrams import kind_of, region_name
 
-STICK, CROSS = EventKind.STICK, EventKind.CROSS
-
 
 def nu0(osc):
     return osc.belts[0].velocity
@@ -81,23 +79,28 @@ def test_branches_of_cycles_go_on_through_grazing_exchange_and_fold(diagram):
     assert np.all(sticks[:, 0] == (values < exchange)) and np.all(sticks[:, 1] != sticks[:, 0])
 
 
+SLIPS, STICKS_0, STICKS_1 = ((1, 1),), ((0, -1), (1, -1)), ((-1, 0), (-1, 1))
+
+
 @pytest.mark.parametrize(
     ("velocities", "stable", "cycles", "name"),
     [
-        ((0.3, 0.7), True, [], "1"),
-        ((0.3, -0.7), True, [], "6"),
-        ((0.3, 0.7), True, [((STICK, 0),)], "2a"),
-        ((-0.3, 0.7), True, [((CROSS, 0), (STICK, 0), (STICK, 1))], "5c"),
-        ((0.3, 0.7), False, [((STICK, 1),)], "3b"),
-        ((-0.3, 0.7), False, [()], "4s"),
-        ((0.3, 0.7), True, [((STICK, 0),), ((STICK, 1),)], "2ab"),
-        ((0.3,), False, [((STICK, 0),)], "3"),
-        ((0.3, 0.4, 0.5), False, [((STICK, 1), (STICK, 2))], "3f"),
+        ((0.3, 0.7), True, (), "1"),
+        ((0.3, -0.7), True, (), "6"),
+        ((0.3, 0.7), True, (STICKS_0,), "2a"),
+        ((-0.3, 0.7), True, (((-1, 0), (-1, 1), (0, 1), (1, 1)),), "5c"),
+        ((0.3, 0.7), False, (STICKS_1,), "3b"),
+        ((-0.3, 0.7), False, (SLIPS,), "4s"),
+        ((0.3, 0.7), True, (STICKS_0, STICKS_1), "2ab"),
+        ((0.3, 0.7), True, (STICKS_0, STICKS_0), "2aa"),
+        ((0.3,), False, (((0,), (1,)),), "3"),
+        ((0.3, 0.4, 0.5), False, (((-1, 0, 1), (-1, -1, 0)),), "3f"),
     ],
 )
 def test_names_of_regions(velocities, stable, cycles, name):
     osc = jb.Oscillator(0.5, [jb.Belt(v, jb.Conti(1.0, 0.6, 10.0)) for v in velocities])
-    assert region_name(osc, Label(((1, stable),), frozenset(cycles))) == name
+    rests = ((1, stable, (1,) * len(velocities)),)
+    assert region_name(osc, Label(rests, cycles)) == name
 
 
 def test_picture(diagram):

@@ -38,6 +38,7 @@ LADDER = (
     "audit",
     "equilibria",
     "cycles",
+    "attractors",
     "functionals",
     "sweep",
     "bifurcations",

@@ -1,0 +1,147 @@
+"""When two motions are one attractor: `itinerary`, `place_of` and `is_same`.
+
+An attractor is where it is. What a cycle does in one turn does not tell: there may be two cycles
+with one sequence of events. Two things tell.
+
+- Its itinerary: the modes that it passes, whole ones, with the contact of every belt in each. So
+  it says on which side of every contact edge the mass sticks, and with which sign of r it slips. A
+  stick phase ends at a place that its modes determine, and the orbit goes on from there in one way
+  only: of cycles that stick there is one with each itinerary.
+- Its place: how far it extends, and how long it takes. Orbits that do not stick do not meet, so of
+  two such cycles one lies inside of the other, or beside it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .cycles import Chain, Cycle, Turn, event_between, find_cycle, modes_of
+from .oscillator import Oscillator
+from .results import EventKind, Status, of_one_turn
+
+if TYPE_CHECKING:
+    import xarray
+
+#: The modes of one turn, contact codes of all belts each, from the least of their orders on.
+Itinerary = tuple[tuple[int, ...], ...]
+#: Places of one cycle that shooting solved for differ by less, relative to its size: its equations
+#: hold to 1e-9, and beside a fold a cycle moves by ten thousand times that.
+SOLVED = 1e-5
+#: The same of runs of a sweep, times its tolerance: its errors are ten to a thousand times that.
+#: Where they are further apart, but not as far as FAR, or their events differ, shooting tells.
+RUN = 1e3
+FAR = 1e-2
+
+
+def itinerary(turn: Chain | Turn) -> Itinerary:
+    """The modes of one turn in order, wherever it was begun."""
+    modes = modes_of(turn)
+    changes = [
+        tuple(mode.tolist())
+        for before, mode in zip(np.roll(modes, 1, axis=0), modes, strict=True)
+        if np.any(mode != before)
+    ]
+    return of_one_turn(changes or [tuple(modes[0].tolist())])
+
+
+def events_of(path: Itinerary) -> tuple[tuple[EventKind, int], ...]:
+    """The events of one turn, (kind, belt) each."""
+    if len(path) == 1:
+        return ()
+    return tuple(event_between(*pair) for pair in zip(path, path[1:] + path[:1], strict=True))
+
+
+def sticks(path: Itinerary) -> bool:
+    """Whether the mass sticks to a belt."""
+    return any(0 in mode for mode in path)
+
+
+def stuck_belts(path: Itinerary) -> frozenset[int]:
+    """The belts that the mass sticks to."""
+    return frozenset(belt for mode in path for belt, code in enumerate(mode) if code == 0)
+
+
+def place_of(cycle: Cycle | Turn) -> np.ndarray:
+    """Where a cycle is: smallest and largest x1, smallest and largest x2, period."""
+    if isinstance(cycle, Cycle):
+        used, rows = np.asarray(cycle.chain.used), np.asarray(cycle.unknowns)
+    else:
+        rows = np.column_stack([np.asarray(cycle.entries), np.asarray(cycle.durations)])
+        used = np.asarray(cycle.used)
+    return extent(rows[used])
+
+
+def extent(rows: np.ndarray) -> np.ndarray:
+    """The same of (x1, x2, T) of the arcs that are used, [arcs, 3]."""
+    x1, x2, durations = rows.T
+    return np.array([x1.min(), x1.max(), x2.min(), x2.max(), durations.sum()])
+
+
+def apart(place: np.ndarray, other: np.ndarray) -> float:
+    """How far apart two places are, relative to the larger of the two."""
+    size = max(np.ptp(place[:4]), np.ptp(other[:4]))
+    return float(np.max(np.abs(place - other)) / size)
+
+
+def is_same(cycle: Cycle, other: Cycle, tolerance: float = SOLVED) -> bool:
+    """Whether two cycles of one oscillator are one; both with status OK."""
+    if int(cycle.status) != Status.OK or int(other.status) != Status.OK:
+        return False
+    same_modes = itinerary(cycle.chain) == itinerary(other.chain)
+    return same_modes and apart(place_of(cycle), place_of(other)) < tolerance
+
+
+def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:
+    """Each of the cycles with status OK once."""
+    found: list[Cycle] = []
+    for cycle in cycles:
+        known = any(is_same(cycle, other) for other in found)
+        if int(cycle.status) == Status.OK and not known:
+            found.append(cycle)
+    return found
+
+
+def lead_to_one_cycle(osc: Oscillator, start: Sequence[float], other: Sequence[float]) -> bool:
+    """Whether two starts lead to one cycle."""
+    one, another = (find_cycle(osc, (float(y0[0]), float(y0[1]))) for y0 in (start, other))
+    return is_same(one, another)
+
+
+# --- what a sweep tells of attractors -------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Where the attractors of the runs of a sweep are, and what happens in a turn.
+
+    places: as `place_of`, [.., 5], the period of what is at rest 0; signatures: names, [..]; error:
+    as far may places of one cycle be apart, relative to its size.
+    """
+
+    places: np.ndarray
+    signatures: np.ndarray
+    error: float
+
+    @classmethod
+    def of(cls, dataset: "xarray.Dataset", dims: Sequence[str]) -> "Runs":
+        names = ("x1_min", "x1_max", "x2_min", "x2_max", "period")
+        columns = [dataset[name].transpose(*dims).values for name in names]
+        meanings = np.array(dataset["signature"].attrs["flag_meanings"].split())
+        signatures = meanings[dataset["signature"].transpose(*dims).values]
+        tolerance = max(dataset.attrs["rtol"], dataset.attrs["atol"])
+        return cls(np.nan_to_num(np.stack(columns, axis=-1)), signatures, RUN * tolerance)
+
+    def at(self, index: tuple[int, ...]) -> "Runs":
+        """One of them."""
+        return Runs(self.places[index], np.asarray(self.signatures[index]), self.error)
+
+    def same(self, others: "Runs") -> tuple[np.ndarray, np.ndarray]:
+        """Which of two runs each lead to one cycle, and for which this does not tell."""
+        both = np.stack(np.broadcast_arrays(self.places, others.places))
+        size = np.max(np.ptp(both[..., :4], axis=-1), axis=0)
+        away = np.max(np.abs(both[0] - both[1]), axis=-1) / np.where(size > 0, size, 1.0)
+        fits = self.signatures == others.signatures
+        same = fits & (away < self.error)
+        return same, ~same & (away < max(FAR, 10 * self.error))

@@ -1,0 +1,486 @@
+"""Paths in one parameter: what `scan` finds against what the engine sees by brute force.
+
+A path is an oscillator, one of its parameters and an interval. On a grid along it the engine runs
+from many starts, and from every attractor that it knows at the value beside, so that one with a
+small basin is not lost. Its label is the equilibria, in closed form and written down here once
+more, and the cycles: the modes of one turn, and where they are. Three things must hold.
+
+- Every cycle of the engine is among those of the label that `scan` goes by, and the other way
+  round, where the engine starts on the cycle that `scan` has.
+- Where the engine's labels differ, by bisection to a small part of the interval, there is a point.
+- On the two sides of a point the engine's labels differ.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from math import inf, isfinite
+
+import numpy as np
+
+import jaxbelt as jb
+from jaxbelt.attractors import place_of
+from jaxbelt.detection import Path, search
+
+from . import engine
+from .cases import random_case, rational_case, structures
+
+#: Programs, one for each combination of laws, that a campaign compiles.
+PROGRAMS = 6
+#: Of so many random paths the first is taken along which something happens by a few runs, at so
+#: many values, if there is one.
+DRAWS, COARSE = 8, 6
+#: Values on the grid, and starts at each.
+GRID, STARTS = 48, 12
+#: Changes are narrowed to this fraction of the interval.
+NARROW = 1e-4
+#: Extrema and periods of one cycle differ by less: the engine's repeat to 2e-11, and what slowly
+#: approaches a limit may be a thousand times as far from it.
+SAME = 1e-6
+#: Smaller cycles than this one around a pseudo-focus are not told from it.
+TINY = 1e-3
+#: Time until the engine gives a run up.
+PATIENCE = 3000.0
+
+NUMBERS = {
+    "conti": ("static", "residual", "steepness", "quadratic"),
+    "coulomb": ("static", "kinetic"),
+    "stribeck": ("static", "kinetic", "velocity"),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """The engine's oscillator, the parameter as (belt or -1, name), and the interval."""
+
+    oscillator: engine.Oscillator
+    parameter: tuple[int, str]
+    span: tuple[float, float]
+    kind: str
+
+    def at(self, value: float) -> engine.Oscillator:
+        """The engine's oscillator there."""
+        return _with(self.oscillator, self.parameter, value)
+
+    def where(self, osc):
+        """The parameter of the package's oscillator."""
+        belt, name = self.parameter
+        if belt < 0:
+            return getattr(osc, name)
+        one = osc.belts[belt]
+        return (
+            getattr(one, name)
+            if name in ("velocity", "load", "lower", "upper")
+            else getattr(one.friction, name.removeprefix("law "))
+        )
+
+
+def _with(osc: engine.Oscillator, parameter: tuple[int, str], value: float) -> engine.Oscillator:
+    number, name = parameter
+    if number < 0:
+        return replace(osc, **{name: value})
+    belt = osc.belts[number]
+    if name.startswith("law "):
+        place = 1 + NUMBERS[belt.law[0]].index(name.removeprefix("law "))
+        belt = replace(belt, law=(*belt.law[:place], value, *belt.law[place + 1 :]))
+    else:
+        belt = replace(belt, **{name: value})
+    return replace(osc, belts=(*osc.belts[:number], belt, *osc.belts[number + 1 :]))
+
+
+def package_of(osc: engine.Oscillator) -> jb.Oscillator:
+    """The package's oscillator."""
+    laws = {"conti": jb.Conti, "coulomb": jb.Coulomb, "stribeck": jb.Stribeck}
+    belts = [
+        jb.Belt(b.velocity, laws[b.law[0]](*b.law[1:]), b.load, lower=b.lower, upper=b.upper)
+        for b in osc.belts
+    ]
+    return jb.Oscillator(osc.damping, belts, omega=osc.omega)
+
+
+# --- random paths ---------------------------------------------------------------------------------
+
+
+def random_path(rng: np.random.Generator, structure, *, rational: bool) -> Case:
+    """A path through a random oscillator; rational: its ends are multiples of 1/20, too."""
+    while True:
+        osc = (rational_case if rational else random_case)(rng, structure).oscillator
+        number = int(rng.integers(-1, len(osc.belts)))
+        if number < 0:
+            parameter, value = (-1, "damping"), osc.damping
+        else:
+            belt = osc.belts[number]
+            law = NUMBERS[belt.law[0]]
+            name = str(rng.choice(["velocity", "velocity", "velocity", "load", "edge", "law"]))
+            ends = [end for end in ("lower", "upper") if isfinite(getattr(belt, end))]
+            if name == "edge" and not ends:
+                continue
+            if name == "edge":
+                name = str(rng.choice(ends))
+            if name == "law":
+                place = int(rng.integers(len(belt.law) - 1))
+                name, value = f"law {law[place]}", belt.law[1 + place]
+            else:
+                value = getattr(belt, name)
+            parameter = number, name
+        width = rng.uniform(0.1, 0.8) * (
+            1.0 if parameter[1] in ("velocity", "lower", "upper") else max(abs(value), 0.1)
+        )
+        first = value - rng.uniform(0, 1) * width
+        span = first, first + width
+        if rational:
+            span = tuple(round(20 * end) / 20 for end in span)
+        if span[0] < span[1] and all(_is_possible(_with(osc, parameter, end)) for end in span):
+            return Case(osc, parameter, span, "rational" if rational else "random")
+
+
+def _is_possible(osc: engine.Oscillator) -> bool:
+    try:
+        package_of(osc).check()
+    except ValueError:
+        return False
+    return osc.damping >= 0 and all(b.lower < b.upper for b in osc.belts)
+
+
+# --- what the engine sees -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """The modes of one turn, (smallest x1, largest, smallest x2, largest, period), and a state."""
+
+    modes: tuple
+    place: np.ndarray
+    state: tuple[float, float]
+
+    def is_same(self, other: "Cycle") -> bool:
+        return self.modes == other.modes and _near(self.place, other.place)
+
+
+def _near(place, other) -> bool:
+    return bool(np.max(np.abs(place - other)) < SAME * max(1.0, np.ptp(place[:4])))
+
+
+@dataclass
+class Label:
+    """Equilibria, (kind, stable, contact codes) each; cycles; whether every run was decided."""
+
+    rests: tuple
+    cycles: list[Cycle]
+    decided: bool
+
+    @property
+    def name(self):
+        """What is compared between one value and another."""
+        return self.rests, tuple(sorted(cycle.modes for cycle in self.cycles))
+
+
+def label_of(osc: engine.Oscillator, starts) -> Label:
+    """The label by runs from these starts."""
+    label = Label(equilibria(osc), [], True)
+    for start in starts:
+        if _circles_an_edge(osc, start, label.rests):
+            continue
+        try:
+            found = engine.attractor(osc, start, t_max=PATIENCE)
+        except ZeroDivisionError:
+            label.decided = False
+            continue
+        label.decided &= found.kind != "undecided"
+        if found.kind == "cycle":
+            cycle = _cycle(osc, found)
+            # Turns around a pseudo-focus seem to repeat long before they have shrunk to it.
+            if any(kind == 3 for kind, _, _ in label.rests) and found.x1[1] - found.x1[0] < TINY:
+                label.decided = False
+                continue
+            if not any(cycle.is_same(other) for other in label.cycles):
+                label.cycles.append(cycle)
+    return label
+
+
+def _circles_an_edge(osc: engine.Oscillator, start, rests) -> bool:
+    """Whether a run passes an edge ever faster around a pseudo-focus that attracts."""
+    if not any(kind == 3 and stable for kind, stable, _ in rests):
+        return False
+    run = engine.simulate(osc, start, 400.0, max_events=8000)
+    ends = [x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)]
+    near = min(abs(run.y_end[0] - x) for x in ends) + abs(run.y_end[1]) < 0.05
+    return near and run.status in (engine.BUDGET, engine.PSEUDO_FOCUS)
+
+
+def _cycle(osc: engine.Oscillator, found: engine.Attractor) -> Cycle:
+    top = (found.x1[1], 0.0)
+    run = engine.simulate(osc, top, 2.3 * found.period)
+    # Not the first moments: a belt at rest may be crossed at the top.
+    inside = (
+        (run.t > 0.3 * found.period) & (run.t <= 1.3 * found.period) & (run.kind <= engine.EDGE)
+    )
+    modes = [tuple(codes) for codes in run.codes[inside].tolist()] or [run.mode_end]
+    place = np.array([*found.x1, *found.x2, found.period])
+    return Cycle(_turn(modes), place, top)
+
+
+def _turn(modes) -> tuple:
+    """Modes one after another without repetition, from the least of their orders on."""
+    before = [modes[-1], *modes[:-1]]
+    kept = [mode for mode, last in zip(modes, before, strict=True) if mode != last] or modes[:1]
+    return min(tuple(kept[i:] + kept[:i]) for i in range(len(kept)))
+
+
+def equilibria(osc: engine.Oscillator) -> tuple:
+    """Where the mass can rest, (kind, stable, contact codes): 1 a fixed point, 2 a segment, 3 a
+    pseudo-focus; from left to right."""
+    table = osc.table()
+    ends = sorted({x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)})
+    zones = list(pairwise([-inf, *ends, inf]))
+    rows = [_rest_in_zone(osc, table, *zone) for zone in zones]
+    found = [row for row in rows if row is not None]
+    for edge, left, right in zip(ends, zones, zones[1:], strict=False):
+        row = _rest_on_edge(osc, table, edge, left, right)
+        if row is not None:
+            found.append(row)
+    return tuple(row[1:] for row in sorted(found, key=lambda row: row[0]))
+
+
+def _side(osc, table, zone):
+    """At rest in a zone: contact codes, the pull, what belts at rest hold and rub with, trace."""
+    codes, pull, held, rubs, trace = [], 0.0, 0.0, 0.0, -osc.damping
+    for row, belt in zip(table, osc.belts, strict=True):
+        if zone[0] < belt.lower or zone[1] > belt.upper:
+            codes.append(-2 if zone[0] < belt.lower else 2)
+            continue
+        codes.append(int(np.sign(belt.velocity)))
+        if belt.velocity == 0:
+            held += belt.load * belt.law[1]
+            rubs += belt.load * engine.mu(row, 0.0)
+        else:
+            speed, h = abs(belt.velocity), 1e-6
+            pull += np.sign(belt.velocity) * belt.load * engine.mu(row, speed)
+            slope = (engine.mu(row, speed + h) - engine.mu(row, speed - h)) / (2 * h)
+            trace -= osc.omega * belt.load * slope
+    return codes, pull, held, rubs, trace
+
+
+def _rest_in_zone(osc, table, lower, upper):
+    codes, pull, held, rubs, trace = _side(osc, table, (lower, upper))
+    if held == 0:
+        # A belt at rest that can hold nothing slips.
+        codes = [1 if code == 0 else code for code in codes]
+        return (pull, 1, trace < 0, tuple(codes)) if lower <= pull <= upper else None
+    first, last = max(pull - held, lower), min(pull + held, upper)
+    attracts = max(pull - rubs, lower) < min(pull + rubs, upper)
+    return (0.5 * (first + last), 2, attracts, tuple(codes)) if first < last else None
+
+
+def _rest_on_edge(osc, table, edge, left, right):
+    (codes, pull, held, rubs, trace), other = _side(osc, table, left), _side(osc, table, right)
+    (a, b), capacity = (pull - edge, other[1] - edge), max(held, other[2])
+    if not a > held or not -b > other[2]:
+        return None
+    signs = [1 if code == 0 else code for code in codes]  # rightwards, before the edge, r < 0
+    signs = [-1 if code == 0 else sign for code, sign in zip(codes, signs, strict=True)]
+    stable = True if capacity + rubs + other[3] > 0 else trace / a + other[4] / -b < 0
+    return edge, 3, stable, tuple(signs)
+
+
+# --- one path -------------------------------------------------------------------------------------
+
+
+@dataclass
+class Report:
+    """What does not agree, a line each; and how much was compared."""
+
+    case: Case
+    points: tuple
+    wrong: list[str]
+    changes: int = 0
+    labels: int = 0
+    undecided: int = 0
+    seconds: tuple[float, float] = (0.0, 0.0)
+
+
+class Brute:
+    """The engine's labels along a path; each value knows the cycles of the ones beside it."""
+
+    def __init__(self, case: Case, rng: np.random.Generator):
+        self.case = case
+        self.starts = np.stack([rng.uniform(-3, 3, STARTS), rng.uniform(-1.5, 1.5, STARTS)], 1)
+        self.labels: dict[float, Label] = {}
+
+    def look(self, value: float, more=()) -> Label:
+        if value not in self.labels:
+            osc = self.case.at(value)
+            near = [row for label in self._beside(value) for row in label.cycles]
+            starts = [*map(tuple, self.starts), *(cycle.state for cycle in near), *more]
+            self.labels[value] = label_of(osc, starts)
+        return self.labels[value]
+
+    def _beside(self, value: float) -> list[Label]:
+        known = sorted(self.labels)
+        at = int(np.searchsorted(known, value))
+        return [self.labels[known[i]] for i in (at - 1, at) if 0 <= i < len(known)]
+
+    def learn(self, value: float, start) -> Cycle | None:
+        """The cycle that a start leads to, which is known from then on."""
+        found = label_of(self.case.at(value), [start])
+        if not found.cycles:
+            return None
+        label, (cycle,) = self.labels[value], found.cycles
+        if not any(cycle.is_same(other) for other in label.cycles):
+            label.cycles.append(cycle)
+        return cycle
+
+    def spread(self) -> None:
+        """Let values know cycles of the ones beside them."""
+        values = sorted(self.labels)
+        for pairs in (pairwise(values), pairwise(values[::-1])):
+            for known, value in pairs:
+                for cycle in self.labels[known].cycles:
+                    if all(cycle.modes != other.modes for other in self.labels[value].cycles):
+                        self.learn(value, cycle.state)
+
+    def changes(self, a: float, b: float) -> Iterator[tuple[float, float]]:
+        """Where labels differ between two values, narrowed."""
+        left, right = self.labels[a], self.labels[b]
+        if not (left.decided and right.decided) or left.name == right.name:
+            return
+        for known, value in ((a, b), (b, a)):
+            for cycle in self.labels[known].cycles:
+                if all(cycle.modes != other.modes for other in self.labels[value].cycles):
+                    self.learn(value, cycle.state)
+        if left.name == right.name:
+            return
+        if b - a < NARROW * (self.case.span[1] - self.case.span[0]):
+            yield a, b
+            return
+        middle = 0.5 * (a + b)
+        self.look(middle)
+        if not self.labels[middle].decided:
+            middle += 0.0123 * (b - a)
+            self.look(middle)
+        yield from self.changes(a, middle)
+        yield from self.changes(middle, b)
+
+
+def check(case: Case, seed: int) -> Report:
+    """Compare along one path."""
+    rng = np.random.default_rng(seed)
+    begun = time.perf_counter()
+    first, last = case.span
+    path = Path(package_of(case.at(0.5 * (first + last))), case.where, case.span)
+    points = search(path)
+    report = Report(case, points, [])
+    at_scan = time.perf_counter() - begun
+    length = last - first
+    # No round numbers.
+    values = (first + length * (np.arange(GRID) + 0.3779) / GRID).tolist()
+    special = [float(point.value) for point in points]
+    brute = Brute(case, rng)
+    for value in values:
+        brute.look(value)
+    path.look(values)
+    for value in values:
+        _compare(path, brute, value, report)
+    brute.spread()
+    tolerance = 2e-6 * (1 + length)
+    for a, b in pairwise(values):
+        for low, high in brute.changes(a, b):
+            report.changes += 1
+            if not any(low - tolerance <= at <= high + tolerance for at in special):
+                names = [_words(brute.labels[at]) for at in (low, high)]
+                report.wrong.append(f"change at {low:.9g}..{high:.9g}: {names[0]} | {names[1]}")
+    report.undecided = sum(not label.decided for label in brute.labels.values())
+    for point in points:
+        _both_sides(case, point, special, brute, report)
+    report.seconds = at_scan, time.perf_counter() - begun - at_scan
+    return report
+
+
+def _compare(path: Path, brute: Brute, value: float, report: Report) -> None:
+    """The label of `scan` and that of the engine at one value."""
+    label, ours = brute.labels[value], path.label(value)
+    if not label.decided:
+        return
+    report.labels += 1
+    for one in path.cycles[value]:
+        if one.path:
+            rows = np.asarray(one.turn.entries)[np.asarray(one.turn.used)]
+            start = tuple(rows[int(np.argmax(rows[:, 0]))].tolist())
+            cycle = brute.learn(value, start)
+            place = place_of(one.turn)
+            if (
+                cycle is None
+                or cycle.modes != one.path
+                or np.max(np.abs(cycle.place - place)) > 1e-4
+            ):
+                report.wrong.append(
+                    f"at {value:.12g} scan has {one.path} {place.round(6)}: {cycle}"
+                )
+    if tuple(sorted(cycle.modes for cycle in label.cycles)) != ours.cycles:
+        report.wrong.append(f"at {value:.12g} cycles {ours.cycles}, engine {_words(label)}")
+    if label.rests != ours.equilibria:
+        report.wrong.append(f"at {value:.12g} rests {ours.equilibria}, engine {label.rests}")
+
+
+def _both_sides(case: Case, point, special, brute: Brute, report: Report) -> None:
+    """Whether something changes at a point of `scan`."""
+    at, (first, last) = float(point.value), case.span
+    others = [abs(at - other) for other in special if other != at]
+    away = min([1e-4 * (last - first), *(gap / 3 for gap in others)])
+    if away < 1e-9 or at - away < first or at + away > last:
+        return
+    sides = [brute.look(at - away), brute.look(at + away)]
+    for label, other, value in ((*sides, at + away), (*sides[::-1], at - away)):
+        for cycle in label.cycles:
+            if all(cycle.modes != one.modes for one in other.cycles):
+                brute.learn(value, cycle.state)
+    if all(side.decided for side in sides) and sides[0].name == sides[1].name:
+        report.wrong.append(f"nothing changes at {point!r}: {_words(sides[0])}")
+
+
+def _words(label: Label) -> str:
+    cycles = [(cycle.modes, cycle.place.round(6).tolist()) for cycle in label.cycles]
+    return f"rests {label.rests} cycles {cycles}"
+
+
+def case_of(seed: int, number: int) -> Case:
+    """The path of that number; every other one is rational."""
+    kinds = structures(np.random.default_rng(seed), PROGRAMS)
+    rng = np.random.default_rng((seed, number))
+    for _ in range(DRAWS):
+        case = random_path(rng, kinds[number // 2 % len(kinds)], rational=number % 2 == 1)
+        if _changes(case):
+            break
+    return case
+
+
+def _changes(case: Case) -> bool:
+    """Whether something happens along a path, by a few runs."""
+    values = np.linspace(*case.span, COARSE + 2)[1:-1] + 1e-3 * (case.span[1] - case.span[0])
+    names = set()
+    for value in values.tolist():
+        names.add(label_of(case.at(value), [(3.0, 0.0)]).name)
+    return len(names) > 1
+
+
+def run(seed: int, paths: int, *, first: int = 0, out=print) -> int:
+    """Compare along so many paths, and say what does not agree; returns how many paths do not."""
+    bad = 0
+    for number in range(first, first + paths):
+        case = case_of(seed, number)
+        report = check(case, seed + number)
+        bad += bool(report.wrong)
+        kinds_found = [point.kind for point in report.points]
+        out(
+            f"path {number} {case.kind} {case.parameter} {case.span}: {len(kinds_found)} points "
+            f"({sum(kind == 'Unexplained' for kind in kinds_found)} unexplained), {report.changes} "
+            f"changes, {report.labels} labels, {report.undecided} undecided, "
+            f"{report.seconds[0]:.1f} + {report.seconds[1]:.1f} s"
+        )
+        for line in report.wrong:
+            out(f"    {line}")
+        if report.wrong:
+            out(f"    {case.oscillator!r}")
+    out(f"{paths} paths, {bad} with something that does not agree")
+    return bad
