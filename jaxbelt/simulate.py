@@ -504,6 +504,13 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
 
     final, records = lax.scan(block, start, length=-(-max_segments // length))
     records = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), records)
+    # A run that begins at a pseudo-focus has one arc, of duration zero.
+    blank, zero = _unused(len(osc.belts)), jnp.zeros(())
+    rest = replace(blank, t=t0, y=jnp.stack(y), mode=_codes(mode), duration=zero)
+    at_rest = start.status == Status.PSEUDO_FOCUS
+    records = jax.tree.map(
+        lambda leaf, first: leaf.at[0].set(jnp.where(at_rest, first, leaf[0])), records, rest
+    )
     unfinished = jnp.where(final.done, final.status, Status.TOO_MANY_SEGMENTS.value)
     return eqx.tree_at(lambda s: s.status, final, unfinished), records
 
