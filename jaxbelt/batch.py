@@ -341,7 +341,10 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
     reach = LANDING * jnp.sqrt(rtol)
     bound = jnp.where(new.a > 0, high, low)
     reached = ~beyond_turn & (jnp.abs(bound - new.x2) <= reach * jnp.abs(new.a))
-    delta = jnp.where(reached, bound - new.x2, 1e300) / jnp.where(reached, new.a, 1.0)
+    slope = jnp.where(reached, new.a, 1.0)
+    delta = jnp.where(reached, bound - new.x2, 1e300) / slope
+    # The next term, too: it counts where x2' is small, and there x2'' is -x2.
+    delta = jnp.where(reached, delta + 0.5 * bound * delta**2 / slope, delta)
     blocked = ((peak > high) | (peak < low)) & ~reached
     target = jnp.where(peak > high, high, low)
     k = lax.stop_gradient(path.k)
@@ -353,7 +356,7 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
         near = jnp.abs(edge - new.x1) <= reach * jnp.abs(new.x2)
         slope = jnp.where(near, new.x2, 1.0)
         delta1 = jnp.where(near, edge - new.x1, 1e300) / slope
-        # The next term, too: in hundreds of slow passages of an edge it adds up.
+        # In hundreds of slow passages of an edge it adds up.
         delta1 = jnp.where(near, delta1 - 0.5 * new.a * delta1**2 / slope, delta1)
         on_edge = near & (delta1 < delta)
         reached, delta = reached | near, jnp.minimum(delta, delta1)
@@ -369,13 +372,16 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
     until = jnp.where(beyond_turn, path.turn, 1.0)
     theta = _first_root(poly, start - target, until, end - target)
     # An extremum that close to a bound is no matter for an interpolant, nor is one that is wanted:
-    # split the step there. Near the ends of a step the interpolant is exact to the second order.
-    doubt = jnp.abs(path.k[3])
+    # split the step there. The terms that the interpolant leaves out are far smaller than its last
+    # ones, and near the ends of a step it is exact to the second order.
+    doubt = jnp.abs(path.k[3]) + 0.1 * jnp.abs(path.k[2])
+    inside = jnp.minimum(path.turn, 1 - path.turn)
     grazes = (path.extremum > high - doubt) | (path.extremum < low + doubt)
+    grazes = grazes & (inside * new.h > reach)
     if window.extrema is not None:
         further = (path.extremum > lanes.upper) | (path.extremum < lanes.lower)
-        grazes = grazes | (window.extrema & further)
-    grazes = grazes & path.turns & ~beyond_turn & (path.turn > 1e-3) & (path.turn < 1 - 1e-3)
+        grazes = grazes | (window.extrema & further & (inside > 1e-3))
+    grazes = grazes & path.turns & ~beyond_turn
     return _Landing(
         reached=reached,
         delta=delta,
