@@ -1,4 +1,4 @@
-"""Campaigns: `python -m tests.campaign final|simulate|attractors|grazing`, see `--help`."""
+"""Campaigns: `python -m tests.campaign final|simulate|attractors|grazing|paths`, see `--help`."""
 
 import argparse
 import json
@@ -17,8 +17,10 @@ def main(arguments=None):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from . import cases, compare, package
+    from . import cases, compare, package, paths
 
+    if options.what == "paths":
+        return paths.run(options.seed, options.paths)
     rng = np.random.default_rng(options.seed)
     began = time.monotonic()
     verdicts, disagreements, graze, done = Counter(), [], [], 0
@@ -80,9 +82,10 @@ def main(arguments=None):
 
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=__doc__)
-    parser.add_argument("what", choices=("final", "simulate", "attractors", "grazing"))
+    parser.add_argument("what", choices=("final", "simulate", "attractors", "grazing", "paths"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=int, default=2000)
+    parser.add_argument("--paths", type=int, default=20)
     parser.add_argument("--rational-share", type=float, default=0.5)
     parser.add_argument(
         "--by",

@@ -19,11 +19,10 @@ from math import inf, isfinite
 
 import numpy as np
 
-import jaxbelt as jb
 from jaxbelt.attractors import place_of
 from jaxbelt.detection import Path, search
 
-from . import engine
+from . import engine, package
 from .cases import random_case, rational_case, structures
 
 #: Programs, one for each combination of laws, that a campaign compiles.
@@ -89,16 +88,6 @@ def _with(osc: engine.Oscillator, parameter: tuple[int, str], value: float) -> e
     return replace(osc, belts=(*osc.belts[:number], belt, *osc.belts[number + 1 :]))
 
 
-def package_of(osc: engine.Oscillator) -> jb.Oscillator:
-    """The package's oscillator."""
-    laws = {"conti": jb.Conti, "coulomb": jb.Coulomb, "stribeck": jb.Stribeck}
-    belts = [
-        jb.Belt(b.velocity, laws[b.law[0]](*b.law[1:]), b.load, lower=b.lower, upper=b.upper)
-        for b in osc.belts
-    ]
-    return jb.Oscillator(osc.damping, belts, omega=osc.omega)
-
-
 # --- random paths ---------------------------------------------------------------------------------
 
 
@@ -137,7 +126,7 @@ def random_path(rng: np.random.Generator, structure, *, rational: bool) -> Case:
 
 def _is_possible(osc: engine.Oscillator) -> bool:
     try:
-        package_of(osc).check()
+        package.oscillator(osc).check()
     except ValueError:
         return False
     return osc.damping >= 0 and all(b.lower < b.upper for b in osc.belts)
@@ -182,11 +171,7 @@ def label_of(osc: engine.Oscillator, starts) -> Label:
     for start in starts:
         if _circles_an_edge(osc, start, label.rests):
             continue
-        try:
-            found = engine.attractor(osc, start, t_max=PATIENCE)
-        except ZeroDivisionError:
-            label.decided = False
-            continue
+        found = engine.attractor(osc, start, t_max=PATIENCE)
         label.decided &= found.kind != "undecided"
         if found.kind == "cycle":
             cycle = _cycle(osc, found)
@@ -368,7 +353,7 @@ def check(case: Case, seed: int) -> Report:
     rng = np.random.default_rng(seed)
     begun = time.perf_counter()
     first, last = case.span
-    path = Path(package_of(case.at(0.5 * (first + last))), case.where, case.span)
+    path = Path(package.oscillator(case.at(0.5 * (first + last))), case.where, case.span)
     points = search(path)
     report = Report(case, points, [])
     at_scan = time.perf_counter() - begun
