@@ -19,6 +19,7 @@ Samples at given times are taken from the arcs afterwards, in parallel.
 
 import functools
 import math
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import diffrax
