@@ -120,6 +120,10 @@ def difference(case, told, mine, tol):
 
 def _focus_difference(case, told, mine):
     """One ended in a pseudo-focus and the other did not, or not yet."""
+    if {told.status, mine.status} == {engine.PSEUDO_FOCUS, engine.STUCK_FOREVER}:
+        # At rest where turns are lost in rounding, on an edge of a belt at rest.
+        same = abs(told.x1 - mine.y_end[0]) < 1e-6 and abs(told.x2 - mine.y_end[1]) < 1e-6
+        return None if same else f"status {told.status}, not {mine.status}"
     longer = replace(case, T=10 * case.T)
     if told.status == engine.PSEUDO_FOCUS:
         if mine.status != engine.OK:
