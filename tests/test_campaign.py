@@ -149,7 +149,6 @@ def test_cases_go_to_json_and_back():
     [
         "final --runs 300 --structure 0 --seed 11",
         "attractors --runs 100 --structure 0 --seed 12",
-        "simulate --runs 32 --structure 2 --seed 13",
     ],
 )
 def test_small_campaign(arguments, capsys):
