@@ -228,7 +228,7 @@ def judge_derivative(case, told, mine, direction, tol):
 # ---------------------------------------------------------------- attractors
 
 
-def label_difference(told, mine, tol):
+def label_difference(told, mine):
     """What differs between two labels, or None."""
     if mine.kind == "undecided":
         return None if told.kind == "undecided" else "engine undecided"
@@ -248,16 +248,16 @@ def label_difference(told, mine, tol):
     return None if all(abs(a - b) <= room for a, b in pairs) else "another cycle"
 
 
-def judge_label(case, told, tol):
+def judge_label(case, told, _tol):
     """The verdict on a label, and the engine's."""
     mine = engine.attractor(case.oscillator, case.y0)
-    what = label_difference(told, mine, tol)
+    what = label_difference(told, mine)
     if what is None:
         return "same", mine
     if case.distance is None and (mine.margin <= CORNER or mine.status == engine.CORNER):
         for other in neighbours(case, joint=12):
             his = engine.attractor(other.oscillator, other.y0)
-            if his.kind != "undecided" and label_difference(told, his, tol) is None:
+            if his.kind != "undecided" and label_difference(told, his) is None:
                 return "corner", mine
         return f"corner: {what}", mine
     return what, mine
