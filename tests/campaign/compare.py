@@ -155,6 +155,8 @@ def _state_difference(case, told, mine, tol):
     rows = np.array([(e[0], e[3], e[4]) for e in told.events])
     table = np.column_stack([mine.t, mine.y])
     away = np.abs(rows - table)
+    # An error in the state is one in time over the speed towards the line.
+    away[:, 0] *= np.minimum(_speeds(case, mine), 1.0)
     if not states and np.all(away <= STEPS * tol):
         return None
     d, runs = spread(
@@ -165,6 +167,19 @@ def _state_difference(case, told, mine, tol):
     tables = [np.column_stack([r.t, r.y]) for r in runs if r.sequence == mine.sequence]
     room = np.max([np.abs(t - table) for t in tables], axis=0) if tables else 0.0
     return None if np.all(away <= STEPS * (tol + room)) else "event"
+
+
+def _speeds(case, mine):
+    """How fast each event's line is approached."""
+    modes = [run(replace(case, T=1e-12)).mode_end, *mine.codes.tolist()]
+    return np.array(
+        [
+            abs(y[1])
+            if kind in (engine.EDGE, engine.SLIP)
+            else abs(engine.force(case.oscillator, mode, *y))
+            for kind, y, mode in zip(mine.kind, mine.y.tolist(), modes)
+        ]
+    )
 
 
 def _same_kind(r, mine, value):
