@@ -341,7 +341,10 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
     reach = LANDING * jnp.sqrt(rtol)
     bound = jnp.where(new.a > 0, high, low)
     reached = ~beyond_turn & (jnp.abs(bound - new.x2) <= reach * jnp.abs(new.a))
-    delta = jnp.where(reached, bound - new.x2, 1e300) / jnp.where(reached, new.a, 1.0)
+    slope = jnp.where(reached, new.a, 1.0)
+    delta = jnp.where(reached, bound - new.x2, 1e300) / slope
+    # The next term, too: it counts where x2' is small, and there x2'' is -x2.
+    delta = jnp.where(reached, delta + 0.5 * bound * delta**2 / slope, delta)
     blocked = ((peak > high) | (peak < low)) & ~reached
     target = jnp.where(peak > high, high, low)
     k = lax.stop_gradient(path.k)
@@ -353,7 +356,7 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
         near = jnp.abs(edge - new.x1) <= reach * jnp.abs(new.x2)
         slope = jnp.where(near, new.x2, 1.0)
         delta1 = jnp.where(near, edge - new.x1, 1e300) / slope
-        # The next term, too: in hundreds of slow passages of an edge it adds up.
+        # In hundreds of slow passages of an edge it adds up.
         delta1 = jnp.where(near, delta1 - 0.5 * new.a * delta1**2 / slope, delta1)
         on_edge = near & (delta1 < delta)
         reached, delta = reached | near, jnp.minimum(delta, delta1)
@@ -369,13 +372,16 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
     until = jnp.where(beyond_turn, path.turn, 1.0)
     theta = _first_root(poly, start - target, until, end - target)
     # An extremum that close to a bound is no matter for an interpolant, nor is one that is wanted:
-    # split the step there. Near the ends of a step the interpolant is exact to the second order.
-    doubt = jnp.abs(path.k[3])
+    # split the step there. The terms that the interpolant leaves out are far smaller than its last
+    # ones, and near the ends of a step it is exact to the second order.
+    doubt = jnp.abs(path.k[3]) + 0.1 * jnp.abs(path.k[2])
+    inside = jnp.minimum(path.turn, 1 - path.turn)
     grazes = (path.extremum > high - doubt) | (path.extremum < low + doubt)
+    grazes = grazes & (inside * new.h > reach)
     if window.extrema is not None:
         further = (path.extremum > lanes.upper) | (path.extremum < lanes.lower)
-        grazes = grazes | (window.extrema & further)
-    grazes = grazes & path.turns & ~beyond_turn & (path.turn > 1e-3) & (path.turn < 1 - 1e-3)
+        grazes = grazes | (window.extrema & further & (inside > 1e-3))
+    grazes = grazes & path.turns & ~beyond_turn
     return _Landing(
         reached=reached,
         delta=delta,
@@ -464,7 +470,7 @@ def _first_root(poly, g_start, end, g_end):
 
 
 def _pass_events(
-    osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array, *, edges: bool
+    program: "Program", osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array
 ) -> tuple[Lanes, Passage]:
     """Lanes that stand on a guard go on; stick phases are passed to their end, or to t1."""
     landed = (lanes.h < 0) & ~lanes.done
@@ -472,7 +478,7 @@ def _pass_events(
     number = guard_passed(osc, lanes.mode, lanes.x1, lanes.x2)
     fired = landed & (number >= 0)
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
-    captured = fired & after.captured
+    captured = fired & after.captured & program.captures
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
 
     stuck = after.mode.any_stuck & ~captured & ~lanes.done
@@ -491,7 +497,7 @@ def _pass_events(
     a = jnp.where(jnp.abs(a) < 1e-12 * (1 + jnp.abs(new_x1)), 0.0, a)
     moved = landed | stuck
     h = jnp.where(fired, _first_step(rtol), jnp.abs(lanes.h))
-    if edges:
+    if program.edges:
         # In a corner one event follows the other at once: a lane that stands on the next guard,
         # and goes on through it, has landed there.
         corner = (fired | released) & ~mode.any_stuck & (guard_passed(osc, mode, new_x1, x2) >= 0)
@@ -545,6 +551,8 @@ class Program(eqx.Module):
     mapped: tuple[bool, ...] = eqx.field(static=True)
     observer: Observer = eqx.field(static=True)
     edges: bool = eqx.field(static=True)
+    #: Whether a run that a pseudo-focus captures ends there.
+    captures: bool = eqx.field(static=True, default=True)
 
 
 def _oscillator(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator:
@@ -687,7 +695,7 @@ def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> 
     osc, observer = _oscillator(program, shared, rows), program.observer
 
     def round_(_, lanes):
-        lanes, passage = _pass_events(osc, lanes, t1, rtol, edges=program.edges)
+        lanes, passage = _pass_events(program, osc, lanes, t1, rtol)
         lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
         window = _window(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
 
@@ -825,6 +833,16 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
+def by_name(layout: dict[str, tuple[int, ...]], columns: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns [..., columns, runs] as results by name, [..., runs] and the shape of each."""
+    results, first = {}, 0
+    for name, shape in layout.items():
+        part = np.moveaxis(columns[..., first : first + math.prod(shape), :], -2, -1)
+        results[name] = part.reshape(*part.shape[:-1], *shape)
+        first += math.prod(shape)
+    return results
+
+
 @functools.lru_cache(maxsize=1)
 def _options() -> tuple[tuple[str, Any], ...]:
     """Compiler options of the kernel: wide vectors where the processor has them."""
@@ -862,15 +880,17 @@ def run(
     rtol: float,
     atol: float,
     derivatives: int = 0,
+    budget: float = 1.0,
 ) -> None:
     """Do all runs: rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]:
     the starts and the parameters that vary, and their derivatives in so many directions;
-    put(numbers, results) takes results [1 + derivatives, columns, runs] in any order.
+    put(numbers, results) takes results [1 + derivatives, columns, runs] in any order. budget: the
+    share of `MAX_STEPS` that a run may take.
 
     Every thread feeds chunks to one compiled kernel (which lets go of Python's lock) on its own
     lanes. Long runs stay in their lanes while the next chunk is worked on.
     """
-    limit = int(MAX_STEPS * max(1.0, t1 / 100)) // (STEPS * ROUNDS)
+    limit = int(budget * MAX_STEPS * max(1.0, t1 / 100)) // (STEPS * ROUNDS)
     settings = (t1, rtol, atol, np.int32(limit))
     kernel = functools.partial(_kernel(program, derivatives), shared, *settings)
     columns = 2 + sum(program.mapped)

@@ -98,6 +98,7 @@ from .modes import (
     stick_limit,
 )
 from .oscillator import Oscillator, check_oscillator
+from .parameters import leaf_index, parameter, vary
 from .results import Status, describe
 
 #: Arcs for which the orbit from slip onset is followed in search of the signature.
@@ -284,40 +285,6 @@ def refine(
 def room_for(solve: Callable) -> int:
     """Room for the arcs of one turn: passing edges takes more of them."""
     return SIZES[1] if solve in (at_edge, at_crossing) else SIZES[0]
-
-
-def leaf_index(osc: Oscillator, where: Callable[[Oscillator], Any]) -> int:
-    """The number of the parameter that `where` selects, among the leaves of the oscillator.
-
-    By its number, not by the function: a new lambda in every call would compile anew every time.
-    """
-    leaves, structure = jax.tree.flatten(osc)
-    index = where(jax.tree.unflatten(structure, list(range(len(leaves)))))
-    require(isinstance(index, int), "where", "a function that selects one parameter", repr(index))
-    return index
-
-
-def vary(osc: Oscillator, index: int | Array, p: Array) -> Oscillator:
-    """The oscillator with the parameters of these numbers, one or [k], replaced by p, [k].
-
-    Where the numbers are arrays, one program serves all parameters.
-    """
-    leaves, structure = jax.tree.flatten(osc)
-    numbers = [index] if isinstance(index, int) or index.ndim == 0 else index
-    known = is_concrete((osc, index, p))
-    # What is known is taken apart in NumPy, which compiles nothing.
-    for which, value in zip(numbers, np.asarray(p) if known else p, strict=True):
-        if known or isinstance(index, int):
-            leaves[int(which)] = jnp.asarray(value)
-        else:
-            leaves = [jnp.where(which == i, value, leaf) for i, leaf in enumerate(leaves)]
-    return jax.tree.unflatten(structure, leaves)
-
-
-def parameter(osc: Oscillator, index: int | Array) -> Array:
-    """The parameter of that number."""
-    leaves = jax.tree.leaves(osc)
-    return leaves[int(index)] if is_concrete(index) else jnp.stack(leaves)[index]
 
 
 # --- systems of a cycle and one condition ---------------------------------------------------------

@@ -13,6 +13,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from .processes import require_own_threads
+
 TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
 
 
@@ -38,8 +40,12 @@ def require(condition: Any, field: str, expected: str, got: Any) -> None:
         raise ValueError(f"{field} must be {expected}, got {got}")
 
 
-def require_float64() -> None:
-    """Raise unless JAX is set to 64-bit floats: event times are meaningless in 32 bits."""
+def require_usable_jax() -> None:
+    """Raise in a forked process, and unless JAX is set to 64-bit floats.
+
+    Event times are meaningless in 32 bits.
+    """
+    require_own_threads()
     if not jax.config.read("jax_enable_x64"):
         raise ValueError(
             "jaxbelt must have 64-bit floats, got JAX set to float32; before anything else, "
@@ -58,7 +64,7 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
 
 def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array | np.ndarray:
     """The same, but left in NumPy if it is known: for what goes into a compiled function anyway."""
-    require_float64()
+    require_usable_jax()
     dtype = getattr(value, "dtype", None)
     if dtype is None:
         try:

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 import jaxbelt as jb
+from jaxbelt.parameters import names_of
 
 app = typer.Typer(
     name="jaxbelt",
@@ -405,10 +406,7 @@ def diagram(
 
 def _where(osc: jb.Oscillator, name: str) -> Any:
     """What selects the parameter of that name or path."""
-    paths = [
-        jax.tree_util.keystr(path).removeprefix(".")
-        for path, _ in jax.tree_util.tree_leaves_with_path(osc)
-    ]
+    paths = names_of(osc)
     path = PARAMETERS.get(name, name)
     if path not in paths:
         raise ValueError(f"vary must be nu0, nu1, zeta or one of {', '.join(paths)}, got {name}")

@@ -15,6 +15,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from .checks import is_concrete
+from .processes import require_own_threads
 
 #: XLA's newer emitter of fused loops takes half as long again to compile programs like these, many
 #: small operations on few numbers, and its code is no faster.
@@ -53,6 +54,7 @@ def jit(function: Callable) -> Any:
 
     @functools.wraps(function)
     def call(*args, **kwargs):
+        require_own_threads()
         outermost = is_concrete((args, kwargs, _probe()))
         return (quick() if outermost else plain)(*args, **kwargs)
 

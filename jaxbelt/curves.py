@@ -49,12 +49,9 @@ from .bifurcations import (
     edge_balance,
     edge_rest,
     end_near_edge,
-    leaf_index,
     least_push,
-    parameter,
     small_newton,
     stick_phase_from,
-    vary,
 )
 from .checks import as_array, check_finite, require
 from .compiling import jit
@@ -76,6 +73,7 @@ from .detection import refined, sudden_sliding
 from .equilibria import Equilibria, EquilibriumKind, equilibria
 from .modes import boundary_guards, edge_guards, mode_acceleration, mode_of
 from .oscillator import Oscillator
+from .parameters import leaf_index, names_of, parameter, vary
 from .results import Status
 
 #: Unknowns of a cycle count this much in the length of a step, beside the two parameters; large
@@ -88,6 +86,9 @@ REMESH = 10
 DEPARTURE = 1e-5
 #: Integration steps for each arc of that orbit; it takes long to leave.
 STEPS = 48
+#: How often the points on both sides of a singular one are brought nearer to it by half; much
+#: nearer Newton's method fails.
+SHRINKS = 8
 
 
 #: The place of nothing.
@@ -216,7 +217,8 @@ def bifurcation_curve(
     """
     require(isinstance(point, BifurcationPoint), "point", "a BifurcationPoint", repr(point))
     require(int(point.status) == Status.OK, "point", "one with status OK", repr(point))
-    require(len(where) == 2, "where", "two functions", repr(where))
+    two = isinstance(where, tuple | list) and len(where) == 2
+    require(two, "where", "two functions", repr(where))
     osc = point.oscillator
     numbers = [leaf_index(osc, one) for one in where]
     indices = jnp.asarray(np.array(numbers))
@@ -231,8 +233,7 @@ def bifurcation_curve(
     closed = ahead.end is End.CLOSED
     behind = _Side(ahead.rows[:1], [], End.CLOSED) if closed else _follow(problem, point, -1.0)
     rows = [*reversed(behind.rows[1:]), *ahead.rows]
-    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(osc)]
-    names = [jax.tree_util.keystr(paths[int(i)]).removeprefix(".") for i in indices]
+    names = [names_of(osc)[number] for number in numbers]
     return BifurcationCurve(
         condition=point.condition,
         values=np.array([row.values for row in rows]),
@@ -403,21 +404,68 @@ def _between(problem: _Problem, system: "_System", before, after) -> list[Specia
         end = seen_b.tests.get(name, np.nan)
         if start * end >= 0 or np.isnan(start * end):
             continue
-        solved: list[tuple[np.ndarray, float]] = []
 
-        def test(part, name=name, solved=solved):
+        def probe(part, name=name):
             at = corrected(*system.problem, a.u, a.tangent, part * length)
             seen = system.look(at.u)
-            solved.append((at.u, max(seen.residual, abs(seen.tests[name]))))
-            return seen.tests[name]
+            value = seen.tests[name]
+            if not at.found or np.isnan(value):
+                raise _SingularError
+            return _Probe(part, value, at.u[-2:], max(seen.residual, abs(value)))
 
-        root: Any = brentq(test, 0.0, 1.0, xtol=1e-14)
-        test(root)
-        u, residual = solved[-1]
-        if np.all((problem.limits[:, 0] <= u[-2:]) & (u[-2:] <= problem.limits[:, 1])):
-            values = (float(u[-2]), float(u[-1]))
-            found.append((root, SpecialPoint(name[0], name[1], values, residual)))
+        try:
+            root: Any = brentq(lambda part, probe=probe: probe(part).test, 0.0, 1.0, xtol=1e-14)
+            special = probe(root)
+        except _SingularError:
+            ends = _Probe(0.0, start, a.u[-2:], 0.0), _Probe(1.0, end, b.u[-2:], 0.0)
+            special = _from_both_sides(probe, *ends)
+        values = special.values
+        if np.all((problem.limits[:, 0] <= values) & (values <= problem.limits[:, 1])):
+            pair = float(values[0]), float(values[1])
+            found.append((special.part, SpecialPoint(name[0], name[1], pair, special.residual)))
     return [point for _, point in sorted(found, key=lambda item: item[0])]
+
+
+class _Probe(NamedTuple):
+    """A part of a step, the watched function and the parameters there, the largest error."""
+
+    part: float
+    test: float
+    values: np.ndarray
+    residual: float
+
+
+class _SingularError(Exception):
+    """Newton's method does not converge there, or the watched function is not defined."""
+
+
+def _from_both_sides(probe: Callable[[float], _Probe], low: _Probe, high: _Probe) -> _Probe:
+    """Where a function vanishes that has no value there: extrapolated from what has on both sides.
+
+    So it is where the cycle of a curve shrinks to a point: with all arcs of duration zero its
+    equations are singular.
+    """
+    from scipy.interpolate import KroghInterpolator
+
+    known = [low, high]
+    for _ in range(SHRINKS):
+        middle = low.part - low.test * (high.part - low.part) / (high.test - low.test)
+        try:
+            nearer = [probe(0.5 * (side.part + middle)) for side in (low, high)]
+        except _SingularError:
+            break
+        if any(new.test * old.test <= 0 for new, old in zip(nearer, (low, high), strict=True)):
+            break
+        known += nearer
+        low, high = nearer
+
+    def at_zero(probes):
+        numbers = [np.array([probe.part, *probe.values]) for probe in probes]
+        return KroghInterpolator([probe.test for probe in probes], numbers)(0.0)
+
+    best, other = at_zero(known[-6:]), at_zero(known[-4:])
+    residual = float(np.max(np.abs(best - other))) if len(known) > 4 else np.nan
+    return _Probe(float(best[0]), 0.0, best[1:], residual)
 
 
 def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np.ndarray):

@@ -491,7 +491,8 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     code = jnp.stack([jnp.asarray(c, dtype=y.dtype) for c in new.codes])
     duration = jnp.where(stuck, phase.duration, t_slip)
 
-    is_top = ~stuck & (fired == names.turn_x1) & (y[1] > 0)
+    # Whatever ends the arc: at the boundary of a belt at rest it is not the guard of turns.
+    is_top = ~stuck & (_after(osc, codes, y)[1] > 0) & (_after(osc, code, y_end)[1] < 0)
     top = jnp.where(is_top, y_end[0], jnp.nan)
     amplitude = top - orbit.low
     rows = jnp.arange(orbit.tops.size)

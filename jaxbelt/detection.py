@@ -67,13 +67,11 @@ from .bifurcations import (
     end_near_edge,
     exchange_near,
     fold_near,
-    leaf_index,
     room_for,
     settled_turns,
     solver_of,
     tangency_near,
     unexplained_point,
-    vary,
 )
 from .checks import as_array, check_finite, require
 from .compiling import each, jit
@@ -90,6 +88,7 @@ from .cycles import (
 )
 from .equilibria import EquilibriumKind, equilibria
 from .oscillator import Oscillator, check_oscillator
+from .parameters import leaf_index, names_of, vary
 from .results import EventKind, Status
 
 #: Values of the parameter in one batch.
@@ -260,8 +259,7 @@ class Path:
         for value in (self.first, self.last):
             self.at(value).check()
         self.length = self.last - self.first
-        paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(osc)]
-        self.name = jax.tree_util.keystr(paths[int(self.index)]).removeprefix(".")
+        self.name = names_of(osc)[int(self.index)]
         self.labels: dict[float, Label] = {}
         self.cycles: dict[float, list[Found]] = {}
         self.unstable_cycles: dict[tuple[float, int], Cycle] = {}

@@ -42,6 +42,7 @@ from .cycles import Cycle, Turn, cut, find_cycle, polish, unstable_cycle
 from .detection import Label, Path, by_value, edges_touched, search
 from .equilibria import EquilibriumKind, candidates, equilibria
 from .oscillator import Oscillator
+from .parameters import set_alone
 from .results import Status
 from .sweep import sweep
 
@@ -293,11 +294,11 @@ def region_map(
     for name, along in zip(names, values, strict=True):
         increases = along.size > 1 and np.all(np.diff(along) > 0)
         require(increases, name, "two values or more that increase", along)
-    where = _leaves_of(make, names, values)
+    numbers = set_alone(make, names)
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:
         cells = beside.submit(_cells, make, names, values, dict(axes), starts)
-        curves = _bounds(make, names, values, where, step, lines) if where and lines else ()
+        curves = _bounds(make, names, values, numbers, step, lines) if numbers and lines else ()
         label, cycles = cells.result()
     pair = (names[0], names[1]), (values[0], values[1])
     return RegionMap(*pair, label, tuple(curves), cycles, make)
@@ -372,28 +373,10 @@ def _at_cells(make, names, cells: Array) -> tuple[Array, Array]:
     return jax.vmap(one)(cells)
 
 
-def _leaves_of(make, names, values):
-    """A function for each argument of `make` that selects the one parameter it sets, or None."""
-    base = [float(along[0]) for along in values]
-
-    def leaves(pair):
-        return [
-            float(leaf) for leaf in jax.tree.leaves(make(**dict(zip(names, pair, strict=True))))
-        ]
-
-    where = []
-    for i, along in enumerate(values):
-        other = [*base[:i], float(along[-1]), *base[i + 1 :]]
-        pairs = zip(leaves(base), leaves(other), strict=True)
-        changed = [index for index, (a, b) in enumerate(pairs) if a != b]
-        if len(changed) != 1 or leaves(other)[changed[0]] != float(along[-1]):
-            return None
-        where.append(lambda osc, index=changed[0]: jax.tree.leaves(osc)[index])
-    return where[0], where[1]
-
-
-def _bounds(make, names, values, where, step, lines) -> list[BifurcationCurve]:
-    """The curve of every point on a few lines, each curve once."""
+def _bounds(make, names, values, numbers, step, lines) -> list[BifurcationCurve]:
+    """The curve of every point on a few lines, each curve once; numbers: of the two leaves."""
+    first, second = (lambda osc, index=index: jax.tree.leaves(osc)[index] for index in numbers)
+    where = first, second
     span = tuple((float(along[0]), float(along[-1])) for along in values)
     step = step * max(b - a for a, b in span) / 1.4
     across = [

@@ -38,6 +38,7 @@ from .checks import as_array, check_finite, require
 from .compiling import jit
 from .cycles import Cycle, find_cycle
 from .oscillator import Oscillator, check_oscillator
+from .parameters import leaf_groups, leaf_index, names_of, parameter
 from .results import Status, describe
 from .simulate import simulate
 from .smoothing import smooth_field
@@ -99,20 +100,12 @@ class Selection(eqx.Module):
 
 def _select(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, np.ndarray]:
     """What `where` selects, a leaf or a tuple of leaves kept equal for each parameter; and u."""
-    leaves, structure = jax.tree.flatten(osc)
-    chosen = where(jax.tree.unflatten(structure, list(range(len(leaves)))))
-    chosen = chosen if isinstance(chosen, tuple) else (chosen,)
-    groups = tuple(group if isinstance(group, tuple) else (group,) for group in chosen)
-    flat = [leaf for group in groups for leaf in group]
-    fine = groups and all(groups) and all(isinstance(leaf, int) for leaf in flat)
-    what = "a function that selects parameters, each a number or a tuple of numbers kept equal"
-    require(fine, "where", what, repr(chosen))
-    require(len(set(flat)) == len(flat), "where", "free of repeats", repr(chosen))
+    groups, leaves = leaf_groups(osc, where), jax.tree.leaves(osc)
     if bounds is None:
         bounds = [None] * len(groups)
     require(len(bounds) == len(groups), "bounds", f"{len(groups)} pairs or None", repr(bounds))
-    paths = [jax.tree_util.keystr(p)[1:] for p, _ in jax.tree_util.tree_leaves_with_path(osc)]
-    names = tuple(" = ".join(paths[leaf] for leaf in group) for group in groups)
+    named = names_of(osc)
+    names = tuple(" = ".join(named[leaf] for leaf in group) for group in groups)
     values = np.array([float(leaves[group[0]]) for group in groups])
     pairs = []
     for group, name, value, pair in zip(groups, names, values, bounds, strict=True):
@@ -683,12 +676,13 @@ def distance_to(
 
     def distance(cycle: Cycle) -> Array:
         osc = cycle.oscillator
+        value = parameter(osc, leaf_index(osc, where))
         distances = []
         for condition in conditions:
             point = refine(condition, osc, where=where)
             found = point.status == Status.OK
             distances.append(
-                jnp.where(found, jnp.abs(jnp.where(found, point.value, 0.0) - where(osc)), jnp.inf)
+                jnp.where(found, jnp.abs(jnp.where(found, point.value, 0.0) - value), jnp.inf)
             )
         return functools.reduce(jnp.minimum, distances)
 

@@ -187,7 +187,7 @@ def has_edges(osc: Oscillator) -> bool:
 
 #: Rounding: a guard this small, over 1 + |nu| or 1 + |x1|, and an x2' this small, over 1 + |x1|,
 #: are 0.
-ON_GUARD, TANGENT = 1e-12, 1e-12
+ON_GUARD, TANGENT = 1e-14, 1e-12
 
 
 def directions(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:

@@ -38,6 +38,7 @@ from .checks import (
 )
 from .compiling import traced_once
 from .friction import AbstractFriction
+from .processes import require_own_threads
 
 
 def _as_friction(law: Any) -> AbstractFriction:
@@ -119,7 +120,11 @@ class Oscillator(eqx.Module):
 
 
 def check_oscillator(osc: Any, field: str = "osc") -> None:
-    """Raise a `ValueError` unless it is one oscillator, all its known values possible."""
+    """Raise a `ValueError` unless it is one oscillator, all its known values possible.
+
+    The entries that take one ask this first; in a forked process they raise a `RuntimeError`.
+    """
+    require_own_threads()
     require(
         isinstance(osc, Oscillator), field, "an Oscillator, such as jb.presets.class_b(...)", osc
     )

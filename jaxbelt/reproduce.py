@@ -26,13 +26,13 @@ from .bifurcations import (
     NonsmoothFold,
     SlidingExchange,
     SuddenSliding,
-    leaf_index,
 )
 from .cycles import Cycle, unstable_cycle
 from .detection import refined
 from .diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
 from .equilibria import Equilibria, equilibria
 from .oscillator import Belt, Oscillator
+from .parameters import leaf_index
 from .presets import (
     PUBLISHED,
     PUBLISHED_NU1,

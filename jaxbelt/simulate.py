@@ -6,19 +6,20 @@ segments, an arc each, so that it works under `jit`, `vmap`, and derivatives for
 
 Slip arcs are integrated by `diffrax.diffeqsolve` with one scalar event, the smallest guard. It is
 looked at after each step; where it is negative, the step is made once more, shorter, so that it
-ends on the first root. That root cannot hide within the step: besides the boundaries and edges, an
-arc also ends where the acceleration changes its sign (and, before a contact edge, where the
-velocity does), unless no boundary (no edge) is within reach. Between two such turns x2 (x1) is
-monotone, so the sign at the end of a step tells all. Between two zeros of x2' lies a zero of x2,
-since x2'' = -x2 there: more than one turn in a step would take a turn of the phase within it, which
-`MAX_ARC` and `MAX_STEP` exclude.
+ends on the first root of a guard, see `roots`. That root cannot hide within the step: besides the
+boundaries and edges, an arc also ends where the acceleration changes its sign (and, before a
+contact edge, where the velocity does), unless no boundary (no edge) is within reach. Between two
+such turns x2 (x1) is monotone, so the sign at the end of a step tells all, and the sign at the turn
+itself whether an orbit that grazes a boundary (an edge) meets it. Between two zeros of x2' lies a
+zero of x2, since x2'' = -x2 there: more than one turn in a step would take a turn of the phase
+within it, which `MAX_ARC` and `MAX_STEP` exclude.
 
 Samples at given times are taken from the arcs afterwards, in parallel.
 """
 
 import functools
 import math
-from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import diffrax
@@ -38,6 +39,8 @@ from .modes import (
     Mode,
     at_focus,
     boundary_guards,
+    bounds_leftward,
+    bounds_rightward,
     contact,
     edge_guards,
     first_of,
@@ -51,6 +54,7 @@ from .modes import (
 )
 from .oscillator import Oscillator, check_oscillator
 from .results import EventKind, Status, describe
+from .roots import first_root
 from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
 #: Longest and first step, as fractions of the time that is integrated over, MAX_ARC at most.
@@ -207,61 +211,30 @@ def _integrate(osc, mode, y, span, rtol, atol, left=None):
     return *last, solution.event_mask
 
 
-def _guards(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], y) -> Array:
-    """All guards of a slip arc: boundaries, edges, then the turns of x2 and of x1.
-
-    A turn does not count while what it protects is out of reach of one step.
-    """
+def _all_guards(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], y) -> Array:
+    """The guards of a slip mode: boundaries, edges, then the turns of x2 and of x1."""
     x1, x2 = y
     a = mode_acceleration(osc, mode, x1, x2)
-    boundary = boundary_guards(osc, mode, x2)
-    edge = edge_guards(osc, mode, x1)
-    reach = jnp.abs(a) + jnp.abs(x2)
-    boundary, edge = jnp.stack(boundary), jnp.stack(edge)
-    turn_x2 = jnp.maximum(turn[0] * a, jnp.min(boundary) / osc.omega - reach)
-    turn_x1 = jnp.maximum(turn[1] * x2, jnp.min(edge) - reach)
-    return jnp.concatenate([boundary, edge, jnp.stack([turn_x2, turn_x1])])
+    guards = [*boundary_guards(osc, mode, x2), *edge_guards(osc, mode, x1)]
+    return jnp.stack([*guards, turn[0] * a, turn[1] * x2])
 
 
-def _first_root(
-    guards: Callable[[Array], Array], at_start: Array, end: Array, at_end: Array
-) -> tuple[Array, Array]:
-    """The root in (0, end] of the smallest guard, and all guards there (Illinois).
+def _that_count(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], guards: Array) -> Array:
+    """The same, larger where they do not count.
 
-    It is positive just after 0 and negative at `end`. At 0 it may vanish, on the boundary that the
-    arc has just left; that root is not the one. Newton's method adds the last digits.
+    A boundary or edge does not from which the orbit moves away until it turns, nor does a turn
+    while what it protects is out of reach of one step.
     """
-    f_start, f_end = jnp.min(at_start), jnp.min(at_end)
-    f_start = jnp.where(f_start > 1e-12, f_start, -f_end)
-    shortest = 5e-13 * end
-
-    def unfinished(state):
-        a, _, b, _, _, _, at_c, count = state
-        return (b - a > 2 * shortest) & (jnp.min(at_c) != 0) & (count < 60)
-
-    def improve(state):
-        a, fa, b, fb, left, _, _, count = state
-        # Not nearer to an end: once that is the root, up to rounding, the other follows at once.
-        c = jnp.clip((a * fb - b * fa) / (fb - fa), a + shortest, b - shortest)
-        at_c = guards(c)
-        fc = jnp.min(at_c)
-        inside = fc > 0
-        # An end that stays for the second time counts half.
-        fa, fb = jnp.where(left < 0, 0.5, 1.0) * fa, jnp.where(left > 0, 0.5, 1.0) * fb
-        return (
-            jnp.where(inside, c, a),
-            jnp.where(inside, fc, fa),
-            jnp.where(inside, b, c),
-            jnp.where(inside, fb, fc),
-            jnp.where(inside, 1, -1),
-            c,
-            at_c,
-            count + 1,
-        )
-
-    start = (jnp.zeros_like(end), f_start, end, f_end, 0, end, at_end, 0)
-    state = lax.while_loop(unfinished, improve, start)
-    return state[5], state[6]
+    n = len(osc.belts)
+    boundary, edge, turn_x2, turn_x1 = guards[:n], guards[n : 3 * n], guards[-2], guards[-1]
+    reach = jnp.abs(turn_x2) + jnp.abs(turn_x1)
+    turn_x2 = jnp.maximum(turn_x2, jnp.min(boundary) / osc.omega - reach)
+    turn_x1 = jnp.maximum(turn_x1, jnp.min(edge) - reach)
+    nears_boundary = turn[0] * jnp.stack(mode.codes) > 0
+    rightward, leftward = jnp.stack(bounds_rightward(mode)), jnp.stack(bounds_leftward(mode))
+    nears_edge = jnp.where(turn[1] > 0, rightward, leftward)
+    nears = jnp.concatenate([nears_boundary, nears_edge])
+    return jnp.append(jnp.where(nears, guards[:-2], jnp.inf), jnp.stack([turn_x2, turn_x1]))
 
 
 class _SlipArc(eqx.Module):
@@ -280,7 +253,8 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
 
     def left_mode(t, y, args, **kwargs):
         # A rejected first step leaves t = 0, where a guard may vanish.
-        return (t > 0) & (jnp.min(_guards(osc, mode, turn, y)) < 0)
+        guards = _that_count(osc, mode, turn, _all_guards(osc, mode, turn, y))
+        return (t > 0) & (jnp.min(guards) < 0)
 
     started, reached, hit = _integrate(osc, mode, y, span, SAFETY * rtol, SAFETY * atol, left_mode)
     (t_start, *start), (t_end, *y_end) = started, reached
@@ -291,20 +265,29 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
     # Make the last step once more, to the root instead of beyond it.
     start, y_end = tuple(start), tuple(y_end)
     last = lax.stop_gradient(t_end - t_start)
-    frozen = lax.stop_gradient((osc, mode, turn))
-    f_osc, f_mode, f_start = lax.stop_gradient((osc, mode, start))
-    root, at_root = _first_root(
-        lambda h: _guards(*frozen, _single_step(f_osc, f_mode, f_start, h)),
-        _guards(*frozen, f_start),
-        jnp.where(hit, last, 0.0),
-        _guards(*frozen, lax.stop_gradient(y_end)),
+    still = lax.stop_gradient((osc, mode, start))
+    f_osc, f_mode, f_turn, f_end = lax.stop_gradient((osc, mode, turn, y_end))
+
+    def guards_at(y):
+        def guards(*y):
+            return _all_guards(f_osc, f_mode, f_turn, y)
+
+        values, slopes = jax.jvp(guards, y, _velocity(f_osc, f_mode, y))
+        return _that_count(f_osc, f_mode, f_turn, values), slopes
+
+    values, slopes = guards_at(f_end)
+    root, fired = first_root(
+        lambda h: guards_at(_single_step(*still, h)),
+        guards_at(still[-1]),
+        last,
+        (jnp.where(hit, values, jnp.inf), slopes),
+        turns=2,
     )
-    fired = jnp.argmin(at_root)
     # A turn is invisible: nothing depends on where the arc is split.
     is_event = hit & (fired < 3 * len(osc.belts))
 
     def guard_fired(*y):
-        guards = _guards(osc, mode, turn, y)
+        guards = _all_guards(osc, mode, turn, y)
         return jnp.sum(jnp.where(jnp.arange(guards.size) == fired, guards, 0.0))
 
     # Two Newton steps, small ones: the digits that are left, and derivatives to second order.
@@ -522,6 +505,13 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
 
     final, records = lax.scan(block, start, length=-(-max_segments // length))
     records = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), records)
+    # A run that begins at a pseudo-focus has one arc, of duration zero.
+    blank, zero = _unused(len(osc.belts)), jnp.zeros(())
+    rest = replace(blank, t=t0, y=jnp.stack(y), mode=_codes(mode), duration=zero)
+    at_rest = start.status == Status.PSEUDO_FOCUS
+    records = jax.tree.map(
+        lambda leaf, first: leaf.at[0].set(jnp.where(at_rest, first, leaf[0])), records, rest
+    )
     unfinished = jnp.where(final.done, final.status, Status.TOO_MANY_SEGMENTS.value)
     return eqx.tree_at(lambda s: s.status, final, unfinished), records
 

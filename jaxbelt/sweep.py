@@ -11,6 +11,7 @@ import inspect
 import json
 import math
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,13 +24,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from . import batch
+from .audit import chosen, differing
 from .checks import (
     as_array,
     check_finite,
     check_positive,
     is_concrete,
     require,
-    require_float64,
+    require_usable_jax,
 )
 from .oscillator import Oscillator, check_scalars
 from .results import of_one_turn
@@ -91,6 +93,7 @@ def sweep(
     derivatives: Sequence[str] = (),
     store: str | Path | None = None,
     progress: bool | None = None,
+    audit: float = 0.0,
 ) -> "xarray.Dataset":
     """Run an oscillator from every point of a grid of parameters and starts.
 
@@ -120,12 +123,14 @@ def sweep(
     derivatives: names of axes. Adds `d_<variable>_d_<axis>` for every variable that is a float, by
     forward mode. store: a folder for the results as they come in; the same call with the same
     store goes on where an interrupted one stopped. progress: whether to show a bar; None: on a
-    terminal, when it takes long.
+    terminal, when it takes long. audit: share of the runs that are done once more without any
+    shortcut and compared, see `audit` for what is left out; the attributes audited and
+    audit_differed say how many, and a warning says so where one differed.
 
     Uses every core (every device, if JAX has others). `ValueError` names the argument that is
     impossible.
     """
-    require_float64()
+    require_usable_jax()
     grid = _Grid(make, axes, y0)
     observer = _observer(observe)
     if t1 is None:
@@ -140,6 +145,14 @@ def sweep(
         require(
             name in grid.axes, "derivatives", f"names of axes, {', '.join(grid.axes)}", repr(name)
         )
+    audit = float(as_array(audit, "audit"))
+    require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
+    require(
+        audit == 0 or not isinstance(observer, batch.Reduce),
+        "audit",
+        '0 but for observe="final" and "attractor"',
+        audit,
+    )
     attributes = _provenance(grid, numbers, observe, derivatives)
     program = grid.program(observer)
     table = _Table(program, grid, derivatives, store, attributes)
@@ -157,7 +170,24 @@ def sweep(
         batch.run(
             program, grid.shared, rows_of, len(todo), put, **numbers, derivatives=len(derivatives)
         )
+    if audit:
+        attributes |= _audited(program, grid, table, audit, numbers)
     return table.dataset(attributes)
+
+
+def _audited(program, grid: "_Grid", table: "_Table", share: float, numbers) -> dict[str, int]:
+    """The attributes that tell of an audit; warns of what differed."""
+    runs = chosen(math.prod(grid.shape), share)
+    known = {name: table.arrays[name][runs] for name in table.layout}
+    differ = differing(program, grid.shared, lambda i: grid.rows(i)[0], runs, known, numbers)
+    if len(differ):
+        places = [tuple(map(int, np.unravel_index(run, grid.shape))) for run in differ[:5]]
+        warnings.warn(
+            f"{len(differ)} of {len(runs)} audited runs differ from the long way, at the indices "
+            f"{', '.join(map(str, places))}{' and others' * (len(differ) > 5)}",
+            stacklevel=3,
+        )
+    return {"audited": len(runs), "audit_differed": len(differ)}
 
 
 def _observer(observe: Any) -> batch.Observer:
@@ -315,13 +345,7 @@ class _Table:
 
     def put(self, runs: np.ndarray, results: np.ndarray) -> None:
         """Store results of runs, [1 + derivatives, columns, runs]; the status last of all."""
-        column = 0
-        parts = {}
-        for name, shape in self.layout.items():
-            width = math.prod(shape)
-            part = np.moveaxis(results[:, column : column + width], 1, -1)
-            parts[name] = part.reshape(*part.shape[:2], *shape)
-            column += width
+        parts = batch.by_name(self.layout, results)
         status = parts.pop("status")[0]
         for name, part in parts.items():
             # Codes of runs that are not finite are not numbers: 0.

@@ -26,12 +26,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .bifurcations import BifurcationPoint, NonsmoothFold, leaf_index, small_newton, vary
+from .bifurcations import BifurcationPoint, NonsmoothFold, small_newton
 from .checks import as_array, check_positive, require
 from .compiling import jit
 from .cycles import flow
 from .modes import Mode, capacity, mode_acceleration
 from .oscillator import Oscillator
+from .parameters import leaf_index, vary
 
 #: Integration steps of order twelve for the slip phase.
 STEPS = 64

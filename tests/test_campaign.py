@@ -148,8 +148,8 @@ def test_cases_go_to_json_and_back():
     "arguments",
     [
         "final --runs 300 --structure 0 --seed 11",
-        "attractors --runs 150 --structure 0 --seed 12",
-        "simulate --runs 64 --structure 0 --seed 13",
+        "attractors --runs 100 --structure 0 --seed 12",
+        "simulate --runs 32 --structure 6 --seed 13",
     ],
 )
 def test_small_campaign(arguments, capsys):

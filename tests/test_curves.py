@@ -312,3 +312,19 @@ def test_nothing_departs_from_a_belt_at_rest_in_a_focus():
     trace = 4 + 4 / 4**2 - 0.5
     strong = 0.5 * trace + np.sqrt(0.25 * trace**2 - 1)
     assert y[1] < 0 and (y[0] - rest) / y[1] == pytest.approx(1 / strong, rel=1e-3)
+
+
+def test_a_curve_ends_where_its_cycle_shrinks_to_a_point():
+    # A cycle around the edge x1 = 0 that touches the boundary of belt 0 there is as small as that
+    # velocity. With both belts at rest it is a point, in which its equations are singular.
+    osc = jb.presets.class_c(nu0=0.1665, nu1=-0.171837304014, sigma=0.0)
+    point = jb.refine(jb.CornerCollision(0), osc, where=nu1)
+    curve = jb.bifurcation_curve(point, (nu0, nu1), ((-0.02, 0.2), (-0.2, 0.02)), step=0.02)
+    assert np.all(np.abs(curve.values) > 0.005)  # the last step goes across
+    found = {(special.kind, special.belts): special for special in curve.special}
+    at_rest = {("BeltAtRest", (0,)), ("BeltAtRest", (1,)), ("EqualVelocities", (0, 1))}
+    assert set(found) == at_rest
+    for special in found.values():
+        assert special.residual < 1e-8
+        assert special.values == pytest.approx((0.0, 0.0), abs=special.residual)
+    assert curve.ends == (End.STOPPED, End.LEFT_SPAN)

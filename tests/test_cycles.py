@@ -60,6 +60,22 @@ def test_cycle_that_passes_contact_edges_is_that_of_the_oracle(kind, parameters)
         assert getattr(cycle, name) == pytest.approx(getattr(expected, name), abs=1e-10)
 
 
+@pytest.mark.parametrize("load", [0.02, 0.0])
+def test_cycle_that_crosses_a_belt_at_rest(load):
+    # There x1 has its extrema on the boundary itself.
+    law, mu = jb.Conti(1.0, 0.6, 10.0), oracle.conti(1.0, 0.6, 10.0)
+    osc = jb.Oscillator(0.5, (jb.Belt(0.2, law), jb.Belt(0.0, law, load)))
+    cycle = jb.find_cycle(osc, START)
+    belts = oracle.Belt(0.2, *mu), oracle.Belt(0.0, *mu, load)
+    expected = oracle_cycles.sticking_cycle(oracle.Oscillator(0.5, belts))
+    assert cycle.status == Status.OK
+    assert tuple((kind.name, belt) for kind, belt in cycle.signature) == expected.signature
+    assert cycle.period == pytest.approx(expected.period, abs=1e-10)
+    assert cycle.stick_durations == pytest.approx(expected.stick_durations, abs=1e-10)
+    for name in EXTREMA:
+        assert getattr(cycle, name) == pytest.approx(getattr(expected, name), abs=1e-10)
+
+
 @pytest.mark.parametrize(
     ("name", "velocities"),
     [

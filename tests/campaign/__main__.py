@@ -28,7 +28,8 @@ def main(arguments=None):
     with ThreadPoolExecutor(options.threads) as pool:
         for batch in _batches(cases, rng, options):
             told = _ask(package, batch, options)
-            judge = compare.judge_label if options.what == "attractors" else compare.judge
+            labels = options.what == "attractors" or options.by == "find_cycle"
+            judge = compare.judge_label if labels else compare.judge
 
             def one(pair, judge=judge):
                 return judge(*pair, options.tol)
@@ -53,7 +54,7 @@ def main(arguments=None):
                 disagreements.append(line)
                 if report:
                     print(json.dumps(line), file=report, flush=True)
-            if options.what == "grazing":
+            if options.what == "grazing" and not labels:
                 _differentiate(graze, verdicts, disagreements, rng, options)
                 graze.clear()
             done += len(batch)
@@ -87,7 +88,10 @@ def _parser():
     parser.add_argument("--paths", type=int, default=20)
     parser.add_argument("--rational-share", type=float, default=0.5)
     parser.add_argument(
-        "--by", choices=("simulate", "sweep"), default="simulate", help="who is asked to graze"
+        "--by",
+        choices=("simulate", "sweep", "find_cycle"),
+        default="simulate",
+        help="who is asked to graze",
     )
     parser.add_argument("--programs", type=int, default=9, help="structures of laws and edges")
     parser.add_argument("--structure", type=int, help="only this one of them")
@@ -140,6 +144,8 @@ def _batches(cases, rng, options):
 
 
 def _ask(package, batch, options):
+    if options.by == "find_cycle":
+        return package.cycles(batch)
     if options.what == "final" or options.by == "sweep":
         return package.finals(batch, options.tol)
     if options.what == "attractors":

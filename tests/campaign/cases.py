@@ -333,6 +333,36 @@ def grazing_case(rng, structure, smallest, largest=1e-3):
             return case
 
 
+def grazing_cycle(rng, smallest, largest=1e-3):
+    """An oscillator with one belt more, whose edge a cycle misses, or goes beyond, by a distance.
+
+    Or whose boundary, if it has no load: then nothing changes but the events. The start is on the
+    cycle of the other belts, half a turn before.
+    """
+    while True:
+        structure = (("conti",) * int(rng.integers(1, 3)), False)
+        osc = random_case(rng, structure).oscillator
+        cycle = engine.attractor(osc, (3.0, 0.0))
+        if cycle.kind != "cycle" or cycle.period > 20 or cycle.margin < 1e-3:
+            continue
+        distance = float(np.exp(rng.uniform(np.log(smallest), np.log(largest))))
+        distance *= 1 if rng.random() < 0.5 else -1
+        sign = int(rng.choice([-1, 1]))
+        law = _random_law(rng, "conti")
+        if rng.random() < 0.5:
+            edge = cycle.x1[(sign + 1) // 2] + sign * distance
+            bounds = (edge, inf) if sign > 0 else (-inf, edge)
+            extra, kind = Belt(rng.uniform(-1, 1), law, rng.uniform(0.3, 1.5), *bounds), "edge"
+        else:
+            x2 = cycle.x2[(sign + 1) // 2]
+            if any(abs(x2 - b.velocity / osc.omega) < 1e-2 for b in osc.belts):
+                continue
+            extra, kind = Belt(osc.omega * (x2 + sign * distance), law, 0.0), "boundary"
+        y0 = engine.simulate(osc, cycle.y, 0.5 * cycle.period).y_end
+        osc = replace(osc, belts=(*osc.belts, extra))
+        return Case(osc, tuple(y0), 50.0, f"cycle, {kind}", distance)
+
+
 def _mode_beside(osc, x1, side, x2, given):
     """The slip mode beside an edge, or at x1; given: signs of some belts."""
     mode = []
@@ -349,6 +379,9 @@ def _mode_beside(osc, x1, side, x2, given):
 def grazing_batches(rng, options):
     """Lists of grazing cases, one structure each; T is the same for all of a list."""
     smallest = 1e-11 if options.tol <= 1e-12 else 1e-8
+    if options.by == "find_cycle":
+        yield [grazing_cycle(rng, smallest) for _ in range(options.runs)]
+        return
     chosen = structures(rng, options.programs)
     for structure in chosen:
         yield [

@@ -875,7 +875,8 @@ def force(osc, mode, x1, x2):
 @dataclass(frozen=True)
 class Attractor:
     """kind: "equilibrium", "cycle", "stuck" or "undecided"; turn: the events of one period, (kind,
-    belt) each, from where their order is least; sticks: time stuck to each belt in one period."""
+    belt) each, from where their order is least; sticks: time stuck to each belt in one period; y: a
+    state on it, of a cycle a maximum of x1."""
 
     kind: str
     period: float = nan
@@ -885,6 +886,7 @@ class Attractor:
     sticks: tuple = ()
     margin: float = inf
     status: int = OK
+    y: tuple = (nan, nan)
 
 
 def attractor(osc, y0, *, chunk=100.0, t_max=200_000.0, same=1e-9, at_rest=1e-6, periods=24):
@@ -960,4 +962,5 @@ def _cycle(osc, run, first, last):
         (float(y[:, 0].min()), float(y[:, 0].max())),
         (float(y[:, 1].min()), float(y[:, 1].max())),
         tuple(stuck.tolist()),
+        y=tuple(y[-1].tolist()),
     )

@@ -185,6 +185,28 @@ def labels(cases, tol, **options):
     return out
 
 
+def cycles(cases):
+    """Attractors by `find_cycle`, one by one."""
+    out = []
+    for case in cases:
+        found = jb.find_cycle(oscillator(case.oscillator), case.y0)
+        status = int(found.status)
+        kind = {0: "cycle", 1: "stuck", 2: "equilibrium", 6: "equilibrium"}.get(status, "undecided")
+        turn = jb.results.of_one_turn([(int(k), int(b)) for k, b in found.signature])
+        out.append(
+            Label(
+                kind,
+                float(found.period),
+                turn,
+                (float(found.x1_min), float(found.x1_max)),
+                (float(found.x2_min), float(found.x2_max)),
+                tuple(np.asarray(found.stick_durations).tolist()),
+                status,
+            )
+        )
+    return out
+
+
 def _turn(word):
     """A signature's word as events, (kind, belt) each; None where it was too long."""
     if word in ("none", "smooth"):

@@ -1,0 +1,118 @@
+"""Audits of sweeps: some runs once more the long way, without any shortcut, and compared.
+
+The kernel of `batch` takes three: a run of final states skips the turns that it has seen repeat; a
+run that looks for its attractor ends as soon as it knows it; and a run that is captured by a
+pseudo-focus ends at rest there. The long way takes none of them to t1. From the state at t1 the
+attractor is then looked for again: it has to be the same one.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from . import batch
+from .modes import FOCUS_RADIUS
+from .results import Status, of_one_turn
+
+#: States and extrema may differ by so many times the tolerance of a step: errors add up over a run.
+CLOSE = 1e4
+#: Share of the usual budget of steps on the long way, where no pseudo-focus ends a run.
+BUDGET = 0.1
+
+Results = dict[str, np.ndarray]
+
+
+def chosen(runs: int, share: float) -> np.ndarray:
+    """The numbers of the runs that are audited: the same ones for the same sweep."""
+    count = math.ceil(share * runs)
+    return np.sort(np.random.default_rng(runs).choice(runs, count, replace=False))
+
+
+def differing(
+    program: batch.Program,
+    shared: list[Any],
+    rows_of: Callable[[np.ndarray], np.ndarray],
+    runs: np.ndarray,
+    known: Results,
+    numbers: dict[str, float],
+) -> np.ndarray:
+    """The numbers of the audited runs of which the long way says otherwise.
+
+    rows_of(runs): the kernel's rows of some runs, [columns, runs]; known: what the sweep says of
+    the audited ones, a row each, in the form of the kernel's results.
+    """
+    rows = np.concatenate(
+        [rows_of(part) for part in np.array_split(runs, -(-len(runs) // batch.CHUNK))], axis=1
+    )
+    long_way = dataclasses.replace(program, observer=batch.Final(skip=False), captures=False)
+    final = _results(long_way, shared, rows, numbers)
+    if isinstance(program.observer, batch.Final):
+        return runs[~_same_ends(known, final, numbers)]
+    rows[:2] = final["x1_end"], final["x2_end"]
+    again = _results(program, shared, rows, numbers)
+    return runs[~_same_attractors(known, final, again, numbers)]
+
+
+def _results(program, shared, rows: np.ndarray, numbers: dict[str, float]) -> Results:
+    """The kernel's results for the rows, in their order."""
+    layout = batch.layout(program, shared)
+    runs = rows.shape[1]
+    columns = np.full((sum(map(math.prod, layout.values())), runs), np.nan)
+
+    def put(done: np.ndarray, results: np.ndarray) -> None:
+        columns[:, done] = results[0]
+
+    batch.run(
+        program,
+        shared,
+        lambda first, last: rows[None, :, first:last],
+        runs,
+        put,
+        **numbers,
+        budget=BUDGET,
+    )
+    return batch.by_name(layout, columns)
+
+
+def _close(a: np.ndarray, b: np.ndarray, numbers: dict[str, float]) -> np.ndarray:
+    largest = np.maximum(np.abs(a), np.abs(b))
+    return np.abs(a - b) <= CLOSE * (numbers["atol"] + numbers["rtol"] * largest)
+
+
+def _same_ends(known: Results, final: Results, numbers: dict[str, float]) -> np.ndarray:
+    """Whether final states agree: to the tolerance, or within the reach of a pseudo-focus."""
+    same = (known["n_events"] == final["n_events"]) & (known["status"] == final["status"])
+    same &= np.all(known["mode_end"] == final["mode_end"], axis=1)
+    for name in ("x1_end", "x2_end"):
+        same &= _close(known[name], final[name], numbers)
+    lost = (known["status"] == Status.NOT_FINITE) & (final["status"] == Status.NOT_FINITE)
+    return same | lost | _captured(known["x1_end"], known, final)
+
+
+def _captured(x1: np.ndarray, known: Results, final: Results) -> np.ndarray:
+    """Whether a run that was ended by a pseudo-focus at x1 has not left it on the long way."""
+    distance = np.hypot(final["x1_end"] - x1, final["x2_end"])
+    return (known["status"] == Status.PSEUDO_FOCUS) & (distance <= FOCUS_RADIUS)
+
+
+def _same_attractors(
+    known: Results, final: Results, again: Results, numbers: dict[str, float]
+) -> np.ndarray:
+    """Whether attractors agree, each with its place. What is undecided claims nothing."""
+    decided = (known["kind"] != batch.UNDECIDED) & (again["kind"] != batch.UNDECIDED)
+    same = known["kind"] == again["kind"]
+    for name in ("x1_min", "x1_max", "x2_min", "x2_max"):
+        same &= _close(known[name], again[name], numbers)
+    cycle = same & (known["kind"] == batch.CYCLE)
+    same &= ~cycle | _close(known["period"], again["period"], numbers)
+    belts = known["sticks"].shape[1]
+    for i in np.flatnonzero(cycle):
+        turns = (
+            of_one_turn(batch.word_events(int(word), belts))
+            for word in (known["signature"][i], again["signature"][i])
+        )
+        same[i] &= len(set(turns)) == 1
+    return same | ~decided | _captured(known["x1_max"], known, final)

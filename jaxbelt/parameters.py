@@ -1,0 +1,164 @@
+"""Which parameter is meant: a leaf of the oscillator, known by its place.
+
+Two parameters may have one value, and two belts may share one friction law; what tells parameters
+apart is their place among the leaves of the oscillator, as JAX counts them. So `where` is asked on
+a copy of the oscillator whose leaves are nothing but themselves: whatever comes back is one of
+them, or it is not a parameter.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Var
+from jaxtyping import Array
+
+from .checks import is_concrete, require
+from .oscillator import Oscillator
+
+
+class Parameter:
+    """Stands for a leaf where `where` is asked. It has no value, so nothing is computed with it."""
+
+    def __init__(self, index: int, name: str):
+        self.index, self.name = index, name
+
+    def __repr__(self) -> str:
+        return self.name
+
+    def _no_value(self, *_: Any) -> NoReturn:
+        raise TypeError(f"{self.name} has no value while `where` selects")
+
+    __bool__ = __eq__ = __ne__ = _no_value
+    __hash__ = object.__hash__
+
+
+def names_of(osc: Oscillator) -> list[str]:
+    """The names of the leaves in their order, such as "belts[0].velocity"."""
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(osc)]
+    return [jax.tree_util.keystr(path).removeprefix(".") for path in paths]
+
+
+def leaf_index(osc: Oscillator, where: Any) -> int:
+    """The number of the parameter that `where` selects, among the leaves of the oscillator.
+
+    By its number, not by the function: a new lambda in every call would compile anew every time.
+    `ValueError` where that is no parameter.
+    """
+    expected = (
+        f"a function that selects one parameter{_of(osc)}, unchanged, such as "
+        "`lambda osc: osc.belts[0].velocity`"
+    )
+    chosen = _ask(osc, where, expected)
+    require(_is_number(osc, chosen), "where", expected, _told(chosen))
+    return chosen.index
+
+
+def leaf_groups(osc: Oscillator, where: Any) -> tuple[tuple[int, ...], ...]:
+    """The numbers of the leaves of each parameter that `where` selects, as for `fit`.
+
+    It gives a leaf, or a tuple with an entry for each parameter: a leaf, or a tuple of leaves that
+    are to be equal. `ValueError` for anything else, and for a leaf that comes twice.
+    """
+    expected = (
+        f"a function that selects parameters{_of(osc)}, unchanged: one, or a tuple, each entry a "
+        "number or a tuple of numbers kept equal, such as `lambda osc: (osc.damping, osc.omega)`"
+    )
+    chosen = _ask(osc, where, expected)
+    groups = [_tuple(one) for one in _tuple(chosen)]
+    flat = [leaf for group in groups for leaf in group]
+    fine = groups and all(groups) and all(_is_number(osc, leaf) for leaf in flat)
+    require(fine, "where", expected, _told(chosen))
+    numbers = [leaf.index for leaf in flat]
+    require(len(set(numbers)) == len(numbers), "where", "free of repeats", _told(chosen))
+    return tuple(tuple(leaf.index for leaf in group) for group in groups)
+
+
+def _ask(osc: Oscillator, where: Any, expected: str) -> Any:
+    """What `where` selects of a copy whose leaves are `Parameter`s."""
+    require(callable(where), "where", expected, repr(where))
+    leaves = [Parameter(index, name) for index, name in enumerate(names_of(osc))]
+    try:
+        return where(jax.tree.unflatten(jax.tree.structure(osc), leaves))
+    except Exception as error:
+        came = str(error).partition("\n")[0]
+        raise ValueError(f"where must be {expected}, got {type(error).__name__}: {came}") from error
+
+
+def _is_number(osc: Oscillator, chosen: Any) -> bool:
+    if not isinstance(chosen, Parameter):
+        return False
+    leaf = jax.tree.leaves(osc)[chosen.index]
+    # Of a law of the user's own a leaf may be anything.
+    return np.ndim(leaf) == 0 and (eqx.is_inexact_array_like(leaf) or type(leaf) is int)
+
+
+def _of(osc: Oscillator) -> str:
+    return f" of an oscillator with belts 0 to {len(osc.belts) - 1}"
+
+
+def _tuple(chosen: Any) -> tuple[Any, ...]:
+    return chosen if isinstance(chosen, tuple) else (chosen,)
+
+
+def _told(chosen: Any) -> str:
+    """What came, in words; numbers are not known here, so modules do not print."""
+    if isinstance(chosen, tuple | list):
+        return f"({', '.join(map(_told, chosen))})"
+    return f"a whole {type(chosen).__name__}" if isinstance(chosen, eqx.Module) else repr(chosen)
+
+
+def vary(osc: Oscillator, index: int | Array, p: Array) -> Oscillator:
+    """The oscillator with the parameters of these numbers, one or [k], replaced by p, [k].
+
+    Where the numbers are arrays, one program serves all parameters.
+    """
+    leaves, structure = jax.tree.flatten(osc)
+    numbers = [index] if isinstance(index, int) or index.ndim == 0 else index
+    known = is_concrete((osc, index, p))
+    # What is known is taken apart in NumPy, which compiles nothing.
+    for which, value in zip(numbers, np.asarray(p) if known else p, strict=True):
+        if known or isinstance(index, int):
+            leaves[int(which)] = jnp.asarray(value)
+        else:
+            leaves = [jnp.where(which == i, value, leaf) for i, leaf in enumerate(leaves)]
+    return jax.tree.unflatten(structure, leaves)
+
+
+def parameter(osc: Oscillator, index: int | Array) -> Array:
+    """The parameter of that number."""
+    leaves = jax.tree.leaves(osc)
+    return leaves[int(index)] if is_concrete(index) else jnp.stack(leaves)[index]
+
+
+def set_alone(make: Callable[..., Oscillator], names: Sequence[str]) -> list[int] | None:
+    """For each argument of `make` the number of the leaf that it is, or None.
+
+    None where an argument is not one leaf, or another leaf depends on it: an oscillator with this
+    leaf changed is then not what `make` gives.
+    """
+    number = jax.ShapeDtypeStruct((), jnp.float64)
+
+    def leaves(*values):
+        every = jax.tree.leaves(make(**dict(zip(names, values, strict=True))))
+        return [leaf if eqx.is_array_like(leaf) else 0.0 for leaf in every]
+
+    program = jax.make_jaxpr(leaves)(*[number] * len(names)).jaxpr
+    numbers = []
+    for argument in program.invars:
+        depending = {argument}
+        for equation in program.eqns:
+            if any(isinstance(one, Var) and one in depending for one in equation.invars):
+                depending.update(equation.outvars)
+        places = [
+            place
+            for place, one in enumerate(program.outvars)
+            if isinstance(one, Var) and one in depending
+        ]
+        if len(places) != 1 or program.outvars[places[0]] is not argument:
+            return None
+        numbers += places
+    return numbers
