@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .cycles import Chain, Cycle, Turn, event_between, find_cycle, modes_of
+from .modes import ABOVE
 from .oscillator import Oscillator
 from .results import EventKind, Status, of_one_turn
 
@@ -35,15 +36,21 @@ RUN = 1e3
 FAR = 1e-2
 
 
-def itinerary(turn: Chain | Turn) -> Itinerary:
+def itinerary(osc: Oscillator, turn: Chain | Turn) -> Itinerary:
     """The modes of one turn in order, wherever it was begun."""
-    modes = modes_of(turn)
+    modes = without_idle(osc, modes_of(turn))
     changes = [
         tuple(mode.tolist())
         for before, mode in zip(np.roll(modes, 1, axis=0), modes, strict=True)
         if np.any(mode != before)
     ]
     return of_one_turn(changes or [tuple(modes[0].tolist())])
+
+
+def without_idle(osc: Oscillator, modes: np.ndarray) -> np.ndarray:
+    """Contact codes, [.., belts], in which a belt without load, which does nothing, is absent."""
+    idle = np.array([float(belt.load) == 0 for belt in osc.belts])
+    return np.where(idle, int(ABOVE), modes)
 
 
 def events_of(path: Itinerary) -> tuple[tuple[EventKind, int], ...]:
@@ -89,8 +96,8 @@ def is_same(cycle: Cycle, other: Cycle, tolerance: float = SOLVED) -> bool:
     """Whether two cycles of one oscillator are one; both with status OK."""
     if int(cycle.status) != Status.OK or int(other.status) != Status.OK:
         return False
-    same_modes = itinerary(cycle.chain) == itinerary(other.chain)
-    return same_modes and apart(place_of(cycle), place_of(other)) < tolerance
+    modes, others = (itinerary(one.oscillator, one.chain) for one in (cycle, other))
+    return modes == others and apart(place_of(cycle), place_of(other)) < tolerance
 
 
 def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:

@@ -41,6 +41,8 @@ from .modes import (
     at_focus,
     begins_at_rest,
     boundary_guards,
+    bounds_leftward,
+    bounds_rightward,
     capacity,
     edge_guards,
     edges,
@@ -58,6 +60,7 @@ from .modes import (
 )
 from .oscillator import Oscillator, check_oscillator
 from .results import EventKind, Status, describe
+from .roots import first_root
 from .simulate import Arcs
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
@@ -413,10 +416,17 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
     a_sign, v_sign = _after(osc, codes, y)
     field = functools.partial(_field, osc, codes)
 
+    # Others are moved away from until the next turn.
+    nears_edge = jnp.where(
+        v_sign > 0, jnp.stack(bounds_rightward(mode)), jnp.stack(bounds_leftward(mode))
+    )
+    nears = jnp.concatenate([a_sign * codes > 0, nears_edge])
+
     def guards(y):
         a = mode_acceleration(osc, mode, y[0], y[1])
-        values = [*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])]
-        return jnp.stack([*values, a_sign * a, v_sign * y[1]])
+        values = jnp.stack([*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])])
+        turns = jnp.stack([a_sign * a, v_sign * y[1]])
+        return jnp.append(jnp.where(nears, values, jnp.inf), turns)
 
     def inside(state):
         _, _, _, y_end, steps = state
@@ -431,41 +441,25 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
 
     zero = jnp.zeros(())
     t, y0, h, y1, steps = lax.while_loop(inside, advance, (zero, y, zero, y, jnp.asarray(0)))
-    # The root on the step's cubic, then two Newton steps of the true state.
-    d0, d1 = field(y0) * h, field(y1) * h
 
-    def cubic(s):
-        return (
-            (1 + 2 * s) * (1 - s) ** 2 * y0
-            + s * (1 - s) ** 2 * d0
-            + s**2 * (3 - 2 * s) * y1
-            + s**2 * (s - 1) * d1
-        )
+    def guards_at(y):
+        return jax.jvp(guards, (y,), (field(y),))
 
-    def halve(_, bracket):
-        left, right = bracket
-        middle = 0.5 * (left + right)
-        out = jnp.any(guards(cubic(middle)) < 0)
-        return jnp.where(out, left, middle), jnp.where(out, middle, right)
-
-    _, root = lax.fori_loop(0, 30, halve, (jnp.zeros(()), jnp.ones(())))
-    fired = jnp.argmin(guards(cubic(root)))
-
-    def polish(_, state):
-        h_root, _, _, fired = state
-        y_root = _step(field, y0, h_root, _MEDIUM)
-        value, slope = jax.jvp(guards, (y_root,), (field(y_root),))
-        regular = jnp.abs(slope) > 1e-6
-        since = jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0)
-        # Another guard may have fired before this one: the cubic does not tell two that are close.
-        late = (value < 0) & (slope < 0) | (jnp.arange(value.size) == fired)
-        before = jnp.where(late, since, -jnp.inf)
-        first = jnp.argmax(before)
-        fired = jnp.where(before[first] > before[fired] + 1e-12, first, fired)
-        return jnp.clip(h_root - since[fired], 0.0, 1.01 * h), h_root, y_root, fired
-
-    _, h_root, y_root, fired = lax.fori_loop(0, 3, polish, (root * h, root * h, y0, fired))
-    return t + h_root, y_root, fired, steps >= 200
+    values, slopes = guards_at(y1)
+    h_root, fired = first_root(
+        lambda h: guards_at(_step(field, y0, h, _MEDIUM)),
+        guards_at(y0),
+        h,
+        (jnp.where(mode.any_stuck, jnp.inf, values), slopes),
+        turns=2,
+    )
+    # Newton's method adds the last digits, but at a tangency.
+    values, slopes = guards_at(_step(field, y0, h_root, _MEDIUM))
+    own = jnp.arange(values.size) == fired
+    value, slope = (jnp.sum(jnp.where(own, part, 0.0)) for part in (values, slopes))
+    regular = jnp.abs(slope) > 1e-6
+    h_root = h_root - jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0)
+    return t + h_root, _step(field, y0, h_root, _MEDIUM), fired, steps >= 200
 
 
 def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:

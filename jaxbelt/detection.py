@@ -31,7 +31,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .attractors import SOLVED, Itinerary, apart, events_of, itinerary, place_of, sticks
+from .attractors import (
+    SOLVED,
+    Itinerary,
+    apart,
+    events_of,
+    itinerary,
+    place_of,
+    sticks,
+    without_idle,
+)
 from .bifurcations import (
     AbstractCondition,
     BeltAtRest,
@@ -168,7 +177,7 @@ def edges_touched(path: "Path", values: np.ndarray, around: int) -> tuple[Bifurc
         return path.unstable(value, around)
 
     def modes(value):
-        return itinerary(unstable(value).chain)
+        return itinerary(path.osc, unstable(value).chain)
 
     def changes(values):
         known = [v for v in map(float, values) if unstable(v).status == Status.OK]
@@ -329,7 +338,7 @@ class Path:
     def _take(self, value: float, seen: "_Seen") -> None:
         """Label a value by what was seen there."""
         exists = seen.kind > 0
-        modes = map(tuple, seen.modes[exists].tolist())
+        modes = map(tuple, without_idle(self.at(value), seen.modes[exists]).tolist())
         rests = tuple(
             zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), modes, strict=True)
         )
@@ -353,18 +362,18 @@ class Path:
 
         A turn that sticks is one of it. Any other may only seem to repeat.
         """
-        if sticks(path := itinerary(turn)):
+        osc, ok = self.at(value), jnp.asarray(Status.OK.value)
+        if sticks(path := itinerary(osc, turn)):
             return Found(path, turn)
         # Where the cycle has other turns than those from which it is solved for, or meets a
         # boundary, it is followed.
-        osc, ok = self.at(value), jnp.asarray(Status.OK.value)
         ways = (lambda: polish(osc, cut([turn])[0], ok), lambda: find_cycle(osc, turn.entries[0]))
         for cycle in (way() for way in ways):
             if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
                 # Not the equilibrium, to which a cycle may shrink.
                 if np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST:
                     turn = jax.tree.map(np.asarray, as_turn(cycle, ROOM))
-                    return Found(itinerary(turn), turn)
+                    return Found(itinerary(osc, turn), turn)
         return None
 
     def _share(self) -> None:

@@ -84,7 +84,9 @@ class Cases:
     def take(self, where) -> "Cases":
         parts = {name: part for name, part in vars(self).items() if isinstance(part, np.ndarray)}
         return replace(
-            self, osc=self.osc.take(where), **{name: part[..., where] for name, part in parts.items()}
+            self,
+            osc=self.osc.take(where),
+            **{name: part[..., where] for name, part in parts.items()},
         )
 
 
@@ -119,7 +121,9 @@ def land(osc, codes, y, guess, axis, level):
 
 def growth(osc, codes, y, duration):
     """By how much deviations from the state y grow at most in that time."""
-    slopes = [flow(osc, codes, (y[0] + u, y[1] + v), duration) for u, v in ((1e-30j, 0), (0, 1e-30j))]
+    slopes = [
+        flow(osc, codes, (y[0] + u, y[1] + v), duration) for u, v in ((1e-30j, 0), (0, 1e-30j))
+    ]
     return np.max(np.abs(np.imag(slopes)) / 1e-30, axis=(0, 1))
 
 
@@ -288,7 +292,16 @@ def edge_cases(seed, n, distances) -> list[Cases]:
         start, fine = path[-1], _stays(osc, before, path, sigma, e)
         fine &= growth(osc, before, start, back) < GROWTH
         case = Cases(
-            osc, start, SPAN_AT_EDGE, back, d, near, np.full(n, "missed", dtype="U7"), before, before, 0
+            osc,
+            start,
+            SPAN_AT_EDGE,
+            back,
+            d,
+            near,
+            np.full(n, "missed", dtype="U7"),
+            before,
+            before,
+            0,
         )
         if d < 0:
             path = flow(osc, before, top, on, path=True)

@@ -252,3 +252,12 @@ def test_a_batch_of_cycles_is_each_of_them():
         assert batch.period[i] == pytest.approx(float(one.period), abs=1e-12)
         assert batch.stick_durations[i] == pytest.approx(one.stick_durations.tolist(), abs=1e-12)
     assert batch.status.tolist() == [Status.OK, Status.OK, Status.EQUILIBRIUM]
+
+
+@pytest.mark.parametrize("offset", [-1e-7, -1e-9, 1e-9, 1e-7])
+def test_an_orbit_that_all_but_touches_an_edge(offset):
+    """Where it does it is pushed over it and comes to rest; the cycle touches it at this load."""
+    law = jb.Coulomb(1.0, 0.5)
+    belts = (jb.Belt(0.2, law, 1.0392850493425 + offset, lower=0.7, upper=1.45), jb.Belt(0.85, law))
+    cycle = jb.find_cycle(jb.Oscillator(0.25, belts), (1.45, 0.2))
+    assert cycle.status == (Status.OK if offset > 0 else Status.EQUILIBRIUM)

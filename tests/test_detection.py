@@ -23,6 +23,10 @@ def nu0(osc):
     return osc.belts[0].velocity
 
 
+def nu1(osc):
+    return osc.belts[1].velocity
+
+
 # Class (b), nu1 = 0.35: the paper's seven points and the one that it misses, see test_bifurcations.
 POINTS = [
     (jb.NonsmoothFold(1), -0.561302406210),
@@ -213,6 +217,16 @@ def test_a_corner_where_only_the_sign_of_what_arrives_changes():
     expected = [jb.CornerCollision(1), jb.CornerCollision(1), jb.GrazingEdge(1)]
     assert [point.condition for point in points] == expected
     assert points[1].value == pytest.approx(0.398440689452, abs=1e-11)
+
+
+def test_a_belt_without_load_changes_nothing():
+    """Neither where it is at rest, nor where a cycle touches its boundary."""
+    belt = jb.Belt(0.3, jb.Conti(1.0, 0.6, 10.0))
+    idle = jb.Belt(0.1, jb.Conti(1.0, 0.6, 10.0), load=0.0)
+    osc = jb.Oscillator(0.5, (belt, idle))
+    assert jb.scan(osc, nu1, (-0.1, 0.2), resolution=16) == ()
+    kinds = [point.kind for point in jb.scan(osc, nu0, (0.15, 0.3), resolution=16)]
+    assert kinds == ["Hopf", "NonsmoothFold"]
 
 
 def bell_oracle(nu):

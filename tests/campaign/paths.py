@@ -201,9 +201,14 @@ def _cycle(osc: engine.Oscillator, found: engine.Attractor) -> Cycle:
     inside = (
         (run.t > 0.3 * found.period) & (run.t <= 1.3 * found.period) & (run.kind <= engine.EDGE)
     )
-    modes = [tuple(codes) for codes in run.codes[inside].tolist()] or [run.mode_end]
+    modes = run.codes[inside].tolist() or [run.mode_end]
     place = np.array([*found.x1, *found.x2, found.period])
-    return Cycle(_turn(modes), place, top)
+    return Cycle(_turn([_told(osc, mode) for mode in modes]), place, top)
+
+
+def _told(osc: engine.Oscillator, codes) -> tuple:
+    """Contact codes in which a belt without load is absent."""
+    return tuple(2 if b.load == 0 else code for b, code in zip(osc.belts, codes, strict=True))
 
 
 def _turn(modes) -> tuple:
@@ -225,7 +230,8 @@ def equilibria(osc: engine.Oscillator) -> tuple:
         row = _rest_on_edge(osc, table, edge, left, right)
         if row is not None:
             found.append(row)
-    return tuple(row[1:] for row in sorted(found, key=lambda row: row[0]))
+    found = sorted(found, key=lambda row: row[0])
+    return tuple((kind, bool(stable), _told(osc, codes)) for _, kind, stable, codes in found)
 
 
 def _side(osc, table, zone):
