@@ -39,6 +39,8 @@ from .extrapolation import Scheme, increments, scheme
 from .modes import (
     Mode,
     boundary_guards,
+    bounds_leftward,
+    bounds_rightward,
     capacity,
     edge_guards,
     edges,
@@ -55,6 +57,7 @@ from .modes import (
 )
 from .oscillator import Oscillator, check_oscillator
 from .results import EventKind, Status, describe
+from .roots import first_root
 from .simulate import Arcs
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
@@ -408,16 +411,25 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
     a_sign, v_sign = _after(osc, codes, y)
     field = functools.partial(_field, osc, codes)
 
-    def guards(y):
+    nears_boundary = a_sign * codes > 0
+    rightward, leftward = jnp.stack(bounds_rightward(mode)), jnp.stack(bounds_leftward(mode))
+    nears = jnp.append(nears_boundary, jnp.where(v_sign > 0, rightward, leftward))
+
+    def all_guards(y):
         a = mode_acceleration(osc, mode, y[0], y[1])
         values = [*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])]
         return jnp.stack([*values, a_sign * a, v_sign * y[1]])
+
+    def guards(y):
+        """With their rates of change; what the orbit moves away from does not count."""
+        values, slopes = jax.jvp(all_guards, (y,), (field(y),))
+        return jnp.append(jnp.where(nears, values[:-2], jnp.inf), values[-2:]), slopes
 
     def inside(state):
         _, _, _, y_end, steps = state
         # A stuck lane has no slip arc to follow; it must not keep a batch waiting.
         going = (steps < 200) & ~mode.any_stuck & jnp.all(jnp.isfinite(y_end))
-        return ((steps == 0) | jnp.all(guards(y_end) >= 0)) & going
+        return ((steps == 0) | jnp.all(guards(y_end)[0] >= 0)) & going
 
     def advance(state):
         t, _, h, y, steps = state
@@ -426,40 +438,12 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
 
     zero = jnp.zeros(())
     t, y0, h, y1, steps = lax.while_loop(inside, advance, (zero, y, zero, y, jnp.asarray(0)))
-    # The root on the step's cubic, then two Newton steps of the true state.
-    d0, d1 = field(y0) * h, field(y1) * h
 
-    def cubic(s):
-        return (
-            (1 + 2 * s) * (1 - s) ** 2 * y0
-            + s * (1 - s) ** 2 * d0
-            + s**2 * (3 - 2 * s) * y1
-            + s**2 * (s - 1) * d1
-        )
+    def after(h):
+        return _step(field, y0, h, _MEDIUM)
 
-    def halve(_, bracket):
-        left, right = bracket
-        middle = 0.5 * (left + right)
-        out = jnp.any(guards(cubic(middle)) < 0)
-        return jnp.where(out, left, middle), jnp.where(out, middle, right)
-
-    _, root = lax.fori_loop(0, 30, halve, (jnp.zeros(()), jnp.ones(())))
-    fired = jnp.argmin(guards(cubic(root)))
-
-    def polish(_, state):
-        h_root, _, _, fired = state
-        y_root = _step(field, y0, h_root, _MEDIUM)
-        value, slope = jax.jvp(guards, (y_root,), (field(y_root),))
-        regular = jnp.abs(slope) > 1e-6
-        since = jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0)
-        # Another guard may have fired before this one: the cubic does not tell two that are close.
-        late = (value < 0) & (slope < 0) | (jnp.arange(value.size) == fired)
-        before = jnp.where(late, since, -jnp.inf)
-        first = jnp.argmax(before)
-        fired = jnp.where(before[first] > before[fired] + 1e-12, first, fired)
-        return jnp.clip(h_root - since[fired], 0.0, 1.01 * h), h_root, y_root, fired
-
-    _, h_root, y_root, fired = lax.fori_loop(0, 3, polish, (root * h, root * h, y0, fired))
+    h_root, fired = first_root(lambda h: guards(after(h)), guards(y0), h, guards(y1), turns=2)
+    y_root = after(h_root)
     return t + h_root, y_root, fired, steps >= 200
 
 
