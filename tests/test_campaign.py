@@ -9,9 +9,10 @@ from math import acos, atan, inf, pi, sqrt
 import numpy as np
 import oracle
 import pytest
-from campaign import __main__ as command
-from campaign import cases, compare, derivatives, engine, package
-from campaign.engine import CROSS, EDGE, SLIP, STICK, Belt, Oscillator
+
+from tests.campaign import __main__ as command
+from tests.campaign import cases, compare, derivatives, engine, package
+from tests.campaign.engine import CROSS, EDGE, SLIP, STICK, Belt, Oscillator
 
 #: The engine integrates at 1e-13, with events of order-one normal speed in these tests.
 EXACT = dict(rel=0, abs=1e-11)

@@ -900,19 +900,19 @@ def attractor(osc, y0, *, chunk=100.0, t_max=200_000.0, same=1e-9, at_rest=1e-6,
     states, to `same`; an equilibrium where the motion has shrunk below `at_rest` and does shrink.
     """
     x1, x2, mode, margin, t = *y0, None, inf, 0.0
-    size = inf
+    size, patience = inf, 4
     while t < t_max:
         run = simulate(
             osc, (x1, x2), chunk, mode=mode, turns=True, extrema=True, max_events=200_000
         )
         (x1, x2), mode = run.y_end, run.mode_end
         margin = min(margin, run.margin) if t == 0 else margin
-        t += chunk
+        t += run.t_end
         if run.status == STUCK_FOREVER:
             return Attractor("stuck", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
         if run.status == PSEUDO_FOCUS:
             return Attractor("equilibrium", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
-        if run.status != OK:
+        if run.status not in (OK, BUDGET):
             return Attractor("undecided", margin=margin, status=run.status)
         crossed_at_rest = (run.kind == CROSS) & (run.y[:, 1] == 0)
         downward = np.array(
@@ -923,17 +923,22 @@ def attractor(osc, y0, *, chunk=100.0, t_max=200_000.0, same=1e-9, at_rest=1e-6,
             bool,
         )
         tops = np.flatnonzero((run.kind == TURN) & (run.belt == 0) | crossed_at_rest & downward)
-        last = run.t > chunk - 30.0
+        last = run.t > run.t_end - 30.0
         seen = run.y[last] if np.any(last) else np.array([[x1, x2]])
         old, size = size, float(np.max(np.ptp(np.vstack([seen, [x1, x2]]), axis=0)))
         if size < at_rest and (size <= 0.999 * old or size < 1e-12) and abs(x2) < at_rest:
             return Attractor("equilibrium", x1=(x1, x1), x2=(0.0, 0.0), margin=margin)
-        found = _repeats(run, tops, same, periods) if t > chunk else None
+        found = _repeats(run, tops, same, periods) if t > run.t_end else None
         if found:
             cycle = _cycle(osc, run, *found)
             if max(np.ptp(cycle.x1), np.ptp(cycle.x2)) > at_rest:
                 return replace(cycle, margin=margin)
-        chunk = 2 * chunk if chunk < 1600.0 or len(tops) < 32 else chunk
+        if run.status == BUDGET:
+            patience -= 1
+            if patience == 0:
+                return Attractor("undecided", margin=margin, status=BUDGET)
+        elif chunk < 1600.0 or len(tops) < 32:
+            chunk *= 2
     return Attractor("undecided", margin=margin)
 
 
