@@ -56,7 +56,7 @@ def differing(
     return runs[~_same_attractors(known, final, again, numbers)]
 
 
-def _results(program, shared, rows: np.ndarray, numbers: dict[str, float]) -> Results:
+def _results(program, shared, rows: np.ndarray, numbers: dict[str, Any]) -> Results:
     """The kernel's results for the rows, in their order."""
     layout = batch.layout(program, shared)
     runs = rows.shape[1]

@@ -47,6 +47,7 @@ from .compiling import one_kernel
 from .modes import (
     ABOVE,
     BELOW,
+    ON_GUARD,
     SMALLEST_DISC,
     Mode,
     at_focus,
@@ -72,6 +73,10 @@ MAX_STEP = 1.5
 LEAST = 1e-5
 #: The way that a Taylor step may bridge to a guard, over the square root of the tolerance.
 LANDING = 0.1
+#: Speed over |x2'| below which a slow passage of an edge begins.
+SLOW = 0.1
+#: A lane whose step is to be shorter than this one stands on a bound of its mode.
+NO_STEP = 1e-15
 #: Steps between two looks at the events, and events between two refills.
 STEPS, ROUNDS = 4, 4
 
@@ -345,7 +350,7 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
     delta = jnp.where(reached, bound - new.x2, 1e300) / slope
     # The next term, too: it counts where x2' is small, and there x2'' is -x2.
     delta = jnp.where(reached, delta + 0.5 * bound * delta**2 / slope, delta)
-    blocked = ((peak > high) | (peak < low)) & ~reached
+    blocked = ((peak > high + ON_GUARD) | (peak < low - ON_GUARD)) & ~reached
     target = jnp.where(peak > high, high, low)
     k = lax.stop_gradient(path.k)
     start, end, poly = lanes.x2, peak, k
@@ -353,11 +358,14 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
     if window.x1 is not None:
         left, right = window.x1
         edge = jnp.where(new.x2 > 0, right, left)
-        near = jnp.abs(edge - new.x1) <= reach * jnp.abs(new.x2)
+        # Slow passages are bridged over less of the way, for there x2' counts more than x2.
+        way, speed = edge - new.x1, jnp.abs(new.x2)
+        near = jnp.abs(way) * jnp.maximum(speed, SLOW * jnp.abs(new.a)) <= reach * speed * speed
+        there = jnp.abs(way) <= ON_GUARD * (1 + jnp.abs(new.x1))
         slope = jnp.where(near, new.x2, 1.0)
-        delta1 = jnp.where(near, edge - new.x1, 1e300) / slope
-        # In hundreds of slow passages of an edge it adds up.
+        delta1 = jnp.where(near, way, jnp.where(there, 0.0, 1e300)) / slope
         delta1 = jnp.where(near, delta1 - 0.5 * new.a * delta1**2 / slope, delta1)
+        near = near | there
         on_edge = near & (delta1 < delta)
         reached, delta = reached | near, jnp.minimum(delta, delta1)
         # x1 over the step is the integral of x2; x2 keeps its sign, so x1 is monotone.
@@ -426,7 +434,9 @@ def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol) -> Lan
     # What has become slower goes on to do so, on the way to a boundary with its bend of the law.
     trend = jnp.where(accepted, jnp.maximum(pace, lanes.pace) / lanes.pace, 1.0)
     proposed = jnp.minimum(0.9 / (pace * trend), MAX_STEP)
-    proposed = jnp.where(shortened, at.theta * h, jnp.where(lands, -proposed, proposed))
+    stands = shortened & (at.theta * h < NO_STEP)
+    proposed = jnp.where(shortened & ~stands, at.theta * h, proposed)
+    proposed = jnp.where(lands | stands, -proposed, proposed)
     lower, upper = lanes.lower, lanes.upper
     if window.extrema is not None:
         extremum = jnp.where(path.turns, path.extremum, x2)
@@ -776,8 +786,7 @@ def _rank(flags: Array) -> Array:
 def _give_up(lanes: Lanes, passes, limit) -> Lanes:
     """End runs that took too many steps, or whose state is not finite."""
     finite = jnp.isfinite(lanes.x1) & jnp.isfinite(lanes.x2) & jnp.isfinite(lanes.a)
-    stands = (lanes.h > 0) & (lanes.t + lanes.h == lanes.t)
-    lost = ~lanes.done & (~finite | stands | (passes - lanes.begun > limit))
+    lost = ~lanes.done & (~finite | (passes - lanes.begun > limit))
     reason = jnp.where(finite, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
     status = jnp.where(lost, reason.astype(lanes.status.dtype), lanes.status)
     return eqx.tree_at(lambda n: (n.status, n.done), lanes, (status, lanes.done | lost))
@@ -1124,6 +1133,8 @@ class Attractor(Observer):
     """
 
     REPEATED: ClassVar[float] = 1e-7
+    #: Smaller motion than so many tolerances that repeats is the integrator's: an equilibrium.
+    RESOLVED: ClassVar[float] = 1e3
     #: Until then extrema are left out, unless a stick phase has ended: about two turns.
     SETTLING: ClassVar[float] = 12.0
     #: Tops without a stick phase after which a run is taken to stick no more.
@@ -1180,7 +1191,8 @@ class Attractor(Observer):
 
         kind = jnp.where(repeats, CYCLE, UNDECIDED)
         # An orbit that sticks is on a cycle, however small.
-        kind = jnp.where(repeats & ~released & (amplitude < self.REPEATED), EQUILIBRIUM, kind)
+        size = jnp.maximum(amplitude, lanes.upper - lanes.lower)
+        kind = jnp.where(repeats & ~released & (size < self.RESOLVED * tol), EQUILIBRIUM, kind)
         kind = jnp.where(passage.captured, EQUILIBRIUM, kind)
         kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind)
         going_on = (turn.kind == UNDECIDED) & (lanes.run >= 0)

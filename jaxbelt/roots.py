@@ -1,10 +1,10 @@
 """Where a step of an orbit first meets one of several guards.
 
-Guards are positive at the start of the step and negative beyond their root. The smallest of them has
-kinks, on which a search for its root may end, and near a tangency one guard is small where another
-has its root. So each is searched for by itself. The turns come first, the zeros of x2' and of x2: up
-to a turn the other guards are monotone, and its sign there, as accurate as the integration, decides
-whether there is a root of a guard before it.
+Guards are positive at the start of the step and negative beyond their root. The smallest of them
+has kinks, on which a search for its root may end, and near a tangency one guard is small where
+another has its root. So each is searched for by itself. The turns come first, the zeros of x2' and
+of x2: up to a turn the other guards are monotone, and its sign there, as accurate as the
+integration, decides whether there is a root of a guard before it.
 """
 
 from collections.abc import Callable

@@ -441,7 +441,9 @@ def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _R
         lambda: _stick_segment(osc, state, t1),
         lambda: _slip_segment(osc, state, slip_until, rtol, atol),
     )
-    t = state.t + step.duration
+    # At t1 itself, where no event is before: the sum of the arcs may be short of it by rounding.
+    out_of_time = step.done & (step.kind == 0)
+    t = jnp.where(out_of_time, t1, state.t + step.duration)
     finite = jnp.isfinite(t) & jnp.isfinite(step.y[0]) & jnp.isfinite(step.y[1])
     status = jnp.where(finite, step.status, Status.NOT_FINITE)
     belt = jnp.where(
@@ -459,7 +461,8 @@ def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _R
         event_t=t,
         event_y=jnp.stack(step.y),
     )
-    new = _State(t, step.y, step.mode, step.turn, status, step.done | (status != Status.OK))
+    done = step.done | (t >= t1) | (status != Status.OK)
+    new = _State(t, step.y, step.mode, step.turn, status, done)
     return new, record
 
 

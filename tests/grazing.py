@@ -68,7 +68,12 @@ class Oscillators:
 
 @dataclass
 class Cases:
-    """Cases of one distance, arrays [..., cases]; before, after: contact codes at start and end."""
+    """Cases of one distance, arrays [..., cases].
+
+    start, end: states at t = 0 and t1; graze: time of the extremum; belt: whose boundary it is, or
+    that touches on this side of the edge, at x1 = edge; outcome; before, beyond, after: contact
+    codes at the start, beyond the edge, and at the end.
+    """
 
     osc: Oscillators
     start: np.ndarray
@@ -76,18 +81,16 @@ class Cases:
     graze: np.ndarray
     distance: float
     belt: np.ndarray
+    edge: np.ndarray
     outcome: np.ndarray
     before: np.ndarray
+    beyond: np.ndarray
     after: np.ndarray
     end: np.ndarray
 
     def take(self, where) -> "Cases":
-        parts = {name: part for name, part in vars(self).items() if isinstance(part, np.ndarray)}
-        return replace(
-            self,
-            osc=self.osc.take(where),
-            **{name: part[..., where] for name, part in parts.items()},
-        )
+        arrays = {k: v[..., where] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, osc=self.osc.take(where), **arrays)
 
 
 def flow(osc, codes, y, duration, steps=STEPS, path=False):
@@ -127,6 +130,80 @@ def growth(osc, codes, y, duration):
     return np.max(np.abs(np.imag(slopes)) / 1e-30, axis=(0, 1))
 
 
+# --- how they end ---------------------------------------------------------------------------------
+
+
+@np.errstate(all="ignore")  # where a case has another outcome
+def final(case: Cases) -> np.ndarray:
+    """The states at t1 by the outcomes, [2, cases]; for complex starts and parameters, too."""
+    ends = {
+        "missed": _along,
+        "sticks": _stuck_on,
+        "holds": _stuck_on,
+        "passes": _passed,
+        "returns": _back_again,
+    }
+    end = 0.0
+    for outcome in np.unique(case.outcome):
+        end = np.where(case.outcome == outcome, np.array(ends[outcome](case)), end)
+    return end
+
+
+def derivative(case: Cases, name: str, index=()) -> np.ndarray:
+    """Derivatives of the states at t1 with respect to a part of the start or of the oscillator.
+
+    name: "start" or a field of `Oscillators`, `index` of it, or "edge", the one that is grazed.
+    """
+    tiny = 1e-40
+    if name == "edge":
+        case = replace(case, edge=case.edge + 1j * tiny)
+    else:
+        owner = case if name == "start" else case.osc
+        changed = getattr(owner, name).astype(complex)
+        changed[index] += 1j * tiny
+        owner = replace(owner, **{name: changed})
+        case = owner if name == "start" else replace(case, osc=owner)
+    return np.imag(final(case)) / tiny
+
+
+def _along(case):
+    middle = flow(case.osc, case.before, case.start, case.graze)
+    return flow(case.osc, case.before, middle, case.t1 - case.graze)
+
+
+def _stuck_on(case):
+    """Onto the boundary, and from there."""
+    osc, belt, codes = case.osc, case.belt, case.before
+    nu = osc.velocity[belt, np.arange(belt.size)]
+    v = nu / osc.omega
+    guess = case.graze - np.sqrt(2 * case.distance / np.abs(nu))
+    t, y = land(osc, codes, case.start, guess, 1, v)
+    held = y[0] + v * (case.t1 - t), v + 0 * y[0]
+    # Slip onset: what the belt can hold is what its friction is there.
+    x1 = osc.acceleration(codes, 0 * v, v)
+    slipped = flow(osc, codes, (x1, v), case.t1 - (t + (x1 - y[0]) / v))
+    return np.where(case.outcome == "holds", np.array(held), np.array(slipped))
+
+
+def _over_edge(case):
+    """Time and state where the edge is met, and how long until the next time, and that state."""
+    push = np.real(np.abs(case.osc.acceleration(case.before, case.edge, 0 * case.graze)))
+    guess = case.graze - np.sqrt(2 * case.distance / push)
+    t, y = land(case.osc, case.before, case.start, guess, 0, case.edge)
+    push = case.osc.acceleration(case.beyond, *y)
+    return t, y, *land(case.osc, case.beyond, y, -2 * y[1] / push, 0, case.edge)
+
+
+def _passed(case):
+    t, y, _, _ = _over_edge(case)
+    return flow(case.osc, case.beyond, y, case.t1 - t)
+
+
+def _back_again(case):
+    t, _, after, y = _over_edge(case)
+    return flow(case.osc, case.before, y, case.t1 - t - after)
+
+
 # --- how they are made ----------------------------------------------------------------------------
 
 
@@ -153,8 +230,7 @@ def _sign(x):
 
 
 def boundary_cases(seed, n, distances, jump=False) -> list[Cases]:
-    """Extrema of x2 at the boundary of a belt: a list of `Cases`, one for each distance, of the
-    same oscillators but for their edges."""
+    """Extrema of x2 at the boundary of a belt: a list of `Cases`, one for each distance."""
     rng = np.random.default_rng([seed, 1, jump])
     osc = _draw(rng, n, (0.1, 0.9), jump)
     lane = np.arange(n)
@@ -163,63 +239,52 @@ def boundary_cases(seed, n, distances, jump=False) -> list[Cases]:
     side = _sign(nu)  # x2'' = -x2 at the extremum
     codes = np.zeros((2, n), int)
     codes[belt, lane], codes[1 - belt, lane] = side, _sign(other - nu)
-    # Both belts in touch, with or without edges, or this one alone, on its side of an edge.
+    # Both belts in touch, with or without edges, or this one alone, on its side of an edge: belt 0
+    # has the other one's interval above it, belt 1 below.
     contact = rng.choice(["b", "c", "d", "both"], n)
     alone = (contact == "c") | (contact == "d")
-    # Belt 0 touches on the left, so alone it has the other one above; belt 1 the other way round.
-    codes[1 - belt, lane] = np.where(
-        alone, np.where(belt == 0, BELOW, ABOVE), codes[1 - belt, lane]
-    )
+    away = np.where(belt == 0, BELOW, ABOVE)
+    codes[1 - belt, lane] = np.where(alone, away, codes[1 - belt, lane])
     back = rng.uniform(0.3, 1.2, n)
-    on = SPAN - back
     margins = rng.uniform(0.05, 0.3, (2, n))
-    found = []
+    outcome = np.full(n, "holds" if jump else "sticks")
+    after = codes.copy()
+    if jump:
+        after[belt, lane] = 0
+    missed = np.full(n, "missed")
+    found, paths, good = [], [], np.ones(n, bool)
     for d in distances:
         x2 = (nu + side * d) / osc.omega
-        x1 = osc.acceleration(codes, np.zeros(n), x2)
-        before = flow(osc, codes, (x1, x2), -back, path=True)
-        start = before[-1]
+        extremum = osc.acceleration(codes, np.zeros(n), x2), x2
+        before = flow(osc, codes, extremum, -back, path=True)
+        then = flow(osc, codes, extremum, SPAN - back, path=True)
         case = Cases(
-            osc, start, SPAN, back, d, belt, np.full(n, "missed", dtype="U7"), codes, codes, 0
+            osc=osc,
+            start=before[-1],
+            t1=SPAN,
+            graze=back,
+            distance=d,
+            belt=belt,
+            edge=np.full(n, np.inf),
+            outcome=outcome if d > 0 else missed,
+            before=codes,
+            beyond=codes,
+            after=after if d > 0 else codes,
+            end=then[-1],
         )
         if d > 0:
-            case = _stuck(case, jump)
-            needed = np.abs(osc.acceleration(case.after, *case.end))
-            holds = needed < 0.99 * (osc.load * osc.static)[belt, lane]
-            holds |= case.outcome != "holds"
-        else:
-            case = replace(case, end=np.array(flow(osc, codes, (x1, x2), on)))
-        after = flow(osc, codes, (x1, x2), on, path=True)
-        path = np.concatenate([before[::-1], after[1:]])
-        fine = _keeps_away(osc, codes, path, belt)
-        fine &= growth(osc, codes, start, back) < GROWTH
-        fine &= growth(osc, codes, (x1, x2), on) < GROWTH
-        if d > 0:
-            fine &= holds
-        found.append((case, path, fine))
-    everywhere = np.concatenate([np.append(path[:, 0], c.end[:1], 0) for c, path, _ in found])
-    osc = _edged(osc, contact, belt, alone, everywhere.min(0), everywhere.max(0), margins)
-    good = np.all([fine for _, _, fine in found], axis=0)
-    return [replace(case, osc=osc).take(good) for case, _, _ in found]
-
-
-def _stuck(case, jump):
-    """Onto the boundary, and from there."""
-    osc, codes, d, belt = case.osc, case.before, case.distance, case.belt
-    lane = np.arange(belt.size)
-    v = osc.velocity[belt, lane] / osc.omega
-    guess = case.graze - np.sqrt(2 * d / np.abs(osc.velocity[belt, lane]))
-    t, y = land(osc, codes, case.start, guess, 1, v)
-    if jump:
-        held = codes.copy()
-        held[belt, lane] = 0
-        end = np.array([y[0] + v * (case.t1 - t), v + 0 * y[0]])
-        return replace(case, outcome=np.full(belt.size, "holds"), after=held, end=end)
-    # Slip onset: what the belt can hold is what its friction is there.
-    x1 = osc.acceleration(codes, 0 * v, v)
-    left = case.t1 - (t + (x1 - y[0]) / v)
-    end = np.array(flow(osc, codes, (x1, v), left))
-    return replace(case, outcome=np.full(belt.size, "sticks"), end=end)
+            case = replace(case, end=final(case))
+        needed = np.abs(osc.acceleration(case.after, *case.end))
+        good &= (case.outcome != "holds") | (needed < 0.99 * (osc.load * osc.static)[belt, lane])
+        good &= growth(osc, codes, case.start, back) < GROWTH
+        good &= growth(osc, codes, extremum, SPAN - back) < GROWTH
+        path = np.concatenate([before[::-1], then[1:]])
+        good &= _keeps_away(osc, codes, path, belt)
+        found.append(case)
+        paths += [path[:, 0], case.end[:1]]
+    paths = np.concatenate(paths)
+    osc = _edged(osc, contact, belt, paths.min(0), paths.max(0), margins)
+    return [replace(case, osc=osc).take(good) for case in found]
 
 
 def _keeps_away(osc, codes, path, belt, margin=2e-3):
@@ -236,11 +301,12 @@ def _keeps_away(osc, codes, path, belt, margin=2e-3):
     return np.all(other > margin, axis=0) & ends & together & once & np.all(np.isfinite(own), 0)
 
 
-def _edged(osc, contact, belt, alone, lowest, highest, margins):
+def _edged(osc, contact, belt, lowest, highest, margins):
     """Contact edges around the paths: belt 0 touches on the left and belt 1 on the right."""
     lower, upper = osc.lower.copy(), osc.upper.copy()
     left, right = lowest - margins[0], highest + margins[1]
     beyond = np.where(contact == "d", margins[0], 0.0)
+    alone = (contact == "c") | (contact == "d")
     # Belt 0 alone: belt 1 begins on the right, and belt 0 ends there or further on.
     first, second = alone & (belt == 0), alone & (belt == 1)
     upper[0] = np.where(first, right + beyond, upper[0])
@@ -282,45 +348,46 @@ def edge_cases(seed, n, distances) -> list[Cases]:
     rest = np.zeros(n)
     push, push_beyond = (osc.acceleration(c, sigma, rest) for c in (before, beyond))
     back = rng.uniform(0.2, 0.6, n)
-    on = SPAN_AT_EDGE - back
     good = (e * push < -0.1) & (np.abs(push_beyond) > 0.1) & (np.abs(sigma - own_end) < 1)
     returns = e * push_beyond < 0
+    over = np.where(returns, "returns", "passes")
     found = []
     for d in distances:
         top = (sigma + e * d, rest)
         path = flow(osc, before, top, -back, path=True)
-        start, fine = path[-1], _stays(osc, before, path, sigma, e)
-        fine &= growth(osc, before, start, back) < GROWTH
         case = Cases(
-            osc,
-            start,
-            SPAN_AT_EDGE,
-            back,
-            d,
-            near,
-            np.full(n, "missed", dtype="U7"),
-            before,
-            before,
-            0,
+            osc=osc,
+            start=path[-1],
+            t1=SPAN_AT_EDGE,
+            graze=back,
+            distance=d,
+            belt=near,
+            edge=sigma,
+            outcome=over if d > 0 else np.full(n, "missed"),
+            before=before,
+            beyond=beyond,
+            after=np.where(returns, before, beyond) if d > 0 else before,
+            end=path[-1],
         )
-        if d < 0:
-            path = flow(osc, before, top, on, path=True)
-            fine &= _stays(osc, before, path, sigma, e)
-            case = replace(case, end=path[-1])
-        else:
-            case, over = _over_edge(case, sigma, beyond, returns, np.abs(push))
-            fine &= ~returns | (over < case.t1 - 0.02)
+        good &= _stays(osc, before, path, sigma, e)
+        good &= growth(osc, before, case.start, back) < GROWTH
+        on = SPAN_AT_EDGE - back
+        if d > 0:
+            t, _, back_in, y = _over_edge(case)
+            good &= ~returns | (back_in < on - 0.02)
+            left = np.where(returns, SPAN_AT_EDGE - t - back_in, on)
+            again = flow(osc, before, y, left, path=True)
             middle = flow(osc, beyond, (sigma, rest), on, path=True)
-            behind = flow(osc, before, (sigma, rest), on, path=True)
-            fine &= np.where(
+            good &= np.where(
                 returns,
-                _stays(osc, before, behind, sigma, e),
-                _stays(osc, beyond, middle, sigma, -e),
+                _stays(osc, before, again, sigma, e),
+                _stays(osc, beyond, middle, sigma, -e) & (np.abs(middle[-1, 0] - sigma) < 0.35),
             )
-            fine &= returns | (np.abs(middle[-1, 0] - sigma) < 0.35)
-        found.append((case, fine))
-    good &= np.all([fine for _, fine in found], axis=0)
-    return [case.take(good) for case, _ in found]
+        else:
+            path = flow(osc, before, top, on, path=True)
+            good &= _stays(osc, before, path, sigma, e)
+        found.append(replace(case, end=final(case)))
+    return [case.take(good) for case in found]
 
 
 def _stays(osc, codes, path, sigma, e, margin=2e-3):
@@ -331,24 +398,6 @@ def _stays(osc, codes, path, sigma, e, margin=2e-3):
     turns = np.sum(np.abs(np.diff(np.sign(path[1:, 1]), axis=0)) > 0, axis=0) == 0
     within = np.all(np.abs(path[:, 0] - sigma) < 2.3, axis=0)
     return slips & apart & turns & within
-
-
-def _over_edge(case, sigma, beyond, returns, push):
-    """Over the edge, and back if it is so; and when the orbit is back."""
-    osc, before = case.osc, case.before
-    t, y = land(osc, before, case.start, case.graze - np.sqrt(2 * case.distance / push), 0, sigma)
-    on = flow(osc, beyond, y, case.t1 - t)
-    push_beyond = osc.acceleration(beyond, *y)
-    guess = np.where(returns, -2 * y[1] / push_beyond, 1e-3)
-    back, y2 = land(osc, beyond, y, guess, 0, sigma)
-    again = flow(osc, before, y2, case.t1 - t - back)
-    case = replace(
-        case,
-        outcome=np.where(returns, "returns", "passes"),
-        after=np.where(returns, before, beyond),
-        end=np.where(returns, np.array(again), np.array(on)),
-    )
-    return case, t + back
 
 
 #: The events of each outcome.

@@ -3,13 +3,14 @@
 The whole campaigns are `python -m tests.campaign`; what they found is in docs/checked.md.
 """
 
+from dataclasses import replace
 from math import acos, atan, inf, pi, sqrt
 
 import numpy as np
 import oracle
 import pytest
 from campaign import __main__ as command
-from campaign import cases, compare, engine, package
+from campaign import cases, compare, derivatives, engine, package
 from campaign.engine import CROSS, EDGE, SLIP, STICK, Belt, Oscillator
 
 #: The engine integrates at 1e-13, with events of order-one normal speed in these tests.
@@ -141,6 +142,76 @@ def test_cases_go_to_json_and_back():
         assert all(b.lower < b.upper and -inf < b.velocity < inf for b in case.oscillator.belts)
 
 
+def told_by(run, **changes):
+    """The engine's own run as if the package had told it, with something changed."""
+    events = tuple(zip(run.t.tolist(), run.kind.tolist(), run.belt.tolist(), *run.y.T.tolist()))
+    right = package.Final(*run.y_end, run.mode_end, len(run.kind), run.status, events)
+    return replace(right, **changes)
+
+
+def test_what_is_wrong_is_found():
+    osc = Oscillator(0.5, (Belt(0.45, cases.PAPER), Belt(0.35, cases.PAPER)))
+    case = cases.Case(osc, (3.0, 0.0), 30.0)
+    run = compare.run(case)
+    swapped = tuple((t, kind, 1 - belt, *y) for t, kind, belt, *y in told_by(run).events)
+    wrong = {
+        "same": {},
+        "state": dict(x1=run.y_end[0] + 1e-5),
+        "more events": dict(n_events=len(run.kind) + 1),
+        "mode": dict(mode=(-1, -1)),
+        "sequence": dict(events=swapped),
+        "status 4, not 0": dict(status=4),
+        "focus that is none": dict(status=engine.PSEUDO_FOCUS),
+    }
+    for verdict, changes in wrong.items():
+        assert compare.judge(case, told_by(run, **changes), 1e-8)[0] == verdict
+    label = engine.attractor(osc, case.y0)
+    told = package.Label(*(getattr(label, f) for f in package.Label.__dataclass_fields__))
+    assert compare.label_difference(told, label) is None
+    for changes in (dict(kind="equilibrium"), dict(turn=()), dict(x1=(0.0, 1.0)), dict(period=3.0)):
+        assert compare.label_difference(replace(told, **changes), label)
+
+
+def test_a_corner_has_the_answers_of_its_neighbours():
+    # At slip onset on an edge: beyond it, before it, or at once; but not stuck for ever.
+    law = ("conti", 1.0, 0.6, 10.0)
+    belts = (Belt(0.4, law, upper=0.9), Belt(-0.55, law, lower=0.9))
+    case = cases.Case(Oscillator(0.25, belts), (3.0, 0.0), 20.0)
+    run = compare.run(case)
+    assert run.margin < compare.CORNER
+    before = compare.run(next(compare.neighbours(case, by=-1e-7)))
+    assert compare.judge(case, told_by(before), 1e-8)[0] in compare.GOOD
+    stuck = told_by(run, x1=0.9, x2=0.4, status=engine.OK)
+    assert compare.judge(case, stuck, 1e-8)[0].startswith("corner: ")
+
+
+def test_derivatives_are_those_of_differences():
+    rng = np.random.default_rng(3)
+    for structure in cases.structures(rng, 9):
+        case = cases.random_case(rng, structure, 8.0)
+        run = compare.run(case)
+        if run.status or run.margin < 1e-2:
+            continue
+        along = derivatives.directions(case, rng)
+
+        def end(h, case=case, along=along):
+            y0 = np.add(case.y0, h * np.array(along[0]))
+            osc = derivatives.moved(case.oscillator, along, h)
+            return np.array(engine.simulate(osc, y0, case.T).y_end)
+
+        expected, error = oracle.richardson(end, 0.0, 1e-5, levels=2)
+        found = derivatives.derivative(case, run, along)
+        # Differences of 1e-13 over 1e-5, beside what Richardson says of the rest.
+        assert np.all(np.abs(found - expected) <= 1e-6 * (1 + np.abs(expected)) + error)
+
+
+def test_rows_take_the_place_of_those_of_the_same_campaign(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("text\n| x | random | 3 | 1e-08 | 0 | 0 | 7 |\n<!-- campaigns -->\n")
+    command._put_rows(page, ["| x | random | 9 | 1e-08 | 0 | 0 | 0 |"])
+    assert page.read_text() == "text\n| x | random | 9 | 1e-08 | 0 | 0 | 0 |\n<!-- campaigns -->\n"
+
+
 # ---------------------------------------------------------------- small campaigns
 
 
@@ -149,7 +220,6 @@ def test_cases_go_to_json_and_back():
     [
         "final --runs 300 --structure 0 --seed 11",
         "attractors --runs 100 --structure 0 --seed 12",
-        "simulate --runs 32 --structure 6 --seed 13",
     ],
 )
 def test_small_campaign(arguments, capsys):

@@ -87,6 +87,7 @@ def _parser():
     parser.add_argument("--runs", type=int, default=2000)
     parser.add_argument("--paths", type=int, default=20)
     parser.add_argument("--rational-share", type=float, default=0.5)
+    parser.add_argument("--extreme-share", type=float, default=0.0)
     parser.add_argument(
         "--by",
         choices=("simulate", "sweep", "find_cycle"),
@@ -134,13 +135,18 @@ def _batches(cases, rng, options):
     for structure, count in zip(structures, counts):
         for first in range(0, count, options.batch):
             yield [
-                (
-                    cases.rational_case
-                    if rng.random() < options.rational_share
-                    else cases.random_case
-                )(rng, structure, options.span)
+                _maker(cases, rng, options)(rng, structure, options.span)
                 for _ in range(min(options.batch, count - first))
             ]
+
+
+def _maker(cases, rng, options):
+    chance = rng.random()
+    if chance < options.rational_share:
+        return cases.rational_case
+    if chance < options.rational_share + options.extreme_share:
+        return cases.extreme_case
+    return cases.random_case
 
 
 def _ask(package, batch, options):

@@ -157,6 +157,32 @@ def random_case(rng, structure, T=50.0):
     return Case(Oscillator(damping, belts, omega), y0, T, "random")
 
 
+def extreme_case(rng, structure, T=50.0):
+    """A random case with one number or two far from the others."""
+    case = random_case(rng, structure, T)
+    osc, belts = case.oscillator, list(case.oscillator.belts)
+    for _ in range(int(rng.integers(1, 3))):
+        i, what = int(rng.integers(len(belts))), rng.integers(7)
+        b = belts[i]
+        if what == 0:
+            belts[i] = replace(b, load=float(10 ** rng.uniform(1, 4)))
+        elif what == 1:
+            belts[i] = replace(b, load=float(10 ** rng.uniform(-9, -1)))
+        elif what == 2:
+            belts[i] = replace(b, velocity=float(rng.choice([-1, 1]) * 10 ** rng.uniform(-9, -2)))
+        elif what == 3:
+            belts[i] = replace(b, velocity=float(rng.choice([-1, 1]) * 10 ** rng.uniform(0, 2)))
+        elif what == 4 and b.law[0] == "conti":
+            belts[i] = replace(b, law=(*b.law[:3], float(10 ** rng.uniform(1.5, 2.5)), b.law[4]))
+        elif what == 5 and isfinite(b.lower):
+            upper = b.lower + float(10 ** rng.uniform(-7, -2))
+            belts[i] = replace(b, upper=min(b.upper, upper))
+        elif what == 6:
+            osc = replace(osc, damping=float(rng.choice([0.0, -0.05, 10.0, 50.0])))
+    start = (case.y0[0] * 10, case.y0[1] * 10) if rng.random() < 0.2 else case.y0
+    return Case(replace(osc, belts=tuple(belts)), start, T, "extreme")
+
+
 # ---------------------------------------------------------------- rational
 
 

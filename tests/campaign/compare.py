@@ -120,6 +120,10 @@ def difference(case, told, mine, tol):
 
 def _focus_difference(case, told, mine):
     """One ended in a pseudo-focus and the other did not, or not yet."""
+    if {told.status, mine.status} == {engine.PSEUDO_FOCUS, engine.STUCK_FOREVER}:
+        # At rest where turns are lost in rounding, on an edge of a belt at rest.
+        same = abs(told.x1 - mine.y_end[0]) < 1e-6 and abs(told.x2 - mine.y_end[1]) < 1e-6
+        return None if same else f"status {told.status}, not {mine.status}"
     longer = replace(case, T=10 * case.T)
     if told.status == engine.PSEUDO_FOCUS:
         if mine.status != engine.OK:
@@ -151,6 +155,8 @@ def _state_difference(case, told, mine, tol):
     rows = np.array([(e[0], e[3], e[4]) for e in told.events])
     table = np.column_stack([mine.t, mine.y])
     away = np.abs(rows - table)
+    # An error in the state is one in time over the speed towards the line.
+    away[:, 0] *= np.minimum(_speeds(case, mine), 1.0)
     if not states and np.all(away <= STEPS * tol):
         return None
     d, runs = spread(
@@ -161,6 +167,19 @@ def _state_difference(case, told, mine, tol):
     tables = [np.column_stack([r.t, r.y]) for r in runs if r.sequence == mine.sequence]
     room = np.max([np.abs(t - table) for t in tables], axis=0) if tables else 0.0
     return None if np.all(away <= STEPS * (tol + room)) else "event"
+
+
+def _speeds(case, mine):
+    """How fast each event's line is approached."""
+    modes = [run(replace(case, T=1e-12)).mode_end, *mine.codes.tolist()]
+    return np.array(
+        [
+            abs(y[1])
+            if kind in (engine.EDGE, engine.SLIP)
+            else abs(engine.force(case.oscillator, mode, *y))
+            for kind, y, mode in zip(mine.kind, mine.y.tolist(), modes)
+        ]
+    )
 
 
 def _same_kind(r, mine, value):
@@ -224,7 +243,7 @@ def judge_derivative(case, told, mine, direction, tol):
 # ---------------------------------------------------------------- attractors
 
 
-def label_difference(told, mine, tol):
+def label_difference(told, mine):
     """What differs between two labels, or None."""
     if mine.kind == "undecided":
         return None if told.kind == "undecided" else "engine undecided"
@@ -244,16 +263,16 @@ def label_difference(told, mine, tol):
     return None if all(abs(a - b) <= room for a, b in pairs) else "another cycle"
 
 
-def judge_label(case, told, tol):
+def judge_label(case, told, _tol):
     """The verdict on a label, and the engine's."""
     mine = engine.attractor(case.oscillator, case.y0)
-    what = label_difference(told, mine, tol)
+    what = label_difference(told, mine)
     if what is None:
         return "same", mine
     if case.distance is None and (mine.margin <= CORNER or mine.status == engine.CORNER):
         for other in neighbours(case, joint=12):
             his = engine.attractor(other.oscillator, other.y0)
-            if his.kind != "undecided" and label_difference(told, his, tol) is None:
+            if his.kind != "undecided" and label_difference(told, his) is None:
                 return "corner", mine
         return f"corner: {what}", mine
     return what, mine

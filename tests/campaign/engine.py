@@ -577,7 +577,7 @@ def _contraction(z, w, B, left, right, edge):
     a_l, a_r = _force(z, w, B, left, edge, 0.0), _force(z, w, B, right, edge, 0.0)
     least = np.inf
     for i in range(B.shape[0]):
-        if abs(left[i]) < 2 or abs(right[i]) < 2:
+        if (abs(left[i]) < 2 or abs(right[i]) < 2) and B[i, 1] * B[i, 4] > 0:
             least = min(least, abs(B[i, 0]) / w)
     s = _trace(z, w, B, left, 0.0) / a_l - _trace(z, w, B, right, 0.0) / a_r
     return 2 / 3 * s, least
@@ -769,6 +769,10 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
                     _contacts(w, B, x1, x2, on, x2 > 0, old, s)
                     stuck, gap, _ = _balance(z, w, B, s, x1, x2)
                     margin = min(margin, gap)
+                    if not stuck and t == t_before and gap < 1e-12:
+                        # Back at once: at the limit, but for rounding, and within it next.
+                        _contacts(w, B, x1, x2, on, x2 > 0, old, s)
+                        stuck = True
                     kind = STICK if stuck else CROSS
                 if stuck or x2 != 0:
                     passed_edge = np.nan
