@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .cycles import Chain, Cycle, Turn, event_between, find_cycle, modes_of
+from .cycles import Chain, Cycle, Ends, Turn, event_between, find_cycle, modes_of
 from .modes import ABOVE
 from .oscillator import Oscillator
 from .results import EventKind, Status, of_one_turn
@@ -73,10 +73,10 @@ def stuck_belts(path: Itinerary) -> frozenset[int]:
 def place_of(cycle: Cycle | Turn) -> np.ndarray:
     """Where a cycle is: smallest and largest x1, smallest and largest x2, period."""
     if isinstance(cycle, Cycle):
-        used, rows = np.asarray(cycle.chain.used), np.asarray(cycle.unknowns)
+        turn, rows = cycle.chain, np.asarray(cycle.unknowns)
     else:
-        rows = np.column_stack([np.asarray(cycle.entries), np.asarray(cycle.durations)])
-        used = np.asarray(cycle.used)
+        turn, rows = cycle, np.column_stack([cycle.entries, cycle.durations])
+    used = np.asarray(turn.ends) != Ends(turn.codes.shape[-1]).unused
     return extent(rows[used])
 
 

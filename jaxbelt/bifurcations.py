@@ -105,8 +105,8 @@ from .results import Status, describe
 HINT_BUDGET = 32
 #: Arcs for which each orbit is followed that may lead to a cycle.
 FOLLOWED = 96
-#: How often an orbit that has not settled is followed anew from what it approaches.
-ATTEMPTS = 4
+#: How often an orbit is followed, from what it approaches, or on, until it has settled.
+ATTEMPTS = 6
 #: Where some of them start to the right of an equilibrium, so far from it.
 DISTANCES = (0.02, 0.3, 3.0)
 
@@ -477,11 +477,11 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
 def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
     """The orbit from a start until it settles, with the status OK where that is on a cycle.
 
-    If it has not settled, the last three tops tell what it approaches: their differences form a
-    geometric sequence, so its limit is known (Aitken). If that is much nearer to the last top than
-    this is to any equilibrium, the orbit from there is followed next, for on the way there may be a
-    boundary. What even then has not settled counts as settled, its last turn as the one that
-    repeats.
+    If it has not settled, it is followed on, from what it approaches where that can be told: the
+    differences of the last three tops form a geometric sequence, so its limit is known (Aitken). If
+    that is much nearer to the last top than this is to any equilibrium, the orbit from there is
+    followed next, for on the way there may be a boundary. What even then has not settled counts as
+    settled, its last turn as the one that repeats.
     """
 
     def attempt(state):
@@ -495,20 +495,21 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
         limit = tops[2] + after * ratio / (1 - ratio)
         distance = jnp.min(jnp.where(rests.kind > 0, jnp.abs(tops[2] - rests.x1), jnp.inf))
         away = jnp.abs(limit - tops[2]) < 0.2 * distance
-        pending = (orbit.status == Status.NOT_SETTLED) & (last[0] >= 0) & (before != 0)
-        is_cycle = pending & (jnp.abs(ratio) < 1) & away
-        return number + 1, jnp.stack([limit, jnp.zeros(())]), orbit, last, is_cycle
+        pending = orbit.status == Status.NOT_SETTLED
+        is_cycle = pending & (last[0] >= 0) & (before != 0) & (jnp.abs(ratio) < 1) & away
+        start = jnp.where(is_cycle, jnp.stack([limit, jnp.zeros(())]), orbit.y)
+        return number + 1, start, orbit, last, pending, is_cycle
 
     def unsettled(state):
-        number, *_, is_cycle = state
-        return (number == 0) | (is_cycle & (number < ATTEMPTS))
+        number, *_, pending, _ = state
+        return (number == 0) | (pending & (number < ATTEMPTS))
 
     none = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
         jax.eval_shape(attempt, (jnp.asarray(0), start)),
     )
     first = (jnp.asarray(0), start, *none[2:])
-    _, _, orbit, last, is_cycle = lax.while_loop(unsettled, attempt, first)
+    _, _, orbit, last, _, is_cycle = lax.while_loop(unsettled, attempt, first)
     ended = eqx.tree_at(
         lambda o: (o.repeats, o.count, o.status),
         orbit,

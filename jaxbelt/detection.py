@@ -26,6 +26,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +37,7 @@ from .attractors import (
     Itinerary,
     apart,
     events_of,
+    is_same,
     itinerary,
     place_of,
     sticks,
@@ -147,7 +149,9 @@ def search(path: "Path", resolution: int = 96) -> tuple[BifurcationPoint, ...]:
         for a, b in intervals:
             point = found.get((a, b))
             if point is not None:
-                points.append(point)
+                # The interval on the other side of a fold may have led to it already.
+                if not any(_is_same_point(point, other) for other in points):
+                    points.append(point)
                 slow = isinstance(point.condition, FoldOfCycles)
                 before, after = path.beside(float(point.value), slow=slow)
                 settled.append((before, after))
@@ -159,6 +163,15 @@ def search(path: "Path", resolution: int = 96) -> tuple[BifurcationPoint, ...]:
                 values += np.linspace(a, b, 3 if b - a <= NEAR * path.length else 9).tolist()
         path.look(values)
     return by_value(points)
+
+
+def _is_same_point(point: BifurcationPoint, other: BifurcationPoint) -> bool:
+    """Whether two points are of one condition, at one value, and of one cycle."""
+    at, error = float(point.value), float(point.error) + float(other.error)
+    if point.condition != other.condition or not abs(at - float(other.value)) <= error:
+        return False
+    is_rest = int(point.cycle.status) != Status.OK
+    return is_rest or is_same(point.cycle, other.cycle)
 
 
 def by_value(points: Sequence[BifurcationPoint]) -> tuple[BifurcationPoint, ...]:
@@ -350,25 +363,26 @@ class Path:
                 found.append(one)
         if not found and not any(stable for _, stable, _ in rests):
             # Nothing holds the orbits but a cycle that they approach slowly.
-            found.append(self._settled(value, turns[-1]) or Found((), turns[-1]))
+            found.append(self._settled(value, turns[-1], closes=False) or Found((), turns[-1]))
         self.cycles[value] = found
         self._name(value, rests)
 
     def _name(self, value: float, rests) -> None:
         self.labels[value] = Label(rests, tuple(sorted(one.path for one in self.cycles[value])))
 
-    def _settled(self, value: float, turn: Turn) -> Found | None:
-        """The attracting cycle that a turn is nearly one of, or None.
+    def _settled(self, value: float, turn: Turn, *, closes: bool = True) -> Found | None:
+        """The attracting cycle that a turn is nearly one of, or else leads to, or None.
 
-        A turn that sticks is one of it. Any other may only seem to repeat.
+        A turn that sticks is one of it. Any other may only seem to repeat. closes: whether it is
+        known to be one turn.
         """
         osc, ok = self.at(value), jnp.asarray(Status.OK.value)
-        if sticks(path := itinerary(osc, turn)):
+        if closes and sticks(path := itinerary(osc, turn)):
             return Found(path, turn)
         # Where the cycle has other turns than those from which it is solved for, or meets a
         # boundary, it is followed.
         ways = (lambda: polish(osc, cut([turn])[0], ok), lambda: find_cycle(osc, turn.entries[0]))
-        for cycle in (way() for way in ways):
+        for cycle in (way() for way in ways[0 if closes else 1 :]):
             if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
                 # Not the equilibrium, to which a cycle may shrink.
                 if np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST:
@@ -410,8 +424,9 @@ class Path:
         nearby = self._settled(known + DIFFERENCE * step, turn)
         expected = turn
         if nearby is not None and nearby.path == path and _fits(nearby.turn, turn):
-            expected = jax.tree.map(lambda a, b: a + (b - a) / DIFFERENCE, turn, nearby.turn)
-            expected = replace(turn, entries=expected.entries, durations=expected.durations)
+            parts = ((t.entries, t.durations) for t in (turn, nearby.turn))
+            moved = [a + (b - a) / DIFFERENCE for a, b in zip(*parts, strict=True)]
+            expected = eqx.tree_at(lambda t: (t.entries, t.durations), turn, tuple(moved))
         found = self._settled(value, expected)
         if found is None or found.path != path:
             return None
@@ -420,8 +435,10 @@ class Path:
             return None
         at = _number(found, self.cycles[value])
         if at is None:
-            at = len(self.cycles[value])
-            self.cycles[value].append(found)
+            others = self.cycles[value]
+            # In place of one that was only taken to be there.
+            at = 0 if others and not others[0].path else len(others)
+            others[at : at + 1] = [found]
             self._name(value, self.labels[value].equilibria)
         return at
 

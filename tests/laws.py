@@ -23,3 +23,25 @@ def bell(r):
 
 
 BELL = Lorentz(jnp.asarray(1.0), jnp.asarray(0.6), jnp.asarray(0.4))
+
+
+class Nested(jb.AbstractFriction):
+    """mu(1 - v) = 1 + v/2 + a polynomial in v, for a belt of velocity 1.
+
+    With damping near 0.5 what is left is weak. Averaged over a turn it lets the amplitude A grow
+    like -A (s - 0.04) (s - 0.08) (s - 0.16), s = A^2: between two attracting cycles lies a third.
+    """
+
+    static: jax.Array
+
+    def mu(self, speed):
+        return nested(speed)
+
+
+def nested(r):
+    v = 1.0 - r
+    rest = (20 * 5.12e-4 * 2, -20 * 0.0224 * 8 / 3, 20 * 0.28 * 16 / 5, -20 * 128 / 35)
+    return 1.0 + 0.5 * v + sum(c * v ** (2 * i + 1) for i, c in enumerate(rest))
+
+
+NESTED = Nested(jnp.asarray(3.0))

@@ -454,11 +454,12 @@ def pseudo_hopf(make, bracket, edge):
     return _solve(lambda p: pseudo_focus_rate(make(p), edge(p)), bracket)
 
 
-def fold_of_cycles(make, bracket, distances):
+def fold_of_cycles(make, bracket, distances, *, attracts_inside=False):
     """Parameter at which two cycles that touch no boundary meet and vanish.
 
     A turn from (focus + d, 0) grows by a factor; between the two cycles that is above one.
-    They meet where its largest value over the distances d is just one.
+    They meet where its largest value over the distances d is just one. attracts_inside: the inner
+    one of the two attracts; then it is below one between them, and its smallest value counts.
     """
 
     def largest(p):
@@ -466,7 +467,8 @@ def fold_of_cycles(make, bracket, distances):
         ((focus, _),) = foci(osc)
 
         def growth(d):
-            return -((one_turn(osc, focus + d).stopped_by.x1 - focus) / d - 1)
+            excess = (one_turn(osc, focus + d).stopped_by.x1 - focus) / d - 1
+            return excess if attracts_inside else -excess
 
         best = minimize_scalar(growth, bounds=distances, method="bounded", options={"xatol": 1e-7})
         assert distances[0] + 1e-3 < best.x < distances[1] - 1e-3, "the largest value is at an end"

@@ -9,7 +9,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
-from laws import BELL, bell
+from laws import BELL, NESTED, bell, nested
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
@@ -217,6 +217,33 @@ def test_a_corner_where_only_the_sign_of_what_arrives_changes():
     expected = [jb.CornerCollision(1), jb.CornerCollision(1), jb.GrazingEdge(1)]
     assert [point.condition for point in points] == expected
     assert points[1].value == pytest.approx(0.398440689452, abs=1e-11)
+
+
+@pytest.mark.slow
+def test_nested_cycles_in_one_mode():
+    """Each ends in a fold, where the other one goes on."""
+    path = Path(
+        jb.Oscillator(0.5, (jb.Belt(1.0, NESTED),)), lambda osc: osc.damping, (0.497, 0.508)
+    )
+    points = search(path, resolution=32)
+    assert [point.condition for point in points] == [jb.FoldOfCycles()] * 2
+
+    def make(damping):
+        return oracle.Oscillator(damping, (oracle.Belt(1.0, nested, 3.0, 1.0),), 1.0)
+
+    expected = (
+        oracle_cycles.fold_of_cycles(make, (0.497, 0.4995), (0.15, 0.3), attracts_inside=True),
+        oracle_cycles.fold_of_cycles(make, (0.5045, 0.5065), (0.3, 0.45)),
+    )
+    assert values_of(points) == pytest.approx(expected, abs=1e-9)
+    path.look([0.4975, 0.5, 0.5075])
+    amplitudes = [
+        [float(np.ptp(one.turn.entries[:, 0])) / 2 for one in path.cycles[value]]
+        for value in (0.4975, 0.5, 0.5075)
+    ]
+    assert [len(sizes) for sizes in amplitudes] == [1, 2, 1]
+    # To first order in the damping less 0.5, so up to some per cent.
+    assert sorted(amplitudes[1]) == pytest.approx([0.2, 0.4], rel=0.02)
 
 
 def test_a_belt_without_load_changes_nothing():

@@ -471,7 +471,10 @@ def run(seed: int, paths: int, *, first: int = 0, out=print) -> int:
         )
         for line in report.wrong:
             out(f"    {line}")
-        if report.wrong:
+        unexplained = [float(p.value) for p in report.points if p.kind == "Unexplained"]
+        if unexplained:
+            out(f"    unexplained at {unexplained}")
+        if report.wrong or unexplained:
             out(f"    {case.oscillator!r}")
     out(f"{paths} paths, {bad} with something that does not agree")
     return bad
