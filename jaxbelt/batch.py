@@ -1133,7 +1133,7 @@ class Attractor(Observer):
     """
 
     REPEATED: ClassVar[float] = 1e-7
-    #: Smaller motion than so many tolerances that repeats is the integrator's: an equilibrium.
+    #: Motion that is smaller than so many tolerances is the integrator's.
     RESOLVED: ClassVar[float] = 1e3
     #: Until then extrema are left out, unless a stick phase has ended: about two turns.
     SETTLING: ClassVar[float] = 12.0
@@ -1191,8 +1191,10 @@ class Attractor(Observer):
 
         kind = jnp.where(repeats, CYCLE, UNDECIDED)
         # An orbit that sticks is on a cycle, however small.
-        size = jnp.maximum(amplitude, lanes.upper - lanes.lower)
-        kind = jnp.where(repeats & ~released & (size < self.RESOLVED * tol), EQUILIBRIUM, kind)
+        # Smaller motion than the tolerance resolves is at rest if it repeats or shrinks.
+        small = jnp.maximum(amplitude, lanes.upper - lanes.lower) < self.RESOLVED * tol
+        shrinks = section & (change < 0) & (turn.change < 0)
+        kind = jnp.where(small & ~released & (repeats | shrinks), EQUILIBRIUM, kind)
         kind = jnp.where(passage.captured, EQUILIBRIUM, kind)
         kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind)
         going_on = (turn.kind == UNDECIDED) & (lanes.run >= 0)

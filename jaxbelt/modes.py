@@ -113,7 +113,8 @@ def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
     """
     needed = mode_acceleration(osc, mode, x1, x2)
     held = capacity(osc, mode)
-    slips = (jnp.abs(needed) > held) | (held == 0)
+    rounding = TANGENT * (held + jnp.abs(x1))
+    slips = (jnp.abs(needed) > held + rounding) | (held == 0)
     sign = jnp.where(needed == 0, jnp.where(x2 < 0, -1.0, 1.0), -jnp.sign(needed))
     codes = tuple(
         jnp.where(stuck & slips, sign, code)
@@ -254,9 +255,21 @@ def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Ar
         at_lower, at_upper = belt.lower == edge, belt.upper == edge
         arrives = jnp.where(rightward, at_lower & (code == BELOW), at_upper & (code == ABOVE))
         leaves = touches & jnp.where(rightward, at_upper, at_lower)
-        code = jnp.where(arrives, jnp.sign(belt.velocity - speed), code)
+        code = jnp.where(arrives, _slip_sign(belt.velocity, speed), code)
         codes.append(jnp.where(leaves, jnp.where(rightward, ABOVE, BELOW), code))
+    # Slip may have set in just before; a belt of that very velocity that arrives asks anew.
+    velocity = stick_velocity(osc, Mode(tuple(codes)), jnp.full_like(edge, jnp.nan))
+    codes = [
+        jnp.where((jnp.abs(code) < 1.5) & (belt.velocity == velocity), STUCK, code)
+        for belt, code in zip(osc.belts, codes, strict=True)
+    ]
     return settle(osc, Mode(tuple(codes)), edge, x2)
+
+
+def _slip_sign(velocity: Array, speed: Array) -> Array:
+    """Sign of velocity - speed; 0 where they are equal but for the rounding of nu/omega."""
+    same = jnp.abs(velocity - speed) <= 4e-16 * jnp.abs(velocity)
+    return jnp.where(same, STUCK, jnp.sign(velocity - speed))
 
 
 class StickPhase(eqx.Module):
@@ -434,10 +447,7 @@ def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
     for belt in osc.belts:
         is_below = x1 < belt.lower if rightward else x1 <= belt.lower
         is_above = x1 >= belt.upper if rightward else x1 > belt.upper
-        speed = osc.omega * x2
-        # Equal but for the rounding of nu/omega counts as equal.
-        on_boundary = jnp.abs(belt.velocity - speed) <= 4e-16 * jnp.abs(belt.velocity)
-        sign = jnp.where(on_boundary, STUCK, jnp.sign(belt.velocity - speed))
+        sign = _slip_sign(belt.velocity, osc.omega * x2)
         codes.append(jnp.where(is_below, BELOW, jnp.where(is_above, ABOVE, sign)))
     return Mode(tuple(codes))
 
