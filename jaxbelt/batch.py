@@ -360,7 +360,7 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
         edge = jnp.where(new.x2 > 0, right, left)
         # Slow passages are bridged over less of the way, for there x2' counts more than x2.
         way, speed = edge - new.x1, jnp.abs(new.x2)
-        near = jnp.abs(way) * jnp.maximum(speed, SLOW * jnp.abs(new.a)) <= reach * speed * speed
+        near = jnp.abs(way) * jnp.maximum(speed, SLOW * jnp.abs(new.a)) < reach * speed * speed
         there = jnp.abs(way) <= ON_GUARD * (1 + jnp.abs(new.x1))
         slope = jnp.where(near, new.x2, 1.0)
         delta1 = jnp.where(near, way, jnp.where(there, 0.0, 1e300)) / slope
