@@ -1,0 +1,210 @@
+"""Round numbers: where a slip onset, an edge, an equilibrium and another belt meet exactly.
+
+Each case went wrong once, in the sweep or in `find_cycle`. The oracle is the engine of the
+campaigns, `tests/campaign/engine.py`; `judge` says what counts as right (docs/checked.md).
+"""
+
+import numpy as np
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import batch
+from jaxbelt.results import Status
+from tests.campaign import compare, package
+from tests.campaign.cases import PAPER, Case
+from tests.campaign.engine import Belt, Oscillator
+
+STEEP, STRONG = ("conti", 1.0, 0.6, 5.0, 0.0), ("conti", 1.0, 0.6, 2.0, 0.0)
+MILD, WEAK = ("conti", 1.0, 0.5, 10.0, 0.0), ("conti", 0.5, 0.25, 10.0, 0.0)
+BOTH = ("conti", "conti")
+
+
+def at_onset(shift):
+    """Slip onset of belt 0 a distance `shift` before the edge of both belts, 0.9."""
+    edge = 0.9 + shift
+    return Oscillator(0.25, (Belt(0.4, PAPER, upper=edge), Belt(-0.55, PAPER, lower=edge)))
+
+
+CASES = {
+    # Stick phases on two belts that end in the same x1 and the same mode.
+    "two ends, one x1": (Oscillator(0.5, (Belt(0.6, PAPER), Belt(-0.9, PAPER))), (3.0, 0.0)),
+    "two ends at T": (Oscillator(0.5, (Belt(0.15, PAPER), Belt(-1.35, PAPER))), (1.85, 0.45)),
+    # Slip onset on an edge, and near it.
+    **{f"onset {d:g} before": (at_onset(d), (3.0, 0.0)) for d in (0.0, 1e-9, 1e-12, -1e-9)},
+    "onset on a leaving edge": (
+        Oscillator(0.5, (Belt(-0.2, STEEP, upper=-0.5), Belt(-0.4, STEEP, 2.0, lower=-1.0))),
+        (0.0, 0.0),
+    ),
+    "onset on an arriving edge": (
+        Oscillator(0.5, (Belt(1.0, MILD, upper=1.0), Belt(-0.55, MILD, lower=0.5))),
+        (-2.0, 0.0),
+    ),
+    "onset, one velocity": (
+        Oscillator(
+            0.05, (Belt(0.35, PAPER, 0.5, -0.035, 0.9), Belt(0.35, PAPER, 0.5, lower=0.465)), 0.5
+        ),
+        (0.0, 0.0),
+    ),
+    # Needed force and capacity are equal, to rounding, where an edge is passed while sticking.
+    "held to rounding": (
+        Oscillator(
+            1.0,
+            (Belt(-0.65, STRONG, 2.0, upper=1.06666666666667), Belt(-0.4, STRONG, 2.0, -1.1)),
+            0.5,
+        ),
+        (3.0, 0.0),
+    ),
+    "held to rounding, again": (
+        Oscillator(
+            0.1, (Belt(-0.9, WEAK, 2.0, -0.45, 0.20666666666667), Belt(-0.4, WEAK, 1.5, -0.45))
+        ),
+        (3.0, 0.0),
+    ),
+    # Rest on an edge: between two pushes, or where the field of one side vanishes.
+    "rest where a side is at rest": (
+        Oscillator(0.5, (Belt(0.75, STEEP, upper=0.0), Belt(0.05, STEEP, 0.0, lower=0.0))),
+        (3.0, 0.0),
+    ),
+    "start there": (
+        Oscillator(0.5, (Belt(0.75, STEEP, upper=0.0), Belt(0.05, STEEP, 0.0, lower=0.0))),
+        (0.0, 0.0),
+    ),
+    "start at a pseudo-focus": (
+        Oscillator(0.5, (Belt(1.0, MILD, upper=1.0), Belt(-0.55, MILD, lower=0.5))),
+        (0.5, 0.0),
+    ),
+    "held on one side of an edge": (
+        Oscillator(0.5, (Belt(0.0, WEAK, upper=1.5), Belt(0.7, WEAK, upper=-0.5))),
+        (-0.5, 0.0),
+    ),
+    "an edge that changes nothing": (
+        Oscillator(
+            0.5,
+            (Belt(0.8, PAPER, upper=0.64444444444444), Belt(0.8, PAPER, lower=0.64444444444444)),
+            0.5,
+        ),
+        (0.64444444444444, 1.2),
+    ),
+    # A belt that exerts no force is no obstacle, at rest or not.
+    "pseudo-focus beside an idle belt": (
+        Oscillator(
+            0.6108,
+            (
+                Belt(0.1345, ("conti", 1.0528, 0.715, 0.8284, 0.1321), 1.3767, upper=0.4697),
+                Belt(0.0, ("conti", 0.52, 0.464, 4.93, 0.235), 0.0, lower=0.4697),
+            ),
+            0.7387,
+        ),
+        (1.3, 0.0),
+    ),
+    "node on an idle belt's boundary": (
+        Oscillator(2.0, (Belt(0.0, PAPER, 0.0, upper=1.4), Belt(-1.0, PAPER, 0.5, lower=-1.15))),
+        (0.7, 0.0),
+    ),
+    # A push five thousand times as hard on one side.
+    "hard push": (
+        Oscillator(
+            0.3356,
+            (
+                Belt(-0.5924, ("conti", 0.5411, 0.4906, 9.2532, 0.0), 4431.87, lower=0.2305),
+                Belt(0.5103, ("conti", 0.6543, 0.4098, 9.0086, 0.0), 1.5834),
+            ),
+        ),
+        (-29.947, 8.034),
+    ),
+}
+
+
+def by_simulate(case):
+    """The case's run, told as the campaigns are told it."""
+    osc = package.oscillator(case.oscillator)
+    run = jb.simulate(osc, case.y0, case.T, ts=np.array([case.T]))
+    events = run.events
+    rows = zip(*(np.asarray(part).tolist() for part in (events.t, events.kind, events.belt)))
+    told = tuple((*row, *y) for row, y in zip(rows, np.asarray(events.y).tolist()))
+    mode = tuple(np.asarray(run.modes[-1]).tolist())
+    return package.Final(*map(float, run.ys[-1]), mode, len(told), int(run.status), told)
+
+
+def wanted(edges):
+    cases = [Case(osc, y0, 50.0, "rational") for osc, y0 in CASES.values()]
+    return [case for case in cases if case.structure == (BOTH, edges)]
+
+
+@pytest.mark.parametrize("edges", [False, True])
+def test_runs_on_round_numbers(edges):
+    cases = wanted(edges)
+    for case, answer in zip(cases, package.finals(cases, 1e-8)):
+        verdict, mine = compare.judge(case, answer, 1e-8)
+        assert verdict in compare.GOOD, (verdict, package.as_code(case), answer, mine)
+    for case in cases:
+        verdict, mine = compare.judge(case, by_simulate(case), 1e-10)
+        assert verdict in compare.GOOD, (verdict, package.as_code(case), mine)
+
+
+@pytest.mark.parametrize("edges", [False, True])
+def test_labels_of_round_numbers(edges):
+    cases = wanted(edges)
+    for case, answer in zip(cases, package.labels(cases, 1e-8)):
+        verdict, mine = compare.judge_label(case, answer, 1e-8)
+        assert verdict in compare.GOOD, (verdict, package.as_code(case), answer, mine)
+
+
+# Around a hard push it takes more turns than `find_cycle` follows, and says so.
+@pytest.mark.parametrize("name", [name for name in CASES if name != "hard push"])
+def test_find_cycle_settles_on_round_numbers(name):
+    osc, y0 = CASES[name]
+    found, known = jb.find_cycle(package.oscillator(osc), y0), compare.engine.attractor(osc, y0)
+    if known.kind == "cycle":
+        turns = known.period / float(found.period)
+        # The engine may tell several turns; both are far more exact than this.
+        assert found.status == Status.OK and abs(turns - round(turns)) < 1e-7
+    elif known.kind == "equilibrium":
+        assert found.status in (Status.EQUILIBRIUM, Status.PSEUDO_FOCUS)
+    else:
+        assert found.status == Status.STUCK_FOREVER
+
+
+def test_huge_loads_do_not_stop_a_sweep():
+    law = jb.Conti(1.0, 0.6, 10.0)
+    found = jb.sweep(
+        lambda load: jb.Oscillator(0.5, (jb.Belt(0.3, law, load),)),
+        {"load": [1e8]},
+        t1=50.0,
+        progress=False,
+    )
+    # It sticks at once (after 4e-9) and is carried along.
+    assert found.status == Status.OK and found.n_events == 1
+    np.testing.assert_allclose(found.x1_end, 3.0 + 0.3 * 50.0, rtol=0, atol=1e-7)
+
+
+# --- audits ---------------------------------------------------------------------------------------
+
+AXES = {"nu0": np.array([0.2, 0.4, 0.6]), "nu1": np.array([-0.9, -0.4, 0.3])}
+
+
+@pytest.mark.parametrize("observe", ["final", "attractor"])
+def test_audits_find_nothing(observe):
+    found = jb.sweep(jb.presets.class_b, AXES, t1=200.0, observe=observe, audit=0.5, progress=False)
+    assert (found.attrs["audited"], found.attrs["audit_differed"]) == (5, 0)
+
+
+@pytest.mark.parametrize("observe", ["final", "attractor"])
+def test_audits_find_repeats_that_are_none(observe, monkeypatch):
+    def in_part(mark, lanes, close):
+        same = batch._code(lanes.mode) == mark.code
+        return same & (abs(lanes.x1 - mark.x1) <= close)
+
+    monkeypatch.setattr(batch, "_returned", in_part)
+    batch._compiled.cache_clear()
+    with pytest.warns(UserWarning, match="1 of 9 audited runs differ .* indices \\(2, 0\\)"):
+        found = jb.sweep(
+            jb.presets.class_b, AXES, t1=60.0, observe=observe, audit=1.0, progress=False
+        )
+    batch._compiled.cache_clear()
+    assert found.attrs["audit_differed"] == 1
+
+
+def test_what_cannot_be_audited_is_refused():
+    with pytest.raises(ValueError, match="audit must be a share from 0 to 1, got 2"):
+        jb.sweep(jb.presets.class_b, AXES, t1=1.0, audit=2.0)
