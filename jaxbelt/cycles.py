@@ -486,7 +486,8 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     duration = jnp.where(stuck, phase.duration, t_slip)
 
     # Whatever ends the arc: at the boundary of a belt at rest it is not the guard of turns.
-    is_top = ~stuck & (_after(osc, codes, y)[1] > 0) & (_after(osc, code, y_end)[1] < 0)
+    falls = ~new.any_stuck & (_after(osc, code, y_end)[1] < 0)
+    is_top = ~stuck & (_after(osc, codes, y)[1] > 0) & falls
     top = jnp.where(is_top, y_end[0], jnp.nan)
     amplitude = top - orbit.low
     rows = jnp.arange(orbit.tops.size)

@@ -107,6 +107,14 @@ def test_there_is_no_unstable_cycle_outside_of_hopf_point_and_fold(nu):
     assert cycle.status == Status.NO_UNSTABLE_CYCLE and jnp.isnan(cycle.period)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_start_that_sticks_to_a_belt_at_rest_stays_there(sign):
+    # It sticks where x1 is smallest, and there is no way from there to a largest one.
+    law = jb.Conti(1.2, 0.6, 5.0)
+    osc = jb.Oscillator(0.1, (jb.Belt(sign * 0.3, law, 0.5), jb.Belt(0.0, law, 0.5)))
+    assert jb.find_cycle(osc, (sign * 0.57, sign * 1.2)).status == Status.STUCK_FOREVER
+
+
 def test_a_start_that_comes_to_rest_leads_to_no_cycle():
     cycle = jb.find_cycle(jb.presets.class_b(0.6, 0.35), START)
     assert cycle.status == Status.EQUILIBRIUM and jnp.isnan(cycle.period)

@@ -4,14 +4,12 @@ import multiprocessing
 import os
 import subprocess
 import sys
-import timeit
 
 import jax
 import numpy as np
 import pytest
 
 import jaxbelt as jb
-from jaxbelt.processes import require_own_threads
 
 OSC = jb.presets.class_b(nu0=0.45, nu1=0.35)
 SPAN, TWO, KEY = (0.1, 0.2), np.array([0.1, 0.2]), jax.random.key(0)
@@ -96,8 +94,3 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
     )
     assert run.stdout.strip() == "7"
-
-
-def test_asking_costs_nothing():
-    # A hundred times less than the cheapest computation.
-    assert min(timeit.repeat(require_own_threads, number=1000)) / 1000 < 5e-6
