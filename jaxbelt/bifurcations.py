@@ -913,7 +913,9 @@ def end_near_edge(osc: Oscillator, turn: Turn, belt: Array, wanted: Array) -> Ed
         to_edges = [jnp.where(turns | meets, jnp.abs(x1 - e), jnp.inf) for e in (lower, upper)]
         # An edge ends it. If that pushes away to both sides: how much further on the orbit would
         # turn as it was.
-        push = [jnp.sign(x2) * mode_acceleration(osc, mode_of(c), x1, x2) for c in (codes, after)]
+        # It moves there as x1 does on this arc; x2 itself may be zero.
+        ahead = jnp.sign(x1 - entry[0])
+        push = [ahead * mode_acceleration(osc, mode_of(c), x1, x2) for c in (codes, after)]
         passes = on_edge & ~stuck & (push[0] < 0) & (push[1] > 0)
         to_turn = jnp.where(passes, 0.5 * x2**2 / jnp.where(passes, -push[0], 1.0), jnp.inf)
         # A boundary may be near that the arc did not begin at: x2 is monotone on it.

@@ -237,6 +237,7 @@ def test_small_campaign(arguments, capsys):
         "simulate --runs 2000 --seed 23",
         "grazing --runs 1000 --tol 1e-13 --seed 24",
         "grazing --runs 1000 --seed 25",
+        "paths --paths 14 --seed 3",
     ],
 )
 def test_campaign(arguments, capsys):
