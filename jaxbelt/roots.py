@@ -3,8 +3,8 @@
 Guards are positive at the start of the step and negative beyond their root. The smallest of them
 has kinks, on which a search for its root may end, and near a tangency one guard is small where
 another has its root. So each is searched for by itself. The turns come first, the zeros of x2' and
-of x2: up to a turn the other guards are monotone, and its sign there, as accurate as the
-integration, decides whether there is a root of a guard before it.
+of x2: up to a turn the other guards are monotone, and the sign of one at the turn, as accurate as
+the integration, tells whether it has a root before.
 """
 
 from collections.abc import Callable

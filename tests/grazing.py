@@ -124,9 +124,8 @@ def land(osc, codes, y, guess, axis, level):
 
 def growth(osc, codes, y, duration):
     """By how much deviations from the state y grow at most in that time."""
-    slopes = [
-        flow(osc, codes, (y[0] + u, y[1] + v), duration) for u, v in ((1e-30j, 0), (0, 1e-30j))
-    ]
+    nudges = (1e-30j, 0), (0, 1e-30j)
+    slopes = [flow(osc, codes, (y[0] + u, y[1] + v), duration) for u, v in nudges]
     return np.max(np.abs(np.imag(slopes)) / 1e-30, axis=(0, 1))
 
 
