@@ -62,11 +62,13 @@ def _root(guards, which: Array, at_start: Guards, end: Array, at_end: Guards):
     shortest = NEAREST * end
     f_start, slope_start = pick(at_start)
 
+    def near(at_c):
+        value, slope = pick(at_c)
+        return jnp.abs(value) <= jnp.abs(slope) * shortest
+
     def unfinished(state):
         a, _, b, _, _, at_c, count = state
-        value, slope = pick(at_c)
-        near = jnp.abs(value) <= jnp.abs(slope) * shortest
-        return (count == 0) | ((b - a > 2 * shortest) & ~near & (count < MOST))
+        return (count == 0) | ((b - a > 2 * shortest) & ~near(at_c) & (count < MOST))
 
     def improve(state):
         a, at_a, b, at_b, _, _, count = state
@@ -87,8 +89,10 @@ def _root(guards, which: Array, at_start: Guards, end: Array, at_end: Guards):
 
     at_a = jnp.maximum(f_start, jnp.finfo(f_start.dtype).tiny), slope_start
     start = (jnp.zeros_like(end), at_a, end, pick(at_end), end, at_end, 0)
-    state = lax.while_loop(unfinished, improve, start)
-    return state[4], state[5]
+    *_, c, at_c, _ = lax.while_loop(unfinished, improve, start)
+    value, slope = pick(at_c)
+    regular = near(at_c) & (slope != 0)
+    return c - jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0), at_c
 
 
 def _interpolated(a, at_a, b, at_b) -> Array:
