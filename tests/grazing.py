@@ -372,11 +372,11 @@ def edge_cases(seed, n, distances) -> list[Cases]:
         good &= growth(osc, before, case.start, back) < GROWTH
         on = SPAN_AT_EDGE - back
         if d > 0:
-            t, _, back_in, y = _over_edge(case)
+            t, crossing, back_in, y = _over_edge(case)
             good &= ~returns | (back_in < on - 0.02)
             left = np.where(returns, SPAN_AT_EDGE - t - back_in, on)
             again = flow(osc, before, y, left, path=True)
-            middle = flow(osc, beyond, (sigma, rest), on, path=True)
+            middle = flow(osc, beyond, crossing, SPAN_AT_EDGE - t, path=True)
             good &= np.where(
                 returns,
                 _stays(osc, before, again, sigma, e),
