@@ -3,8 +3,8 @@
 Guards are positive at the start of the step and negative beyond their root. The smallest of them
 has kinks, on which a search for its root may end, and near a tangency one guard is small where
 another has its root. So each is searched for by itself. The turns come first, the zeros of x2' and
-of x2: up to a turn the other guards are monotone, and its sign there, as accurate as the
-integration, decides whether there is a root of a guard before it.
+of x2: up to a turn the other guards are monotone, and the sign of one at the turn, as accurate as
+the integration, tells whether it has a root before.
 """
 
 from collections.abc import Callable
@@ -62,11 +62,13 @@ def _root(guards, which: Array, at_start: Guards, end: Array, at_end: Guards):
     shortest = NEAREST * end
     f_start, slope_start = pick(at_start)
 
+    def near(at_c):
+        value, slope = pick(at_c)
+        return jnp.abs(value) <= jnp.abs(slope) * shortest
+
     def unfinished(state):
         a, _, b, _, _, at_c, count = state
-        value, slope = pick(at_c)
-        near = jnp.abs(value) <= jnp.abs(slope) * shortest
-        return (count == 0) | ((b - a > 2 * shortest) & ~near & (count < MOST))
+        return (count == 0) | ((b - a > 2 * shortest) & ~near(at_c) & (count < MOST))
 
     def improve(state):
         a, at_a, b, at_b, _, _, count = state
@@ -87,8 +89,10 @@ def _root(guards, which: Array, at_start: Guards, end: Array, at_end: Guards):
 
     at_a = jnp.maximum(f_start, jnp.finfo(f_start.dtype).tiny), slope_start
     start = (jnp.zeros_like(end), at_a, end, pick(at_end), end, at_end, 0)
-    state = lax.while_loop(unfinished, improve, start)
-    return state[4], state[5]
+    *_, c, at_c, _ = lax.while_loop(unfinished, improve, start)
+    value, slope = pick(at_c)
+    regular = near(at_c) & (slope != 0)
+    return c - jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0), at_c
 
 
 def _interpolated(a, at_a, b, at_b) -> Array:

@@ -124,9 +124,8 @@ def land(osc, codes, y, guess, axis, level):
 
 def growth(osc, codes, y, duration):
     """By how much deviations from the state y grow at most in that time."""
-    slopes = [
-        flow(osc, codes, (y[0] + u, y[1] + v), duration) for u, v in ((1e-30j, 0), (0, 1e-30j))
-    ]
+    nudges = (1e-30j, 0), (0, 1e-30j)
+    slopes = [flow(osc, codes, (y[0] + u, y[1] + v), duration) for u, v in nudges]
     return np.max(np.abs(np.imag(slopes)) / 1e-30, axis=(0, 1))
 
 
@@ -373,11 +372,11 @@ def edge_cases(seed, n, distances) -> list[Cases]:
         good &= growth(osc, before, case.start, back) < GROWTH
         on = SPAN_AT_EDGE - back
         if d > 0:
-            t, _, back_in, y = _over_edge(case)
+            t, crossing, back_in, y = _over_edge(case)
             good &= ~returns | (back_in < on - 0.02)
             left = np.where(returns, SPAN_AT_EDGE - t - back_in, on)
             again = flow(osc, before, y, left, path=True)
-            middle = flow(osc, beyond, (sigma, rest), on, path=True)
+            middle = flow(osc, beyond, crossing, SPAN_AT_EDGE - t, path=True)
             good &= np.where(
                 returns,
                 _stays(osc, before, again, sigma, e),
