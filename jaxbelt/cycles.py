@@ -67,6 +67,8 @@ from .simulate import Arcs
 SIZES = (16, 32, 64)
 #: Integration steps per slip arc (an arc is about a quarter of a turn at most).
 STEPS = 8
+#: The same where those leave a larger error in the shooting equations than EXACT.
+FINE_STEPS, EXACT = 32, 1e-11
 #: Arcs that an orbit is followed for before it is given up.
 BUDGET = 1024
 #: A turn that repeats to this fraction of the amplitude has repeated; Newton does the rest.
@@ -122,8 +124,8 @@ def density(osc: Oscillator, codes: Array, y: Array) -> Array:
     return 1 + 0.4 * bend * jnp.abs(osc.omega * a) + turning
 
 
-def _mesh(osc: Oscillator, codes: Array, y: Array, duration: Array) -> Array:
-    """Steps as fractions of the duration, [STEPS], so that each has about the same share of it."""
+def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
+    """Steps as fractions of the duration, [steps], so that each has about the same share of it."""
     n = 24
     h = duration / n
 
@@ -137,7 +139,7 @@ def _mesh(osc: Oscillator, codes: Array, y: Array, duration: Array) -> Array:
     rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
     share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
     grid = jnp.interp(
-        jnp.linspace(0.0, 1.0, STEPS + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
+        jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
     )
     return jnp.diff(grid)
 
@@ -157,6 +159,11 @@ class Chain(eqx.Module):
     @property
     def used(self) -> Array:
         return self.ends != Ends(self.codes.shape[-1]).unused
+
+    @property
+    def halved(self) -> "Chain":
+        """The same chain with every integration step halved."""
+        return replace(self, mesh=jnp.repeat(self.mesh / 2, 2, axis=-1))
 
 
 class Ends:
@@ -611,11 +618,11 @@ def turn_of(orbit: Orbit, size: int, n: int) -> Turn:
     return Turn(orbit.codes[source], ends, orbit.entries[source], durations)
 
 
-def meshed(osc: Oscillator, turn: Turn) -> tuple[Chain, Array]:
+def meshed(osc: Oscillator, turn: Turn, steps: int = STEPS) -> tuple[Chain, Array]:
     """The chain of a turn with its mesh, and the guess of its unknowns."""
     stuck = jnp.any(turn.codes == 0, axis=-1)
     slip = jnp.where(stuck, 0.0, turn.durations)
-    mesh = jax.vmap(functools.partial(_mesh, osc))(turn.codes, turn.entries, slip)
+    mesh = jax.vmap(functools.partial(_mesh, osc, steps))(turn.codes, turn.entries, slip)
     z = jnp.concatenate([turn.entries, turn.durations[:, None]], axis=1)
     return lax.stop_gradient((Chain(turn.codes, turn.ends, mesh), z))
 
@@ -629,7 +636,8 @@ class Cycle(eqx.Module):
     oscillator: whose cycle it is; chain: its signature, see `Chain`; unknowns: (x1, x2, T) at the
     entry of every arc, [arcs, 3]; both padded. multiplier: nontrivial Floquet multiplier, the
     determinant of the monodromy matrix with its saltation matrices, exactly 0 where the cycle
-    sticks. residual: largest error in the shooting equations. iterations: Newton steps. status: a
+    sticks. residual: largest error in the shooting
+    equations, with every integration step halved. iterations: Newton steps. status: a
     `Status` code; where it is not OK every number is NaN.
 
     `period`; `stick_durations`, [belts], summed over the phases of one turn; `x1_min`, `x1_max`,
@@ -894,7 +902,8 @@ def cycle_of(
     they hold: an arc that was solved for backwards may magnify what is followed forwards a hundred
     thousand times.
     """
-    forwards, slope = closure(osc, chain, z)
+    # With every step halved, so that the error is that of the integration, too.
+    forwards, slope = closure(osc, chain.halved, z)
     if error is None:
         error = forwards
         status = _first_failure(status, error < 1e-9, Status.NO_CONVERGENCE)
@@ -933,10 +942,19 @@ def _if_it_fits(status: Array, count: Array, size: int) -> Array:
     return _first_failure(status, count <= size, Status.TOO_MANY_ARCS)
 
 
+def exactly(osc: Oscillator, turn: Turn, status: Array) -> Cycle:
+    """The cycle that a turn nearly is; where it is known, with as many steps as it takes."""
+    cycle = polish(osc, turn, status)
+    if is_concrete(cycle) and int(status) == Status.OK:
+        inexact = int(cycle.status) == Status.NO_CONVERGENCE or float(cycle.residual) > EXACT
+        cycle = polish(osc, turn, status, steps=FINE_STEPS) if inexact else cycle
+    return cycle
+
+
 @jit
-def polish(osc: Oscillator, turn: Turn, status: Array) -> Cycle:
+def polish(osc: Oscillator, turn: Turn, status: Array, steps: int = STEPS) -> Cycle:
     """The cycle that a turn nearly is, by Newton's method; one program for all that need it."""
-    chain, guess = meshed(lax.stop_gradient(osc), turn)
+    chain, guess = meshed(lax.stop_gradient(osc), turn, steps)
     z, iterations = _solve(osc, chain, guess)
     return cycle_of(osc, chain, z, iterations, status)[0]
 
@@ -975,7 +993,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
         turn = pick(turn, slice(room_of(needed)))
     elif max_arcs is None:
         turn, status = pick(turn, slice(SIZES[0])), _if_it_fits(status, count, SIZES[0])
-    return polish(osc, turn, status)
+    return exactly(osc, turn, status)
 
 
 # --- the unstable cycle ---------------------------------------------------------------------------
@@ -1001,7 +1019,7 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
     whole = isinstance(around, int) and around >= 0
     require(whole, "around", "the number of an equilibrium, 0 or more", repr(around))
     turn, status, distance = separating_turn(osc, max_arcs or SIZES[0], around)
-    return _if_meant(polish(osc, turn, status), turn, distance)
+    return _if_meant(exactly(osc, turn, status), turn, distance)
 
 
 def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
