@@ -47,7 +47,6 @@ from .compiling import one_kernel
 from .modes import (
     ABOVE,
     BELOW,
-    ON_GUARD,
     SMALLEST_DISC,
     Mode,
     at_focus,
@@ -75,8 +74,11 @@ LEAST = 1e-5
 LANDING = 0.1
 #: Speed over |x2'| below which a slow passage of an edge begins.
 SLOW = 0.1
-#: A lane whose step is to be shorter than this one stands on a bound of its mode.
-NO_STEP = 1e-15
+#: A lane whose step is to be shorter than this one stands on a bound of its mode; if it is also as
+#: slow as AT_REST and leaves through no guard, it is at rest there.
+NO_STEP, AT_REST = 1e-15, 1e-12
+#: What is this near to a bound, relative to it, is there up to rounding; near x2 = 0 a quarter.
+ULPS = 4e-16
 #: Steps between two looks at the events, and events between two refills.
 STEPS, ROUNDS = 4, 4
 
@@ -141,8 +143,9 @@ class Passage(eqx.Module):
     """What happened to the lanes in one look at the events, arrays [lanes].
 
     landed: a step ended on a guard or where x2 = 0. fired: it was a guard, its number is `guard`,
-    and `mode` is what followed, at (t, x1, x2). stuck: there was a stick phase, of that duration;
-    released: it ended, by slip onset or at an edge.
+    and `mode` is what followed, at (t, x1, x2). captured: by a pseudo-focus. rests: it is at rest
+    but for rounding. stuck: there was a stick phase, of that duration; released: it ended, by slip
+    onset or at an edge.
     """
 
     landed: Array
@@ -154,6 +157,7 @@ class Passage(eqx.Module):
     x1: Array
     x2: Array
     captured: Array
+    rests: Array
     stuck: Array
     duration: Array
     released: Array
@@ -350,7 +354,9 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
     delta = jnp.where(reached, bound - new.x2, 1e300) / slope
     # The next term, too: it counts where x2' is small, and there x2'' is -x2.
     delta = jnp.where(reached, delta + 0.5 * bound * delta**2 / slope, delta)
-    blocked = ((peak > high + ON_GUARD) | (peak < low - ON_GUARD)) & ~reached
+    rounding = ULPS * (0.25 + jnp.abs(peak))
+    outside = (peak > high + rounding) | (peak < low - rounding)
+    blocked = outside & ~reached
     target = jnp.where(peak > high, high, low)
     k = lax.stop_gradient(path.k)
     start, end, poly = lanes.x2, peak, k
@@ -361,7 +367,7 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
         # Slow passages are bridged over less of the way, for there x2' counts more than x2.
         way, speed = edge - new.x1, jnp.abs(new.x2)
         near = jnp.abs(way) * jnp.maximum(speed, SLOW * jnp.abs(new.a)) < reach * speed * speed
-        there = jnp.abs(way) <= ON_GUARD * (1 + jnp.abs(new.x1))
+        there = jnp.abs(way) <= ULPS * jnp.abs(new.x1)
         slope = jnp.where(near, new.x2, 1.0)
         delta1 = jnp.where(near, way, jnp.where(there, 0.0, 1e300)) / slope
         delta1 = jnp.where(near, delta1 - 0.5 * new.a * delta1**2 / slope, delta1)
@@ -435,7 +441,8 @@ def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol) -> Lan
     trend = jnp.where(accepted, jnp.maximum(pace, lanes.pace) / lanes.pace, 1.0)
     proposed = jnp.minimum(0.9 / (pace * trend), MAX_STEP)
     stands = shortened & (at.theta * h < NO_STEP)
-    proposed = jnp.where(shortened & ~stands, at.theta * h, proposed)
+    proposed = jnp.where(shortened, at.theta * h, proposed)
+    proposed = jnp.where(stands, NO_STEP, proposed)
     proposed = jnp.where(lands | stands, -proposed, proposed)
     lower, upper = lanes.lower, lanes.upper
     if window.extrema is not None:
@@ -490,6 +497,8 @@ def _pass_events(
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
     captured = fired & after.captured & program.captures
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
+    slow = jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < AT_REST * (1 + jnp.abs(lanes.x1))
+    rests = landed & ~fired & (lanes.h >= -NO_STEP) & slow
 
     stuck = after.mode.any_stuck & ~captured & ~lanes.done
     phase = stick_phase(osc, after.mode, x1)
@@ -500,7 +509,7 @@ def _pass_events(
     mode = select(released, leave_stick(osc, after.mode, phase, x2), after.mode)
     mode = select(captured, lanes.mode, mode)
     new_x1 = jnp.where(stuck, jnp.where(ends, x1 + x2 * left, phase.x1), x1)
-    t = jnp.where(stuck & ends, t1, lanes.t + duration)
+    t = jnp.where(stuck & ends | rests, t1, lanes.t + duration)
 
     # Slip onset is tangent: x2' = 0 there, for a law without a jump, but for rounding.
     a = mode_acceleration(osc, mode, new_x1, x2)
@@ -525,6 +534,7 @@ def _pass_events(
         x1=x1,
         x2=x2,
         captured=captured,
+        rests=rests,
         stuck=stuck,
         duration=duration,
         released=released,
@@ -1195,7 +1205,7 @@ class Attractor(Observer):
         small = jnp.maximum(amplitude, lanes.upper - lanes.lower) < self.RESOLVED * tol
         shrinks = section & (change < 0) & (turn.change < 0)
         kind = jnp.where(small & ~released & (repeats | shrinks), EQUILIBRIUM, kind)
-        kind = jnp.where(passage.captured, EQUILIBRIUM, kind)
+        kind = jnp.where(passage.captured | passage.rests, EQUILIBRIUM, kind)
         kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind)
         going_on = (turn.kind == UNDECIDED) & (lanes.run >= 0)
         kind = (jnp.where(going_on, kind, UNDECIDED) / one).astype(turn.kind.dtype)

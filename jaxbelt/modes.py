@@ -198,7 +198,7 @@ def directions(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array
     equilibrium only.
     """
     a = mode_acceleration(osc, mode, x1, x2)
-    tangent = jnp.abs(a) < TANGENT * (1 + jnp.abs(x1))
+    tangent = (jnp.abs(a) < TANGENT * (1 + jnp.abs(x1))) & (x2 != 0)
     a_sign = jnp.sign(jnp.where(tangent, -x2, a))
     return a_sign, jnp.where(x2 == 0, a_sign, jnp.sign(x2))
 
