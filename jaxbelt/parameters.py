@@ -93,7 +93,9 @@ def _is_number(osc: Oscillator, chosen: Any) -> bool:
         return False
     leaf = jax.tree.leaves(osc)[chosen.index]
     # Of a law of the user's own a leaf may be anything.
-    return np.ndim(leaf) == 0 and (eqx.is_inexact_array_like(leaf) or type(leaf) is int)
+    dtype = getattr(leaf, "dtype", None)
+    is_real = type(leaf) in (int, float) if dtype is None else jnp.issubdtype(dtype, jnp.floating)
+    return bool(is_real) and np.ndim(leaf) == 0
 
 
 def _of(osc: Oscillator) -> str:

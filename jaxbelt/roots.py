@@ -17,6 +17,8 @@ from jaxtyping import Array
 Guards = tuple[Array, Array]
 #: A root is found to this fraction of the step.
 NEAREST = 5e-13
+#: A guard this small at the start is rounding: the orbit has just left it.
+ROUNDING = 5e-16
 #: A bracket that interpolation does not narrow in so many steps is halved in every other.
 TRIALS, MOST = 8, 100
 
@@ -51,65 +53,52 @@ def first_root(
 
 
 def _root(guards, which: Array, at_start: Guards, end: Array, at_end: Guards):
-    """The root of one guard in (0, end], and all guards there.
+    """The root of one guard in (0, end], and all guards there, by the Illinois method.
 
-    At 0 it may vanish, or be negative by rounding, where the orbit has just left it.
+    At 0 it may vanish, or be negative by rounding, where the orbit has just left it. Only values
+    make trial points: rates of change round differently in a batch, and its runs would differ.
     """
 
     def pick(both):
         return tuple(jnp.sum(jnp.where(which, part, 0.0)) for part in both)
 
     shortest = NEAREST * end
-    f_start, slope_start = pick(at_start)
+    f_start, _ = pick(at_start)
+    f_end, _ = pick(at_end)
 
     def near(at_c):
         value, slope = pick(at_c)
         return jnp.abs(value) <= jnp.abs(slope) * shortest
 
     def unfinished(state):
-        a, _, b, _, _, at_c, count = state
+        a, _, b, _, _, _, at_c, count = state
         return (count == 0) | ((b - a > 2 * shortest) & ~near(at_c) & (count < MOST))
 
     def improve(state):
-        a, at_a, b, at_b, _, _, count = state
+        a, fa, b, fb, left, _, _, count = state
         halved = (count > TRIALS) & (count % 2 == 0)
-        c = jnp.where(halved, 0.5 * (a + b), _interpolated(a, at_a, b, at_b))
+        c = jnp.where(halved, 0.5 * (a + b), (a * fb - b * fa) / (fb - fa))
         # Not nearer to an end: once that is the root, up to rounding, the other follows at once.
         c = jnp.clip(c, a + shortest, b - shortest)
         at_c = guards(c)
-        value, slope = pick(at_c)
+        value, _ = pick(at_c)
         inside = value > 0
+        # An end that stays for the second time counts half.
+        fa, fb = jnp.where(left < 0, 0.5, 1.0) * fa, jnp.where(left > 0, 0.5, 1.0) * fb
+        return (
+            jnp.where(inside, c, a),
+            jnp.where(inside, value, fa),
+            jnp.where(inside, b, c),
+            jnp.where(inside, fb, value),
+            jnp.where(inside, 1, -1),
+            c,
+            at_c,
+            count + 1,
+        )
 
-        def choose(new, old):
-            return jnp.where(inside, new, old)
-
-        a, at_a = choose(c, a), (choose(value, at_a[0]), choose(slope, at_a[1]))
-        b, at_b = choose(b, c), (choose(at_b[0], value), choose(at_b[1], slope))
-        return a, at_a, b, at_b, c, at_c, count + 1
-
-    at_a = jnp.maximum(f_start, jnp.finfo(f_start.dtype).tiny), slope_start
-    start = (jnp.zeros_like(end), at_a, end, pick(at_end), end, at_end, 0)
+    f_start = jnp.where(f_start > ROUNDING, f_start, -f_end)
+    start = (jnp.zeros_like(end), f_start, end, f_end, 0, end, at_end, 0)
     *_, c, at_c, _ = lax.while_loop(unfinished, improve, start)
     value, slope = pick(at_c)
     regular = near(at_c) & (slope != 0)
     return c - jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0), at_c
-
-
-def _interpolated(a, at_a, b, at_b) -> Array:
-    """The root of Hermite's cubic between a, where it is positive, and b, where it is not."""
-    (f0, slope0), (f1, slope1) = at_a, at_b
-    width = b - a
-    m0, m1, rise = width * slope0, width * slope1, f1 - f0
-
-    def cubic(s):
-        return f0 + s * (m0 + s * (3 * rise - 2 * m0 - m1 + s * (m0 + m1 - 2 * rise)))
-
-    def halve(_, bracket):
-        left, right = bracket
-        middle = 0.5 * (left + right)
-        inside = cubic(middle) > 0
-        return jnp.where(inside, middle, left), jnp.where(inside, right, middle)
-
-    left, right = lax.fori_loop(0, 12, halve, (jnp.zeros_like(a), jnp.ones_like(a)))
-    above, below = cubic(left), cubic(right)
-    return a + width * (left + (right - left) * above / (above - below))
