@@ -66,9 +66,9 @@ from .simulate import Arcs
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
 #: Integration steps per slip arc (an arc is about a quarter of a turn at most).
-STEPS = 8
+STEPS = 10
 #: The same where those leave a larger error in the shooting equations than EXACT.
-FINE_STEPS, EXACT = 32, 1e-12
+FINE_STEPS, EXACT = 32, 1e-11
 #: Arcs that an orbit is followed for before it is given up.
 BUDGET = 1024
 #: A turn that repeats to this fraction of the amplitude has repeated; Newton does the rest.
