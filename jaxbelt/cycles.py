@@ -66,8 +66,8 @@ from .simulate import Arcs
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
 #: Integration steps per slip arc (an arc is about a quarter of a turn at most).
-STEPS = 10
-#: The same where those leave a larger error in the shooting equations than EXACT.
+STEPS = 8
+#: The same where those leave a larger error than EXACT, as halved steps tell it.
 FINE_STEPS, EXACT = 32, 1e-11
 #: Arcs that an orbit is followed for before it is given up.
 BUDGET = 1024
@@ -637,7 +637,7 @@ class Cycle(eqx.Module):
     entry of every arc, [arcs, 3]; both padded. multiplier: nontrivial Floquet multiplier, the
     determinant of the monodromy matrix with its saltation matrices, exactly 0 where the cycle
     sticks. residual: largest error in the shooting
-    equations, with every integration step halved. iterations: Newton steps. status: a
+    equations. iterations: Newton steps. status: a
     `Status` code; where it is not OK every number is NaN.
 
     `period`; `stick_durations`, [belts], summed over the phases of one turn; `x1_min`, `x1_max`,
@@ -902,10 +902,12 @@ def cycle_of(
     they hold: an arc that was solved for backwards may magnify what is followed forwards a hundred
     thousand times.
     """
-    # With every step halved, so that the error is that of the integration, too.
-    forwards, slope = closure(osc, chain.halved, z)
+    forwards, slope = closure(osc, chain, z)
     if error is None:
         error = forwards
+        status = _first_failure(
+            status, closure(osc, chain.halved, z)[0] < 1e-9, Status.NO_CONVERGENCE
+        )
         status = _first_failure(status, error < 1e-9, Status.NO_CONVERGENCE)
     status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
@@ -946,9 +948,15 @@ def exactly(osc: Oscillator, turn: Turn, status: Array) -> Cycle:
     """The cycle that a turn nearly is; where it is known, with as many steps as it takes."""
     cycle = polish(osc, turn, status)
     if is_concrete(cycle) and int(status) == Status.OK:
-        inexact = int(cycle.status) == Status.NO_CONVERGENCE or float(cycle.residual) > EXACT
+        inexact = int(cycle.status) == Status.NO_CONVERGENCE or integration_error(cycle) > EXACT
         cycle = polish(osc, turn, status, steps=FINE_STEPS) if inexact else cycle
     return cycle
+
+
+@jit
+def integration_error(cycle: Cycle) -> Array:
+    """The largest error in the shooting equations with every integration step halved."""
+    return closure(cycle.oscillator, cycle.chain.halved, cycle.unknowns)[0]
 
 
 @jit
