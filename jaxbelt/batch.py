@@ -48,6 +48,8 @@ from .modes import (
     ABOVE,
     BELOW,
     SMALLEST_DISC,
+    TANGENT,
+    ULPS,
     Mode,
     at_focus,
     begins_at_rest,
@@ -77,8 +79,6 @@ SLOW = 0.1
 #: A lane whose step is to be shorter than this one stands on a bound of its mode; if it is also as
 #: slow as AT_REST and leaves through no guard, it is at rest there.
 NO_STEP, AT_REST = 1e-15, 1e-12
-#: What is this near to a bound, relative to it, is there up to rounding; near x2 = 0 a quarter.
-ULPS = 4e-16
 #: Steps between two looks at the events, and events between two refills.
 STEPS, ROUNDS = 4, 4
 
@@ -354,6 +354,7 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
     delta = jnp.where(reached, bound - new.x2, 1e300) / slope
     # The next term, too: it counts where x2' is small, and there x2'' is -x2.
     delta = jnp.where(reached, delta + 0.5 * bound * delta**2 / slope, delta)
+    # A quarter where the bound is x2 = 0: what is left there is the rounding of x2' in a step.
     rounding = ULPS * (0.25 + jnp.abs(peak))
     outside = (peak > high + rounding) | (peak < low - rounding)
     blocked = outside & ~reached
@@ -513,7 +514,7 @@ def _pass_events(
 
     # Slip onset is tangent: x2' = 0 there, for a law without a jump, but for rounding.
     a = mode_acceleration(osc, mode, new_x1, x2)
-    a = jnp.where(jnp.abs(a) < 1e-12 * (1 + jnp.abs(new_x1)), 0.0, a)
+    a = jnp.where(jnp.abs(a) < TANGENT * (1 + jnp.abs(new_x1)), 0.0, a)
     moved = landed | stuck
     h = jnp.where(fired, _first_step(rtol), jnp.abs(lanes.h))
     if program.edges:
@@ -1200,8 +1201,8 @@ class Attractor(Observer):
         repeats = repeats & (released | converged)
 
         kind = jnp.where(repeats, CYCLE, UNDECIDED)
-        # An orbit that sticks is on a cycle, however small.
-        # Smaller motion than the tolerance resolves is at rest if it repeats or shrinks.
+        # Motion that the tolerance does not resolve is at rest if it repeats or shrinks; but an
+        # orbit that sticks is on a cycle, however small.
         small = jnp.maximum(amplitude, lanes.upper - lanes.lower) < self.RESOLVED * tol
         shrinks = section & (change < 0) & (turn.change < 0)
         kind = jnp.where(small & ~released & (repeats | shrinks), EQUILIBRIUM, kind)

@@ -31,6 +31,8 @@ from .oscillator import Oscillator, acceleration
 
 Tree = TypeVar("Tree")
 STUCK, BELOW, ABOVE = 0.0, -2.0, 2.0
+#: Numbers that differ by this fraction of them are the same, but for the rounding of nu/omega, say.
+ULPS = 4e-16
 #: An orbit this close to a stable pseudo-focus (|x2| at the edge) has converged to it.
 FOCUS_RADIUS = 1e-2
 #: Turns with a smaller |x2| than this are smaller than the rounding of x1.
@@ -268,7 +270,7 @@ def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Ar
 
 def _slip_sign(velocity: Array, speed: Array) -> Array:
     """Sign of velocity - speed; 0 where they are equal but for the rounding of nu/omega."""
-    same = jnp.abs(velocity - speed) <= 4e-16 * jnp.abs(velocity)
+    same = jnp.abs(velocity - speed) <= ULPS * jnp.abs(velocity)
     return jnp.where(same, STUCK, jnp.sign(velocity - speed))
 
 
