@@ -72,7 +72,7 @@ def test_final_states_and_events_equal_those_of_simulate(kind, record_property):
 
 
 def test_slow_passages_of_an_edge_keep_the_time():
-    """Some 900 and 200: an error in the time of a landing adds up, as it does without x2'."""
+    """Some 900 and 200 in a run: errors in the times of landings would add up."""
     table = lanes("c", 10_000, seed=7)[:, [153, 41]]
     dataset = sweep_of("c", table, t1=SPAN, y0=(3.0, 0.0), rtol=TIGHT, atol=TIGHT)
     for i, parameters in enumerate(table.T.tolist()):
