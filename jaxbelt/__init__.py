@@ -2,14 +2,39 @@
 
 Everything a user needs is `import jaxbelt as jb`. Turn 64-bit floats on first:
 `jax.config.update("jax_enable_x64", True)`.
+
+Inside, data goes one way: parameters, modes, motion, cycles, bifurcations, pictures. The code is a
+ladder that shows it. Read from top to bottom, a module imports only what stands before it:
+
+    results         status codes and what to do about them
+    processes       processes in which JAX cannot compute
+    checks          arguments, checked at the public edge
+    numerics/       compiling continuation derivatives extrapolation roots
+    model/          friction oscillator parameters modes equilibria
+    presets         the published systems
+    motion/         smoothing simulate
+    cycles/         cycle attractors functionals
+    sweeps/         batch audit sweep basins
+    bifurcations/   refine switch_folds scan curves diagrams
+    inverse/        inverse
+    plotting/       plotting
+    paper           the paper's table and figures
+    __init__        the public names
+    cli             the command line
 """
 
 import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 from . import presets
-from .basins import Basins, BasinStability, basin_stability, basins
-from .bifurcations import (
+from .bifurcations.curves import BifurcationCurve, SpecialPoint, bifurcation_curve
+from .bifurcations.diagrams import (
+    BifurcationDiagram,
+    RegionMap,
+    bifurcation_diagram,
+    region_map,
+)
+from .bifurcations.refine import (
     BeltAtRest,
     BifurcationPoint,
     BoundaryEquilibrium,
@@ -25,18 +50,9 @@ from .bifurcations import (
     SuddenSliding,
     refine,
 )
-from .curves import BifurcationCurve, SpecialPoint, bifurcation_curve
-from .cycles import Cycle, find_cycle, unstable_cycle
-from .detection import scan
-from .diagrams import (
-    BifurcationDiagram,
-    RegionMap,
-    bifurcation_diagram,
-    region_map,
-)
-from .equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
-from .friction import AbstractFriction, Conti, Coulomb, Stribeck
-from .functionals import (
+from .bifurcations.scan import scan
+from .cycles.cycle import Cycle, find_cycle, unstable_cycle
+from .cycles.functionals import (
     amplitude,
     energy_dissipated,
     energy_fed,
@@ -47,14 +63,17 @@ from .functionals import (
     stick_duration,
     stick_fraction,
 )
-from .inverse import Design, Fit, design, distance_to, fit
-from .oscillator import Belt, Oscillator
+from .inverse.inverse import Design, Fit, design, distance_to, fit
+from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
+from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck
+from .model.oscillator import Belt, Oscillator
+from .motion.simulate import Arcs, Events, Trajectory, simulate
 from .results import EventKind, Status, describe
-from .simulate import Arcs, Events, Trajectory, simulate
-from .sweep import sweep
+from .sweeps.basins import Basins, BasinStability, basin_stability, basins
+from .sweeps.sweep import sweep
 
 if TYPE_CHECKING:
-    from .plotting import (
+    from .plotting.plotting import (
         plot_basins,
         plot_friction_law,
         plot_phase_portrait,
@@ -138,7 +157,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     # Matplotlib is imported when something is drawn, not before.
     if name.startswith("plot_") and name in __all__:
-        from . import plotting
+        from .plotting import plotting
 
         return getattr(plotting, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 import jaxbelt as jb
-from jaxbelt.parameters import names_of
+from jaxbelt.model.parameters import names_of
 
 app = typer.Typer(
     name="jaxbelt",
@@ -105,7 +105,7 @@ def reproduce(
     Example: **jaxbelt reproduce --out results**
     """
     # Imported late, with matplotlib behind it, to keep `--help` quick.
-    from . import reproduce as paper
+    from . import paper
 
     console = _console()
     columns = (
@@ -220,8 +220,8 @@ def simulate(
 
     - jaxbelt simulate --belt 0.3 --belt 0.5,law=coulomb,static=0.8,kinetic=0.5,lower=0.2
     """
-    from . import plotting
-    from .reproduce import steady_cycle
+    from .paper import steady_cycle
+    from .plotting import plotting
 
     console = _console()
     with _plain_errors():
@@ -382,7 +382,7 @@ def diagram(
 
     - jaxbelt diagram --nu0 -0.2 --nu1 0.35 --vary zeta --span 0 1.5 --quantity x1
     """
-    from . import plotting
+    from .plotting import plotting
 
     console = _console()
     with _plain_errors():
@@ -475,7 +475,7 @@ def region_map(
 
     Example: jaxbelt map --class b --cells 400
     """
-    from . import plotting
+    from .plotting import plotting
 
     console = _console()
     with _plain_errors():
@@ -572,7 +572,7 @@ def sweep(
 
     - jaxbelt sweep x1=-2:2:200 x2=-2:2:200 --observe final --t1 50 --out starts.zarr
     """
-    from . import plotting
+    from .plotting import plotting
 
     console = _console()
     with _plain_errors():
@@ -672,7 +672,7 @@ def basins(
     - jaxbelt basins --belt 1.4,law=stribeck,static=1,kinetic=0.5,stribeck_velocity=0.5
       --damping 0.1 --x1 -2 2 --x2 0 2
     """
-    from . import plotting
+    from .plotting import plotting
 
     console = _console()
     with _plain_errors():

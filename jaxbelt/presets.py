@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from .checks import is_concrete, require
-from .friction import Conti
-from .oscillator import Belt, Oscillator
+from .model.friction import Conti
+from .model.oscillator import Belt, Oscillator
 
 DAMPING = 0.5
 

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.basins import _labels
 from jaxbelt.cli import app
+from jaxbelt.sweeps.basins import _labels
 
 # One belt, zeta = 0.1, mu(r) = 0.5 (1 + exp(-r/0.5)); starts uniform in this box. Fraction of
 # them that comes to rest: bSTAB and pyBasin, from 5,000 starts each.

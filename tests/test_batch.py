@@ -8,8 +8,9 @@ import oracle_cycles
 import pytest
 
 import jaxbelt as jb
-from jaxbelt import Status, batch
-from jaxbelt.sweep import _signatures
+from jaxbelt import Status
+from jaxbelt.sweeps import batch
+from jaxbelt.sweeps.sweep import _signatures
 
 SPAN = 40.0
 #: Both integrate with this tolerance.

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import jaxbelt as jb
-from jaxbelt import reproduce
+from jaxbelt import paper as reproduce
 from jaxbelt.cli import _belts_of_class, app, parse_belt, write_rows
 
 runner = CliRunner()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxbelt as jb
-from jaxbelt import batch
 from jaxbelt.results import Status
+from jaxbelt.sweeps import batch
 from tests.campaign import compare, package
 from tests.campaign.cases import PAPER, Case
 from tests.campaign.engine import Belt, Oscillator

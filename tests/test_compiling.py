@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 
 import jaxbelt as jb
-from jaxbelt import compiling
+from jaxbelt.numerics import compiling
 
 
 @compiling.jit

@@ -10,8 +10,8 @@ from scipy.optimize import brentq
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
-from jaxbelt.continuation import End
-from jaxbelt.detection import Path
+from jaxbelt.bifurcations.scan import Path
+from jaxbelt.numerics.continuation import End
 
 EDGE = EventKind.EDGE
 

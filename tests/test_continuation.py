@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbelt.continuation import End, continue_curve
+from jaxbelt.numerics.continuation import End, continue_curve
 
 # Points solve their equation to rounding; Newton's method ends below this.
 ROUNDING = 1e-12

@@ -9,10 +9,10 @@ from laws import BELL, bell
 from scipy.optimize import brentq
 
 import jaxbelt as jb
-from jaxbelt.bifurcations import leaf_index, vary
-from jaxbelt.continuation import End
-from jaxbelt.curves import _departure
-from jaxbelt.detection import refined
+from jaxbelt.bifurcations.curves import _departure
+from jaxbelt.bifurcations.refine import leaf_index, vary
+from jaxbelt.bifurcations.scan import refined
+from jaxbelt.numerics.continuation import End
 
 
 def nu0(osc):

@@ -13,10 +13,10 @@ from laws import BELL, NESTED, bell, nested
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
-from jaxbelt.attractors import distinct
-from jaxbelt.bifurcations import leaf_index, vary
-from jaxbelt.cycles import turn_events
-from jaxbelt.detection import Path, search
+from jaxbelt.bifurcations.refine import leaf_index, vary
+from jaxbelt.bifurcations.scan import Path, search
+from jaxbelt.cycles.attractors import distinct
+from jaxbelt.cycles.cycle import turn_events
 
 
 def nu0(osc):

@@ -7,8 +7,8 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import EventKind
-from jaxbelt.detection import Label
-from jaxbelt.diagrams import kind_of, region_name
+from jaxbelt.bifurcations.diagrams import kind_of, region_name
+from jaxbelt.bifurcations.scan import Label
 
 
 def nu0(osc):

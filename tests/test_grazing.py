@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import jaxbelt as jb
-from jaxbelt import Status, batch
+from jaxbelt import Status
+from jaxbelt.sweeps import batch
 
 AXES = {f.name: 0 if f.name in ("damping", "omega") else 1 for f in fields(grazing.Oscillators)}
 #: Distances of the cases, on both sides.

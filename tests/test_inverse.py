@@ -9,7 +9,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.inverse import Selection, _inverse, _local_cubics
+from jaxbelt.inverse.inverse import Selection, _inverse, _local_cubics
 
 TS = np.arange(400) * 0.1
 START = (0.0, -2.0)

@@ -17,75 +17,71 @@ import jaxbelt
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "jaxbelt"
 
-# Read from top to bottom: a module imports only from lines above its own.
-LADDER = (
-    "results",
-    "processes",
-    "checks",
-    "compiling",
-    "friction",
-    "oscillator",
-    "parameters",
-    "modes",
-    "presets",
-    "continuation",
-    "derivatives",
-    "extrapolation",
-    "roots",
-    "smoothing",
-    "simulate",
-    "batch",
-    "audit",
-    "equilibria",
-    "cycles",
-    "attractors",
-    "functionals",
-    "sweep",
-    "bifurcations",
-    "switch_folds",
-    "detection",
-    "curves",
-    "diagrams",
-    "basins",
-    "inverse",
-    "plotting",
-    "reproduce",
-    "__init__",
-    "cli",
-    "__main__",
-)
-MODULES = sorted(
-    path.relative_to(PACKAGE).with_suffix("").as_posix() for path in PACKAGE.rglob("*.py")
-)
+MODULES = {
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+FOLDERS = {module for module in MODULES if module.endswith(".__init__")}
+
+
+def ladder() -> list[str]:
+    """The modules in the order of the package's docstring; a line of a folder lists its modules."""
+    (text,) = re.findall(r"(?<=\n\n)(?: {4}\S.*\n)+", ast.get_docstring(ast.parse(init())) + "\n")
+    rungs = []
+    for line in text.splitlines():
+        name, words = line.split(maxsplit=1)
+        rungs += [f"{name[:-1]}.{m}" for m in words.split()] if name.endswith("/") else [name]
+    return rungs
+
+
+def init() -> str:
+    return (PACKAGE / "__init__.py").read_text(encoding="utf-8")
+
+
+LADDER = ladder()
 
 
 def imported_names(module: str) -> Iterator[str]:
     """Full names of what a module of the package imports, also inside its functions."""
-    for node in ast.walk(ast.parse((PACKAGE / f"{module}.py").read_text(encoding="utf-8"))):
+    package = ["jaxbelt", *module.split(".")[:-1]]
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            # The package is flat, so a leading dot is the package.
-            parts = ("jaxbelt" if node.level else None, node.module)
-            source = ".".join(part for part in parts if part)
+            above = package[: len(package) - node.level + 1] if node.level else []
+            source = ".".join([*above, *([node.module] if node.module else [])])
             yield from (f"{source}.{alias.name}" for alias in node.names)
 
 
 def rung(name: str) -> str:
     """The module that a full name inside the package belongs to; the package itself is __init__."""
-    part = name.removeprefix("jaxbelt").lstrip(".").partition(".")[0]
-    return part if part in LADDER else "__init__"
+    parts = name.split(".")[1:]
+    for length in (2, 1):
+        if ".".join(parts[:length]) in LADDER:
+            return ".".join(parts[:length])
+    return "__init__"
 
 
-@pytest.mark.parametrize("module", MODULES)
+def test_every_module_has_its_place_in_the_ladder_of_the_docstring():
+    assert sorted(LADDER) == sorted(MODULES.keys() - FOLDERS)
+
+
+@pytest.mark.parametrize("folder", sorted(FOLDERS))
+def test_folders_have_a_docstring_and_nothing_else(folder: str):
+    tree = ast.parse(MODULES[folder].read_text(encoding="utf-8"))
+    assert len(tree.body) == 1 and ast.get_docstring(tree)
+
+
+@pytest.mark.parametrize("module", LADDER)
 def test_module_imports_only_from_above_it(module: str):
-    assert module in LADDER, f"{module}.py has no place in the ladder of modules"
     inside = [name for name in imported_names(module) if name.partition(".")[0] == "jaxbelt"]
     above = LADDER[: LADDER.index(module)]
     assert [name for name in inside if rung(name) not in above] == []
 
 
-@pytest.mark.parametrize("module", [module for module in MODULES if module != "plotting"])
+@pytest.mark.parametrize(
+    "module", [module for module in LADDER if not module.startswith("plotting.")]
+)
 def test_matplotlib_is_imported_by_plotting_only(module: str):
     roots = {name.partition(".")[0] for name in imported_names(module)}
     assert roots.isdisjoint({"matplotlib", "mpl_toolkits"})

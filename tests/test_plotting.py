@@ -9,7 +9,8 @@ import pytest
 from matplotlib.colors import to_hex
 
 import jaxbelt as jb
-from jaxbelt import plotting, reproduce
+from jaxbelt import paper as reproduce
+from jaxbelt.plotting import plotting
 
 
 def run(nu0: float, start=(3.0, 0.0)) -> jb.Trajectory:

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import jaxbelt as jb
-from jaxbelt import EventKind, Status, batch
+from jaxbelt import EventKind, Status
+from jaxbelt.sweeps import batch
 
 #: Time of the runs, and at which times they are compared.
 T1, SAMPLES = 15.0, 33

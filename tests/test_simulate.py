@@ -10,7 +10,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
-from jaxbelt.reproduce import formulation_errors
+from jaxbelt.paper import formulation_errors
 
 # One budget for every run with two belts: they then share one compiled program.
 simulate = functools.partial(jb.simulate, max_segments=4096)

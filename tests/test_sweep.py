@@ -12,8 +12,9 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import jaxbelt as jb
-from jaxbelt import Status, batch
+from jaxbelt import Status
 from jaxbelt.cli import app
+from jaxbelt.sweeps import batch
 
 NU0, NU1 = np.linspace(-0.6, 0.55, 4), np.array([0.35, -0.2])
 AXES = {"nu0": NU0, "nu1": NU1}

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, minimize_scalar
 
 import jaxbelt as jb
-from jaxbelt.switch_folds import switch_band, switch_fold
+from jaxbelt.bifurcations.switch_folds import switch_band, switch_fold
 
 
 def nu0(osc):

@@ -18,7 +18,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
-from jaxbelt import batch
+from jaxbelt.sweeps import batch
 
 SPAN, TOLERANCE = 100.0, 1e-8
 

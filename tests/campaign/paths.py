@@ -19,8 +19,8 @@ from math import inf, isfinite
 
 import numpy as np
 
-from jaxbelt.attractors import place_of
-from jaxbelt.detection import Path, search
+from jaxbelt.bifurcations.scan import Path, search
+from jaxbelt.cycles.attractors import place_of
 
 from . import engine, package
 from .cases import random_case, rational_case, structures

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .checks import (
+from ..checks import (
     as_array,
     check_finite,
     check_nonnegative,
@@ -36,9 +36,9 @@ from .checks import (
     number,
     require,
 )
-from .compiling import traced_once
+from ..numerics.compiling import traced_once
+from ..processes import require_own_threads
 from .friction import AbstractFriction
-from .processes import require_own_threads
 
 
 def _as_friction(law: Any) -> AbstractFriction:

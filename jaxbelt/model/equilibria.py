@@ -21,8 +21,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .checks import is_concrete, number, pick
-from .compiling import jit
+from ..checks import is_concrete, number, pick
+from ..numerics.compiling import jit
 from .modes import (
     ABOVE,
     BELOW,

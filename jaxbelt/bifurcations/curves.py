@@ -24,8 +24,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .attractors import extent, place_of
-from .bifurcations import (
+from ..checks import as_array, check_finite, require
+from ..cycles.attractors import extent, place_of
+from ..cycles.cycle import (
+    SIZES,
+    Chain,
+    Ends,
+    Turn,
+    admissible,
+    cycle_of,
+    end_guard,
+    follow,
+    meshed,
+    newton,
+    trace_of,
+)
+from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
+from ..model.modes import boundary_guards, edge_guards, mode_acceleration, mode_of
+from ..model.oscillator import Oscillator
+from ..model.parameters import leaf_index, names_of, parameter, vary
+from ..numerics.compiling import jit
+from ..numerics.continuation import CurvePoint, End, continue_curve, corrected
+from ..results import Status
+from .refine import (
     HINT_BUDGET,
     AbstractCondition,
     BeltAtRest,
@@ -53,28 +74,7 @@ from .bifurcations import (
     small_newton,
     stick_phase_from,
 )
-from .checks import as_array, check_finite, require
-from .compiling import jit
-from .continuation import CurvePoint, End, continue_curve, corrected
-from .cycles import (
-    SIZES,
-    Chain,
-    Ends,
-    Turn,
-    admissible,
-    cycle_of,
-    end_guard,
-    follow,
-    meshed,
-    newton,
-    trace_of,
-)
-from .detection import refined, sudden_sliding
-from .equilibria import Equilibria, EquilibriumKind, equilibria
-from .modes import boundary_guards, edge_guards, mode_acceleration, mode_of
-from .oscillator import Oscillator
-from .parameters import leaf_index, names_of, parameter, vary
-from .results import Status
+from .scan import refined, sudden_sliding
 
 #: Unknowns of a cycle count this much in the length of a step, beside the two parameters; large
 #: ones less, for durations of stick phases go to infinity where a belt comes to rest.
@@ -189,7 +189,7 @@ class BifurcationCurve(eqx.Module):
 
     def plot(self, ax: Any = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned."""
-        plotting = importlib.import_module(".plotting", __package__)
+        plotting = importlib.import_module("jaxbelt.plotting.plotting")
         return plotting.plot_curves([self], ax)
 
     def __repr__(self) -> str:

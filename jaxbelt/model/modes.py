@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .checks import is_concrete
+from ..checks import is_concrete
 from .oscillator import Oscillator, acceleration
 
 Tree = TypeVar("Tree")

@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import plotting
-from .bifurcations import (
+from .bifurcations.diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
+from .bifurcations.refine import (
     AbstractCondition,
     GrazingSliding,
     Hopf,
@@ -27,12 +27,13 @@ from .bifurcations import (
     SlidingExchange,
     SuddenSliding,
 )
-from .cycles import Cycle, unstable_cycle
-from .detection import refined
-from .diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
-from .equilibria import Equilibria, equilibria
-from .oscillator import Belt, Oscillator
-from .parameters import leaf_index
+from .bifurcations.scan import refined
+from .cycles.cycle import Cycle, unstable_cycle
+from .model.equilibria import Equilibria, equilibria
+from .model.oscillator import Belt, Oscillator
+from .model.parameters import leaf_index
+from .motion.simulate import Trajectory, simulate
+from .plotting import plotting
 from .presets import (
     PUBLISHED,
     PUBLISHED_NU1,
@@ -43,7 +44,6 @@ from .presets import (
     paper_friction,
 )
 from .results import EventKind, Status
-from .simulate import Trajectory, simulate
 
 #: Every portrait runs over this time (dimensionless), sampled at so many times.
 TIME_SPAN, SAMPLES = 60.0, 2401

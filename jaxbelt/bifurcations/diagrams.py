@@ -26,8 +26,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .attractors import Runs, distinct, lead_to_one_cycle, stuck_belts
-from .bifurcations import (
+from ..checks import as_array, require
+from ..cycles.attractors import Runs, distinct, lead_to_one_cycle, stuck_belts
+from ..cycles.cycle import Cycle, Turn, cut, find_cycle, polish, unstable_cycle
+from ..model.equilibria import EquilibriumKind, candidates, equilibria
+from ..model.oscillator import Oscillator
+from ..model.parameters import set_alone
+from ..numerics.compiling import jit
+from ..results import Status
+from ..sweeps.sweep import sweep
+from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere, place_at
+from .refine import (
     AbstractCondition,
     BeltAtRest,
     BifurcationPoint,
@@ -35,16 +44,7 @@ from .bifurcations import (
     NonsmoothFold,
     SuddenSliding,
 )
-from .checks import as_array, require
-from .compiling import jit
-from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere, place_at
-from .cycles import Cycle, Turn, cut, find_cycle, polish, unstable_cycle
-from .detection import Label, Path, by_value, edges_touched, search
-from .equilibria import EquilibriumKind, candidates, equilibria
-from .oscillator import Oscillator
-from .parameters import set_alone
-from .results import Status
-from .sweep import sweep
+from .scan import Label, Path, by_value, edges_touched, search
 
 #: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
 SAME = 1e-2
@@ -104,7 +104,7 @@ class BifurcationDiagram(eqx.Module):
         velocity of the belt, others by their largest x2; or "x1" (smallest and largest), "period".
         """
         # By its name: the modules are a ladder, in which pictures come last.
-        plotting = importlib.import_module(".plotting", __package__)
+        plotting = importlib.import_module("jaxbelt.plotting.plotting")
         return plotting.plot_diagram(self, ax, quantity=quantity)
 
     def __repr__(self) -> str:
@@ -248,7 +248,7 @@ class RegionMap(eqx.Module):
         None: new ones, and a sketch of the phase portrait of each region in its example beside
         them, as in the paper's Fig. 6.
         """
-        plotting = importlib.import_module(".plotting", __package__)
+        plotting = importlib.import_module("jaxbelt.plotting.plotting")
         return plotting.plot_region_map(self, ax)
 
     def __repr__(self) -> str:

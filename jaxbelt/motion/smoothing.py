@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .derivatives import forward_jacobian
-from .modes import STUCK, Mode, capacity, contact, mode_acceleration, select, stick_velocity
-from .oscillator import Oscillator
+from ..model.modes import STUCK, Mode, capacity, contact, mode_acceleration, select, stick_velocity
+from ..model.oscillator import Oscillator
+from ..numerics.derivatives import forward_jacobian
 
 #: Steps between two samples before a run is given up.
 MAX_STEPS = 1_000_000

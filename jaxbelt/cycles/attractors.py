@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .cycles import Chain, Cycle, Ends, Turn, event_between, find_cycle, modes_of
-from .modes import ABOVE
-from .oscillator import Oscillator
-from .results import EventKind, Status, of_one_turn
+from ..model.modes import ABOVE
+from ..model.oscillator import Oscillator
+from ..results import EventKind, Status, of_one_turn
+from .cycle import Chain, Cycle, Ends, Turn, event_between, find_cycle, modes_of
 
 if TYPE_CHECKING:
     import xarray

@@ -32,18 +32,18 @@ from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from scipy import ndimage
 
-from .basins import Basins
-from .checks import require
-from .compiling import jit
-from .curves import BifurcationCurve
-from .cycles import Cycle
-from .diagrams import BifurcationDiagram, Branch, RegionMap, interior
-from .equilibria import Equilibria, EquilibriumKind
-from .equilibria import equilibria as find_equilibria
-from .friction import AbstractFriction
-from .modes import mode_acceleration, mode_of_state
-from .oscillator import Oscillator
-from .simulate import Trajectory
+from ..bifurcations.curves import BifurcationCurve
+from ..bifurcations.diagrams import BifurcationDiagram, Branch, RegionMap, interior
+from ..checks import require
+from ..cycles.cycle import Cycle
+from ..model.equilibria import Equilibria, EquilibriumKind
+from ..model.equilibria import equilibria as find_equilibria
+from ..model.friction import AbstractFriction
+from ..model.modes import mode_acceleration, mode_of_state
+from ..model.oscillator import Oscillator
+from ..motion.simulate import Trajectory
+from ..numerics.compiling import jit
+from ..sweeps.basins import Basins
 
 #: One colour a belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
 BELT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")

@@ -32,7 +32,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .attractors import (
+from ..checks import as_array, check_finite, require
+from ..cycles.attractors import (
     SOLVED,
     Itinerary,
     apart,
@@ -43,7 +44,23 @@ from .attractors import (
     sticks,
     without_idle,
 )
-from .bifurcations import (
+from ..cycles.cycle import (
+    AT_REST,
+    SIZES,
+    Cycle,
+    Turn,
+    as_turn,
+    cut,
+    find_cycle,
+    polish,
+    unstable_cycle,
+)
+from ..model.equilibria import EquilibriumKind, equilibria
+from ..model.oscillator import Oscillator, check_oscillator
+from ..model.parameters import leaf_index, names_of, vary
+from ..numerics.compiling import each, jit
+from ..results import EventKind, Status
+from .refine import (
     AbstractCondition,
     BeltAtRest,
     BifurcationPoint,
@@ -75,23 +92,6 @@ from .bifurcations import (
     tangency_near,
     unexplained_point,
 )
-from .checks import as_array, check_finite, require
-from .compiling import each, jit
-from .cycles import (
-    AT_REST,
-    SIZES,
-    Cycle,
-    Turn,
-    as_turn,
-    cut,
-    find_cycle,
-    polish,
-    unstable_cycle,
-)
-from .equilibria import EquilibriumKind, equilibria
-from .oscillator import Oscillator, check_oscillator
-from .parameters import leaf_index, names_of, vary
-from .results import EventKind, Status
 
 #: Values of the parameter in one batch.
 BATCH = 32

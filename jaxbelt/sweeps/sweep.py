@@ -23,9 +23,7 @@ from jaxtyping import ArrayLike
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from . import batch
-from .audit import chosen, differing
-from .checks import (
+from ..checks import (
     as_array,
     check_finite,
     check_positive,
@@ -33,8 +31,10 @@ from .checks import (
     require,
     require_usable_jax,
 )
-from .oscillator import Oscillator, check_scalars
-from .results import of_one_turn
+from ..model.oscillator import Oscillator, check_scalars
+from ..results import of_one_turn
+from . import batch
+from .audit import chosen, differing
 
 if TYPE_CHECKING:
     import xarray

@@ -43,8 +43,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .compiling import one_kernel
-from .modes import (
+from ..model.modes import (
     ABOVE,
     BELOW,
     SMALLEST_DISC,
@@ -63,8 +62,9 @@ from .modes import (
     select,
     stick_phase,
 )
-from .oscillator import Oscillator
-from .results import EventKind, Status
+from ..model.oscillator import Oscillator
+from ..numerics.compiling import one_kernel
+from ..results import EventKind, Status
 
 #: First step of a run and after each event, at a tolerance of 1e-8.
 FIRST_STEP = 0.1

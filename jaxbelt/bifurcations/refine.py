@@ -53,9 +53,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .checks import is_concrete, number, require
-from .compiling import each, jit
-from .cycles import (
+from ..checks import is_concrete, number, require
+from ..cycles.cycle import (
     AT_REST,
     NEWTON_STEPS,
     SIZES,
@@ -81,8 +80,8 @@ from .cycles import (
     trace_of,
     turn_of,
 )
-from .equilibria import Equilibria, EquilibriumKind, candidates
-from .modes import (
+from ..model.equilibria import Equilibria, EquilibriumKind, candidates
+from ..model.modes import (
     STUCK,
     Mode,
     boundary_guards,
@@ -97,9 +96,10 @@ from .modes import (
     select,
     stick_limit,
 )
-from .oscillator import Oscillator, check_oscillator
-from .parameters import leaf_index, parameter, vary
-from .results import Status, describe
+from ..model.oscillator import Oscillator, check_oscillator
+from ..model.parameters import leaf_index, parameter, vary
+from ..numerics.compiling import each, jit
+from ..results import Status, describe
 
 #: Arcs for which the orbit from slip onset is followed in search of the signature.
 HINT_BUDGET = 32

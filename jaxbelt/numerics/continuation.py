@@ -25,7 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .checks import as_array, check_finite, require
+from ..checks import as_array, check_finite, require
 from .compiling import jit
 
 #: Newton's method may take so many steps; half of it is quick.

@@ -31,11 +31,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .checks import as_numbers, check_finite, check_positive, is_concrete, require
-from .compiling import jit, one_kernel
-from .derivatives import forward_jacobian
-from .extrapolation import increments, scheme
-from .modes import (
+from ..checks import as_numbers, check_finite, check_positive, is_concrete, require
+from ..model.modes import (
     Mode,
     at_focus,
     boundary_guards,
@@ -52,9 +49,12 @@ from .modes import (
     stick_phase,
     stick_velocity,
 )
-from .oscillator import Oscillator, check_oscillator
-from .results import EventKind, Status, describe
-from .roots import first_root
+from ..model.oscillator import Oscillator, check_oscillator
+from ..numerics.compiling import jit, one_kernel
+from ..numerics.derivatives import forward_jacobian
+from ..numerics.extrapolation import increments, scheme
+from ..numerics.roots import first_root
+from ..results import EventKind, Status, describe
 from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
 #: Longest and first step, as fractions of the time that is integrated over, MAX_ARC at most.

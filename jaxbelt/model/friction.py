@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .checks import (
+from ..checks import (
     as_array,
     check_finite,
     check_nonnegative,

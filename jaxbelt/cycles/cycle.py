@@ -32,11 +32,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .checks import as_array, check_finite, is_concrete, number, pick, require
-from .compiling import each, jit, one_kernel
-from .equilibria import Equilibria, EquilibriumKind, candidates
-from .extrapolation import Scheme, increments, scheme
-from .modes import (
+from ..checks import as_array, check_finite, is_concrete, number, pick, require
+from ..model.equilibria import Equilibria, EquilibriumKind, candidates
+from ..model.modes import (
     Mode,
     at_focus,
     begins_at_rest,
@@ -58,10 +56,12 @@ from .modes import (
     stick_phase,
     stick_velocity,
 )
-from .oscillator import Oscillator, check_oscillator
-from .results import EventKind, Status, describe
-from .roots import first_root
-from .simulate import Arcs
+from ..model.oscillator import Oscillator, check_oscillator
+from ..motion.simulate import Arcs
+from ..numerics.compiling import each, jit, one_kernel
+from ..numerics.extrapolation import Scheme, increments, scheme
+from ..numerics.roots import first_root
+from ..results import EventKind, Status, describe
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)

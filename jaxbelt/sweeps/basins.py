@@ -15,12 +15,12 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..checks import as_array, check_finite, require
+from ..cycles.attractors import Runs, is_same
+from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
+from ..model.equilibria import EquilibriumKind, equilibria
+from ..model.oscillator import Oscillator, check_oscillator
 from . import batch
-from .attractors import Runs, is_same
-from .checks import as_array, check_finite, require
-from .cycles import Cycle, find_cycle, unstable_cycle
-from .equilibria import EquilibriumKind, equilibria
-from .oscillator import Oscillator, check_oscillator
 from .sweep import LONG_ENOUGH, sweep
 
 if TYPE_CHECKING:

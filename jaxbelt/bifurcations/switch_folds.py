@@ -26,13 +26,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .bifurcations import BifurcationPoint, NonsmoothFold, small_newton
-from .checks import as_array, check_positive, require
-from .compiling import jit
-from .cycles import flow
-from .modes import Mode, capacity, mode_acceleration
-from .oscillator import Oscillator
-from .parameters import leaf_index, vary
+from ..checks import as_array, check_positive, require
+from ..cycles.cycle import flow
+from ..model.modes import Mode, capacity, mode_acceleration
+from ..model.oscillator import Oscillator
+from ..model.parameters import leaf_index, vary
+from ..numerics.compiling import jit
+from .refine import BifurcationPoint, NonsmoothFold, small_newton
 
 #: Integration steps of order twelve for the slip phase.
 STEPS = 64

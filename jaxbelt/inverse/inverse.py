@@ -33,15 +33,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .bifurcations import AbstractCondition, refine
-from .checks import as_array, check_finite, require
-from .compiling import jit
-from .cycles import Cycle, find_cycle
-from .oscillator import Oscillator, check_oscillator
-from .parameters import leaf_groups, leaf_index, names_of, parameter
-from .results import Status, describe
-from .simulate import simulate
-from .smoothing import smooth_field
+from ..bifurcations.refine import AbstractCondition, refine
+from ..checks import as_array, check_finite, require
+from ..cycles.cycle import Cycle, find_cycle
+from ..model.oscillator import Oscillator, check_oscillator
+from ..model.parameters import leaf_groups, leaf_index, names_of, parameter
+from ..motion.simulate import simulate
+from ..motion.smoothing import smooth_field
+from ..numerics.compiling import jit
+from ..results import Status, describe
 
 #: Length of the first windows, less than half a turn: no phase is lost over it.
 WINDOW = 2.5

@@ -16,7 +16,7 @@ import numpy as np
 from jax.extend.core import Var
 from jaxtyping import Array
 
-from .checks import is_concrete, require
+from ..checks import is_concrete, require
 from .oscillator import Oscillator
 
 

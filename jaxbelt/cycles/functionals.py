@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .checks import require
-from .compiling import jit
-from .cycles import Chain, Cycle, flow
-from .modes import Mode, mode_acceleration
-from .oscillator import Oscillator
+from ..checks import require
+from ..model.modes import Mode, mode_acceleration
+from ..model.oscillator import Oscillator
+from ..numerics.compiling import jit
+from .cycle import Chain, Cycle, flow
 
 _COORDINATES = {"x1": 0, "x2": 1}
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ..model.modes import FOCUS_RADIUS
+from ..results import Status, of_one_turn
 from . import batch
-from .modes import FOCUS_RADIUS
-from .results import Status, of_one_turn
 
 #: States and extrema may differ by so many times the tolerance of a step: errors add up over a run.
 CLOSE = 1e4

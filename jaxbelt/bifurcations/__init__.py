@@ -1,0 +1,1 @@
+"""Bifurcations: points, scans along a parameter, curves, diagrams and maps."""

@@ -1,0 +1,1 @@
+"""From data or aims to parameters: `fit` and `design`."""

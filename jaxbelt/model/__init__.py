@@ -1,0 +1,1 @@
+"""The oscillator: laws, belts, modes with their transitions, equilibria."""

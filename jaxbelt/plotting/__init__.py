@@ -1,0 +1,1 @@
+"""Pictures. Matplotlib is imported here only, and no numerics import this folder."""
