@@ -1,6 +1,6 @@
 """Belt-driven dry-friction oscillators: exact, batched, differentiable simulation in JAX.
 
-Everything a user needs is `import jaxbelt as jb`. Turn 64-bit floats on first:
+Everything a user needs is `import jaxbelt as jb`. Loop 64-bit floats on first:
 `jax.config.update("jax_enable_x64", True)`.
 
 Inside, data goes one way: parameters, modes, motion, cycles, bifurcations, pictures. The code is a

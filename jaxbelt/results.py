@@ -62,10 +62,10 @@ ADVICE = {
         "out, or look at equilibria(osc)."
     ),
     Status.NOT_SETTLED: (
-        "No turn of the orbit repeated within the budget of arcs: it approaches its attractor very "
+        "No loop of the orbit repeated within the budget of arcs: it approaches its attractor very "
         "slowly. Start nearer to the cycle, or move away from the bifurcation point."
     ),
-    Status.TOO_MANY_ARCS: "A turn has more arcs than there is room for: pass a larger max_arcs.",
+    Status.TOO_MANY_ARCS: "A loop has more arcs than there is room for: pass a larger max_arcs.",
     Status.NO_CONVERGENCE: (
         "Newton's method did not converge from this guess; there may be no such solution near it, "
         "or none that this side of it leads to: try a guess on the other side."
@@ -88,7 +88,7 @@ ADVICE = {
         "a nonsmooth fold ends the cycle, at a grazing point it goes on to both sides."
     ),
     Status.NO_FOLD: (
-        "No turn of the orbits around the equilibrium is extremal in its growth, or none that is "
+        "No loop of the orbits around the equilibrium is extremal in its growth, or none that is "
         "closes nearby: no two cycles meet near here."
     ),
     Status.NO_FIXED_POINT: "There is no fixed point in a smooth field whose trace could vanish.",
@@ -126,8 +126,8 @@ class EventKind(enum.IntEnum):
     EDGE = 4
 
 
-def of_one_turn(steps: Sequence[Step]) -> tuple[Step, ...]:
-    """The steps of a turn, events or modes, wherever it was begun: the least of the orders."""
-    turn = tuple(steps)
-    orders: Any = (turn[i:] + turn[:i] for i in range(len(turn)))
+def of_one_loop(steps: Sequence[Step]) -> tuple[Step, ...]:
+    """The steps of a loop, events or modes, wherever it was begun: the least of the orders."""
+    loop = tuple(steps)
+    orders: Any = (loop[i:] + loop[:i] for i in range(len(loop)))
     return min(orders, default=())

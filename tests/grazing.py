@@ -394,9 +394,9 @@ def _stays(osc, codes, path, sigma, e, margin=2e-3):
     guards = np.array([osc.boundary(codes, x2) for x2 in path[:, 1]])
     slips = np.all(guards > margin, axis=(0, 1))
     apart = e * (sigma - path[-1, 0]) > margin
-    turns = np.sum(np.abs(np.diff(np.sign(path[1:, 1]), axis=0)) > 0, axis=0) == 0
+    loops = np.sum(np.abs(np.diff(np.sign(path[1:, 1]), axis=0)) > 0, axis=0) == 0
     within = np.all(np.abs(path[:, 0] - sigma) < 2.3, axis=0)
-    return slips & apart & turns & within
+    return slips & apart & loops & within
 
 
 #: The events of each outcome.

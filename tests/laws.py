@@ -28,7 +28,7 @@ BELL = Lorentz(jnp.asarray(1.0), jnp.asarray(0.6), jnp.asarray(0.4))
 class Nested(jb.AbstractFriction):
     """mu(1 - v) = 1 + v/2 + a polynomial in v, for a belt of velocity 1.
 
-    With damping near 0.5 what is left is weak. Averaged over a turn it lets the amplitude A grow
+    With damping near 0.5 what is left is weak. Averaged over a loop it lets the amplitude A grow
     like -A (s - 0.04) (s - 0.08) (s - 0.16), s = A^2: between two attracting cycles lies a third.
     """
 

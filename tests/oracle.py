@@ -16,7 +16,7 @@ monotone, so no boundary can be passed and passed back unseen.
 `Run.margin` says how far the run stays from the cases whose sequence of events is decided by
 rounding (corners, tangencies, a needed force equal to the capacity, an event at the final time).
 Compare sequences only where it is well above the accuracy of the code under test. It is small by
-nature for a run into a pseudo-focus, whose turns shrink to a point.
+nature for a run into a pseudo-focus, whose loops shrink to a point.
 """
 
 from bisect import bisect_right
@@ -203,7 +203,7 @@ class Event:
 
 
 @dataclass(frozen=True)
-class Turn:
+class Loop:
     """An extremum inside a slip arc: of x1 (axis 0, there x2 = 0) or of x2 (axis 1, x2' = 0)."""
 
     t: float
@@ -220,7 +220,7 @@ class Arc:
     t_end: float
     entry: tuple
     steps: list = field(default_factory=list, repr=False)  # (t, y, interpolant) per solver step
-    turns: list = field(default_factory=list, repr=False)
+    loops: list = field(default_factory=list, repr=False)
     land: Any = field(default=None, repr=False)
     exit: tuple = None
 
@@ -366,7 +366,7 @@ def advance(
 ):
     """Run on from a state in a mode.
 
-    until(item): called with every Event and Turn; the run stops where it is true.
+    until(item): called with every Event and Loop; the run stops where it is true.
     slack: {belt: distance}; the boundary of such a belt is not acted upon, the orbit runs on in
     its mode and stops (status "overshot") where it is this far beyond.
     """
@@ -498,25 +498,25 @@ class _Walk:
                 raise RuntimeError(f"integration failed at t = {solver.t}, x = {solver.y}")
             dense, t_old = solver.dense_output(), solver.t_old
             arc.steps.append((t_old, y_old, dense))
-            turns = _turns(dense, t_old, solver.t, x2_prime, self.mode, fresh)
+            loops = _loops(dense, t_old, solver.t, x2_prime, self.mode, fresh)
             fresh = False
             left = t_old
-            for turn in [*turns, None]:
-                right, y = (turn.t, (turn.x1, turn.x2)) if turn else (solver.t, solver.y)
+            for loop in [*loops, None]:
+                right, y = (loop.t, (loop.x1, loop.x2)) if loop else (solver.t, solver.y)
                 passed = [g for g in guards if g(y) < 0]
                 if passed:
                     roots = [_root(g, dense, left, right) for g in passed]
                     first = int(np.argmin(roots))
                     self._reach(arc, passed[first], roots[first], t_old, y_old, x2_prime)
                     return
-                if turn:
+                if loop:
                     for g in guards:
-                        if g.axis == turn.axis:
+                        if g.axis == loop.axis:
                             self.near(g(y))
-                    arc.turns.append(turn)
-                    self.tell(turn)
+                    arc.loops.append(loop)
+                    self.tell(loop)
                     if self.status:
-                        self.t, self.y = turn.t, tuple(land(t_old, y_old, turn.t).tolist())
+                        self.t, self.y = loop.t, tuple(land(t_old, y_old, loop.t).tolist())
                         arc.t_end, arc.exit = self.t, self.y
                         return
                 left = right
@@ -604,7 +604,7 @@ class _Walk:
         turns_back = before * x2 > 0 > after * x2
         speeds = self.passages.get(level, []) if turns_back else []
         self.passages = {level: [*speeds[-1:], abs(x2)]}
-        # Two passages ago the mass went the same way: compare whole turns.
+        # Two passages ago the mass went the same way: compare whole loops.
         small = turns_back and len(speeds) >= 2 and abs(x2) < self.focus_speed
         if small and abs(x2) < speeds[-2]:
             self.status = "pseudo_focus"
@@ -622,17 +622,17 @@ def _root(guard, dense, left, right):
 _SAMPLES = np.linspace(0.0, 1.0, 7)
 
 
-def _turns(dense, t_old, t_new, x2_prime, mode, fresh):
+def _loops(dense, t_old, t_new, x2_prime, mode, fresh):
     """The zeros of x2 and x2' in a step, in order.
 
-    fresh: the step starts at a slip onset, where x2' is zero up to rounding and not a turn.
+    fresh: the step starts at a slip onset, where x2' is zero up to rounding and not a loop.
     """
     ts = t_old + (t_new - t_old) * _SAMPLES
     x1, x2 = dense(ts)
     a = x2_prime(x1, x2)
     if fresh and abs(a[0]) < 1e-10:
         a[0] = a[1]
-    turns = []
+    loops = []
     for axis, values in ((0, x2), (1, a)):
         if values[0] == 0:
             values[0] = values[1]
@@ -642,8 +642,8 @@ def _turns(dense, t_old, t_new, x2_prime, mode, fresh):
                 t = _zero(lambda t: dense(t)[1], ts[i], ts[i + 1])
             else:
                 t = _zero(lambda t: x2_prime(*dense(t)), ts[i], ts[i + 1])
-            turns.append(Turn(float(t), axis, *dense(t).tolist(), mode))
-    return sorted(turns, key=lambda turn: turn.t)
+            loops.append(Loop(float(t), axis, *dense(t).tolist(), mode))
+    return sorted(loops, key=lambda loop: loop.t)
 
 
 def _zero(f, a, b):

@@ -19,8 +19,8 @@ from oracle import (
     BELOW,
     STUCK,
     Event,
+    Loop,
     Oscillator,
-    Turn,
     acceleration,
     advance,
     capacity,
@@ -35,12 +35,12 @@ from scipy.optimize import brentq, minimize_scalar
 @dataclass(frozen=True)
 class Cycle:
     period: float
-    stick_durations: tuple  # per belt, summed over the phases of one turn
+    stick_durations: tuple  # per belt, summed over the phases of one loop
     x1_min: float
     x1_max: float
     x2_min: float
     x2_max: float
-    signature: tuple  # ((kind, belt), ...) of one turn, the start's event last
+    signature: tuple  # ((kind, belt), ...) of one loop, the start's event last
     start: tuple
     margin: float
     run: Any = field(repr=False)
@@ -97,7 +97,7 @@ def _cycle(osc, run, **more):
         sum(arc.duration for arc in run.arcs if arc.mode[k] == STUCK) for k in range(len(osc.belts))
     )
     points = [p for arc in run.arcs for p in (arc.entry, arc.exit)]
-    points += [(turn.x1, turn.x2) for arc in run.arcs for turn in arc.turns]
+    points += [(loop.x1, loop.x2) for arc in run.arcs for loop in arc.loops]
     (x1_min, x2_min), (x1_max, x2_max) = np.min(points, axis=0), np.max(points, axis=0)
     extrema = map(float, (x1_min, x1_max, x2_min, x2_max))
     start = run.arcs[0].entry
@@ -113,7 +113,7 @@ def slope(mu, r):
 
 
 def foci(osc):
-    """Equilibria that orbits turn around, from left to right: [(x1, "focus" | "pseudo_focus")].
+    """Equilibria that orbits loop around, from left to right: [(x1, "focus" | "pseudo_focus")].
 
     At rest every touching belt pulls with load mu(|nu|) sgn(nu), so x2' falls along x1 but for
     jumps at the contact edges.
@@ -156,7 +156,7 @@ def hopf(make, bracket):
 
 
 def pseudo_focus_rate(osc, sigma):
-    """Growth rate of small turns around the pseudo-focus at the edge sigma (design, section 1)."""
+    """Growth rate of small loops around the pseudo-focus at the edge sigma (design, section 1)."""
     (a_l, tr_l), (a_r, tr_r) = (_beside(osc, sigma, d) for d in (-1, 1))
     return (tr_l / a_l + tr_r / abs(a_r)) / (3 * (1 / a_l + 1 / abs(a_r)))
 
@@ -184,14 +184,14 @@ def reverse(osc):
     return Oscillator(-osc.damping, belts, osc.omega)
 
 
-def one_turn(osc, x1, turns=2):
-    """Run in slip from (x1, 0) until x2 = 0 again (turns=1: half a turn); None at a boundary."""
+def one_loop(osc, x1, loops=2):
+    """Run in slip from (x1, 0) until x2 = 0 again (loops=1: half a loop); None at a boundary."""
     mode = _slip_mode(osc, x1)
     count = [0]
 
     def until(item):
-        count[0] += isinstance(item, Turn) and item.axis == 0
-        return count[0] == turns
+        count[0] += isinstance(item, Loop) and item.axis == 0
+        return count[0] == loops
 
     never = dict.fromkeys(range(len(osc.belts)), 0.0)
     run = advance(osc, (x1, 0.0), mode, 100.0, until=until, slack=never, focus_speed=0.0)
@@ -210,7 +210,7 @@ def unstable_cycle(osc, focus=None, samples=40):
     """The unstable cycle nearest to a stable focus that touches no boundary, or None.
 
     It may pass contact edges. With d the distance of the start (focus - d, 0), the orbit is run
-    backwards for one turn to distance q(d): near a stable focus q > d, outside an unstable cycle
+    backwards for one loop to distance q(d): near a stable focus q > d, outside an unstable cycle
     q < d. The largest d that reaches no boundary is found first, by bisection.
     """
     if focus is None:
@@ -218,7 +218,7 @@ def unstable_cycle(osc, focus=None, samples=40):
     back = reverse(osc)
 
     def growth(d):
-        run = one_turn(back, focus - d)
+        run = one_loop(back, focus - d)
         return None if run is None else focus - run.stopped_by.x1 - d
 
     inside, outside = 1e-6, 10.0
@@ -235,7 +235,7 @@ def unstable_cycle(osc, focus=None, samples=40):
         grows = growth(d) > 0
         if growing and not grows:
             distance = brentq(growth, before, d, xtol=1e-15, rtol=1e-14)
-            run = one_turn(osc, focus - distance)
+            run = one_loop(osc, focus - distance)
             if run is None:  # forwards it leaves: it touches a boundary within rounding
                 return None
             return _cycle(osc, run, multiplier=exp(_divergence(osc, run)))
@@ -350,7 +350,7 @@ def _to_extremum(osc, y, mode, belts, slack):
     level = osc.speed(belts[-1])
 
     def until(item):
-        return isinstance(item, Turn) and item.axis == 1 and item.x2 * level > 0
+        return isinstance(item, Loop) and item.axis == 1 and item.x2 * level > 0
 
     within = dict.fromkeys(belts, slack)
     return advance(osc, y, mode, 100.0, until=until, slack=within, focus_speed=0.0)
@@ -450,14 +450,14 @@ def corner(make, bracket, belt, start, passages=2, slack=0.02):
 
 
 def pseudo_hopf(make, bracket, edge):
-    """Parameter at which turns around the pseudo-focus at edge(parameter) do not grow or shrink."""
+    """Parameter at which loops around the pseudo-focus at edge(parameter) do not grow or shrink."""
     return _solve(lambda p: pseudo_focus_rate(make(p), edge(p)), bracket)
 
 
 def fold_of_cycles(make, bracket, distances, *, attracts_inside=False):
     """Parameter at which two cycles that touch no boundary meet and vanish.
 
-    A turn from (focus + d, 0) grows by a factor; between the two cycles that is above one.
+    A loop from (focus + d, 0) grows by a factor; between the two cycles that is above one.
     They meet where its largest value over the distances d is just one. attracts_inside: the inner
     one of the two attracts; then it is below one between them, and its smallest value counts.
     """
@@ -467,7 +467,7 @@ def fold_of_cycles(make, bracket, distances, *, attracts_inside=False):
         ((focus, _),) = foci(osc)
 
         def growth(d):
-            excess = (one_turn(osc, focus + d).stopped_by.x1 - focus) / d - 1
+            excess = (one_loop(osc, focus + d).stopped_by.x1 - focus) / d - 1
             return excess if attracts_inside else -excess
 
         best = minimize_scalar(growth, bounds=distances, method="bounded", options={"xatol": 1e-7})

@@ -105,7 +105,7 @@ def test_labels_tell_attractors_of_one_kind_apart():
 
 
 def test_two_cycles_with_one_sequence_of_events_are_two():
-    """Both stick to belt 0 once a turn, to the left of where belt 1 begins and to the right."""
+    """Both stick to belt 0 once a loop, to the left of where belt 1 begins and to the right."""
     osc = jb.presets.class_d(-0.06341, 0.5073, -0.49694, 0.61855)
     found = jb.basins(osc, x1=np.linspace(-2.0, 2.0, 9), x2=np.linspace(-1.0, 1.0, 5))
     assert len({cycle.signature for cycle in found.cycles}) == 1

@@ -183,8 +183,8 @@ def test_attractors_equal_the_cycles_of_the_oracle():
 def signature_word(events):
     """What a signature is called in a dataset: from where its sequence of events is smallest."""
     told = [(jb.EventKind[kind], belt) for kind, belt in events]
-    turn = min(told[i:] + told[:i] for i in range(len(told)))
-    return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in turn)
+    loop = min(told[i:] + told[:i] for i in range(len(told)))
+    return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in loop)
 
 
 def test_signatures_that_are_not_of_one_turn():

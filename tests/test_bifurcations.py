@@ -172,7 +172,7 @@ def test_fold_of_small_cycles(short):
     for offset in (-1.0, 0.0, 0.3, 2.0, 3.0):
         osc = jb.Oscillator(0.5 - short, (jb.Belt(start + offset * away, BELL),))
         point = jb.refine(jb.FoldOfCycles(), osc, where=nu0)
-        # The oracle's turns are good to 1e-13, relative to the amplitude.
+        # The oracle's loops are good to 1e-13, relative to the amplitude.
         assert point.value == pytest.approx(expected, abs=1e-11) and point.error < 1e-11
         assert point.residual < 1e-11
         assert point.cycle.x1_max - point.cycle.x1_min == pytest.approx(2 * amplitude, rel=0.05)

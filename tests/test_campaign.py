@@ -54,7 +54,7 @@ def test_stick_slip_is_a_circle_and_a_straight_line(v):
     onset, arrival = (side * mus, v), (side * (mud - d), v)
     check(run, [e for t in times for e in ((t, SLIP, 0, *onset), (t + slip, STICK, 0, *arrival))])
     found = engine.attractor(osc, (side * (mus - d / 2), v))
-    assert found.kind == "cycle" and found.turn == ((STICK, 0), (SLIP, 0))
+    assert found.kind == "cycle" and found.loop == ((STICK, 0), (SLIP, 0))
     assert found.period == pytest.approx(slip + stick, **EXACT)
     assert found.sticks == pytest.approx((stick,), **EXACT)
     assert max(map(abs, found.x1)) == pytest.approx(mud + sqrt(d * d + v * v), **EXACT)
@@ -169,7 +169,7 @@ def test_what_is_wrong_is_found():
     label = engine.attractor(osc, case.y0)
     told = package.Label(*(getattr(label, f) for f in package.Label.__dataclass_fields__))
     assert compare.label_difference(told, label) is None
-    for changes in (dict(kind="equilibrium"), dict(turn=()), dict(x1=(0.0, 1.0)), dict(period=3.0)):
+    for changes in (dict(kind="equilibrium"), dict(loop=()), dict(x1=(0.0, 1.0)), dict(period=3.0)):
         assert compare.label_difference(replace(told, **changes), label)
 
 

@@ -150,15 +150,15 @@ def test_labels_of_round_numbers(edges):
         assert verdict in compare.GOOD, (verdict, package.as_code(case), answer, mine)
 
 
-# Around a hard push it takes more turns than `find_cycle` follows, and says so.
+# Around a hard push it takes more loops than `find_cycle` follows, and says so.
 @pytest.mark.parametrize("name", [name for name in CASES if name != "hard push"])
 def test_find_cycle_settles_on_round_numbers(name):
     osc, y0 = CASES[name]
     found, known = jb.find_cycle(package.oscillator(osc), y0), compare.engine.attractor(osc, y0)
     if known.kind == "cycle":
-        turns = known.period / float(found.period)
-        # The engine may tell several turns; both are far more exact than this.
-        assert found.status == Status.OK and abs(turns - round(turns)) < 1e-7
+        loops = known.period / float(found.period)
+        # The engine may tell several loops; both are far more exact than this.
+        assert found.status == Status.OK and abs(loops - round(loops)) < 1e-7
     elif known.kind == "equilibrium":
         assert found.status in (Status.EQUILIBRIUM, Status.PSEUDO_FOCUS)
     else:

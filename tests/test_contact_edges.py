@@ -226,19 +226,19 @@ def test_the_passage_of_an_edge_becomes_tangent():
 
     def miss(nu):
         """How far from the edge the orbit turns back that left it at rest, to the right, came round
-        and passed it: by the left belt alone, at the second turn."""
+        and passed it: by the left belt alone, at the second loop."""
         right = oracle.class_c(0.31, nu, 0.7)
         passes = oracle.advance(
             right, (0.7, 0.0), (oracle.ABOVE, 1), 100.0, until=lambda i: isinstance(i, oracle.Event)
         )
-        turns = []
+        loops = []
 
         def until(item):
-            turns.extend([item.x1] if isinstance(item, oracle.Turn) and item.axis == 0 else [])
-            return len(turns) == 2
+            loops.extend([item.x1] if isinstance(item, oracle.Loop) and item.axis == 0 else [])
+            return len(loops) == 2
 
         oracle.advance(oracle.class_a(0.31), tuple(passes.y_end), (1,), 100.0, until=until)
-        return turns[1] - 0.7
+        return loops[1] - 0.7
 
     expected = brentq(miss, 0.1846, 0.18475, xtol=1e-14)
     assert points[2].value == pytest.approx(expected, abs=1e-11)
@@ -273,9 +273,9 @@ def test_a_small_cycle_that_sticks_until_the_edge():
         small = oracle_cycles.sticking_cycle(
             oracle.class_d(nu, 0.175, 1.16, 1.5), (1.5, min(nu, 0.175))
         )
-        turns = [one.turn for one in path.cycles[nu]]
-        (turn,) = (turn for turn in turns if np.ptp(turn.entries[:, 0]) < 0.3)
-        assert np.sum(turn.durations) == pytest.approx(small.period, abs=1e-6)
+        loops = [one.loop for one in path.cycles[nu]]
+        (loop,) = (loop for loop in loops if np.ptp(loop.entries[:, 0]) < 0.3)
+        assert np.sum(loop.durations) == pytest.approx(small.period, abs=1e-6)
 
 
 def test_the_onset_of_a_belt_that_touches_on_the_right_only():

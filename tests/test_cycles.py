@@ -1,7 +1,7 @@
 """Cycles and their functionals against the oracle, published numbers and balances.
 
 Tolerances: the fixed steps of shooting are good to about 1e-12 per arc, the oracle to 1e-12 per
-turn; 1e-10 leaves room for the amplification by an unstable multiplier of 20.
+loop; 1e-10 leaves room for the amplification by an unstable multiplier of 20.
 """
 
 import jax
@@ -48,7 +48,7 @@ def test_cycle_that_passes_contact_edges_is_that_of_the_oracle(kind, parameters)
     cycle = jb.find_cycle(getattr(jb.presets, f"class_{kind}")(*parameters), START)
     expected = oracle_cycles.sticking_cycle(getattr(oracle, f"class_{kind}")(*parameters))
     assert cycle.status == Status.OK and cycle.multiplier == 0
-    # The two begin their turn at different ends of a stick phase.
+    # The two begin their loop at different ends of a stick phase.
     events = tuple((event.name, belt) for event, belt in cycle.signature)
     assert ("EDGE", 0) in events or ("EDGE", 1) in events
     assert expected.signature in {events[i:] + events[:i] for i in range(len(events))}

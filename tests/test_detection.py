@@ -16,7 +16,7 @@ from jaxbelt import EventKind, Status
 from jaxbelt.bifurcations.refine import leaf_index, vary
 from jaxbelt.bifurcations.scan import Path, search
 from jaxbelt.cycles.attractors import distinct
-from jaxbelt.cycles.cycle import turn_events
+from jaxbelt.cycles.cycle import loop_events
 
 
 def nu0(osc):
@@ -173,7 +173,7 @@ def test_a_curve_of_crossing_sliding(crossing):
 
 
 def test_a_fold_of_an_orbit_that_repels_strongly():
-    """What is followed forwards to the tangency grows by more than a thousand in one turn."""
+    """What is followed forwards to the tangency grows by more than a thousand in one loop."""
 
     def make(load):
         return pair(0.82, (0.47, 0.64, 9.5, 0.67), (0.235, 0.54, 15.0, load))
@@ -197,9 +197,9 @@ def test_two_cycles_with_one_sequence_of_events():
     points = search(path)
     assert [point.condition for point in points] == [jb.GrazingEdge(1), jb.Hopf(), jb.Hopf()]
     path.look([-0.06341])
-    turns = [one.turn for one in path.cycles[-0.06341]]
-    assert len({turn_events(turn) for turn in turns}) == 1
-    assert sorted(np.sum(turn.durations) for turn in turns) == pytest.approx(
+    loops = [one.loop for one in path.cycles[-0.06341]]
+    assert len({loop_events(loop) for loop in turns}) == 1
+    assert sorted(np.sum(loop.durations) for loop in loops) == pytest.approx(
         [9.9148027860, 10.9019400715], abs=1e-7
     )
     # By simulation: how many cycles there are just before and just after.
@@ -238,7 +238,7 @@ def test_nested_cycles_in_one_mode():
     assert values_of(points) == pytest.approx(expected, abs=1e-9)
     path.look([0.4975, 0.5, 0.5075])
     amplitudes = [
-        [float(np.ptp(one.turn.entries[:, 0])) / 2 for one in path.cycles[value]]
+        [float(np.ptp(one.loop.entries[:, 0])) / 2 for one in path.cycles[value]]
         for value in (0.4975, 0.5, 0.5075)
     ]
     assert [len(sizes) for sizes in amplitudes] == [1, 2, 1]

@@ -62,10 +62,10 @@ def test_branches_of_cycles_go_on_through_grazing_exchange_and_fold(diagram):
     fold, _, hopf, grazing, _, _, exchange, other_fold = (float(p.value) for p in diagram.points)
     for branch, turning in ((left, fold), (right, other_fold)):
         # From where belt 0 rests to the fold, and back from there to the Hopf point.
-        turn = int(np.argmax(np.abs(branch.values)))
+        loop = int(np.argmax(np.abs(branch.values)))
         # Rows end beside the points, 1e-6 (1 + span) away.
-        assert branch.values[turn] == pytest.approx(turning, abs=3e-6)
-        assert np.all(branch.stable[: turn + 1]) and not np.any(branch.stable[turn + 2 :])
+        assert branch.values[loop] == pytest.approx(turning, abs=3e-6)
+        assert np.all(branch.stable[: loop + 1]) and not np.any(branch.stable[loop + 2 :])
         assert abs(branch.values[-1]) == pytest.approx(-hopf, abs=3e-6)
         # It shrinks to the equilibrium like a square root: to 1e-3 at 2.4e-6 from the Hopf point.
         assert branch.x1_max[-1] - branch.x1_min[-1] < 3e-3

@@ -132,7 +132,7 @@ def test_equal_speeds_are_one_belt_of_both_loads():
 
 
 def test_a_fixed_point_turns_and_grows_as_its_eigenvalues_say():
-    # Five turns from 1e-6 away, to 3e-5 at most: the linear motion, but for squares of that.
+    # Five loops from 1e-6 away, to 3e-5 at most: the linear motion, but for squares of that.
     for p in [(0.35, -0.2), (0.15, 0.6)]:
         (point,) = jb.equilibria(jb.presets.class_b(*p))
         value = complex(point.eigenvalues[0])
@@ -160,7 +160,7 @@ def test_hopf_points_of_the_paper(make, bracket, exact):
 
 
 def check_against_foci(points, osc):
-    """Where the oracle sees orbits turn, and how fast they grow there."""
+    """Where the oracle sees orbits loop, and how fast they grow there."""
     expected = oracle_cycles.foci(osc)
     assert np.sum(points.kind > 0) == len(expected)
     for i, (x1, kind) in enumerate(expected):
@@ -296,7 +296,7 @@ def test_a_belt_at_rest_ends_a_pseudo_focus_in_finite_time():
     slow = oracle.Oscillator(0.5, (b0, oracle.Belt(-0.3, b1.mu, 1.0, 2.0, -1.2, inf)))
     run = oracle.simulate(slow, (-1.2, 0.05), 9.0, max_events=21)
     assert run.sequence[1:] == ((("CROSS", 0), ("EDGE", 0), ("EDGE", 0)) * 7)[:20]
-    # Each turn multiplies x2, and so the time that the next one takes, by (out/in)^(1/2), with the
+    # Each loop multiplies x2, and so the time that the next one takes, by (out/in)^(1/2), with the
     # accelerations 1.2 - 1 and 1.2 + 1 left of the edge: a geometric series.
     ratio = sqrt(0.2 / 2.2)
     one, two, three = run.events[14], run.events[17], run.events[20]
@@ -619,7 +619,7 @@ def test_a_law_of_ones_own_and_a_supercritical_point():
     radius = sqrt(-half_trace / float(a))
     belt = oracle.Belt(nu, lambda r: 1 - r + r**3, 1.0)
     run = oracle.simulate(oracle.Oscillator(zeta, (belt,)), (float(point.x1) + radius, 0.0), 300.0)
-    x1 = [turn.x1 for arc in run.arcs for turn in arc.turns if turn.axis == 0 and turn.t > 280]
+    x1 = [loop.x1 for arc in run.arcs for loop in arc.loops if loop.axis == 0 and loop.t > 280]
     # The cycle attracts like exp(-2 half_trace t): of an error of a hundredth 5 % are left.
     assert np.ptp(x1) / 2 == pytest.approx(radius, rel=2e-2)
 

@@ -231,7 +231,7 @@ def test_slopes_of_a_sweep_are_those_of_their_side(kind):
 
 
 def test_no_edge_where_an_orbit_turns_before_it():
-    """It turns 2e-9 before the edge: a search on the smallest of all guards met the edge."""
+    """It loops 2e-9 before the edge: a search on the smallest of all guards met the edge."""
     edge = -0.6037118870579379
     left = jb.Belt(
         -0.15732429933837827,

@@ -32,7 +32,7 @@ from oracle_cycles import (
     grazing,
     hopf,
     nonsmooth_fold,
-    one_turn,
+    one_loop,
     pseudo_focus_rate,
     reverse,
     sticking_cycle,
@@ -96,8 +96,8 @@ def test_belt_at_rest_takes_a_fixed_bite_per_half_cycle_and_holds_for_ever():
     # 5 -> -4 -> 3 -> -2 -> 1 -> 0 with mu = 1/2, each in half a period; then |x1| < 1/2 holds.
     osc = undamped(coulomb_belt(0.0, 0.5, 0.5))
     run = simulate(osc, (5.0, 0.0), 1000.0)
-    turns = [(i * pi, "CROSS", 0, x, 0.0) for i, x in enumerate([-4.0, 3.0, -2.0, 1.0], 1)]
-    check(run, [*turns, (5 * pi, "STICK", 0, 0.0, 0.0)])
+    loops = [(i * pi, "CROSS", 0, x, 0.0) for i, x in enumerate([-4.0, 3.0, -2.0, 1.0], 1)]
+    check(run, [*loops, (5 * pi, "STICK", 0, 0.0, 0.0)])
     assert run.mode_end == (0,) and tuple(run.at(999.0)) == pytest.approx((0, 0), abs=1e-11)
     assert simulate(osc, (0.3, 0.0), 50.0).events == []
 
@@ -201,7 +201,7 @@ def test_an_excursion_over_an_edge_within_one_step(depth):
     t, v = pi - acos(edge), sqrt(2 * depth - depth**2)
     back = t + 2 * atan(v / (edge - 0.5))
     assert run.sequence == (("EDGE", 0), ("EDGE", 0))
-    # A passage at speed v turns an error e of x1 into e/v of time.
+    # A passage at speed v loops an error e of x1 into e/v of time.
     times = [e.t for e in run.events]
     assert times == pytest.approx([t, back], rel=0, abs=1e-13 + 1e-14 / v)
 
@@ -259,7 +259,7 @@ def test_pseudo_focus_is_recognised_and_its_rate_is_right():
     assert rate < 0
     run = simulate(osc, (0.1, 0.1), 60.0)
     assert run.status == "pseudo_focus" and 0 < abs(run.y_end[1]) < 1e-3
-    # The law is the limit of small turns: the error of the measured rate is of order x2.
+    # The law is the limit of small loops: the error of the measured rate is of order x2.
     first, last = next(e for e in run.events if abs(e.x2) < 5e-3), run.events[-1]
     measured = np.log(abs(last.x2 / first.x2)) / (last.t - first.t)
     assert measured == pytest.approx(rate, rel=2e-2)
@@ -433,7 +433,7 @@ def test_unstable_cycle_repeats_and_its_multiplier_is_the_slope_of_the_return_ma
     cycle = unstable_cycle(osc)
 
     def back(x1):
-        return one_turn(osc, x1).stopped_by.x1
+        return one_loop(osc, x1).stopped_by.x1
 
     assert back(cycle.start[0]) == pytest.approx(cycle.start[0], abs=1e-12)
     slope, error = richardson(back, cycle.start[0], 1e-3)

@@ -121,7 +121,7 @@ def changed_belt(belt: jb.Belt, **fields) -> jb.Belt:
 
 
 def reflected(osc: jb.Oscillator) -> Image:
-    """x -> -x turns the belts round, and the contact intervals."""
+    """x -> -x loops the belts round, and the contact intervals."""
     belts = [
         changed_belt(belt, velocity=-belt.velocity, lower=-belt.upper, upper=-belt.lower)
         for belt in osc.belts

@@ -522,7 +522,7 @@ def test_a_pseudo_focus_with_a_belt_at_rest_is_reached_in_finite_time(x2):
     run = simulate(osc, (-1.2, x2), 9.0)
     assert run.status == Status.PSEUDO_FOCUS
     assert run.ys[-1].tolist() == [-1.2, 0.0]
-    # The oracle's turns have shrunk to nothing by then.
+    # The oracle's loops have shrunk to nothing by then.
     assert float(run.arcs.t[-1]) < 0.8724
 
 

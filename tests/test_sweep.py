@@ -136,7 +136,7 @@ def test_a_reducer_sees_every_event(dataset):
         assert reduced.sticks_to_1[i, 0] == len(sticks)
         # Here at 1e-8, there at 1e-13.
         np.testing.assert_allclose(reduced["last"][i, 0], run.events[-1].t, atol=1e-5)
-    # Not skipping turns changes nothing but the sum of the rounding of the clock.
+    # Not skipping loops changes nothing but the sum of the rounding of the clock.
     np.testing.assert_allclose(reduced.end[..., 0], dataset.x1_end, atol=1e-9)
 
 

@@ -30,7 +30,7 @@ from ..cycles.cycle import (
     SIZES,
     Chain,
     Ends,
-    Turn,
+    Loop,
     admissible,
     cycle_of,
     end_guard,
@@ -603,8 +603,8 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
     names = Ends(len(osc.belts))
     exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
     side = jnp.sign(jnp.stack([belt.velocity for belt in osc.belts])[touched])
-    turns = (orbit.ends == names.turn_x2) & (exits[:, 1] * side > 0)
-    meets = (turns | (orbit.ends == touched)) & (jnp.arange(HINT_BUDGET) < orbit.count)
+    loops = (orbit.ends == names.extremum_x2) & (exits[:, 1] * side > 0)
+    meets = (loops | (orbit.ends == touched)) & (jnp.arange(HINT_BUDGET) < orbit.count)
     last = jnp.argmax(meets)
 
     rows = jnp.arange(SIZES[0])
@@ -645,7 +645,7 @@ def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
     With x2' = -(x1 - rest) + trace x2 + bend x2^2 and eigenvalues strong > weak, whose product is
     one, x1 - rest = weak x2 - weak bend / (2 strong - weak) x2^2 is invariant to third order. NaN
     where they are negative, as nothing departs then, and where they are complex, a +- i b: the
-    orbit turns back to the belt within half a turn, on a cycle with -exp(pi a/b) times the belt's
+    orbit turns back to the belt within half a loop, on a cycle with -exp(pi a/b) times the belt's
     velocity as its smallest x2. It shrinks with that velocity, so it touches nothing else, and no
     curve of tangencies to another belt ends here.
 
@@ -917,13 +917,13 @@ class _CycleSystem(_System):
     @classmethod
     def begun(cls, problem: _Problem, point: BifurcationPoint) -> "_CycleSystem":
         chain, z, condition = point.cycle.chain, point.cycle.unknowns, point.condition
-        turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
+        loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
         codes, ends = np.asarray(chain.codes), np.array(chain.ends)
         names = Ends(codes.shape[1])
         row, belts = -1, (0, 0)
         if isinstance(condition, NonsmoothFold | GrazingSliding):
             belts = (condition.belt, condition.belt)
-            arrival, _ = least_push(point.oscillator, turn, jnp.asarray(condition.belt))
+            arrival, _ = least_push(point.oscillator, loop, jnp.asarray(condition.belt))
             ends[int(arrival)] = names.tangent + condition.belt
             row = (int(arrival) + 1) % int(np.sum(ends != names.unused))
         elif isinstance(condition, SlidingExchange):
@@ -932,12 +932,12 @@ class _CycleSystem(_System):
         if isinstance(condition, FoldOfCycles):
             system = UnitMultiplier(chain)
         elif isinstance(condition, CrossingSliding):
-            near = arrival_near_limit(point.oscillator, turn, jnp.asarray(condition.belt))
+            near = arrival_near_limit(point.oscillator, loop, jnp.asarray(condition.belt))
             row = (int(near.row) + 1) % int(np.sum(ends != names.unused))
             system = StickLimit(chain, near.row, near.codes, near.side)
         elif isinstance(condition, GrazingEdge | CornerCollision):
             belt, either = jnp.asarray(condition.belt), jnp.zeros(())
-            near = end_near_edge(point.oscillator, turn, belt, either)
+            near = end_near_edge(point.oscillator, loop, belt, either)
             # In a corner a stick phase that begins or ends there may have no duration.
             row = (int(near.row) + 1) % int(np.sum(ends != names.unused))
             system = EdgeContact(chain, near.row, near.end, near.codes)
@@ -1012,12 +1012,12 @@ def _look_at_cycle(args, u: Array):
     following = jnp.roll(z, -1, axis=0)
     last = rows == jnp.sum(chain.used) - 1
     following = jnp.where(last[:, None], z[0], following)
-    turns = chain.used & (system.chain.ends == names.turn_x2)
+    loops = chain.used & (system.chain.ends == names.extremum_x2)
     for belt in range(n):
         own = sticks & (chain.codes[:, belt] == 0)
         shortest = jnp.min(jnp.where(own, z[:, 2], jnp.inf))
         r = osc.belts[belt].velocity - osc.omega * following[:, 1]
-        slips = turns & (jnp.abs(chain.codes[:, belt]) == 1)
+        slips = loops & (jnp.abs(chain.codes[:, belt]) == 1)
         gap = jnp.min(jnp.where(slips, chain.codes[:, belt] * r, jnp.inf))
         nearest = jnp.where(jnp.any(own), shortest, gap)
         # An exchange ends where the phase of sticking vanishes.
@@ -1032,6 +1032,6 @@ def _look_at_cycle(args, u: Array):
 def _meshed_anew(args, u: Array):
     osc_of, system, z, p = _parts(u, args)
     chain = system.chain
-    turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
-    fresh, _ = meshed(osc_of(p), turn)
+    loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
+    fresh, _ = meshed(osc_of(p), loop)
     return (*args[:2], eqx.tree_at(lambda s: s.chain, system, fresh), args[3], _weights(z))

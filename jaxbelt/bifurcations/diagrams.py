@@ -28,7 +28,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, require
 from ..cycles.attractors import Runs, distinct, lead_to_one_cycle, stuck_belts
-from ..cycles.cycle import Cycle, Turn, cut, find_cycle, polish, unstable_cycle
+from ..cycles.cycle import Cycle, Loop, cut, find_cycle, polish, unstable_cycle
 from ..model.equilibria import EquilibriumKind, candidates, equilibria
 from ..model.oscillator import Oscillator
 from ..model.parameters import set_alone
@@ -56,7 +56,7 @@ class Branch(eqx.Module):
     kind: "equilibrium" or "cycle". values: of the parameter, [rows]; they turn back at a fold.
     stable: [rows]. x1_min, x1_max, x2_min, x2_max: the range of the motion, [rows]; of a segment of
     pseudo-equilibria its ends. period, multiplier (the nontrivial one): of a cycle, else NaN.
-    stick_durations, stick_velocities: per turn, and of the belt over omega, [rows, belts]; NaN
+    stick_durations, stick_velocities: per loop, and of the belt over omega, [rows, belts]; NaN
     where a cycle does not stick to that belt.
     """
 
@@ -467,15 +467,15 @@ def _equilibrium_pieces(path: Path, nodes: Sequence[np.ndarray]) -> list[_Piece]
 
 
 def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Label]) -> list[_Piece]:
-    wanted: list[tuple[int, np.ndarray, list[Turn]]] = []
+    wanted: list[tuple[int, np.ndarray, list[Loop]]] = []
     for stretch in range(len(labels)):
-        for turns in path.followed(nodes[stretch].tolist()):
-            wanted.append((stretch, np.array(list(turns)), list(turns.values())))
+        for loops in path.followed(nodes[stretch].tolist()):
+            wanted.append((stretch, np.array(list(loops)), list(loops.values())))
     pieces = []
     if wanted:
         groups = [values for _, values, _ in wanted]
-        turns = [turn for _, _, group in wanted for turn in group]
-        cycles = _attracting(path, np.concatenate(groups), turns)
+        loops = [loop for _, _, group in wanted for loop in group]
+        cycles = _attracting(path, np.concatenate(groups), loops)
         pieces += _as_pieces(path, cycles, groups, [stretch for stretch, _, _ in wanted])
     both = _separated(labels)
     if both:
@@ -546,10 +546,10 @@ def _stacked(program, items: Iterable[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
 
-def _attracting(path: Path, values: np.ndarray, turns: Sequence[Turn]) -> _Rows:
+def _attracting(path: Path, values: np.ndarray, loops: Sequence[Loop]) -> _Rows:
     ok = jnp.asarray(Status.OK.value)
-    pairs = zip(values, cut(turns), strict=True)
-    return _stacked(_row, (polish(path.at(value), turn, ok) for value, turn in pairs))
+    pairs = zip(values, cut(loops), strict=True)
+    return _stacked(_row, (polish(path.at(value), loop, ok) for value, loop in pairs))
 
 
 def _repelling(path: Path, values: np.ndarray, arounds: np.ndarray) -> _Rows:

@@ -30,14 +30,14 @@ unknowns of fixed-signature shooting (see `cycles`) the same equation is harmles
   cycle alone are singular; with this one, and the parameter, they are not. (A cycle that sticks
   has the multiplier zero and takes part in nonsmooth folds only.)
 - `GrazingEdge`, `CornerCollision`: an arc of a cycle ends on a contact edge and in something else
-  at once. With a turn of x1, the orbit is tangent to the edge, x2 = 0; with a boundary r_k = 0 or
-  slip onset, it runs into the corner of that and the edge. To one side of the point the edge ends
-  the arc, to the other that does: the equation is that the other's guard vanishes, which is linear
-  in the unknowns. A cycle that passes the edge and turns soon after has that excursion left out:
-  with it the equation is of second order in the velocity at the edge.
+  at once. With an extremum of x1, the orbit is tangent to the edge, x2 = 0; with a boundary r_k = 0
+  or slip onset, it runs into the corner of that and the edge. To one side of the point the edge
+  ends the arc, to the other that does: the equation is that the other's guard vanishes, which is
+  linear in the unknowns. A cycle that passes the edge and turns back soon after has that
+  excursion left out: with it the equation is of second order in the velocity at the edge.
 - `BoundaryEquilibrium`: at rest on an edge, the force on one of its sides is zero, or as large as
   belts at rest there can hold: a fixed point, or the end of a segment, comes to lie on the edge.
-- `PseudoHopf`: at a pseudo-focus the leading term by which turns grow or shrink is zero.
+- `PseudoHopf`: at a pseudo-focus the leading term by which loops grow or shrink is zero.
 """
 
 import abc
@@ -61,24 +61,24 @@ from ..cycles.cycle import (
     Chain,
     Cycle,
     Ends,
+    Loop,
     Orbit,
-    Turn,
     closure,
     cycle_of,
     end_guard,
-    first_turn,
+    first_loop,
     follow,
     following_codes,
     jacobian,
-    last_turn,
+    last_loop,
+    loop_of,
     meshed,
     multiplier_and_slopes,
     newton,
     residual,
     residual_and_blocks,
-    separating_turn,
+    separating_loop,
     trace_of,
-    turn_of,
 )
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.modes import (
@@ -140,7 +140,7 @@ class CrossingSliding(_BeltCondition):
 
 
 class SuddenSliding(_BeltCondition):
-    """A belt comes to rest: the time that the mass sticks to it in each turn goes to infinity."""
+    """A belt comes to rest: the time that the mass sticks to it in each loop goes to infinity."""
 
 
 class BeltAtRest(_BeltCondition):
@@ -169,7 +169,7 @@ class SlidingExchange(AbstractCondition):
 
 
 class GrazingEdge(_BeltCondition):
-    """The cycle is tangent to a contact edge of a belt: a turn, an extremum of x1, touches it.
+    """The cycle is tangent to a contact edge of a belt: a loop, an extremum of x1, touches it.
 
     Beyond, the cycle passes the edge; or there is none, where the edge pushes away to both sides.
     There, too, a cycle that passes the edge ends, with the velocity zero on it.
@@ -256,7 +256,7 @@ def refine(
     belt with a contact edge `GrazingEdge(belt)`, `CornerCollision(belt)`,
     `BoundaryEquilibrium(belt)` or `PseudoHopf(belt)`. osc: a rough guess, on either side of the
     point. where: selects the parameter that is varied, such as
-    `lambda osc: osc.belts[0].velocity`. max_arcs: room for the arcs of one turn (default
+    `lambda osc: osc.belts[0].velocity`. max_arcs: room for the arcs of one loop (default
     16; where edges are passed 32).
 
     Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`; `value` and
@@ -283,7 +283,7 @@ def refine(
 
 
 def room_for(solve: Callable) -> int:
-    """Room for the arcs of one turn: passing edges takes more of them."""
+    """Room for the arcs of one loop: passing edges takes more of them."""
     return SIZES[1] if solve in (at_edge, at_crossing) else SIZES[0]
 
 
@@ -481,7 +481,7 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
     differences of the last three tops form a geometric sequence, so its limit is known (Aitken). If
     that is much nearer to the last top than this is to any equilibrium, the orbit from there is
     followed next, for on the way there may be a boundary. What even then has not settled counts as
-    settled, its last turn as the one that repeats.
+    settled, its last loop as the one that repeats.
     """
 
     def attempt(state):
@@ -519,29 +519,29 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
 
 
 @jit
-def settled_turns(osc: Oscillator, rests: Equilibria, size: int) -> tuple[Turn, Array]:
-    """The turns that the orbits from `starts` repeat, in `size` arcs each, and their status."""
+def settled_loops(osc: Oscillator, rests: Equilibria, size: int) -> tuple[Loop, Array]:
+    """The loops that the orbits from `starts` repeat, in `size` arcs each, and their status."""
 
     def run(start):
         orbit = approach(osc, rests, start)
-        _, count = last_turn(orbit)
+        _, count = last_loop(orbit)
         fits = (orbit.status != Status.OK) | (count <= size)
         status = jnp.where(fits, orbit.status, Status.TOO_MANY_ARCS.value)
-        return turn_of(orbit, size, len(osc.belts)), status
+        return loop_of(orbit, size, len(osc.belts)), status
 
     osc, rests = lax.stop_gradient((osc, rests))
     return each(run)(starts(osc, rests))
 
 
 @jit
-def _nearest(osc: Oscillator, turns: Turn, status: Array, distance: Callable) -> tuple[Turn, Array]:
-    """Of the turns that were found the one for which distance(osc, turn) is least, and a status."""
-    distances = jax.vmap(functools.partial(distance, lax.stop_gradient(osc)))(turns)
+def _nearest(osc: Oscillator, loops: Loop, status: Array, distance: Callable) -> tuple[Loop, Array]:
+    """Of the loops that were found the one for which distance(osc, loop) is least, and a status."""
+    distances = jax.vmap(functools.partial(distance, lax.stop_gradient(osc)))(loops)
     distances = jnp.where(status == Status.OK, distances, jnp.inf)
     at, large = jnp.argmin(distances), jnp.any(status == Status.TOO_MANY_ARCS)
     none = jnp.where(large, Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
     found = jnp.isfinite(distances[at])
-    return jax.tree.map(lambda x: x[at], turns), jnp.where(found, Status.OK.value, none)
+    return jax.tree.map(lambda x: x[at], loops), jnp.where(found, Status.OK.value, none)
 
 
 @jit
@@ -559,7 +559,7 @@ def _orbit_after_stick(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array
     moving = eqx.tree_at(lambda o: [one.velocity for one in o.belts], osc, velocities)
     moving = lax.stop_gradient(moving)
     n = len(osc.belts)
-    velocity, turn_x2 = _velocity(moving, belts[0]), Ends(n).turn_x2
+    velocity, extremum_x2 = _velocity(moving, belts[0]), Ends(n).extremum_x2
     states = before_stick_ends(moving, belts[0])
     exists = jnp.isfinite(states[:, 0])
     states = states[jnp.argsort(~exists)]
@@ -567,10 +567,10 @@ def _orbit_after_stick(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array
     def attempt(tried):
         number, best, kept = tried
         orbit = follow(moving, states[number], HINT_BUDGET)
-        _, push = least_push(moving, turn_of(orbit, HINT_BUDGET, n), belts[0])
+        _, push = least_push(moving, loop_of(orbit, HINT_BUDGET, n), belts[0])
         x2 = jnp.roll(orbit.entries[:, 1], -1).at[orbit.count - 1].set(orbit.y[1])
-        turns = (orbit.ends == turn_x2) & (x2 * velocity > 0) & (jnp.arange(HINT_BUDGET) > 0)
-        gap = jnp.min(jnp.where(turns, jnp.abs(velocity - osc.omega * x2), jnp.inf))
+        loops = (orbit.ends == extremum_x2) & (x2 * velocity > 0) & (jnp.arange(HINT_BUDGET) > 0)
+        gap = jnp.min(jnp.where(loops, jnp.abs(velocity - osc.omega * x2), jnp.inf))
         sticks = (orbit.status == Status.OK) & jnp.isfinite(push)
         size = jnp.where(sticks, push, 1e6 + gap)
         better = (number == 0) | (size < best)
@@ -607,41 +607,41 @@ def _touching(osc: Oscillator, orbit: Orbit, belts: Array, wanted: Array, size: 
     velocity = _velocity(still, belt)
     repeated = orbit.status == Status.OK
 
-    # Either a cycle was found, or the orbit left the boundary for good: then its first turn from
+    # Either a cycle was found, or the orbit left the boundary for good: then its first loop from
     # slip onset to the next extremum of x2 on that side, closed there, is nearly the cycle.
     exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
     rows = jnp.arange(HINT_BUDGET)
-    near = (orbit.ends == names.turn_x2) & (exits[:, 1] * jnp.sign(velocity) > 0) & (rows > 0)
+    near = (orbit.ends == names.extremum_x2) & (exits[:, 1] * jnp.sign(velocity) > 0) & (rows > 0)
     last = jnp.argmax(near)
-    first_turn = eqx.tree_at(lambda o: (o.repeats, o.count), orbit, (jnp.asarray(0), last + 1))
+    first_loop = eqx.tree_at(lambda o: (o.repeats, o.count), orbit, (jnp.asarray(0), last + 1))
     returns = jnp.any(near) & ~jnp.any(
         (rows > 0) & (rows <= last) & jnp.any(orbit.codes == 0, axis=-1)
     )
-    orbit = jax.tree.map(lambda a, b: jnp.where(repeated, a, b), orbit, first_turn)
-    _, count = last_turn(orbit)
+    orbit = jax.tree.map(lambda a, b: jnp.where(repeated, a, b), orbit, first_loop)
+    _, count = last_loop(orbit)
     status = jnp.where(repeated | returns, Status.OK.value, Status.NOT_TOUCHED.value)
     # It may need one arc more.
     status = jnp.where((status == Status.OK) & (count >= size), Status.TOO_MANY_ARCS.value, status)
-    return _tangent(still, belts, wanted, turn_of(orbit, size, n), status)
+    return _tangent(still, belts, wanted, loop_of(orbit, size, n), status)
 
 
-def tangency_near(osc: Oscillator, index: int | Array, belts: Array, turn: Turn, status: Array):
-    """The cycle near a turn that is tangent to the boundary of a belt; status: of the turn."""
-    return _solved_point(osc, index, *_tangent_cycle(osc, belts, turn, status))
+def tangency_near(osc: Oscillator, index: int | Array, belts: Array, loop: Loop, status: Array):
+    """The cycle near a loop that is tangent to the boundary of a belt; status: of the loop."""
+    return _solved_point(osc, index, *_tangent_cycle(osc, belts, loop, status))
 
 
 @jit
-def _tangent_cycle(osc: Oscillator, belts: Array, turn: Turn, status: Array):
-    fits = jnp.sum(turn.used) < turn.ends.size
+def _tangent_cycle(osc: Oscillator, belts: Array, loop: Loop, status: Array):
+    fits = jnp.sum(loop.used) < loop.ends.size
     status = jnp.where(fits | (status != Status.OK), status, Status.TOO_MANY_ARCS.value)
-    return _tangent(lax.stop_gradient(osc), belts, jnp.zeros(()), turn, status)
+    return _tangent(lax.stop_gradient(osc), belts, jnp.zeros(()), loop, status)
 
 
-def _tangent(osc: Oscillator, belts: Array, wanted: Array, turn: Turn, status: Array):
+def _tangent(osc: Oscillator, belts: Array, wanted: Array, loop: Loop, status: Array):
     """The system of a tangency with a guess of its unknowns, a status, and the judge."""
     belt = belts[0]
-    turn, row, found = _with_stick(osc, turn, belt)
-    chain, z = meshed(osc, turn)
+    loop, row, found = _with_stick(osc, loop, belt)
+    chain, z = meshed(osc, loop)
     status = jnp.where(found | (status != Status.OK), status, Status.NOT_TOUCHED.value)
     status = jnp.where(_velocity(osc, belt) == 0, Status.STUCK_FOREVER.value, status)
     # The arc before the stick arc is the one that becomes tangent.
@@ -654,29 +654,29 @@ def _tangent(osc: Oscillator, belts: Array, wanted: Array, turn: Turn, status: A
 def at_exchange(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
     """A cycle that sticks to one of two belts which run at one velocity, and touches both."""
     _, _, orbit = _orbit_after_stick(osc, belts)
-    return exchange_near(osc, index, belts, *_repeated_turn(orbit, size, len(osc.belts)))
+    return exchange_near(osc, index, belts, *_repeated_loop(orbit, size, len(osc.belts)))
 
 
 @jit
-def _repeated_turn(orbit: Orbit, size: int, n: int) -> tuple[Turn, Array]:
-    """The turn that an orbit repeats, and a status."""
-    _, count = last_turn(orbit)
+def _repeated_loop(orbit: Orbit, size: int, n: int) -> tuple[Loop, Array]:
+    """The loop that an orbit repeats, and a status."""
+    _, count = last_loop(orbit)
     status = jnp.where(count <= size, Status.OK.value, Status.TOO_MANY_ARCS.value)
     status = jnp.where(orbit.status == Status.OK, status, Status.NOT_TOUCHED.value)
-    return turn_of(orbit, size, n), status
+    return loop_of(orbit, size, n), status
 
 
-def exchange_near(osc: Oscillator, index: int | Array, belts: Array, turn: Turn, status: Array):
-    """The exchange of two belts by the cycle near a turn; status: of the turn."""
-    return _solved_point(osc, index, *_exchanging(osc, belts, turn, status))
+def exchange_near(osc: Oscillator, index: int | Array, belts: Array, loop: Loop, status: Array):
+    """The exchange of two belts by the cycle near a loop; status: of the loop."""
+    return _solved_point(osc, index, *_exchanging(osc, belts, loop, status))
 
 
 @jit
-def _exchanging(osc: Oscillator, belts: Array, turn: Turn, status: Array):
+def _exchanging(osc: Oscillator, belts: Array, loop: Loop, status: Array):
     """The system of `exchange_near` with a guess of its unknowns, a status, and the judge."""
-    chain, z = meshed(lax.stop_gradient(osc), turn)
-    sticks = jnp.any(turn.codes[:, belts] == 0, axis=-1)
-    exchanges = jnp.any(turn.used & sticks & _both_touch(turn.codes, belts))
+    chain, z = meshed(lax.stop_gradient(osc), loop)
+    sticks = jnp.any(loop.codes[:, belts] == 0, axis=-1)
+    exchanges = jnp.any(loop.used & sticks & _both_touch(loop.codes, belts))
     meant = (status != Status.OK) | exchanges
     status = jnp.where(meant, status, Status.NOT_TOUCHED.value)
     either, row = jnp.zeros(()), jnp.asarray(0)
@@ -714,40 +714,40 @@ def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
     return phase
 
 
-def least_push(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Array, Array]:
+def least_push(osc: Oscillator, loop: Loop, belt: Array) -> tuple[Array, Array]:
     """The arc that arrives to stick to a belt with the least x2': its row, and the size of that.
 
     From the side on which that vanishes where the orbit is tangent to the boundary; inf: none.
     """
     side = jnp.sign(_velocity(osc, belt))
-    arrives = turn.used & (following_codes(turn)[:, belt] == 0) & (turn.codes[:, belt] == side)
+    arrives = loop.used & (following_codes(loop)[:, belt] == 0) & (loop.codes[:, belt] == side)
 
     def push(codes, y):
         return jnp.abs(mode_acceleration(osc, mode_of(codes), y[0], y[1]))
 
-    pushes = jnp.where(arrives, jax.vmap(push)(turn.codes, turn.exits), jnp.inf)
+    pushes = jnp.where(arrives, jax.vmap(push)(loop.codes, loop.exits), jnp.inf)
     return jnp.argmin(pushes), jnp.min(pushes)
 
 
-def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, Array]:
-    """A turn with a stick arc on the belt, its row, whether there is one.
+def _with_stick(osc: Oscillator, loop: Loop, belt: Array) -> tuple[Loop, Array, Array]:
+    """A loop with a stick arc on the belt, its row, whether there is one.
 
     Its own that begins most nearly by a tangency, or one of duration zero where x2 comes closest to
     the boundary from inside.
     """
     velocity = _velocity(osc, belt)
-    rows = jnp.arange(turn.ends.size)
+    rows = jnp.arange(loop.ends.size)
     names = Ends(len(osc.belts))
-    arrival, push = least_push(osc, turn, belt)
+    arrival, push = least_push(osc, loop, belt)
     has_own = jnp.isfinite(push)
-    own = (arrival + 1) % jnp.maximum(jnp.sum(turn.used), 1)
+    own = (arrival + 1) % jnp.maximum(jnp.sum(loop.used), 1)
 
-    following = turn.exits
-    turns = turn.used & (turn.ends == names.turn_x2)
-    turns = turns & (turn.codes[:, belt] == jnp.sign(velocity))
-    turns = turns & (following[:, 1] * jnp.sign(velocity) > 0)
+    following = loop.exits
+    loops = loop.used & (loop.ends == names.extremum_x2)
+    loops = loops & (loop.codes[:, belt] == jnp.sign(velocity))
+    loops = loops & (following[:, 1] * jnp.sign(velocity) > 0)
     distance = jnp.abs(velocity - osc.omega * following[:, 1])
-    at = jnp.argmin(jnp.where(turns, distance, jnp.inf))
+    at = jnp.argmin(jnp.where(loops, distance, jnp.inf))
 
     def inserted(array, new):
         shifted = jnp.roll(array, 1, axis=0)
@@ -755,14 +755,14 @@ def _with_stick(osc: Oscillator, turn: Turn, belt: Array) -> tuple[Turn, Array, 
         return jnp.where(after, shifted, array).at[at + 1].set(new)
 
     # Where all rows are in use the last one is shifted out; the caller knows.
-    new = Turn(
-        codes=inserted(turn.codes, turn.codes[at].at[belt].set(STUCK)),
-        ends=inserted(turn.ends.at[at].set(belt), jnp.asarray(names.onset)),
-        entries=inserted(turn.entries, jnp.stack([following[at, 0], velocity / osc.omega])),
-        durations=inserted(turn.durations, jnp.zeros(())),
+    new = Loop(
+        codes=inserted(loop.codes, loop.codes[at].at[belt].set(STUCK)),
+        ends=inserted(loop.ends.at[at].set(belt), jnp.asarray(names.onset)),
+        entries=inserted(loop.entries, jnp.stack([following[at, 0], velocity / osc.omega])),
+        durations=inserted(loop.durations, jnp.zeros(())),
     )
-    turn = jax.tree.map(lambda a, b: jnp.where(has_own, a, b), turn, new)
-    return turn, jnp.where(has_own, own, at + 1), has_own | jnp.any(turns)
+    loop = jax.tree.map(lambda a, b: jnp.where(has_own, a, b), loop, new)
+    return loop, jnp.where(has_own, own, at + 1), has_own | jnp.any(loops)
 
 
 # --- crossing a boundary, or sticking to it -------------------------------------------------------
@@ -794,8 +794,8 @@ class Arrival(eqx.Module):
     side: Array
 
 
-def arrival_near_limit(osc: Oscillator, turn: Turn, belt: Array) -> Arrival:
-    """Of the arcs of a turn that arrive at the boundary of a belt that nearest to such an end.
+def arrival_near_limit(osc: Oscillator, loop: Loop, belt: Array) -> Arrival:
+    """Of the arcs of a loop that arrive at the boundary of a belt that nearest to such an end.
 
     At the other end the orbit would arrive tangentially, with the other sign of r.
     """
@@ -810,7 +810,7 @@ def arrival_near_limit(osc: Oscillator, turn: Turn, belt: Array) -> Arrival:
         arrives = arrives & (jnp.abs(codes[belt]) == 1)
         return jnp.where(arrives, distance, jnp.inf), held, side
 
-    distance, held, side = jax.vmap(one)(turn.codes, turn.ends, turn.exits[:, 0])
+    distance, held, side = jax.vmap(one)(loop.codes, loop.ends, loop.exits[:, 0])
     row = jnp.argmin(distance)
     return Arrival(distance[row], row, held[row], side[row])
 
@@ -818,36 +818,36 @@ def arrival_near_limit(osc: Oscillator, turn: Turn, belt: Array) -> Arrival:
 def at_crossing(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
     """An attracting cycle that arrives at the boundary of the first belt at such an end."""
     distance = eqx.Partial(_distance_to_limit, belts)
-    turn, status = _nearest(osc, *settled_turns(osc, candidates(osc), size), distance)
-    return crossing_near(osc, index, belts, turn, status)
+    loop, status = _nearest(osc, *settled_loops(osc, candidates(osc), size), distance)
+    return crossing_near(osc, index, belts, loop, status)
 
 
-def _distance_to_limit(belts, osc: Oscillator, turn: Turn) -> Array:
-    return arrival_near_limit(osc, turn, belts[0]).distance
+def _distance_to_limit(belts, osc: Oscillator, loop: Loop) -> Array:
+    return arrival_near_limit(osc, loop, belts[0]).distance
 
 
-def crossing_near(osc: Oscillator, index: int | Array, belts: Array, turn: Turn, status: Array):
-    """The cycle near a turn that arrives at such an end; status: of the turn."""
-    return _solved_point(osc, index, *_arriving(osc, belts, turn, status))
+def crossing_near(osc: Oscillator, index: int | Array, belts: Array, loop: Loop, status: Array):
+    """The cycle near a loop that arrives at such an end; status: of the loop."""
+    return _solved_point(osc, index, *_arriving(osc, belts, loop, status))
 
 
 @jit
-def _arriving(osc: Oscillator, belts: Array, turn: Turn, status: Array):
+def _arriving(osc: Oscillator, belts: Array, loop: Loop, status: Array):
     """The system of `crossing_near` with a guess of its unknowns, a status, and the judge."""
     still = lax.stop_gradient(osc)
-    near = arrival_near_limit(still, turn, belts[0])
+    near = arrival_near_limit(still, loop, belts[0])
     exists = (status != Status.OK) | jnp.isfinite(near.distance)
     status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
     # Having crossed, the orbit may come back to the boundary soon and stick. The equations of that
     # excursion are of second order, and it is left out.
-    count = jnp.maximum(jnp.sum(turn.used), 1)
+    count = jnp.maximum(jnp.sum(loop.used), 1)
     after = (near.row + 1 + jnp.arange(3)) % count
-    returns = (turn.ends[after[0]] == Ends(len(osc.belts)).turn_x2) & (count > 3)
-    returns = returns & (turn.ends[after[1]] == turn.ends[near.row])
-    returns = returns & (turn.codes[after[2], belts[0]] == 0)
-    shorter = _without(turn, near.row, jnp.asarray(2))
-    turn, row = jax.tree.map(lambda a, b: jnp.where(returns, a, b), shorter, (turn, near.row))
-    chain, z = meshed(still, turn)
+    returns = (loop.ends[after[0]] == Ends(len(osc.belts)).extremum_x2) & (count > 3)
+    returns = returns & (loop.ends[after[1]] == loop.ends[near.row])
+    returns = returns & (loop.codes[after[2], belts[0]] == 0)
+    shorter = _without(loop, near.row, jnp.asarray(2))
+    loop, row = jax.tree.map(lambda a, b: jnp.where(returns, a, b), shorter, (loop, near.row))
+    chain, z = meshed(still, loop)
     return StickLimit(chain, row, near.codes, near.side), z, status, eqx.Partial(_judge_arrival)
 
 
@@ -890,8 +890,8 @@ class EdgeEnd(eqx.Module):
 
 
 @jit
-def end_near_edge(osc: Oscillator, turn: Turn, belt: Array, wanted: Array) -> EdgeEnd:
-    """Of the ends of the arcs of a turn that nearest to an edge of the belt and something else.
+def end_near_edge(osc: Oscillator, loop: Loop, belt: Array, wanted: Array) -> EdgeEnd:
+    """Of the ends of the arcs of a loop that nearest to an edge of the belt and something else.
 
     wanted: 1 tangent to the edge, -1 in a corner, 0 either.
     """
@@ -899,7 +899,7 @@ def end_near_edge(osc: Oscillator, turn: Turn, belt: Array, wanted: Array) -> Ed
     names = Ends(n)
     positions = jnp.stack(edges(osc))
     lower, upper = positions[belt], positions[n + belt]
-    following = following_codes(turn)
+    following = following_codes(loop)
 
     def distances(codes, end, entry, after, at):
         """From every end that this arc might have as well; those of stick phases in two modes."""
@@ -909,15 +909,15 @@ def end_near_edge(osc: Oscillator, turn: Turn, belt: Array, wanted: Array) -> Ed
         on_edge = on_edge & ((edge == lower) | (edge == upper))
         stuck = jnp.any(codes == 0)
         # What ends it is something else: how far it is to an edge.
-        turns, meets = end == names.turn_x1, (end < n) | (end == names.onset)
-        to_edges = [jnp.where(turns | meets, jnp.abs(x1 - e), jnp.inf) for e in (lower, upper)]
+        loops, meets = end == names.extremum_x1, (end < n) | (end == names.onset)
+        to_edges = [jnp.where(loops | meets, jnp.abs(x1 - e), jnp.inf) for e in (lower, upper)]
         # An edge ends it. If that pushes away to both sides: how much further on the orbit would
-        # turn as it was.
+        # loop as it was.
         # It moves there as x1 does on this arc; x2 itself may be zero.
         ahead = jnp.sign(x1 - entry[0])
         push = [ahead * mode_acceleration(osc, mode_of(c), x1, x2) for c in (codes, after)]
         passes = on_edge & ~stuck & (push[0] < 0) & (push[1] > 0)
-        to_turn = jnp.where(passes, 0.5 * x2**2 / jnp.where(passes, -push[0], 1.0), jnp.inf)
+        to_extremum = jnp.where(passes, 0.5 * x2**2 / jnp.where(passes, -push[0], 1.0), jnp.inf)
         # A boundary may be near that the arc did not begin at: x2 is monotone on it.
         to_boundaries = []
         for i, one in enumerate(osc.belts):
@@ -932,104 +932,104 @@ def end_near_edge(osc: Oscillator, turn: Turn, belt: Array, wanted: Array) -> Ed
             may = on_edge & stuck & jnp.any(one == 0)
             away = jnp.abs(x1 - onset_position(osc, mode_of(one)))
             to_onsets.append(jnp.where(may, away, jnp.inf))
-        found = jnp.stack([*to_edges, to_turn, *to_boundaries, *to_onsets])
-        grazes = jnp.stack([turns, turns, True, *[False] * (n + 2)])
+        found = jnp.stack([*to_edges, to_extremum, *to_boundaries, *to_onsets])
+        grazes = jnp.stack([loops, loops, True, *[False] * (n + 2)])
         usable = (end != names.unused) & jnp.where(grazes, wanted >= 0, wanted <= 0)
         return jnp.where(usable & jnp.isfinite(found), found, jnp.inf), grazes, held
 
-    rows = turn.codes, turn.ends, turn.entries, following, turn.exits
+    rows = loop.codes, loop.ends, loop.entries, following, loop.exits
     found, grazes, held = jax.vmap(distances)(*rows)
     row, which = jnp.divmod(jnp.argmin(found), found.shape[1])
     own = jnp.stack([n + belt, 2 * n + belt])
-    others = jnp.array([names.turn_x1, *range(n), names.onset, names.onset])
+    others = jnp.array([names.extremum_x1, *range(n), names.onset, names.onset])
     end = jnp.concatenate([own, others])[which]
-    codes = jnp.where(which == found.shape[1] - 1, held[row], turn.codes[row])
+    codes = jnp.where(which == found.shape[1] - 1, held[row], loop.codes[row])
     return EdgeEnd(found[row, which], row, end, codes, grazes[row, which])
 
 
-def _without_excursion(osc: Oscillator, turn: Turn, near: EdgeEnd) -> tuple[Turn, Array]:
-    """The turn without what lies beyond the edge, if all of it is the turn of x1 that ends a row;
-    and the row that then ends in that turn of x1."""
+def _without_excursion(osc: Oscillator, loop: Loop, near: EdgeEnd) -> tuple[Loop, Array]:
+    """The loop without what lies beyond the edge, if all of that is the extremum of x1 that ends a
+    row; and the row that then ends in that extremum."""
     row = near.row
     n = len(osc.belts)
     names = Ends(n)
-    rows, count = jnp.arange(turn.ends.size), jnp.maximum(jnp.sum(turn.used), 1)
-    passes = (turn.ends >= n) & (turn.ends < 3 * n)
+    rows, count = jnp.arange(loop.ends.size), jnp.maximum(jnp.sum(loop.used), 1)
+    passes = (loop.ends >= n) & (loop.ends < 3 * n)
     edge = jnp.stack(edges(osc))[jnp.clip(near.end - n, 0, 2 * n - 1)]
-    passes = passes & (turn.exits[:, 0] == edge)
-    # The events before and after; turns of x2 are none.
-    events = turn.used & (turn.ends != names.turn_x2) & (rows != row)
+    passes = passes & (loop.exits[:, 0] == edge)
+    # The events before and after; extremum of x2 are none.
+    events = loop.used & (loop.ends != names.extremum_x2) & (rows != row)
     before = jnp.argmin(jnp.where(events, (row - rows) % count, rows.size))
     after = jnp.argmin(jnp.where(events, (rows - row) % count, rows.size))
-    is_excursion = (turn.ends[row] == names.turn_x1) & passes[before] & passes[after]
+    is_excursion = (loop.ends[row] == names.extremum_x1) & passes[before] & passes[after]
     is_excursion = is_excursion & (before != after)
-    without, last = _without(turn, before, (after - before) % count)
-    without = eqx.tree_at(lambda t: t.ends, without, without.ends.at[last].set(names.turn_x1))
-    turn = jax.tree.map(lambda a, b: jnp.where(is_excursion, a, b), without, turn)
-    return turn, jnp.where(is_excursion, last, row)
+    without, last = _without(loop, before, (after - before) % count)
+    without = eqx.tree_at(lambda t: t.ends, without, without.ends.at[last].set(names.extremum_x1))
+    loop = jax.tree.map(lambda a, b: jnp.where(is_excursion, a, b), without, loop)
+    return loop, jnp.where(is_excursion, last, row)
 
 
-def _without(turn: Turn, row: Array, removed: Array) -> tuple[Turn, Array]:
-    """The turn without so many arcs after a row; and that row, which is its last one then."""
-    rows, count = jnp.arange(turn.ends.size), jnp.maximum(jnp.sum(turn.used), 1)
+def _without(loop: Loop, row: Array, removed: Array) -> tuple[Loop, Array]:
+    """The loop without so many arcs after a row; and that row, which is its last one then."""
+    rows, count = jnp.arange(loop.ends.size), jnp.maximum(jnp.sum(loop.used), 1)
     left, first = count - removed, row + removed + 1
     source = jnp.where(rows < left, first + rows, first) % count
-    ends = jnp.where(rows < left, turn.ends[source], Ends(turn.codes.shape[-1]).unused)
-    durations = jnp.where(rows < left, turn.durations[source], 0.0)
-    return Turn(turn.codes[source], ends, turn.entries[source], durations), left - 1
+    ends = jnp.where(rows < left, loop.ends[source], Ends(loop.codes.shape[-1]).unused)
+    durations = jnp.where(rows < left, loop.durations[source], 0.0)
+    return Loop(loop.codes[source], ends, loop.entries[source], durations), left - 1
 
 
 def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
     """An attracting cycle of which an arc ends on an edge of the first belt, not by that edge.
 
-    wanted: 1 a turn ends it (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
+    wanted: 1 a loop ends it (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
     these cycles that which comes nearest to this is taken.
     """
     distance = eqx.Partial(_distance_to_edge, belts, wanted)
-    turn, status = _nearest(osc, *settled_turns(osc, candidates(osc), size), distance)
-    return edge_contact(osc, index, belts, wanted, turn, status, repels=False)
+    loop, status = _nearest(osc, *settled_loops(osc, candidates(osc), size), distance)
+    return edge_contact(osc, index, belts, wanted, loop, status, repels=False)
 
 
-def _distance_to_edge(belts, wanted, osc: Oscillator, turn: Turn) -> Array:
-    return end_near_edge(osc, turn, belts[0], wanted).distance
+def _distance_to_edge(belts, wanted, osc: Oscillator, loop: Loop) -> Array:
+    return end_near_edge(osc, loop, belts[0], wanted).distance
 
 
 def at_edge_unstable(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
-    """The unstable cycle around a stable equilibrium, with a turn on an edge of the first belt."""
-    turn, status, _ = separating_turn(osc, size)
-    return edge_contact(osc, index, belts, wanted, turn, status, repels=True)
+    """The unstable cycle around a stable equilibrium, with a loop on an edge of the first belt."""
+    loop, status, _ = separating_loop(osc, size)
+    return edge_contact(osc, index, belts, wanted, loop, status, repels=True)
 
 
 def edge_contact(
-    osc: Oscillator, index: int | Array, belts, wanted, turn: Turn, status: Array, *, repels: bool
+    osc: Oscillator, index: int | Array, belts, wanted, loop: Loop, status: Array, *, repels: bool
 ) -> BifurcationPoint:
-    """The cycle near a turn of which an arc ends on an edge of the first belt.
+    """The cycle near a loop of which an arc ends on an edge of the first belt.
 
-    wanted: as for `at_edge`; status: of the turn; repels: whether the cycle is to be unstable.
+    wanted: as for `at_edge`; status: of the loop; repels: whether the cycle is to be unstable.
     """
     unstable = jnp.asarray(np.array(repels))
-    return _solved_point(osc, index, *_touching_edge(osc, belts, wanted, turn, status, unstable))
+    return _solved_point(osc, index, *_touching_edge(osc, belts, wanted, loop, status, unstable))
 
 
 @jit
-def _touching_edge(osc: Oscillator, belts: Array, wanted, turn: Turn, status: Array, repels):
+def _touching_edge(osc: Oscillator, belts: Array, wanted, loop: Loop, status: Array, repels):
     """The system of `edge_contact` with a guess of its unknowns, a status, and the judge."""
     still = lax.stop_gradient(osc)
-    near = end_near_edge(still, turn, belts[0], wanted)
+    near = end_near_edge(still, loop, belts[0], wanted)
     exists = (status != Status.OK) | jnp.isfinite(near.distance)
     status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
-    turn, row = _without_excursion(still, turn, near)
-    chain, z = meshed(still, turn)
+    loop, row = _without_excursion(still, loop, near)
+    chain, z = meshed(still, loop)
     system = EdgeContact(chain, row, near.end, near.codes)
     return system, z, status, eqx.Partial(_judge_contact, row, repels)
 
 
 def _judge_contact(row, repels, osc: Oscillator, z, cycle: Cycle, slope):
-    # A turn at once after the edge is passed solves the equations, too, but they are singular;
+    # A loop at once after the edge is passed solves the equations, too, but they are singular;
     # and a cycle that has shrunk to a pseudo-focus meets everything there.
-    turns = cycle.chain.ends[row] == Ends(len(osc.belts)).turn_x1
+    loops = cycle.chain.ends[row] == Ends(len(osc.belts)).extremum_x1
     shrunk = jnp.ptp(z[:, 0]) < AT_REST
-    fails = turns & (z[row, 2] < 1e-6) | shrunk
+    fails = loops & (z[row, 2] < 1e-6) | shrunk
     solved = cycle.status == Status.OK
     status = jnp.where(solved & fails, Status.NO_CONVERGENCE.value, cycle.status)
     none = repels & (solved & ~(slope > 1) | shrunk & (status == Status.NO_CONVERGENCE))
@@ -1038,7 +1038,7 @@ def _judge_contact(row, repels, osc: Oscillator, z, cycle: Cycle, slope):
 
 # --- the fold of cycles ---------------------------------------------------------------------------
 
-#: Starts of which the first turns are compared.
+#: Starts of which the first loops are compared.
 STARTS = 48
 
 
@@ -1057,19 +1057,19 @@ class UnitMultiplier(System):
 
 
 def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
-    """Two cycles meet where a turn neither grows nor shrinks, and neither do its neighbours.
+    """Two cycles meet where a loop neither grows nor shrinks, and neither do its neighbours.
 
-    So the guess is the first turn whose growth is extremal among its neighbours'; of several the
+    So the guess is the first loop whose growth is extremal among its neighbours'; of several the
     one that closes best. Near a fixed point with eigenvalues rate +- i frequency the growth tends
     to 2 pi rate/frequency, and it has an extremum there that is no more than an effect of where
-    turns begin: it differs from that limit by a term of second order in the rate.
+    loops begin: it differs from that limit by a term of second order in the rate.
     """
-    return fold_near(osc, index, *_extremal_turn(osc, candidates(osc), size))
+    return fold_near(osc, index, *_extremal_loop(osc, candidates(osc), size))
 
 
 @jit
-def _extremal_turn(osc: Oscillator, rests: Equilibria, size: int):
-    """The turn of `at_fold_of_cycles`, and a status."""
+def _extremal_loop(osc: Oscillator, rests: Equilibria, size: int):
+    """The loop of `at_fold_of_cycles`, and a status."""
     still, rests = lax.stop_gradient((osc, rests))
     eligible = (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
     row = jnp.argmax(eligible)
@@ -1077,15 +1077,15 @@ def _extremal_turn(osc: Oscillator, rests: Equilibria, size: int):
     rate = jnp.where(rests.kind[row] == EquilibriumKind.FIXED_POINT, rests.rate[row], 0.0)
     limit = 2 * jnp.pi * rate / jnp.sqrt(jnp.maximum(1 - rate**2, 1e-12))
 
-    def turn(distance):
-        orbit, _, top = first_turn(still, x1, distance, size)
+    def loop(distance):
+        orbit, _, top = first_loop(still, x1, distance, size)
         rows = jnp.arange(size) < orbit.count
         sticks = jnp.any(rows & jnp.any(orbit.codes == 0, axis=-1))
         return orbit, jnp.log((top - x1) / distance), sticks
 
     def narrow(bracket, _):
         distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
-        orbits, growth, sticks = each(turn)(distances)
+        orbits, growth, sticks = each(loop)(distances)
         change = jnp.diff(growth)
         # Its neighbours may stick; what is extremal lies beside them.
         extremal = (change[1:] * change[:-1] < 0) & ~sticks[1:-1]
@@ -1098,18 +1098,18 @@ def _extremal_turn(osc: Oscillator, rests: Equilibria, size: int):
     _, (orbits, found) = lax.scan(narrow, jnp.array([1e-3, 10.0]), None, length=2)
     orbit, found = jax.tree.map(lambda leaf: leaf[-1], (orbits, found))
     status = jnp.where(jnp.any(eligible) & found, Status.OK.value, Status.NO_FOLD.value)
-    return turn_of(orbit, size, len(osc.belts)), status
+    return loop_of(orbit, size, len(osc.belts)), status
 
 
-def fold_near(osc: Oscillator, index: int | Array, turn: Turn, status: Array) -> BifurcationPoint:
-    """The cycle near a turn that is to have multiplier one; status: of the turn."""
-    return _solved_point(osc, index, *_closing(osc, turn, status))
+def fold_near(osc: Oscillator, index: int | Array, loop: Loop, status: Array) -> BifurcationPoint:
+    """The cycle near a loop that is to have multiplier one; status: of the loop."""
+    return _solved_point(osc, index, *_closing(osc, loop, status))
 
 
 @jit
-def _closing(osc: Oscillator, turn: Turn, status: Array):
+def _closing(osc: Oscillator, loop: Loop, status: Array):
     """The system of `fold_near` with a guess of its unknowns, a status, and the judge."""
-    chain, z = meshed(lax.stop_gradient(osc), turn)
+    chain, z = meshed(lax.stop_gradient(osc), loop)
     return UnitMultiplier(chain), z, status, eqx.Partial(_judge_fold, jnp.ptp(z[:, 0]))
 
 
@@ -1351,8 +1351,8 @@ def at_rest(osc: Oscillator, index: int | Array, belts, wanted, size) -> Bifurca
 def _belt_at_rest(osc, index, belts, moving: Oscillator, start: Array, orbit: Orbit):
     belt = belts[0]
     rows = jnp.arange(HINT_BUDGET)
-    turn = (rows > orbit.repeats) & (rows < orbit.count)
-    sticks = (orbit.status == Status.OK) & jnp.any(turn & (orbit.codes[:, belt] == 0))
+    loop = (rows > orbit.repeats) & (rows < orbit.count)
+    sticks = (orbit.status == Status.OK) & jnp.any(loop & (orbit.codes[:, belt] == 0))
     # The contacts at slip onset are those at the equilibrium that it meets.
     mode = Mode(tuple(orbit.codes[0, i] for i in range(len(osc.belts))))
     rest = jnp.zeros(())

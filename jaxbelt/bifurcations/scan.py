@@ -2,7 +2,7 @@
 
 What the oscillator does at one value of the parameter is summed up in a label: the kind and the
 stability of every equilibrium, and the itinerary of every attracting cycle, that is, the modes that
-it passes in one turn, see `attractors`. A
+it passes in one loop, see `attractors`. A
 cycle that sticks comes by a place where a stick phase ends, in slip onset or on a contact edge, so
 it is found by following the orbits from there; a few starts beside the equilibria find the rest.
 
@@ -48,8 +48,8 @@ from ..cycles.cycle import (
     AT_REST,
     SIZES,
     Cycle,
-    Turn,
-    as_turn,
+    Loop,
+    as_loop,
     cut,
     find_cycle,
     polish,
@@ -87,7 +87,7 @@ from .refine import (
     exchange_near,
     fold_near,
     room_for,
-    settled_turns,
+    settled_loops,
     solver_of,
     tangency_near,
     unexplained_point,
@@ -95,7 +95,7 @@ from .refine import (
 
 #: Values of the parameter in one batch.
 BATCH = 32
-#: Room for the arcs of one turn.
+#: Room for the arcs of one loop.
 ROOM = SIZES[1]
 #: Intervals narrower than this fraction of the span are good guesses for Newton's method.
 NEAR = 1 / 400
@@ -200,9 +200,9 @@ def edges_touched(path: "Path", values: np.ndarray, around: int) -> tuple[Bifurc
     while intervals:
         a, b = intervals.pop()
         solved = (
-            refined(path.osc, path.index, value, GrazingEdge(belt, unstable=True), turn)
+            refined(path.osc, path.index, value, GrazingEdge(belt, unstable=True), loop)
             for value in (a, b)
-            for turn in [as_turn(unstable(value), ROOM)]
+            for loop in [as_loop(unstable(value), ROOM)]
             for belt in path.edged
         )
         points_inside = (point for point in solved if point is not None and a < point.value < b)
@@ -248,18 +248,18 @@ class Label(NamedTuple):
 
 
 class Found(NamedTuple):
-    """An attracting cycle: its itinerary, and a turn of it, with ROOM arcs.
+    """An attracting cycle: its itinerary, and a loop of it, with ROOM arcs.
 
-    The turn of one that does not stick solves the equations of the cycle, but where `approach` did
+    The loop of one that does not stick solves the equations of the cycle, but where `approach` did
     not tell where the orbit settles.
     """
 
     path: Itinerary
-    turn: Turn
+    loop: Loop
 
 
 class Path:
-    """A path in one parameter: its labels, each computed once, and turns of the cycles in them."""
+    """A path in one parameter: its labels, each computed once, and loops of the cycles in them."""
 
     def __init__(self, osc, where, span):
         check_oscillator(osc)
@@ -294,9 +294,9 @@ class Path:
 
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
         """The values just below and just above; farther off where motions are slow to settle."""
-        # Not nearer in a short span: a turn counts as repeated when it does so to 1e-7.
+        # Not nearer in a short span: a loop counts as repeated when it does so to 1e-7.
         distance = CLOSE * (1.0 + self.length)
-        # Turns around a pseudo-focus with a velocity below 1e-5 are lost in rounding.
+        # Loops around a pseudo-focus with a velocity below 1e-5 are lost in rounding.
         if slow or (value in self.breaks and self.edged):
             distance *= 30.0
         return value - distance, value + distance
@@ -356,38 +356,38 @@ class Path:
             zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), modes, strict=True)
         )
         found: list[Found] = []
-        turns = [jax.tree.map(lambda x, i=i: x[i], seen.turn) for i in range(len(seen.status))]
-        for turn, status in zip(turns, seen.status.tolist(), strict=True):
-            one = self._settled(value, turn) if status == Status.OK else None
+        loops = [jax.tree.map(lambda x, i=i: x[i], seen.loop) for i in range(len(seen.status))]
+        for loop, status in zip(loops, seen.status.tolist(), strict=True):
+            one = self._settled(value, loop) if status == Status.OK else None
             if one is not None and _number(one, found) is None:
                 found.append(one)
         if not found and not any(stable for _, stable, _ in rests):
             # Nothing holds the orbits but a cycle that they approach slowly.
-            found.append(self._settled(value, turns[-1], closes=False) or Found((), turns[-1]))
+            found.append(self._settled(value, loops[-1], closes=False) or Found((), loops[-1]))
         self.cycles[value] = found
         self._name(value, rests)
 
     def _name(self, value: float, rests) -> None:
         self.labels[value] = Label(rests, tuple(sorted(one.path for one in self.cycles[value])))
 
-    def _settled(self, value: float, turn: Turn, *, closes: bool = True) -> Found | None:
-        """The attracting cycle that a turn is nearly one of, or else leads to, or None.
+    def _settled(self, value: float, loop: Loop, *, closes: bool = True) -> Found | None:
+        """The attracting cycle that a loop is nearly one of, or else leads to, or None.
 
-        A turn that sticks is one of it. Any other may only seem to repeat. closes: whether it is
-        known to be one turn.
+        A loop that sticks is one of it. Any other may only seem to repeat. closes: whether it is
+        known to be one loop.
         """
         osc, ok = self.at(value), jnp.asarray(Status.OK.value)
-        if closes and sticks(path := itinerary(osc, turn)):
-            return Found(path, turn)
-        # Where the cycle has other turns than those from which it is solved for, or meets a
+        if closes and sticks(path := itinerary(osc, loop)):
+            return Found(path, loop)
+        # Where the cycle has other loops than those from which it is solved for, or meets a
         # boundary, it is followed.
-        ways = (lambda: polish(osc, cut([turn])[0], ok), lambda: find_cycle(osc, turn.entries[0]))
+        ways = (lambda: polish(osc, cut([loop])[0], ok), lambda: find_cycle(osc, loop.entries[0]))
         for cycle in (way() for way in ways[0 if closes else 1 :]):
             if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
                 # Not the equilibrium, to which a cycle may shrink.
                 if np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST:
-                    turn = jax.tree.map(np.asarray, as_turn(cycle, ROOM))
-                    return Found(itinerary(osc, turn), turn)
+                    loop = jax.tree.map(np.asarray, as_loop(cycle, ROOM))
+                    return Found(itinerary(osc, loop), loop)
         return None
 
     def _share(self) -> None:
@@ -419,18 +419,18 @@ class Path:
 
         It is looked for where that is expected to be, by its derivative.
         """
-        path, turn = self.cycles[known][number]
+        path, loop = self.cycles[known][number]
         step = value - known
-        nearby = self._settled(known + DIFFERENCE * step, turn)
-        expected = turn
-        if nearby is not None and nearby.path == path and _fits(nearby.turn, turn):
-            parts = ((t.entries, t.durations) for t in (turn, nearby.turn))
+        nearby = self._settled(known + DIFFERENCE * step, loop)
+        expected = loop
+        if nearby is not None and nearby.path == path and _fits(nearby.loop, loop):
+            parts = ((t.entries, t.durations) for t in (loop, nearby.loop))
             moved = [a + (b - a) / DIFFERENCE for a, b in zip(*parts, strict=True)]
-            expected = eqx.tree_at(lambda t: (t.entries, t.durations), turn, tuple(moved))
+            expected = eqx.tree_at(lambda t: (t.entries, t.durations), loop, tuple(moved))
         found = self._settled(value, expected)
         if found is None or found.path != path:
             return None
-        places = [place_of(one) for one in (turn, expected, found.turn)]
+        places = [place_of(one) for one in (loop, expected, found.loop)]
         if apart(places[1], places[2]) > EXPECTED * (1 + 300 * apart(places[0], places[1])):
             return None
         at = _number(found, self.cycles[value])
@@ -442,27 +442,27 @@ class Path:
             self._name(value, self.labels[value].equilibria)
         return at
 
-    def followed(self, values: Sequence[float]) -> list[dict[float, Turn]]:
+    def followed(self, values: Sequence[float]) -> list[dict[float, Loop]]:
         """The attracting cycles at these values, in order, in which nothing else happens.
 
-        Of each that goes on from value to value its turns, by the value.
+        Of each that goes on from value to value its loops, by the value.
         """
-        strands: list[dict[float, Turn]] = []
-        sticking: dict[Itinerary, dict[float, Turn]] = {}
+        strands: list[dict[float, Loop]] = []
+        sticking: dict[Itinerary, dict[float, Loop]] = {}
         before, smooth = None, {}
         for value in sorted(v for v in self.labels if values[0] <= v <= values[-1]):
             here = {}
             for number, one in enumerate(self.cycles[value]):
                 origin = self._origin(before, value, number)
                 known = sticking.get(one.path) if sticks(one.path) else smooth.get(origin)
-                strand: dict[float, Turn] = {} if known is None else known
+                strand: dict[float, Loop] = {} if known is None else known
                 if known is None:
                     strands.append(strand)
                 here[number] = strand
                 if sticks(one.path):
                     sticking[one.path] = strand
                 if value in values:
-                    strand[value] = one.turn
+                    strand[value] = one.loop
             before, smooth = value, here
         return [strand for strand in strands if strand]
 
@@ -483,24 +483,24 @@ def _number(cycle: Found, among: Sequence[Found]) -> int | None:
     """The number of a cycle among others, or None."""
     for number, other in enumerate(among):
         if other.path == cycle.path:
-            if sticks(cycle.path) or apart(place_of(cycle.turn), place_of(other.turn)) < SOLVED:
+            if sticks(cycle.path) or apart(place_of(cycle.loop), place_of(other.loop)) < SOLVED:
                 return number
     return None
 
 
-def _fits(turn: Turn, other: Turn) -> bool:
-    """Whether two turns have the same arcs in the same order."""
-    return np.array_equal(turn.codes, other.codes) and np.array_equal(turn.ends, other.ends)
+def _fits(loop: Loop, other: Loop) -> bool:
+    """Whether two loops have the same arcs in the same order."""
+    return np.array_equal(loop.codes, other.codes) and np.array_equal(loop.ends, other.ends)
 
 
 class _Seen(NamedTuple):
-    """Equilibria, [rows], and of every orbit its status and last turn, [starts, ROOM]."""
+    """Equilibria, [rows], and of every orbit its status and last loop, [starts, ROOM]."""
 
     kind: Any
     stable: Any
     modes: Any
     status: Any
-    turn: Any
+    loop: Any
 
 
 @jit
@@ -510,8 +510,8 @@ def _look(osc: Oscillator, index: Array, values: Array) -> _Seen:
 
 def _look_at(osc: Oscillator) -> _Seen:
     rests = equilibria(osc)
-    turn, status = settled_turns(osc, rests, ROOM)
-    return _Seen(rests.kind, rests.stable, rests.modes, status, turn)
+    loop, status = settled_loops(osc, rests, ROOM)
+    return _Seen(rests.kind, rests.stable, rests.modes, status, loop)
 
 
 # --- what makes the difference between two values -------------------------------------------------
@@ -538,22 +538,22 @@ def _explained(path: Path, a: float, b: float, conditions) -> BifurcationPoint |
             # Beyond a fold orbits pass the place of the cycles slowly, as if they were there.
             low, high = path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]
         for value in (a, b):
-            for turn in _turns(path, value, condition):
-                point = refined(path.osc, path.index, value, condition, turn)
+            for loop in _loops(path, value, condition):
+                point = refined(path.osc, path.index, value, condition, loop)
                 if point is not None and low <= point.value <= high:
                     return point
     return None
 
 
-def _turns(path: Path, value: float, condition: AbstractCondition) -> Sequence[Turn | None]:
+def _loops(path: Path, value: float, condition: AbstractCondition) -> Sequence[Loop | None]:
     """Those of the attracting cycles there, for what needs one; None for what finds its own."""
     cycles, solve = path.cycles[value], solver_of(condition)
-    turns = [one.turn for one in cycles if not sticks(one.path) or solve is not at_fold_of_cycles]
+    loops = [one.loop for one in cycles if not sticks(one.path) or solve is not at_fold_of_cycles]
     if solve is at_tangency:
-        return [None, *turns]
+        return [None, *loops]
     if solve is at_fold_of_cycles:
-        return [*turns, None]
-    return turns if solve in (at_edge, at_exchange, at_crossing) else [None]
+        return [*loops, None]
+    return loops if solve in (at_edge, at_exchange, at_crossing) else [None]
 
 
 def _local_conditions(path: Path, before: Label, after: Label) -> list[AbstractCondition]:
@@ -573,7 +573,7 @@ def _edge_conditions(path: Path, before: Label, after: Label) -> list[AbstractCo
         kinds = (BoundaryEquilibrium, PseudoHopf)
         conditions += [kind(belt) for kind in kinds for belt in path.edged]
     if before.cycles != after.cycles:
-        # Whether an end of an arc on an edge is a turn or a corner is seen when it is found.
+        # Whether an end of an arc on an edge is a loop or a corner is seen when it is found.
         conditions += [GrazingEdge(belt) for belt in path.edged]
     return conditions
 
@@ -616,30 +616,30 @@ def refined(
     index: Array,
     value: float,
     condition: AbstractCondition,
-    turn: Turn | None = None,
+    loop: Loop | None = None,
 ) -> BifurcationPoint | None:
     """The point that is found from that value of the parameter, or None.
 
     A tangency, or an end of an arc on an edge, of whichever kind it is looked for, is returned as
-    what it is. turn: of the cycle that may touch an edge or fold, where it is known, with ROOM
+    what it is. loop: of the cycle that may touch an edge or fold, where it is known, with ROOM
     arcs.
     """
     p, belts, either = (jnp.asarray(np.array(x)) for x in ([value], _belts(condition), 0.0))
     at, known = vary(osc, index, p), jnp.asarray(Status.OK.value)
-    if turn is None:
+    if loop is None:
         solve = solver_of(condition)
         point = solve(at, index, belts, either, room_for(solve))
     elif isinstance(condition, FoldOfCycles):
-        point = fold_near(at, index, cut([turn])[0], known)
+        point = fold_near(at, index, cut([loop])[0], known)
     elif isinstance(condition, NonsmoothFold | GrazingSliding):
-        point = tangency_near(at, index, belts, cut([turn], more=1)[0], known)
+        point = tangency_near(at, index, belts, cut([loop], more=1)[0], known)
     elif isinstance(condition, SlidingExchange):
-        point = exchange_near(at, index, belts, cut([turn])[0], known)
+        point = exchange_near(at, index, belts, cut([loop])[0], known)
     elif isinstance(condition, CrossingSliding):
-        point = crossing_near(at, index, belts, cut([turn])[0], known)
+        point = crossing_near(at, index, belts, cut([loop])[0], known)
     else:
         repels = solver_of(condition) is at_edge_unstable
-        point = edge_contact(at, index, belts, either, turn, known, repels=repels)
+        point = edge_contact(at, index, belts, either, loop, known, repels=repels)
     if int(point.status) != Status.OK:
         return None
     return replace(point, condition=_kind_found(condition, point))
@@ -650,9 +650,9 @@ def _kind_found(condition: AbstractCondition, point: BifurcationPoint) -> Abstra
         return (NonsmoothFold if point.multiplier > 1 else GrazingSliding)(condition.belt)
     if isinstance(condition, GrazingEdge | CornerCollision) and solver_of(condition) is at_edge:
         chain, z = point.cycle.chain, point.cycle.unknowns
-        turn = Turn(chain.codes, chain.ends, z[:, :2], z[:, 2])
+        loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
         belt, either = jnp.asarray(condition.belt), jnp.zeros(())
-        near = end_near_edge(point.oscillator, turn, belt, either)
+        near = end_near_edge(point.oscillator, loop, belt, either)
         return (GrazingEdge if near.grazes else CornerCollision)(condition.belt)
     return condition
 

@@ -8,7 +8,7 @@ from r = 0. The cycle is lost too early, by about (m - 1) v_star over the speed 
 opens, m the multiplier of the cycle that it meets.
 
 How it is lost: the later the orbit enters the band, the less time is left for r to decay, the
-later it enters in the next turn. So the cycle that sticks meets another one that does, a smooth
+later it enters in the next loop. So the cycle that sticks meets another one that does, a smooth
 fold. With the unknowns (g, tau, T) of such a cycle, g how far before the point of x2' = 0 it
 enters, T the duration of slip, there are three equations: slip onset at the end of the band, and
 the orbit from there comes back to the entry (x1, x2). At the fold their Jacobian is singular; that

@@ -1,6 +1,6 @@
 """When two motions are one attractor: `itinerary`, `place_of` and `is_same`.
 
-An attractor is where it is. What a cycle does in one turn does not tell: there may be two cycles
+An attractor is where it is. What a cycle does in one loop does not tell: there may be two cycles
 with one sequence of events. Two things tell.
 
 - Its itinerary: the modes that it passes, whole ones, with the contact of every belt in each. So
@@ -19,13 +19,13 @@ import numpy as np
 
 from ..model.modes import ABOVE
 from ..model.oscillator import Oscillator
-from ..results import EventKind, Status, of_one_turn
-from .cycle import Chain, Cycle, Ends, Turn, event_between, find_cycle, modes_of
+from ..results import EventKind, Status, of_one_loop
+from .cycle import Chain, Cycle, Ends, Loop, event_between, find_cycle, modes_of
 
 if TYPE_CHECKING:
     import xarray
 
-#: The modes of one turn, contact codes of all belts each, from the least of their orders on.
+#: The modes of one loop, contact codes of all belts each, from the least of their orders on.
 Itinerary = tuple[tuple[int, ...], ...]
 #: Places of one cycle that shooting solved for differ by less, relative to its size: its equations
 #: hold to 1e-9, and beside a fold a cycle moves by ten thousand times that.
@@ -36,15 +36,15 @@ RUN = 1e3
 FAR = 1e-2
 
 
-def itinerary(osc: Oscillator, turn: Chain | Turn) -> Itinerary:
-    """The modes of one turn in order, wherever it was begun."""
-    modes = without_idle(osc, modes_of(turn))
+def itinerary(osc: Oscillator, loop: Chain | Loop) -> Itinerary:
+    """The modes of one loop in order, wherever it was begun."""
+    modes = without_idle(osc, modes_of(loop))
     changes = [
         tuple(mode.tolist())
         for before, mode in zip(np.roll(modes, 1, axis=0), modes, strict=True)
         if np.any(mode != before)
     ]
-    return of_one_turn(changes or [tuple(modes[0].tolist())])
+    return of_one_loop(changes or [tuple(modes[0].tolist())])
 
 
 def without_idle(osc: Oscillator, modes: np.ndarray) -> np.ndarray:
@@ -54,7 +54,7 @@ def without_idle(osc: Oscillator, modes: np.ndarray) -> np.ndarray:
 
 
 def events_of(path: Itinerary) -> tuple[tuple[EventKind, int], ...]:
-    """The events of one turn, (kind, belt) each."""
+    """The events of one loop, (kind, belt) each."""
     if len(path) == 1:
         return ()
     return tuple(event_between(*pair) for pair in zip(path, path[1:] + path[:1], strict=True))
@@ -70,13 +70,13 @@ def stuck_belts(path: Itinerary) -> frozenset[int]:
     return frozenset(belt for mode in path for belt, code in enumerate(mode) if code == 0)
 
 
-def place_of(cycle: Cycle | Turn) -> np.ndarray:
+def place_of(cycle: Cycle | Loop) -> np.ndarray:
     """Where a cycle is: smallest and largest x1, smallest and largest x2, period."""
     if isinstance(cycle, Cycle):
-        turn, rows = cycle.chain, np.asarray(cycle.unknowns)
+        loop, rows = cycle.chain, np.asarray(cycle.unknowns)
     else:
-        turn, rows = cycle, np.column_stack([cycle.entries, cycle.durations])
-    used = np.asarray(turn.ends) != Ends(turn.codes.shape[-1]).unused
+        loop, rows = cycle, np.column_stack([cycle.entries, cycle.durations])
+    used = np.asarray(loop.ends) != Ends(loop.codes.shape[-1]).unused
     return extent(rows[used])
 
 
@@ -121,7 +121,7 @@ def lead_to_one_cycle(osc: Oscillator, start: Sequence[float], other: Sequence[f
 
 @dataclass(frozen=True)
 class Runs:
-    """Where the attractors of the runs of a sweep are, and what happens in a turn.
+    """Where the attractors of the runs of a sweep are, and what happens in a loop.
 
     places: as `place_of`, [.., 5], the period of what is at rest 0; signatures: names, [..]; error:
     as far may places of one cycle be apart, relative to its size.

@@ -3,7 +3,7 @@
 A cycle is a closed chain of arcs, and its signature, (the mode, what ends it) arc by arc, is all
 that has to be known to compute it: the numbers then follow from a square system of equations
 without any event detection (fixed-signature multiple shooting). An arc ends at a boundary r_k = 0,
-at a contact edge, at slip onset, or at a turn, x2' = 0 or x2 = 0. The turns make x1 and x2 monotone
+at a contact edge, at slip onset, or at a loop, x2' = 0 or x2 = 0. The loops make x1 and x2 monotone
 on every arc, so all extrema of a cycle are ends of arcs. Counted for N arcs:
 
     3N unknowns    entry state (x1, x2) and duration T of every arc
@@ -17,7 +17,7 @@ once, each step smooth in everything. Derivatives of a solution come from the im
 theorem and work in forward and reverse mode and under `jax.vmap`.
 
 The signature comes from following the orbit, with the same steps and with the transition rules of
-`modes`, until a turn repeats.
+`modes`, until a loop repeats.
 """
 
 import functools
@@ -65,13 +65,13 @@ from ..results import EventKind, Status, describe
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
-#: Integration steps per slip arc (an arc is about a quarter of a turn at most).
+#: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 STEPS = 8
 #: The same where those leave a larger error than EXACT, as halved steps tell it.
 FINE_STEPS, EXACT = 32, 1e-11
 #: Arcs that an orbit is followed for before it is given up.
 BUDGET = 1024
-#: A turn that repeats to this fraction of the amplitude has repeated; Newton does the rest.
+#: A loop that repeats to this fraction of the amplitude has repeated; Newton does the rest.
 REPEATED = 1e-7
 #: Amplitudes below this one are an equilibrium, up to what can be told.
 AT_REST = 1e-5
@@ -147,8 +147,8 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
 class Chain(eqx.Module):
     """A signature: contact codes [arcs, belts], what ends each arc [arcs], and the step fractions.
 
-    ends: i < n the boundary of belt i; n <= i < 3n the edge i - n of `modes.edges`; then the turn
-    x2' = 0, the turn x2 = 0, slip onset, an unused arc, of duration zero, and from there on a
+    ends: i < n the boundary of belt i; n <= i < 3n the edge i - n of `modes.edges`; then the loop
+    x2' = 0, the loop x2 = 0, slip onset, an unused arc, of duration zero, and from there on a
     tangency to the boundary of belt i (see `_arc_equations`).
     """
 
@@ -170,7 +170,9 @@ class Ends:
     """Numbers for what ends an arc, for n belts."""
 
     def __init__(self, n: int):
-        self.turn_x2, self.turn_x1, self.onset, self.unused, self.tangent = range(3 * n, 3 * n + 5)
+        self.extremum_x2, self.extremum_x1, self.onset, self.unused, self.tangent = range(
+            3 * n, 3 * n + 5
+        )
 
 
 def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, extra=None):
@@ -423,7 +425,7 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
     a_sign, v_sign = _after(osc, codes, y)
     field = functools.partial(_field, osc, codes)
 
-    # Others are moved away from until the next turn.
+    # Others are moved away from until the next loop.
     nears_edge = jnp.where(
         v_sign > 0, jnp.stack(bounds_rightward(mode)), jnp.stack(bounds_leftward(mode))
     )
@@ -432,8 +434,8 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
     def guards(y):
         a = mode_acceleration(osc, mode, y[0], y[1])
         values = jnp.stack([*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])])
-        turns = jnp.stack([a_sign * a, v_sign * y[1]])
-        return jnp.append(jnp.where(nears, values, jnp.inf), turns)
+        loops = jnp.stack([a_sign * a, v_sign * y[1]])
+        return jnp.append(jnp.where(nears, values, jnp.inf), loops)
 
     def inside(state):
         _, _, _, y_end, steps = state
@@ -458,7 +460,7 @@ def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
         guards_at(y0),
         h,
         (jnp.where(mode.any_stuck, jnp.inf, values), slopes),
-        turns=2,
+        extrema=2,
     )
     # Newton's method adds the last digits, but at a tangency.
     values, slopes = guards_at(_step(field, y0, h_root, _MEDIUM))
@@ -492,7 +494,7 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     code = jnp.stack([jnp.asarray(c, dtype=y.dtype) for c in new.codes])
     duration = jnp.where(stuck, phase.duration, t_slip)
 
-    # Whatever ends the arc: at the boundary of a belt at rest it is not the guard of turns.
+    # Whatever ends the arc: at the boundary of a belt at rest it is not the guard of loops.
     falls = ~new.any_stuck & (_after(osc, code, y_end)[1] < 0)
     is_top = ~stuck & (_after(osc, codes, y)[1] > 0) & falls
     top = jnp.where(is_top, y_end[0], jnp.nan)
@@ -545,7 +547,7 @@ def _follow_from(osc: Oscillator, start: Orbit) -> Orbit:
 
 
 def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
-    """The orbit from y0 until a turn repeats, it comes to rest, or the budget is used up."""
+    """The orbit from y0 until a loop repeats, it comes to rest, or the budget is used up."""
     osc, y0 = lax.stop_gradient((osc, y0))
     n = len(osc.belts)
     mode = mode_of_state(osc, y0[0], y0[1])
@@ -573,11 +575,11 @@ def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
     return eqx.tree_at(lambda orbit: orbit.status, orbit, status)
 
 
-def last_turn(orbit: Orbit) -> tuple[Array, Array]:
-    """(first row, number of rows) of the turn that repeats; it begins at the end of a stick phase.
+def last_loop(orbit: Orbit) -> tuple[Array, Array]:
+    """(first row, number of rows) of the loop that repeats; it begins at the end of a stick phase.
 
     That of the longest one, if there are several; if there is none, at the top. Rows are to be
-    taken modulo the number, see `turn_of`.
+    taken modulo the number, see `loop_of`.
     """
     rows = jnp.arange(orbit.durations.size)
     size = orbit.count - 1 - orbit.repeats
@@ -588,8 +590,8 @@ def last_turn(orbit: Orbit) -> tuple[Array, Array]:
     return shift, size
 
 
-class Turn(eqx.Module):
-    """One turn of an orbit, arc by arc, padded: a signature, and a guess of the unknowns."""
+class Loop(eqx.Module):
+    """One loop of an orbit, arc by arc, padded: a signature, and a guess of the unknowns."""
 
     codes: Array
     ends: Array
@@ -607,24 +609,24 @@ class Turn(eqx.Module):
         return jnp.where(last[:, None], self.entries[0], jnp.roll(self.entries, -1, axis=0))
 
 
-def turn_of(orbit: Orbit, size: int, n: int) -> Turn:
-    """The turn that repeats, padded to `size` arcs, of an oscillator with n belts."""
-    shift, count = last_turn(orbit)
+def loop_of(orbit: Orbit, size: int, n: int) -> Loop:
+    """The loop that repeats, padded to `size` arcs, of an oscillator with n belts."""
+    shift, count = last_loop(orbit)
     rows = jnp.arange(size)
     used = rows < count
     source = orbit.repeats + 1 + jnp.where(used, shift + rows, shift) % jnp.maximum(count, 1)
     ends = jnp.where(used, orbit.ends[source], Ends(n).unused)
     durations = jnp.where(used, orbit.durations[source], 0.0)
-    return Turn(orbit.codes[source], ends, orbit.entries[source], durations)
+    return Loop(orbit.codes[source], ends, orbit.entries[source], durations)
 
 
-def meshed(osc: Oscillator, turn: Turn, steps: int = STEPS) -> tuple[Chain, Array]:
-    """The chain of a turn with its mesh, and the guess of its unknowns."""
-    stuck = jnp.any(turn.codes == 0, axis=-1)
-    slip = jnp.where(stuck, 0.0, turn.durations)
-    mesh = jax.vmap(functools.partial(_mesh, osc, steps))(turn.codes, turn.entries, slip)
-    z = jnp.concatenate([turn.entries, turn.durations[:, None]], axis=1)
-    return lax.stop_gradient((Chain(turn.codes, turn.ends, mesh), z))
+def meshed(osc: Oscillator, loop: Loop, steps: int = STEPS) -> tuple[Chain, Array]:
+    """The chain of a loop with its mesh, and the guess of its unknowns."""
+    stuck = jnp.any(loop.codes == 0, axis=-1)
+    slip = jnp.where(stuck, 0.0, loop.durations)
+    mesh = jax.vmap(functools.partial(_mesh, osc, steps))(loop.codes, loop.entries, slip)
+    z = jnp.concatenate([loop.entries, loop.durations[:, None]], axis=1)
+    return lax.stop_gradient((Chain(loop.codes, loop.ends, mesh), z))
 
 
 # --- the cycle ------------------------------------------------------------------------------------
@@ -640,8 +642,8 @@ class Cycle(eqx.Module):
     equations. iterations: Newton steps. status: a
     `Status` code; where it is not OK every number is NaN.
 
-    `period`; `stick_durations`, [belts], summed over the phases of one turn; `x1_min`, `x1_max`,
-    `x2_min`, `x2_max`; `stable`; `signature`, ((kind, belt), ...) of the events of one turn;
+    `period`; `stick_durations`, [belts], summed over the phases of one loop; `x1_min`, `x1_max`,
+    `x2_min`, `x2_max`; `stable`; `signature`, ((kind, belt), ...) of the events of one loop;
     `arcs`, as of a trajectory; `sample(n)`. A cycle that sticks begins at the end of its longest
     stick phase, any other at its largest x1.
     """
@@ -701,14 +703,14 @@ class Cycle(eqx.Module):
 
     @property
     def signature(self) -> tuple[tuple[EventKind, int], ...]:
-        """The events of one turn, (kind, belt) each; outside of transformations only."""
+        """The events of one loop, (kind, belt) each; outside of transformations only."""
         require(
             is_concrete(self.chain) and self.chain.ends.ndim == 1,
             "signature",
             "asked of one cycle outside of transformations",
             "a traced or batched cycle",
         )
-        return turn_events(self.chain) if int(self.status) == Status.OK else ()
+        return loop_events(self.chain) if int(self.status) == Status.OK else ()
 
     def sample(self, n: int) -> Array:
         """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
@@ -728,18 +730,18 @@ class Cycle(eqx.Module):
         )
 
 
-def as_turn(cycle: Cycle, size: int) -> Turn:
-    """The turn that a cycle is, padded to `size` arcs."""
+def as_loop(cycle: Cycle, size: int) -> Loop:
+    """The loop that a cycle is, padded to `size` arcs."""
     chain, z = cycle.chain, cycle.unknowns
     own = np.arange(size) < len(z)
     source = np.where(own, np.arange(size), 0)
     ends = jnp.where(own, chain.ends[source], Ends(chain.codes.shape[-1]).unused)
-    return Turn(chain.codes[source], ends, z[source, :2], jnp.where(own, z[source, 2], 0.0))
+    return Loop(chain.codes[source], ends, z[source, :2], jnp.where(own, z[source, 2], 0.0))
 
 
-def modes_of(turn: Chain | Turn) -> np.ndarray:
-    """The contact codes of the arcs of one turn, [arcs, belts], without those that are unused."""
-    codes, ends = np.asarray(turn.codes), np.asarray(turn.ends)
+def modes_of(loop: Chain | Loop) -> np.ndarray:
+    """The contact codes of the arcs of one loop, [arcs, belts], without those that are unused."""
+    codes, ends = np.asarray(loop.codes), np.asarray(loop.ends)
     return codes[ends != Ends(codes.shape[-1]).unused].astype(int)
 
 
@@ -759,9 +761,9 @@ def event_between(before: Sequence[int], after: Sequence[int]) -> tuple[EventKin
     return kind, changes[kind].index(True)
 
 
-def turn_events(turn: Chain | Turn) -> tuple[tuple[EventKind, int], ...]:
-    """The events of one turn, (kind, belt) each; for EDGE the lowest belt that comes or goes."""
-    modes = modes_of(turn).tolist()
+def loop_events(loop: Chain | Loop) -> tuple[tuple[EventKind, int], ...]:
+    """The events of one loop, (kind, belt) each; for EDGE the lowest belt that comes or goes."""
+    modes = modes_of(loop).tolist()
     pairs = zip(modes, modes[1:] + modes[:1], strict=True)
     return tuple(event_between(before, after) for before, after in pairs if before != after)
 
@@ -859,7 +861,7 @@ def _factors_and_slopes(osc, along: Oscillator, chain: Chain, following, z: Arra
     return lax.map(one, (chain.codes, chain.ends, chain.mesh, following, z, entries))
 
 
-def following_codes(chain: Chain | Turn) -> Array:
+def following_codes(chain: Chain | Loop) -> Array:
     """Contact codes of the arc after each; after the last used one comes the first."""
     following = jnp.roll(chain.codes, -1, axis=0)
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
@@ -929,27 +931,27 @@ def _first_failure(status: Array, fine: Array, code: Status) -> Array:
 
 
 @jit
-def _turn_reached(osc: Oscillator, y0: Array, size: int) -> tuple[Turn, Array, Array]:
-    """The turn that the start leads to, in `size` arcs; how many it has, and a status."""
+def _loop_reached(osc: Oscillator, y0: Array, size: int) -> tuple[Loop, Array, Array]:
+    """The loop that the start leads to, in `size` arcs; how many it has, and a status."""
     orbit = follow(osc, y0, BUDGET)
     # Where there is no cycle the first arc still gives finite numbers to calculate with.
-    turn = orbit.repeats, orbit.count
-    turn = select(orbit.status == Status.OK, turn, (jnp.asarray(-1), jnp.asarray(1)))
-    orbit = eqx.tree_at(lambda orbit: (orbit.repeats, orbit.count), orbit, turn)
-    _, count = last_turn(orbit)
-    return turn_of(orbit, size, len(osc.belts)), count, _if_it_fits(orbit.status, count, size)
+    loop = orbit.repeats, orbit.count
+    loop = select(orbit.status == Status.OK, loop, (jnp.asarray(-1), jnp.asarray(1)))
+    orbit = eqx.tree_at(lambda orbit: (orbit.repeats, orbit.count), orbit, loop)
+    _, count = last_loop(orbit)
+    return loop_of(orbit, size, len(osc.belts)), count, _if_it_fits(orbit.status, count, size)
 
 
 def _if_it_fits(status: Array, count: Array, size: int) -> Array:
     return _first_failure(status, count <= size, Status.TOO_MANY_ARCS)
 
 
-def exactly(osc: Oscillator, turn: Turn, status: Array) -> Cycle:
-    """The cycle that a turn nearly is; where it is known, with as many steps as it takes."""
-    cycle = polish(osc, turn, status)
+def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
+    """The cycle that a loop nearly is; where it is known, with as many steps as it takes."""
+    cycle = polish(osc, loop, status)
     if is_concrete(cycle) and int(status) == Status.OK:
         inexact = int(cycle.status) == Status.NO_CONVERGENCE or integration_error(cycle) > EXACT
-        cycle = polish(osc, turn, status, steps=FINE_STEPS) if inexact else cycle
+        cycle = polish(osc, loop, status, steps=FINE_STEPS) if inexact else cycle
     return cycle
 
 
@@ -960,9 +962,9 @@ def integration_error(cycle: Cycle) -> Array:
 
 
 @jit
-def polish(osc: Oscillator, turn: Turn, status: Array, steps: int = STEPS) -> Cycle:
-    """The cycle that a turn nearly is, by Newton's method; one program for all that need it."""
-    chain, guess = meshed(lax.stop_gradient(osc), turn, steps)
+def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = STEPS) -> Cycle:
+    """The cycle that a loop nearly is, by Newton's method; one program for all that need it."""
+    chain, guess = meshed(lax.stop_gradient(osc), loop, steps)
     z, iterations = _solve(osc, chain, guess)
     return cycle_of(osc, chain, z, iterations, status)[0]
 
@@ -972,21 +974,21 @@ def room_of(arcs: int) -> int:
     return next(size for size in SIZES if size >= arcs)
 
 
-def cut(turns: Sequence[Turn], *, more: int = 0) -> list[Turn]:
-    """The turns, known ones, with no more room than the longest of them needs, and some more."""
-    unused = Ends(turns[0].codes.shape[-1]).unused
-    longest = max(int(np.sum(np.asarray(turn.ends) != unused)) for turn in turns)
+def cut(loops: Sequence[Loop], *, more: int = 0) -> list[Loop]:
+    """The loops, known ones, with no more room than the longest of them needs, and some more."""
+    unused = Ends(loops[0].codes.shape[-1]).unused
+    longest = max(int(np.sum(np.asarray(loop.ends) != unused)) for loop in loops)
     room = slice(room_of(min(longest + more, SIZES[-1])))
-    return [jax.tree.map(lambda leaf: leaf[room], turn) for turn in turns]
+    return [jax.tree.map(lambda leaf: leaf[room], loop) for loop in loops]
 
 
 def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Cycle:
     """The steady cycle that the start y0 leads to.
 
-    osc: `Oscillator`; y0: start (x1, x2), shape [2]. max_arcs: room for the arcs of one turn, where
+    osc: `Oscillator`; y0: start (x1, x2), shape [2]. max_arcs: room for the arcs of one loop, where
     under a transformation 16 are not enough.
 
-    The orbit is followed until a turn repeats; then all arcs are polished together by Newton's
+    The orbit is followed until a loop repeats; then all arcs are polished together by Newton's
     method. Differentiable with respect to the parameters (the derivative with respect to y0 is
     zero: a cycle does not depend on where it was approached from), forward and reverse, and under
     `jax.vmap`. Where the start leads to an equilibrium, or nothing repeats, the status says so.
@@ -995,13 +997,13 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     check_oscillator(osc)
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
-    turn, count, status = _turn_reached(osc, y0, max_arcs or SIZES[-1])
+    loop, count, status = _loop_reached(osc, y0, max_arcs or SIZES[-1])
     if max_arcs is None and is_concrete(count):
         needed = int(count) if int(status) == Status.OK else 0
-        turn = pick(turn, slice(room_of(needed)))
+        loop = pick(loop, slice(room_of(needed)))
     elif max_arcs is None:
-        turn, status = pick(turn, slice(SIZES[0])), _if_it_fits(status, count, SIZES[0])
-    return exactly(osc, turn, status)
+        loop, status = pick(loop, slice(SIZES[0])), _if_it_fits(status, count, SIZES[0])
+    return exactly(osc, loop, status)
 
 
 # --- the unstable cycle ---------------------------------------------------------------------------
@@ -1019,21 +1021,21 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
     like any `Cycle`. Where there is none, or none of this sort, the status is NO_UNSTABLE_CYCLE.
     `ValueError` names an impossible argument.
 
-    Starts to the right of the equilibrium at different distances are followed for one turn. The
+    Starts to the right of the equilibrium at different distances are followed for one loop. The
     first one that does not come nearer, or that touches a boundary, lies outside of the cycle;
     between it and its neighbour the search is repeated, and Newton's method does the rest.
     """
     check_oscillator(osc)
     whole = isinstance(around, int) and around >= 0
     require(whole, "around", "the number of an equilibrium, 0 or more", repr(around))
-    turn, status, distance = separating_turn(osc, max_arcs or SIZES[0], around)
-    return _if_meant(exactly(osc, turn, status), turn, distance)
+    loop, status, distance = separating_loop(osc, max_arcs or SIZES[0], around)
+    return _if_meant(exactly(osc, loop, status), loop, distance)
 
 
-def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
+def first_loop(osc: Oscillator, x1: Array, distance: Array, size: int):
     """The orbit from (x1 + distance, 0) to its first maximum of x1, within `size` arcs.
 
-    Returns it as if that turn repeated, whether it meets a boundary, and x1 there (NaN: none).
+    Returns it as if that loop repeated, whether it meets a boundary, and x1 there (NaN: none).
     """
     orbit = follow(osc, jnp.stack([x1 + distance, jnp.zeros(())]), size)
     is_top = ~jnp.isnan(orbit.tops)
@@ -1044,28 +1046,28 @@ def first_turn(osc: Oscillator, x1: Array, distance: Array, size: int):
     return eqx.tree_at(lambda o: (o.repeats, o.count), orbit, closed), meets, top
 
 
-def separating_turn(osc: Oscillator, size: int, around: int = 0) -> tuple[Turn, Array, Array]:
-    """A turn near the unstable cycle, a status, and how far from the equilibrium it begins."""
-    return _separating_turn(osc, candidates(osc), jnp.asarray(np.array(around)), size)
+def separating_loop(osc: Oscillator, size: int, around: int = 0) -> tuple[Loop, Array, Array]:
+    """A loop near the unstable cycle, a status, and how far from the equilibrium it begins."""
+    return _separating_loop(osc, candidates(osc), jnp.asarray(np.array(around)), size)
 
 
 @jit
-def _separating_turn(osc: Oscillator, rests: Equilibria, around: Array, size: int):
+def _separating_loop(osc: Oscillator, rests: Equilibria, around: Array, size: int):
     still, rests = lax.stop_gradient((osc, rests))
     eligible = rests.stable & (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
     meant = eligible & (jnp.cumsum(eligible) - 1 == around)
     exists = jnp.any(meant)
     x1 = jnp.where(exists, rests.x1[jnp.argmax(meant)], 0.0)
 
-    def turn(distance):
-        orbit, touches, top = first_turn(still, x1, distance, size)
+    def loop(distance):
+        orbit, touches, top = first_loop(still, x1, distance, size)
         rests = (orbit.status == Status.PSEUDO_FOCUS) | (orbit.status == Status.EQUILIBRIUM)
         inside = ~touches & jnp.where(jnp.isnan(top), rests, top - x1 < distance)
         return orbit, inside
 
     def narrow(bracket, _):
         distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
-        orbits, inside = each(turn)(distances)
+        orbits, inside = each(loop)(distances)
         first = jnp.argmin(inside)
         bounded = ~inside[-1] & (first > 0)
         low, high = distances[jnp.maximum(first - 1, 0)], distances[first]
@@ -1076,14 +1078,14 @@ def _separating_turn(osc: Oscillator, rests: Equilibria, around: Array, size: in
     bracket, (found, orbits) = lax.scan(narrow, jnp.array([1e-4, 10.0]), None, length=REFINEMENTS)
     orbit = jax.tree.map(lambda leaf: leaf[-1], orbits)
     status = jnp.where(exists & found[0], Status.OK.value, Status.NO_UNSTABLE_CYCLE.value)
-    return turn_of(orbit, size, len(osc.belts)), status, bracket[0]
+    return loop_of(orbit, size, len(osc.belts)), status, bracket[0]
 
 
 @jit
-def _if_meant(cycle: Cycle, turn: Turn, distance: Array) -> Cycle:
-    """The cycle, if it repels and begins near the turn; one found elsewhere by Newton's method, or
+def _if_meant(cycle: Cycle, loop: Loop, distance: Array) -> Cycle:
+    """The cycle, if it repels and begins near the loop; one found elsewhere by Newton's method, or
     that has shrunk to the equilibrium, is not the one meant."""
-    near = jnp.abs(cycle.unknowns[0, 0] - turn.entries[0, 0]) < 0.1 * distance
+    near = jnp.abs(cycle.unknowns[0, 0] - loop.entries[0, 0]) < 0.1 * distance
     same = near & (cycle.multiplier > 1)
     missing = (cycle.status == Status.OK) & ~same | (cycle.status == Status.NOT_ADMISSIBLE)
     missing = missing | (cycle.status == Status.NO_CONVERGENCE)

@@ -19,12 +19,12 @@ _COORDINATES = {"x1": 0, "x2": 1}
 
 
 def period(cycle: Cycle) -> Array:
-    """Duration of one turn."""
+    """Duration of one loop."""
     return cycle.period
 
 
 def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
-    """Time per turn for which the mass sticks to a belt, summed over its stick phases.
+    """Time per loop for which the mass sticks to a belt, summed over its stick phases.
 
     belt: index of the belt; None: any belt. `ValueError` if there is no such belt.
     """
@@ -34,7 +34,7 @@ def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
 
 
 def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
-    """Time per turn for which the mass touches a belt and slips on it.
+    """Time per loop for which the mass touches a belt and slips on it.
 
     belt: index of the belt; None: time for which the mass sticks to no belt. `ValueError` if there
     is no such belt.
@@ -46,7 +46,7 @@ def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
 
 
 def stick_fraction(cycle: Cycle, belt: int | None = None) -> Array:
-    """Fraction of a turn for which the mass sticks to a belt (None: to any), from 0 to 1."""
+    """Fraction of a loop for which the mass sticks to a belt (None: to any), from 0 to 1."""
     return stick_duration(cycle, belt) / cycle.period
 
 
@@ -57,7 +57,7 @@ def amplitude(cycle: Cycle, coordinate: str = "x1") -> Array:
 
 
 def peak(cycle: Cycle, coordinate: str = "x1") -> Array:
-    """Largest absolute value of "x1" or "x2" in a turn."""
+    """Largest absolute value of "x1" or "x2" in a loop."""
     return jnp.max(jnp.abs(_values(cycle, coordinate)), axis=-1)
 
 
@@ -75,7 +75,7 @@ def gap(cycle: Cycle, belt: int) -> Array:
 
 
 def energy_fed(cycle: Cycle) -> Array:
-    """Work that the drives of the belts do in one turn: the sum of friction times belt velocity.
+    """Work that the drives of the belts do in one loop: the sum of friction times belt velocity.
 
     In a steady cycle it equals `energy_dissipated`. Negative parts occur: a belt can brake.
     """
@@ -83,7 +83,7 @@ def energy_fed(cycle: Cycle) -> Array:
 
 
 def energy_dissipated(cycle: Cycle) -> Array:
-    """Energy that damping and slipping contacts turn into heat in one turn."""
+    """Energy that damping and slipping contacts turn into heat in one loop."""
     return _energies(cycle)[1]
 
 
@@ -104,7 +104,7 @@ def _values(cycle: Cycle, coordinate: str) -> Array:
 
 @jit
 def _energies(cycle: Cycle) -> Array:
-    """[fed, dissipated] in one turn, each the integral of a power over every arc."""
+    """[fed, dissipated] in one loop, each the integral of a power over every arc."""
     return _energies_of(cycle.oscillator, cycle.chain, cycle.unknowns)
 
 

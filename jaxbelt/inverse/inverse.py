@@ -1,9 +1,9 @@
 """Inverse problems by gradients: `fit` parameters to a measured record, `design` a cycle.
 
 **Fitting.** A record of stick-slip motion is hard to fit from afar: a guess with a wrong period
-slips by whole turns against the record, and the sum of squares has a minimum for each of them. So
+slips by whole loops against the record, and the sum of squares has a minimum for each of them. So
 
-1. *search*: the record is cut into windows shorter than half a turn, over which no phase is lost.
+1. *search*: the record is cut into windows shorter than half a loop, over which no phase is lost.
    Each starts from the record itself, from a local polynomial. The misfit of the smooth formulation
    (tanh for sgn, a fixed step) is minimised by Adam (optax) from several starts under `vmap`. Its
    answer is biased, by the smoothing and by the starts, but near.
@@ -43,7 +43,7 @@ from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
 from ..results import Status, describe
 
-#: Length of the first windows, less than half a turn: no phase is lost over it.
+#: Length of the first windows, less than half a loop: no phase is lost over it.
 WINDOW = 2.5
 #: Each stage joins so many neighbouring windows.
 JOIN = 3
@@ -275,7 +275,7 @@ def _search(starts, selection: Selection, osc: Oscillator, record: Record, eps, 
 
 def _candidates(selection, u, osc, record: Record, starts: int):
     """The ends of the search, best first, each with its window starts; near ones count once."""
-    # The velocity over which tanh turns. Steps of the scheme are stable up to 2.8 over the slope of
+    # The velocity over which tanh loops. Steps of the scheme are stable up to 2.8 over the slope of
     # the friction there; two belts of one velocity double it.
     eps = 0.1 * float(record.scale[1])
     slope = max(float(b.load * b.friction.static * osc.omega) for b in osc.belts) / eps
@@ -469,7 +469,7 @@ def fit(
 ) -> Fit:
     """Parameters of an oscillator from a measured record of its motion, with standard errors.
 
-    oscillator: the guess; 30 per cent off is near enough for a stick-slip record of many turns.
+    oscillator: the guess; 30 per cent off is near enough for a stick-slip record of many loops.
     ts: the times, increasing, [samples]; x1, x2: displacement, velocity, or both, [samples], NaN
     where a datum is missing. All dimensionless, as in `simulate`. The start of the motion, its
     state at ts[0], is estimated too.

@@ -229,8 +229,8 @@ def _at_edges(osc: Oscillator, positions: Array) -> Equilibria:
     focus = edge_focus(osc, left, right, x1)
     # Where a belt at rest holds the mass, the segment on that side ends here.
     exists = is_edge & focus.exists & ~left.any_stuck & ~right.any_stuck
-    # A belt at rest brakes on the way out and on the way back: each turn takes off a fraction of
-    # the velocity that does not go to 0 with it, so infinitely many turns take a finite time.
+    # A belt at rest brakes on the way out and on the way back: each loop takes off a fraction of
+    # the velocity that does not go to 0 with it, so infinitely many loops take a finite time.
     rubs = capacity(osc, on_left) + capacity(osc, on_right) > 0
     rate = jnp.where(exists, jnp.where(rubs, -jnp.inf, focus.rate), jnp.nan)
     x1 = jnp.where(exists, x1, jnp.nan)

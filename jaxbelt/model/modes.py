@@ -35,7 +35,7 @@ STUCK, BELOW, ABOVE = 0.0, -2.0, 2.0
 ULPS = 4e-16
 #: An orbit this close to a stable pseudo-focus (|x2| at the edge) has converged to it.
 FOCUS_RADIUS = 1e-2
-#: Turns with a smaller |x2| than this are smaller than the rounding of x1.
+#: Loops with a smaller |x2| than this are smaller than the rounding of x1.
 FOCUS_ROUNDING = 1e-7
 
 
@@ -499,14 +499,14 @@ class EdgeFocus(eqx.Module):
     """Leading-order motion around a point (edge, 0) with the field a_L on its left, a_R right.
 
     exists: a_L > 0 > a_R, so that the mass at rest there is pushed back from both sides. The
-    velocity at successive crossings behaves like exp(rate t); a turn takes turn_time * |x2|.
-    With u = 1/|x2| at the crossings a turn leads from u to u - contraction - bend/u^2 + O(1/u^3);
+    velocity at successive crossings behaves like exp(rate t); a loop takes loop_time * |x2|.
+    With u = 1/|x2| at the crossings a loop leads from u to u - contraction - bend/u^2 + O(1/u^3);
     bend is a bound of that coefficient's size.
     """
 
     exists: Array
     rate: Array
-    turn_time: Array
+    loop_time: Array
     contraction: Array
     bend: Array
 
@@ -529,11 +529,11 @@ def field_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array,
 def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFocus:
     """The pseudo-focus at x1 = edge between the slip modes to its left and right.
 
-    Of the half-turn on one side, from (edge, v) to (edge, -w), with x2' = -a - (x1 - edge) +
+    Of the half-loop on one side, from (edge, v) to (edge, -w), with x2' = -a - (x1 - edge) +
     b x2 + c x2^2 + d x2^3 there: 1/w = 1/v - k - e v^2 + O(v^3), where k = 2 b / (3 a) and
     e = 2 d/(5 a) + 2 b c/(15 a^2) + 4 b^3/(135 a^3) - 2 b/(15 a^3), with -c for c on the left, by
     inserting the series into the orbit x1(x2). Both sides add up. rate is the sum of k over
-    2/a_L + 2/|a_R|, which is turn_time.
+    2/a_L + 2/|a_R|, which is loop_time.
     """
     sides = [field_at_rest(osc, mode, edge) for mode in (left, right)]
     exists = (sides[0][0] > 0) & (sides[1][0] < 0)
@@ -550,8 +550,8 @@ def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFoc
 def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array) -> Array:
     """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
 
-    The leading term of a turn must outweigh the next one by ten (see `EdgeFocus`), and no boundary
-    may be near. With a belt at rest, or with a fixed point on the edge, the turns shrink to
+    The leading term of a loop must outweigh the next one by ten (see `EdgeFocus`), and no boundary
+    may be near. With a belt at rest, or with a fixed point on the edge, the loops shrink to
     rounding.
     """
     focus = edge_focus(osc, left, right, edge)

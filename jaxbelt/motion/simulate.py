@@ -9,10 +9,10 @@ looked at after each step; where it is negative, the step is made once more, sho
 ends on the first root of a guard, see `roots`. That root cannot hide within the step: besides the
 boundaries and edges, an arc also ends where the acceleration changes its sign (and, before a
 contact edge, where the velocity does), unless no boundary (no edge) is within reach. Between two
-such turns x2 (x1) is monotone, so the sign at the end of a step tells all, and the sign at the turn
-itself whether an orbit that grazes a boundary (an edge) meets it. Between two zeros of x2' lies a
-zero of x2, since x2'' = -x2 there: more than one turn in a step would take a turn of the phase
-within it, which `MAX_ARC` and `MAX_STEP` exclude.
+such extrema x2 (x1) is monotone, so the sign at the end of a step tells all, and the sign at the
+extremum itself whether an orbit that grazes a boundary (an edge) meets it. Between two zeros of x2'
+lies a zero of x2, since x2'' = -x2 there: two extrema of x2 in one step would take half a loop
+around a focus within it, which `MAX_ARC` and `MAX_STEP` exclude.
 
 Samples at given times are taken from the arcs afterwards, in parallel.
 """
@@ -62,7 +62,7 @@ MAX_STEP, FIRST_STEP = 0.5, 0.2
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
 #: because near-grazing events amplify them.
 SAFETY = 0.03
-#: Longest slip arc, well below half a turn; longer ones are cut.
+#: Longest slip arc, well below half a loop; longer ones are cut.
 MAX_ARC = 1.0
 #: Segments are run in blocks of so many; the budget is rounded up to whole blocks.
 BLOCK = 32
@@ -97,7 +97,7 @@ class Arcs(eqx.Module):
 
     t: entry times, [arcs]; y: entry states, [arcs, 2]; mode: contact codes, [arcs, belts]
     (+1/-1 slip with that sign of r, 0 stuck, -2/+2 mass below/above the belt's interval);
-    duration: [arcs]. Consecutive arcs of one mode occur: an arc also ends at a turn.
+    duration: [arcs]. Consecutive arcs of one mode occur: an arc also ends at an extremum.
     """
 
     t: Array
@@ -211,30 +211,30 @@ def _integrate(osc, mode, y, span, rtol, atol, left=None):
     return *last, solution.event_mask
 
 
-def _all_guards(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], y) -> Array:
-    """The guards of a slip mode: boundaries, edges, then the turns of x2 and of x1."""
+def _all_guards(osc: Oscillator, mode: Mode, extremum: tuple[Array, Array], y) -> Array:
+    """The guards of a slip mode: boundaries, edges, then the extremum of x2 and of x1."""
     x1, x2 = y
     a = mode_acceleration(osc, mode, x1, x2)
     guards = [*boundary_guards(osc, mode, x2), *edge_guards(osc, mode, x1)]
-    return jnp.stack([*guards, turn[0] * a, turn[1] * x2])
+    return jnp.stack([*guards, extremum[0] * a, extremum[1] * x2])
 
 
-def _that_count(osc: Oscillator, mode: Mode, turn: tuple[Array, Array], guards: Array) -> Array:
+def _that_count(osc: Oscillator, mode: Mode, extremum: tuple[Array, Array], guards: Array) -> Array:
     """The same, larger where they do not count.
 
-    A boundary or edge does not from which the orbit moves away until it turns, nor does a turn
-    while what it protects is out of reach of one step.
+    A boundary or edge from which the orbit moves away until its next extremum does not, nor does an
+    extremum while what it protects is out of reach of one step.
     """
     n = len(osc.belts)
-    boundary, edge, turn_x2, turn_x1 = guards[:n], guards[n : 3 * n], guards[-2], guards[-1]
-    reach = jnp.abs(turn_x2) + jnp.abs(turn_x1)
-    turn_x2 = jnp.maximum(turn_x2, jnp.min(boundary) / osc.omega - reach)
-    turn_x1 = jnp.maximum(turn_x1, jnp.min(edge) - reach)
-    nears_boundary = turn[0] * jnp.stack(mode.codes) > 0
+    boundary, edge, extremum_x2, extremum_x1 = guards[:n], guards[n : 3 * n], guards[-2], guards[-1]
+    reach = jnp.abs(extremum_x2) + jnp.abs(extremum_x1)
+    extremum_x2 = jnp.maximum(extremum_x2, jnp.min(boundary) / osc.omega - reach)
+    extremum_x1 = jnp.maximum(extremum_x1, jnp.min(edge) - reach)
+    nears_boundary = extremum[0] * jnp.stack(mode.codes) > 0
     rightward, leftward = jnp.stack(bounds_rightward(mode)), jnp.stack(bounds_leftward(mode))
-    nears_edge = jnp.where(turn[1] > 0, rightward, leftward)
+    nears_edge = jnp.where(extremum[1] > 0, rightward, leftward)
     nears = jnp.concatenate([nears_boundary, nears_edge])
-    return jnp.append(jnp.where(nears, guards[:-2], jnp.inf), jnp.stack([turn_x2, turn_x1]))
+    return jnp.append(jnp.where(nears, guards[:-2], jnp.inf), jnp.stack([extremum_x2, extremum_x1]))
 
 
 class _SlipArc(eqx.Module):
@@ -248,12 +248,12 @@ class _SlipArc(eqx.Module):
 
 @forward_jacobian
 @one_kernel
-def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
+def _slip_arc(osc, mode, extremum, y, span, rtol, atol) -> _SlipArc:
     """Follow the slip arc from y until a guard fires or the time span is over."""
 
     def left_mode(t, y, args, **kwargs):
         # A rejected first step leaves t = 0, where a guard may vanish.
-        guards = _that_count(osc, mode, turn, _all_guards(osc, mode, turn, y))
+        guards = _that_count(osc, mode, extremum, _all_guards(osc, mode, extremum, y))
         return (t > 0) & (jnp.min(guards) < 0)
 
     started, reached, hit = _integrate(osc, mode, y, span, SAFETY * rtol, SAFETY * atol, left_mode)
@@ -266,14 +266,14 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
     start, y_end = tuple(start), tuple(y_end)
     last = lax.stop_gradient(t_end - t_start)
     still = lax.stop_gradient((osc, mode, start))
-    f_osc, f_mode, f_turn, f_end = lax.stop_gradient((osc, mode, turn, y_end))
+    f_osc, f_mode, f_extremum, f_end = lax.stop_gradient((osc, mode, extremum, y_end))
 
     def guards_at(y):
         def guards(*y):
-            return _all_guards(f_osc, f_mode, f_turn, y)
+            return _all_guards(f_osc, f_mode, f_extremum, y)
 
         values, slopes = jax.jvp(guards, y, _velocity(f_osc, f_mode, y))
-        return _that_count(f_osc, f_mode, f_turn, values), slopes
+        return _that_count(f_osc, f_mode, f_extremum, values), slopes
 
     values, slopes = guards_at(f_end)
     root, fired = first_root(
@@ -281,13 +281,13 @@ def _slip_arc(osc, mode, turn, y, span, rtol, atol) -> _SlipArc:
         guards_at(still[-1]),
         last,
         (jnp.where(hit, values, jnp.inf), slopes),
-        turns=2,
+        extrema=2,
     )
-    # A turn is invisible: nothing depends on where the arc is split.
+    # An extremum is invisible: nothing depends on where the arc is split.
     is_event = hit & (fired < 3 * len(osc.belts))
 
     def guard_fired(*y):
-        guards = _all_guards(osc, mode, turn, y)
+        guards = _all_guards(osc, mode, extremum, y)
         return jnp.sum(jnp.where(jnp.arange(guards.size) == fired, guards, 0.0))
 
     # Two Newton steps, small ones: the digits that are left, and derivatives to second order.
@@ -321,23 +321,23 @@ def _flow(osc, mode, y, duration, rtol, atol):
 
 
 class _State(eqx.Module):
-    """Where a run is: time, state, mode, the turn signs of x2' and x2, and how it stands."""
+    """Where a run is: time, state, mode, the extremum signs of x2' and x2, and how it stands."""
 
     t: Array
     y: tuple[Array, Array]
     mode: Mode
-    turn: tuple[Array, Array]
+    extremum: tuple[Array, Array]
     status: Array
     done: Array
 
 
 class _Step(eqx.Module):
-    """An arc's end: duration, state, next mode, the event, turn signs where they are known."""
+    """An arc's end: duration, state, next mode, the event, extremum signs where they are known."""
 
     duration: Array
     y: tuple[Array, Array]
     mode: Mode
-    turn: tuple[Array, Array]
+    extremum: tuple[Array, Array]
     kind: Array
     status: Array
     done: Array
@@ -347,7 +347,7 @@ def _sign(value, tie):
     return jnp.where(value == 0, tie, jnp.sign(value))
 
 
-def _turn_signs(osc, mode, y):
+def _extremum_signs(osc, mode, y):
     """Signs of x2' and x2 just after y. Where x2' = 0, as at slip onset, x2'' = -x2 decides."""
     x1, x2 = y
     a = mode_acceleration(osc, mode, x1, x2)
@@ -360,7 +360,7 @@ def _slip_segment(osc: Oscillator, state: _State, t1, rtol, atol) -> _Step:
     n = len(osc.belts)
     left = t1 - state.t
     span = jnp.minimum(left, MAX_ARC)
-    arc = _slip_arc(osc, state.mode, state.turn, state.y, span, rtol, atol)
+    arc = _slip_arc(osc, state.mode, state.extremum, state.y, span, rtol, atol)
     fired = arc.fired
     ended = (fired < 0) & (left <= MAX_ARC)
 
@@ -371,18 +371,18 @@ def _slip_segment(osc: Oscillator, state: _State, t1, rtol, atol) -> _Step:
         jnp.where(after.mode.any_stuck, EventKind.STICK, EventKind.CROSS),
         jnp.where(after.at_edge, EventKind.EDGE, 0),
     )
-    turned = (
-        jnp.where(fired == 3 * n, -state.turn[0], state.turn[0]),
-        jnp.where(fired == 3 * n + 1, -state.turn[1], state.turn[1]),
+    flipped = (
+        jnp.where(fired == 3 * n, -state.extremum[0], state.extremum[0]),
+        jnp.where(fired == 3 * n + 1, -state.extremum[1], state.extremum[1]),
     )
-    fresh = _turn_signs(osc, after.mode, (x1, x2))
+    fresh = _extremum_signs(osc, after.mode, (x1, x2))
     status = jnp.where(after.captured, Status.PSEUDO_FOCUS, Status.OK)
     status = jnp.where(arc.failed, Status.TOO_MANY_STEPS, status)
     return _Step(
         duration=arc.duration,
         y=(x1, x2),
         mode=after.mode,
-        turn=select(after.at_boundary | after.at_edge, fresh, turned),
+        extremum=select(after.at_boundary | after.at_edge, fresh, flipped),
         kind=kind,
         status=status,
         done=ended | after.captured,
@@ -402,7 +402,7 @@ def _stick_segment(osc: Oscillator, state: _State, t1) -> _Step:
         duration=duration,
         y=(x1_end, x2),
         mode=mode,
-        turn=_turn_signs(osc, mode, (x1_end, x2)),
+        extremum=_extremum_signs(osc, mode, (x1_end, x2)),
         kind=jnp.where(ended, 0, jnp.where(phase.slips, EventKind.SLIP, EventKind.EDGE)),
         status=jnp.where(forever, Status.STUCK_FOREVER, Status.OK),
         done=ended,
@@ -462,7 +462,7 @@ def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _R
         event_y=jnp.stack(step.y),
     )
     done = step.done | (t >= t1) | (status != Status.OK)
-    new = _State(t, step.y, step.mode, step.turn, status, done)
+    new = _State(t, step.y, step.mode, step.extremum, status, done)
     return new, record
 
 
@@ -475,7 +475,7 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
         finite = finite & jnp.all(~jnp.isnan(leaf))
     status = jnp.where(at_focus(osc, *y), Status.PSEUDO_FOCUS.value, Status.OK.value)
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
-    start = _State(t0, y, mode, _turn_signs(osc, mode, y), status, status != Status.OK)
+    start = _State(t0, y, mode, _extremum_signs(osc, mode, y), status, status != Status.OK)
 
     def segment(given, state):
         osc, t1, rtol, atol = given

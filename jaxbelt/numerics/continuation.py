@@ -8,7 +8,7 @@ that is normal to t at the distance of one step. Newton's method solves these n 
 
 which are regular where the curve turns round with respect to any of its coordinates, too. The
 tangent comes from the exact Jacobian, the same one that Newton's method ends with. The step grows
-where Newton's method is quick, and is halved where it is slow, fails, or the tangent turns by more
+where Newton's method is quick, and is halved where it is slow, fails, or the tangent loops by more
 than an angle; that is the control of the error as well, for every point is a solution to rounding.
 Along a regular curve the determinant of the n + 1 equations keeps its sign, so where it does not,
 the step has gone over to another branch, and is halved, too.

@@ -2,9 +2,9 @@
 
 Guards are positive at the start of the step and negative beyond their root. The smallest of them
 has kinks, on which a search for its root may end, and near a tangency one guard is small where
-another has its root. So each is searched for by itself. The turns come first, the zeros of x2' and
-of x2: up to a turn the other guards are monotone, and the sign of one at the turn, as accurate as
-the integration, tells whether it has a root before.
+another has its root. So each is searched for by itself. The extrema come first, the zeros of x2'
+and of x2: up to an extremum the other guards are monotone, and the sign of one at the extremum, as
+accurate as the integration, tells whether it has a root before.
 """
 
 from collections.abc import Callable
@@ -24,15 +24,15 @@ TRIALS, MOST = 8, 100
 
 
 def first_root(
-    guards: Callable[[Array], Guards], at_start: Guards, end: Array, at_end: Guards, turns: int
+    guards: Callable[[Array], Guards], at_start: Guards, end: Array, at_end: Guards, extrema: int
 ) -> tuple[Array, Array]:
     """The time in (0, end] at which a guard first vanishes, and the number of that guard.
 
-    guards: all of them at a time; the last `turns` of them are turns. Where none is negative at the
-    end the number is -1, and the time the end.
+    guards: all of them at a time; the last `extrema` of them are extrema. Where none is negative at
+    the end the number is -1, and the time the end.
     """
     numbers = jnp.arange(at_end[0].size)
-    is_turn = numbers >= numbers.size - turns
+    is_extremum = numbers >= numbers.size - extrema
 
     def passed(state):
         _, (values, _), _, known = state
@@ -41,8 +41,8 @@ def first_root(
     def earlier(state):
         end, at_end, _, known = state
         candidates = passed(state)
-        turn = candidates & is_turn
-        candidates = jnp.where(jnp.any(turn), turn, candidates)
+        extremum = candidates & is_extremum
+        candidates = jnp.where(jnp.any(extremum), extremum, candidates)
         number = jnp.argmin(jnp.where(candidates, at_end[0], jnp.inf))
         end, at_end = _root(guards, numbers == number, at_start, end, at_end)
         return end, at_end, number, known | (numbers == number)

@@ -1,6 +1,6 @@
 """Audits of sweeps: some runs once more the long way, without any shortcut, and compared.
 
-The kernel of `batch` takes three: a run of final states skips the turns that it has seen repeat; a
+The kernel of `batch` takes three: a run of final states skips the loops that it has seen repeat; a
 run that looks for its attractor ends as soon as it knows it; and a run that is captured by a
 pseudo-focus ends at rest there. The long way takes none of them to t1. From the state at t1 the
 attractor is then looked for again: it has to be the same one.
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..model.modes import FOCUS_RADIUS
-from ..results import Status, of_one_turn
+from ..results import Status, of_one_loop
 from . import batch
 
 #: States and extrema may differ by so many times the tolerance of a step: errors add up over a run.
@@ -110,9 +110,9 @@ def _same_attractors(
     same &= ~cycle | _close(known["period"], again["period"], numbers)
     belts = known["sticks"].shape[1]
     for i in np.flatnonzero(cycle):
-        turns = (
-            of_one_turn(batch.word_events(int(word), belts))
+        loops = (
+            of_one_loop(batch.word_events(int(word), belts))
             for word in (known["signature"][i], again["signature"][i])
         )
-        same[i] &= len(set(turns)) == 1
+        same[i] &= len(set(loops)) == 1
     return same | ~decided | _captured(known["x1_max"], known, final)

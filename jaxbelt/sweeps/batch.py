@@ -68,7 +68,7 @@ from ..results import EventKind, Status
 
 #: First step of a run and after each event, at a tolerance of 1e-8.
 FIRST_STEP = 0.1
-#: Longest step: a quarter of a turn, so that x2 has at most one extremum in it.
+#: Longest step: a quarter of a loop, so that x2 has at most one extremum in it.
 MAX_STEP = 1.5
 #: Errors over the tolerance below this one are taken for it: they may be rounding.
 LEAST = 1e-5
@@ -225,7 +225,7 @@ def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | None
         boundary = belt.velocity / osc.omega
         high = jnp.where(code == 1, jnp.minimum(high, boundary), high)
         low = jnp.where(code == -1, jnp.maximum(low, boundary), low)
-    x1, turns = None, jnp.zeros_like(lanes.done) if extrema is None else extrema
+    x1, loops = None, jnp.zeros_like(lanes.done) if extrema is None else extrema
     if edges:
         left, right = -inf, inf
         for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
@@ -234,13 +234,13 @@ def _window(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | None
             right = jnp.where(touches, jnp.minimum(right, belt.upper), right)
             right = jnp.where(code == BELOW, jnp.minimum(right, belt.lower), right)
         x1 = left, right
-        # Far from the edges, as measured by the motion, no turn matters. Without this a lane that
-        # comes to rest would turn for ever, with steps as small as rounding.
+        # Far from the edges, as measured by the motion, no loop matters. Without this a lane that
+        # comes to rest would loop for ever, with steps as small as rounding.
         reach = 4 * (jnp.abs(lanes.x2) + jnp.abs(lanes.a))
-        turns = turns | (jnp.minimum(lanes.x1 - left, right - lanes.x1) <= reach)
+        loops = loops | (jnp.minimum(lanes.x1 - left, right - lanes.x1) <= reach)
     if edges or extrema is not None:
-        up = turns & ((lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0)))
-        down = turns & ((lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0)))
+        up = loops & ((lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0)))
+        down = loops & ((lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0)))
         low = jnp.where(up, jnp.maximum(low, 0.0), low)
         high = jnp.where(down, jnp.minimum(high, 0.0), high)
     signs = mode.signs
@@ -301,13 +301,14 @@ def _attempt(osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol) -> _
 class _Path(eqx.Module):
     """x2 within a step, x2 + k1 theta + ... + k4 theta^4 for theta from 0 to 1, and its extremum.
 
-    turns: whether there is one inside, at theta = turn; extremum: x2 there, at the end if none.
+    has_extremum: whether there is one inside, at theta = extremum; x2_extremum: x2 there, or at
+    the end if there is none.
     """
 
     k: tuple[Array, Array, Array, Array]
-    turns: Array
-    turn: Array
+    has_extremum: Array
     extremum: Array
+    x2_extremum: Array
 
 
 def _path(one: Array, lanes: Lanes, new: _Attempt) -> _Path:
@@ -318,20 +319,20 @@ def _path(one: Array, lanes: Lanes, new: _Attempt) -> _Path:
     c2, c3 = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
     k = (m0, c2 + k4, c3 - 2 * k4, k4)
     # Where the cubic is extreme: of an error there only the square counts.
-    turns = lanes.a * new.a < 0
+    has_extremum = lanes.a * new.a < 0
     divisor = jnp.sign(m0) * jnp.sqrt(jnp.maximum(c2 * c2 - 3 * c3 * m0, 0.0)) - c2
-    safe = turns & (divisor != 0)
-    turn = lax.stop_gradient(jnp.where(safe, m0, 1.0) / jnp.where(safe, divisor, 1.0))
-    extremum = x2 + turn * (k[0] + turn * (k[1] + turn * (k[2] + turn * k[3])))
-    return _Path(k, turns, turn, jnp.where(turns, extremum, new.x2) / one)
+    safe = has_extremum & (divisor != 0)
+    extremum = lax.stop_gradient(jnp.where(safe, m0, 1.0) / jnp.where(safe, divisor, 1.0))
+    x2_extremum = x2 + extremum * (k[0] + extremum * (k[1] + extremum * (k[2] + extremum * k[3])))
+    return _Path(k, has_extremum, extremum, jnp.where(has_extremum, x2_extremum, new.x2) / one)
 
 
 class _Landing(eqx.Module):
     """What a step has to do with the bounds of its mode.
 
     reached: it ends so near to one that the time `delta` is left to (x1, x2) on it; blocked: it
-    ends, or turns, beyond one; theta: the fraction of it that ends on the bound. on_edge: the bound
-    is a contact edge.
+    ends beyond one, or has its extremum there; theta: the fraction of it that ends on the bound.
+    on_edge: the bound is a contact edge.
     """
 
     reached: Array
@@ -345,11 +346,11 @@ class _Landing(eqx.Module):
 
 def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rtol) -> _Landing:
     low, high = window.x2
-    beyond_turn = path.turns & ((path.extremum > high) | (path.extremum < low))
-    peak = jnp.where(beyond_turn, path.extremum, new.x2)
+    beyond_extremum = path.has_extremum & ((path.x2_extremum > high) | (path.x2_extremum < low))
+    peak = jnp.where(beyond_extremum, path.x2_extremum, new.x2)
     reach = LANDING * jnp.sqrt(rtol)
     bound = jnp.where(new.a > 0, high, low)
-    reached = ~beyond_turn & (jnp.abs(bound - new.x2) <= reach * jnp.abs(new.a))
+    reached = ~beyond_extremum & (jnp.abs(bound - new.x2) <= reach * jnp.abs(new.a))
     slope = jnp.where(reached, new.a, 1.0)
     delta = jnp.where(reached, bound - new.x2, 1e300) / slope
     # The next term, too: it counts where x2' is small, and there x2'' is -x2.
@@ -384,19 +385,19 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
         start, end = jnp.where(use, lanes.x1, start), jnp.where(use, new.x1, end)
         target = jnp.where(use, jnp.where(new.x1 > right, right, left), target)
         blocked = blocked | beyond
-    until = jnp.where(beyond_turn, path.turn, 1.0)
+    until = jnp.where(beyond_extremum, path.extremum, 1.0)
     theta = _first_root(poly, start - target, until, end - target)
     # An extremum that close to a bound is no matter for an interpolant, nor is one that is wanted:
     # split the step there. The terms that the interpolant leaves out are far smaller than its last
     # ones, and near the ends of a step it is exact to the second order.
     doubt = jnp.abs(path.k[3]) + 0.1 * jnp.abs(path.k[2])
-    inside = jnp.minimum(path.turn, 1 - path.turn)
-    grazes = (path.extremum > high - doubt) | (path.extremum < low + doubt)
+    inside = jnp.minimum(path.extremum, 1 - path.extremum)
+    grazes = (path.x2_extremum > high - doubt) | (path.x2_extremum < low + doubt)
     grazes = grazes & (inside * new.h > reach)
     if window.extrema is not None:
         further = (path.extremum > lanes.upper) | (path.extremum < lanes.lower)
         grazes = grazes | (window.extrema & further & (inside > 1e-3))
-    grazes = grazes & path.turns & ~beyond_turn
+    grazes = grazes & path.has_extremum & ~beyond_extremum
     return _Landing(
         reached=reached,
         delta=delta,
@@ -404,7 +405,7 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
         x2=bound,
         on_edge=on_edge,
         blocked=blocked | grazes,
-        theta=jnp.where(blocked, theta, path.turn) / one,
+        theta=jnp.where(blocked, theta, path.extremum) / one,
     )
 
 
@@ -447,7 +448,7 @@ def _step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol) -> Lan
     proposed = jnp.where(lands | stands, -proposed, proposed)
     lower, upper = lanes.lower, lanes.upper
     if window.extrema is not None:
-        extremum = jnp.where(path.turns, path.extremum, x2)
+        extremum = jnp.where(path.has_extremum, path.x2_extremum, x2)
         lower = jnp.where(kept, jnp.minimum(lower, jnp.minimum(x2, extremum)), lower)
         upper = jnp.where(kept, jnp.maximum(upper, jnp.maximum(x2, extremum)), upper)
     return replace(
@@ -1066,7 +1067,7 @@ class Final(Observer):
     """The state at t1.
 
     At the end of a stick phase the state is a function of the parameters alone. Where it repeats,
-    everything repeats, to the last bit; so the run then goes on a whole number of turns at once
+    everything repeats, to the last bit; so the run then goes on a whole number of loops at once
     (unless `skip` is false).
     """
 
@@ -1082,11 +1083,11 @@ class Final(Observer):
         released = passage.released & ~lanes.mode.any_stuck
         period = lanes.t - mark.t
         repeats = released & _returned(mark, lanes, 0.0) & (period > 0)
-        turns = jnp.floor((t1 - lanes.t) / jnp.where(repeats, period, jnp.inf))
-        turns = lax.stop_gradient(jnp.maximum(turns, 0.0))
-        per_turn = lanes.events - mark.events
-        t = jnp.where(repeats, lanes.t + turns * period, lanes.t)
-        events = lanes.events + jnp.where(repeats, turns.astype(per_turn.dtype) * per_turn, 0)
+        loops = jnp.floor((t1 - lanes.t) / jnp.where(repeats, period, jnp.inf))
+        loops = lax.stop_gradient(jnp.maximum(loops, 0.0))
+        per_loop = lanes.events - mark.events
+        t = jnp.where(repeats, lanes.t + loops * period, lanes.t)
+        events = lanes.events + jnp.where(repeats, loops.astype(per_loop.dtype) * per_loop, 0)
         lanes = eqx.tree_at(lambda n: (n.t, n.events), lanes, (t, events))
         return eqx.tree_at(lambda n: n.memory, lanes, _renew(mark, lanes, released, one)[0])
 
@@ -1107,8 +1108,8 @@ KINDS = ("undecided", "equilibrium", "cycle", "stuck")
 UNDECIDED, EQUILIBRIUM, CYCLE, STUCK_FOR_EVER = range(4)
 
 
-class _Turn(eqx.Module):
-    """The turn under way, since the last mark; arrays [lanes], sticks one a belt.
+class _Loop(eqx.Module):
+    """The loop under way, since the last mark; arrays [lanes], sticks one a belt.
 
     tops: how many there were since the last stick phase; previous, change: the top before, and how
     far it was from the one before that; word: the events,
@@ -1126,7 +1127,7 @@ class _Turn(eqx.Module):
     kind: Array
     period: Array
     transient: Array
-    turn_events: Array
+    loop_events: Array
 
 
 class Attractor(Observer):
@@ -1146,7 +1147,7 @@ class Attractor(Observer):
     REPEATED: ClassVar[float] = 1e-7
     #: Motion that is smaller than so many tolerances is the integrator's.
     RESOLVED: ClassVar[float] = 1e3
-    #: Until then extrema are left out, unless a stick phase has ended: about two turns.
+    #: Until then extrema are left out, unless a stick phase has ended: about two loops.
     SETTLING: ClassVar[float] = 12.0
     #: Tops without a stick phase after which a run is taken to stick no more.
     SMOOTH: ClassVar[int] = 2
@@ -1159,7 +1160,7 @@ class Attractor(Observer):
         count = jnp.zeros_like(lanes.events)
         nothing = zero + jnp.nan
         rests = begins_at_rest(osc, lanes.x1, lanes.x2)
-        return _Turn(
+        return _Loop(
             mark=_no_mark(lanes),
             x1_min=lanes.x1,
             x1_max=lanes.x1,
@@ -1171,31 +1172,31 @@ class Attractor(Observer):
             kind=count + jnp.where(rests, EQUILIBRIUM, UNDECIDED).astype(count.dtype),
             period=nothing,
             transient=jnp.where(rests, 0.0, nothing),
-            turn_events=count,
+            loop_events=count,
         )
 
     def watch(self, osc, lanes, passage, one, t1, tol):
-        turn: _Turn = lanes.memory
+        loop: _Loop = lanes.memory
         sticks = tuple(
             total + jnp.where(stuck, passage.duration, 0.0)
-            for total, stuck in zip(turn.sticks, passage.mode.stuck, strict=True)
+            for total, stuck in zip(loop.sticks, passage.mode.stuck, strict=True)
         )
-        word = turn.word
+        word = loop.word
         for happened, kind, belt in _event_kinds(lanes, passage):
             longer = _append(word, kind, belt, len(osc.belts))
             word = jnp.where(happened & (belt >= 0), longer, word)
         # x1 is extreme where x2 = 0, and a step ends there.
-        x1_min, x1_max = jnp.minimum(turn.x1_min, lanes.x1), jnp.maximum(turn.x1_max, lanes.x1)
+        x1_min, x1_max = jnp.minimum(loop.x1_min, lanes.x1), jnp.maximum(loop.x1_max, lanes.x1)
         top = _once(passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done, one)
 
-        mark, amplitude = turn.mark, x1_max - x1_min
-        change = lanes.x1 - turn.previous
-        ratio = jnp.abs(change / jnp.where(turn.change == 0, 1.0, turn.change))
+        mark, amplitude = loop.mark, x1_max - x1_min
+        change = lanes.x1 - loop.previous
+        ratio = jnp.abs(change / jnp.where(loop.change == 0, 1.0, loop.change))
         left = jnp.where(ratio < 1, ratio / jnp.where(ratio < 1, 1 - ratio, 1.0), jnp.inf)
         moved, close = jnp.abs(lanes.x1 - mark.x1), amplitude * self.REPEATED
         converged = (moved * left <= close) | (moved < 30 * tol * amplitude)
         released = _once(passage.released & ~lanes.mode.any_stuck & ~lanes.done, one)
-        tops = jnp.where(released, 0, turn.tops + jnp.where(top, 1, 0))
+        tops = jnp.where(released, 0, loop.tops + jnp.where(top, 1, 0))
         section = released | (top & (tops > self.SMOOTH))
         repeats = section & _returned(mark, lanes, jnp.where(released, 1e-9 * amplitude, close))
         repeats = repeats & (released | converged)
@@ -1204,18 +1205,18 @@ class Attractor(Observer):
         # Motion that the tolerance does not resolve is at rest if it repeats or shrinks; but an
         # orbit that sticks is on a cycle, however small.
         small = jnp.maximum(amplitude, lanes.upper - lanes.lower) < self.RESOLVED * tol
-        shrinks = section & (change < 0) & (turn.change < 0)
+        shrinks = section & (change < 0) & (loop.change < 0)
         kind = jnp.where(small & ~released & (repeats | shrinks), EQUILIBRIUM, kind)
         kind = jnp.where(passage.captured | passage.rests, EQUILIBRIUM, kind)
         kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind)
-        going_on = (turn.kind == UNDECIDED) & (lanes.run >= 0)
-        kind = (jnp.where(going_on, kind, UNDECIDED) / one).astype(turn.kind.dtype)
+        going_on = (loop.kind == UNDECIDED) & (lanes.run >= 0)
+        kind = (jnp.where(going_on, kind, UNDECIDED) / one).astype(loop.kind.dtype)
         found = kind != UNDECIDED
         resting = found & (kind != CYCLE)
         renewed, new = _renew(mark, lanes, section & ~found, one)
-        # An attractor at rest is a point; a new mark begins a new turn.
+        # An attractor at rest is a point; a new mark begins a new loop.
         fresh = new | resting
-        memory = _Turn(
+        memory = _Loop(
             mark=renewed,
             x1_min=jnp.where(fresh, lanes.x1, x1_min),
             x1_max=jnp.where(fresh, lanes.x1, x1_max),
@@ -1225,15 +1226,15 @@ class Attractor(Observer):
             ),
             word=jnp.where(fresh, 1.0, word),
             tops=tops,
-            previous=jnp.where(top, lanes.x1, turn.previous),
-            change=jnp.where(top, change, turn.change),
-            kind=jnp.where(found, kind, turn.kind),
-            period=jnp.where(found & ~resting, lanes.t - mark.t, turn.period),
-            transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), turn.transient),
-            turn_events=jnp.where(found & ~resting, lanes.events - mark.events, turn.turn_events),
+            previous=jnp.where(top, lanes.x1, loop.previous),
+            change=jnp.where(top, change, loop.change),
+            kind=jnp.where(found, kind, loop.kind),
+            period=jnp.where(found & ~resting, lanes.t - mark.t, loop.period),
+            transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), loop.transient),
+            loop_events=jnp.where(found & ~resting, lanes.events - mark.events, loop.loop_events),
         )
         # Decided lanes may have to wait until their result is taken.
-        memory = select(turn.kind == UNDECIDED, memory, turn)
+        memory = select(loop.kind == UNDECIDED, memory, loop)
         return eqx.tree_at(
             lambda n: (n.lower, n.upper, n.done, n.memory),
             lanes,
@@ -1246,7 +1247,7 @@ class Attractor(Observer):
         )
 
     def rest(self, osc, lanes, one):
-        turn: _Turn = lanes.memory
+        loop: _Loop = lanes.memory
         zero = jnp.zeros_like(lanes.t)
         x1_rest = mode_acceleration(osc, lanes.mode, zero, zero)
         radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), SMALLEST_DISC)
@@ -1255,13 +1256,13 @@ class Attractor(Observer):
         found = margin > 0
         memory = eqx.tree_at(
             lambda m: (m.kind, m.x1_min, m.x1_max, m.sticks, m.transient),
-            turn,
+            loop,
             (
-                jnp.where(found, EQUILIBRIUM, turn.kind).astype(turn.kind.dtype),
-                jnp.where(found, x1_rest, turn.x1_min),
-                jnp.where(found, x1_rest, turn.x1_max),
-                tuple(jnp.where(found, 0.0, total) for total in turn.sticks),
-                jnp.where(found, lanes.t, turn.transient),
+                jnp.where(found, EQUILIBRIUM, loop.kind).astype(loop.kind.dtype),
+                jnp.where(found, x1_rest, loop.x1_min),
+                jnp.where(found, x1_rest, loop.x1_max),
+                tuple(jnp.where(found, 0.0, total) for total in loop.sticks),
+                jnp.where(found, lanes.t, loop.transient),
             ),
         )
         return eqx.tree_at(
@@ -1276,22 +1277,22 @@ class Attractor(Observer):
         )
 
     def finish(self, osc, lanes):
-        turn: _Turn = lanes.memory
-        undecided = (turn.kind == UNDECIDED) & (lanes.status == Status.OK.value)
+        loop: _Loop = lanes.memory
+        undecided = (loop.kind == UNDECIDED) & (lanes.status == Status.OK.value)
         status = jnp.where(undecided, Status.NOT_SETTLED.value, lanes.status)
-        word = jnp.where(jnp.isinf(turn.word), -1.0, turn.word)
+        word = jnp.where(jnp.isinf(loop.word), -1.0, loop.word)
         return {
-            "kind": turn.kind,
-            "signature": jnp.where(turn.kind == CYCLE, word, 0.0),
-            "sticks": tuple(total > 0 for total in turn.sticks),
-            "period": turn.period,
-            "stick_duration": turn.sticks,
-            "x1_min": turn.x1_min,
-            "x1_max": turn.x1_max,
+            "kind": loop.kind,
+            "signature": jnp.where(loop.kind == CYCLE, word, 0.0),
+            "sticks": tuple(total > 0 for total in loop.sticks),
+            "period": loop.period,
+            "stick_duration": loop.sticks,
+            "x1_min": loop.x1_min,
+            "x1_max": loop.x1_max,
             "x2_min": lanes.lower,
             "x2_max": lanes.upper,
-            "transient": turn.transient,
-            "n_events": jnp.where(turn.kind == CYCLE, turn.turn_events, lanes.events),
+            "transient": loop.transient,
+            "n_events": jnp.where(loop.kind == CYCLE, loop.loop_events, lanes.events),
             "status": status,
         }
 

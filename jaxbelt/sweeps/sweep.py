@@ -32,7 +32,7 @@ from ..checks import (
     require_usable_jax,
 )
 from ..model.oscillator import Oscillator, check_scalars
-from ..results import of_one_turn
+from ..results import of_one_loop
 from . import batch
 from .audit import chosen, differing
 
@@ -56,16 +56,16 @@ LONG_NAMES = {
     "mode_end": "contact at t1: 1/-1 slips with that sign of nu - omega x2, 0 stuck, "
     "-2/2 mass below/above the belt's interval",
     "kind": "what the run leads to",
-    "signature": "events of one turn of the cycle, by number of flag_meanings",
+    "signature": "events of one loop of the cycle, by number of flag_meanings",
     "sticks": "whether the attractor sticks to the belt",
     "period": "period of the cycle",
-    "stick_duration": "time stuck to the belt in one turn",
+    "stick_duration": "time stuck to the belt in one loop",
     "x1_min": "smallest displacement on the attractor",
     "x1_max": "largest displacement on the attractor",
     "x2_min": "smallest velocity on the attractor",
     "x2_max": "largest velocity on the attractor",
     "transient": "time at which the attractor was reached",
-    "n_events": "number of events (of a cycle: in one turn)",
+    "n_events": "number of events (of a cycle: in one loop)",
     "status": "how the run ended, a jaxbelt.Status",
 }
 #: Types of what is not a float.
@@ -108,10 +108,10 @@ def sweep(
 
     - `"final"`: x1_end, x2_end, mode_end(belt) (contact codes as in `Trajectory.modes`), n_events.
     - `"attractor"`: kind ("equilibrium", "cycle", "stuck", or "undecided" at t1, which is 3000
-      unless given), signature (the events of one turn, kind and belt: a number, with its meaning in
+      unless given), signature (the events of one loop, kind and belt: a number, with its meaning in
       the attributes flag_values and flag_meanings), sticks(belt), period, stick_duration(belt) in
-      a turn (inf where stuck for ever), x1_min, x1_max, x2_min, x2_max on the attractor,
-      transient: the time at which it was reached, n_events: of a cycle in one turn, else until it
+      a loop (inf where stuck for ever), x1_min, x1_max, x2_min, x2_max on the attractor,
+      transient: the time at which it was reached, n_events: of a cycle in one loop, else until it
       was known. Runs end as soon as their attractor is known, see `batch.Attractor`.
     - an object with three methods for scalars: `init(osc, x1, x2)`, the state of a run, any tree of
       arrays; `update(state, event)`, the state after a `batch.Event` (t, x1, x2, kind, belt); and
@@ -388,7 +388,7 @@ def _signatures(words: np.ndarray, belts: int) -> tuple[np.ndarray, dict[str, An
     """Numbers of the signatures that these words stand for, and CF's attributes that name them.
 
     A signature begins where the sequence of its events is smallest, so that it does not depend on
-    where the turn began.
+    where the loop began.
     """
     different = np.unique(words)
     meanings = [_meaning(int(word), belts) for word in different]
@@ -407,8 +407,8 @@ def _meaning(word: int, belts: int) -> str:
     """A signature as one word; -1 stands for one that is too long to be told."""
     if word < 1:
         return "none" if word == 0 else "long"
-    turn = of_one_turn(batch.word_events(word, belts))
-    return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in turn) or "smooth"
+    loop = of_one_loop(batch.word_events(word, belts))
+    return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in loop) or "smooth"
 
 
 def _position(name: str) -> tuple[int, str]:

@@ -59,13 +59,13 @@ def test_scipy(benchmark):
             pull = friction(nu - y[1]) + friction(max(NU1 - y[1], -0.05))
             return y[1], -y[0] - 0.5 * y[1] + pull
 
-        def turns(t, y):
+        def loops(t, y):
             return field(t, y)[1]
 
-        turns.terminal, turns.direction = True, -1
+        loops.terminal, loops.direction = True, -1
         onset = (friction(nu - NU1) + 1.0 - 0.5 * NU1, NU1)
         out = solve_ivp(field, (0, 1.0), onset, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-        run = solve_ivp(field, (0, 20), out, "DOP853", rtol=1e-12, atol=1e-12, events=turns)
+        run = solve_ivp(field, (0, 20), out, "DOP853", rtol=1e-12, atol=1e-12, events=loops)
         return NU1 - run.y[1, -1]
 
     value = benchmark(lambda: brentq(gap, EXACT - 0.02, EXACT + 0.02, xtol=1e-12))

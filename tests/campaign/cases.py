@@ -363,7 +363,7 @@ def grazing_cycle(rng, smallest, largest=1e-3):
     """An oscillator with one belt more, whose edge a cycle misses, or goes beyond, by a distance.
 
     Or whose boundary, if it has no load: then nothing changes but the events. The start is on the
-    cycle of the other belts, half a turn before.
+    cycle of the other belts, half a loop before.
     """
     while True:
         structure = (("conti",) * int(rng.integers(1, 3)), False)

@@ -121,7 +121,7 @@ def difference(case, told, mine, tol):
 def _focus_difference(case, told, mine):
     """One ended in a pseudo-focus and the other did not, or not yet."""
     if {told.status, mine.status} == {engine.PSEUDO_FOCUS, engine.STUCK_FOREVER}:
-        # At rest where turns are lost in rounding, on an edge of a belt at rest.
+        # At rest where loops are lost in rounding, on an edge of a belt at rest.
         same = abs(told.x1 - mine.y_end[0]) < 1e-6 and abs(told.x2 - mine.y_end[1]) < 1e-6
         return None if same else f"status {told.status}, not {mine.status}"
     longer = replace(case, T=10 * case.T)
@@ -256,8 +256,8 @@ def label_difference(told, mine):
         return None
     if mine.kind != "cycle":
         return None if abs(told.x1[0] - mine.x1[0]) <= room else f"another {mine.kind}"
-    if told.turn is not None and told.turn != mine.turn:
-        return "turn"
+    if told.loop is not None and told.loop != mine.loop:
+        return "loop"
     pairs = [(told.period, mine.period), *zip(told.x1, mine.x1), *zip(told.x2, mine.x2)]
     pairs += list(zip(told.sticks, mine.sticks))
     return None if all(abs(a - b) <= room for a, b in pairs) else "another cycle"

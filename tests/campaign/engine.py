@@ -384,7 +384,7 @@ def _look(z, w, B, s, x1, x2, a, y1, y2, b, h, axis, level, side, box, V, K):
     """Whether side (x_axis - level), positive at first, is negative within the step.
 
     Returns (verdict, length, state, distance): 0 no, 1 at that length, 2 cannot tell; and how far
-    from the line a turn in the step is, on either side of it.
+    from the line a loop in the step is, on either side of it.
     """
     if axis == 0:
         g0, g1, d0, d1 = side * (x1 - level), side * (y1 - level), side * x2, side * y2
@@ -570,7 +570,7 @@ def _nearest(L, x1, x2):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _contraction(z, w, B, left, right, edge):
-    """To leading order a turn around the rest on an edge multiplies x2 there by 1 + (this) |x2|.
+    """To leading order a loop around the rest on an edge multiplies x2 there by 1 + (this) |x2|.
 
     Also the least speed of a belt that touches: turns have to be well below it.
     """
@@ -878,13 +878,13 @@ def force(osc, mode, x1, x2):
 
 @dataclass(frozen=True)
 class Attractor:
-    """kind: "equilibrium", "cycle", "stuck" or "undecided"; turn: the events of one period, (kind,
+    """kind: "equilibrium", "cycle", "stuck" or "undecided"; loop: the events of one period, (kind,
     belt) each, from where their order is least; sticks: time stuck to each belt in one period; y: a
     state on it, of a cycle a maximum of x1."""
 
     kind: str
     period: float = nan
-    turn: tuple = ()
+    loop: tuple = ()
     x1: tuple = (nan, nan)
     x2: tuple = (nan, nan)
     sticks: tuple = ()

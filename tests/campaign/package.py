@@ -154,7 +154,7 @@ def finals(cases, tol):
 class Label:
     kind: str
     period: float
-    turn: tuple
+    loop: tuple
     x1: tuple
     x2: tuple
     sticks: tuple
@@ -175,7 +175,7 @@ def labels(cases, tol, **options):
             Label(
                 str(row.kind.values),
                 float(row.period),
-                _turn(meanings[int(row.signature)]),
+                _loop(meanings[int(row.signature)]),
                 (float(row.x1_min), float(row.x1_max)),
                 (float(row.x2_min), float(row.x2_max)),
                 tuple(row.stick_duration.values.tolist()),
@@ -192,12 +192,12 @@ def cycles(cases):
         found = jb.find_cycle(oscillator(case.oscillator), case.y0)
         status = int(found.status)
         kind = {0: "cycle", 1: "stuck", 2: "equilibrium", 6: "equilibrium"}.get(status, "undecided")
-        turn = jb.results.of_one_turn([(int(k), int(b)) for k, b in found.signature])
+        loop = jb.results.of_one_loop([(int(k), int(b)) for k, b in found.signature])
         out.append(
             Label(
                 kind,
                 float(found.period),
-                turn,
+                loop,
                 (float(found.x1_min), float(found.x1_max)),
                 (float(found.x2_min), float(found.x2_max)),
                 tuple(np.asarray(found.stick_durations).tolist()),
@@ -207,7 +207,7 @@ def cycles(cases):
     return out
 
 
-def _turn(word):
+def _loop(word):
     """A signature's word as events, (kind, belt) each; None where it was too long."""
     if word in ("none", "smooth"):
         return ()

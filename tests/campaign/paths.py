@@ -3,7 +3,7 @@
 A path is an oscillator, one of its parameters and an interval. On a grid along it the engine runs
 from many starts, and from every attractor that it knows at the value beside, so that one with a
 small basin is not lost. Its label is the equilibria, in closed form and written down here once
-more, and the cycles: the modes of one turn, and where they are. Three things must hold.
+more, and the cycles: the modes of one loop, and where they are. Three things must hold.
 
 - Every cycle of the engine is among those of the label that `scan` goes by, and the other way
   round, where the engine starts on the cycle that `scan` has.
@@ -137,7 +137,7 @@ def _is_possible(osc: engine.Oscillator) -> bool:
 
 @dataclass(frozen=True)
 class Cycle:
-    """The modes of one turn, (smallest x1, largest, smallest x2, largest, period), and a state."""
+    """The modes of one loop, (smallest x1, largest, smallest x2, largest, period), and a state."""
 
     modes: tuple
     place: np.ndarray
@@ -175,7 +175,7 @@ def label_of(osc: engine.Oscillator, starts) -> Label:
         label.decided &= found.kind != "undecided"
         if found.kind == "cycle":
             cycle = _cycle(osc, found)
-            # Turns around a pseudo-focus seem to repeat long before they have shrunk to it.
+            # Loops around a pseudo-focus seem to repeat long before they have shrunk to it.
             if any(kind == 3 for kind, _, _ in label.rests) and found.x1[1] - found.x1[0] < TINY:
                 label.decided = False
                 continue
@@ -203,7 +203,7 @@ def _cycle(osc: engine.Oscillator, found: engine.Attractor) -> Cycle:
     )
     modes = run.codes[inside].tolist() or [run.mode_end]
     place = np.array([*found.x1, *found.x2, found.period])
-    return Cycle(_turn([_told(osc, mode) for mode in modes]), place, top)
+    return Cycle(_loop([_told(osc, mode) for mode in modes]), place, top)
 
 
 def _told(osc: engine.Oscillator, codes) -> tuple:
@@ -211,7 +211,7 @@ def _told(osc: engine.Oscillator, codes) -> tuple:
     return tuple(2 if b.load == 0 else code for b, code in zip(osc.belts, codes, strict=True))
 
 
-def _turn(modes) -> tuple:
+def _loop(modes) -> tuple:
     """Modes one after another without repetition, from the least of their orders on."""
     before = [modes[-1], *modes[:-1]]
     kept = [mode for mode, last in zip(modes, before, strict=True) if mode != last] or modes[:1]
@@ -396,10 +396,10 @@ def _compare(path: Path, brute: Brute, value: float, report: Report) -> None:
     report.labels += 1
     for one in path.cycles[value]:
         if one.path:
-            rows = np.asarray(one.turn.entries)[np.asarray(one.turn.used)]
+            rows = np.asarray(one.loop.entries)[np.asarray(one.loop.used)]
             start = tuple(rows[int(np.argmax(rows[:, 0]))].tolist())
             cycle = brute.learn(value, start)
-            place = place_of(one.turn)
+            place = place_of(one.loop)
             if (
                 cycle is None
                 or cycle.modes != one.path
