@@ -10,9 +10,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     processes       processes in which JAX cannot compute
     checks          arguments, checked at the public edge
     numerics/       compiling continuation derivatives extrapolation newton roots
-    model/          friction oscillator parameters modes equilibria
+    model/          friction oscillator parameters modes events equilibria
     presets         the published systems
-    motion/         smoothing simulate
+    motion/         integrators arcs smoothing simulate
     cycles/         shooting orbits cycle attractors functionals
     sweeps/         batch audit sweep basins
     bifurcations/   refine switch_folds scan curves diagrams
