@@ -13,7 +13,7 @@ by `leave_slip` and `leave_stick`, and both leave the question "stuck or not" to
 the contacts that are to be stuck can hold the force needed.
 
 Everything here is elementwise: codes and states may be scalars (the trajectories of `simulate`)
-or arrays of lanes (the kernel of `batch`), belts are unrolled.
+or arrays of lanes (the kernel of `sweeps.queue`), belts are unrolled.
 """
 
 import functools
