@@ -25,7 +25,7 @@ from .threads import CHUNK, run
 #: States and extrema may differ by so many times the tolerance of a step: errors add up over a run.
 CLOSE = 1e4
 #: Share of the usual budget of steps on the long way, where no pseudo-focus ends a run.
-BUDGET = 0.1
+BUDGET = 0.025
 
 Results = dict[str, np.ndarray]
 

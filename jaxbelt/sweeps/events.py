@@ -33,12 +33,13 @@ def pass_events(
     landed = (lanes.h < 0) & ~lanes.done
     # A lane may also have landed where x2 = 0, which is no guard.
     number = guard_passed(osc, lanes.mode, lanes.x1, lanes.x2)
-    fired = landed & (number >= 0)
+    # At rest but for rounding a lane stays, even on a guard.
+    slow = jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < AT_REST * (1 + jnp.abs(lanes.x1))
+    fired = landed & (number >= 0) & ~slow
+    rests = landed & slow & ((number >= 0) | (lanes.h >= -NO_STEP))
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
     captured = fired & after.captured & program.captures
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
-    slow = jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < AT_REST * (1 + jnp.abs(lanes.x1))
-    rests = landed & ~fired & (lanes.h >= -NO_STEP) & slow
 
     stuck = after.mode.any_stuck & ~captured & ~lanes.done
     phase = stick_phase(osc, after.mode, x1)

@@ -16,8 +16,9 @@ from jaxtyping import Array
 from .lanes import Program
 from .queue import ROUNDS, STEPS, advance, idle
 
-#: Steps that a run may take for each 100 units of time before it is given up.
-MAX_STEPS = 100_000
+#: Steps that a run may take for each 100 units of time before it is given up. On its way to a
+#: pseudo-focus beside a slow belt it may pass ten thousand events in that time.
+MAX_STEPS = 400_000
 #: Runs that the kernel is given at once.
 CHUNK = 2**14
 #: Lanes. On the CPU few, which stay near the processor, but more than is lost at each refill.
