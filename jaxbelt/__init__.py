@@ -7,19 +7,19 @@ Inside, data goes one way: parameters, modes, motion, cycles, bifurcations, pict
 ladder that shows it. Read from top to bottom, a module imports only what stands before it:
 
     results         status codes and what to do about them
-    processes       processes in which JAX cannot compute
     checks          arguments, checked at the public edge
     numerics/       compiling continuation derivatives extrapolation newton roots
     model/          friction oscillator parameters modes events equilibria
     presets         the published systems
     motion/         integrators arcs smoothing simulate
     cycles/         shooting orbits cycle attractors functionals
-    sweeps/         batch audit sweep basins
+    sweeps/         lanes step events observers attractor queue threads audit sweep basins
     bifurcations/   refine switch_folds scan curves diagrams
-    inverse/        inverse
-    plotting/       plotting
+    inverse/        selection record fit design
+    plotting/       style phase diagrams sweeps model
     paper           the paper's table and figures
     __init__        the public names
+    commands/       options reproduce simulate diagram map sweep basins
     cli             the command line
 """
 
@@ -63,7 +63,8 @@ from .cycles.functionals import (
     stick_duration,
     stick_fraction,
 )
-from .inverse.inverse import Design, Fit, design, distance_to, fit
+from .inverse.design import Design, design, distance_to
+from .inverse.fit import Fit, fit
 from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
 from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck
 from .model.oscillator import Belt, Oscillator
@@ -73,13 +74,9 @@ from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.sweep import sweep
 
 if TYPE_CHECKING:
-    from .plotting.plotting import (
-        plot_basins,
-        plot_friction_law,
-        plot_phase_portrait,
-        plot_time_history,
-        plot_vector_field,
-    )
+    from .plotting.model import plot_friction_law
+    from .plotting.phase import plot_phase_portrait, plot_time_history, plot_vector_field
+    from .plotting.sweeps import plot_basins
 
 __version__ = importlib.metadata.version("jaxbelt")
 
@@ -157,9 +154,9 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     # Matplotlib is imported when something is drawn, not before.
     if name.startswith("plot_") and name in __all__:
-        from .plotting import plotting
+        from .plotting import model, phase, sweeps
 
-        return getattr(plotting, name)
+        return next(getattr(m, name) for m in (model, phase, sweeps) if hasattr(m, name))
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -180,7 +180,7 @@ class BifurcationCurve(eqx.Module):
 
     def plot(self, ax: Any = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned."""
-        plotting = importlib.import_module("jaxbelt.plotting.plotting")
+        plotting = importlib.import_module("jaxbelt.plotting.diagrams")
         return plotting.plot_curves([self], ax)
 
     def __repr__(self) -> str:

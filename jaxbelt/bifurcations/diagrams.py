@@ -105,7 +105,7 @@ class BifurcationDiagram(eqx.Module):
         velocity of the belt, others by their largest x2; or "x1" (smallest and largest), "period".
         """
         # By its name: the modules are a ladder, in which pictures come last.
-        plotting = importlib.import_module("jaxbelt.plotting.plotting")
+        plotting = importlib.import_module("jaxbelt.plotting.diagrams")
         return plotting.plot_diagram(self, ax, quantity=quantity)
 
     def __repr__(self) -> str:
@@ -249,7 +249,7 @@ class RegionMap(eqx.Module):
         None: new ones, and a sketch of the phase portrait of each region in its example beside
         them, as in the paper's Fig. 6.
         """
-        plotting = importlib.import_module("jaxbelt.plotting.plotting")
+        plotting = importlib.import_module("jaxbelt.plotting.diagrams")
         return plotting.plot_region_map(self, ax)
 
     def __repr__(self) -> str:
