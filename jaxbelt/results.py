@@ -4,12 +4,8 @@
 """
 
 import enum
-from collections.abc import Sequence
-from typing import Any, TypeVar
 
 import numpy as np
-
-Step = TypeVar("Step")
 
 
 class Status(enum.IntEnum):
@@ -124,10 +120,3 @@ class EventKind(enum.IntEnum):
     SLIP = 2
     CROSS = 3
     EDGE = 4
-
-
-def of_one_loop(steps: Sequence[Step]) -> tuple[Step, ...]:
-    """The steps of a loop, events or modes, wherever it was begun: the least of the orders."""
-    loop = tuple(steps)
-    orders: Any = (loop[i:] + loop[:i] for i in range(len(loop)))
-    return min(orders, default=())

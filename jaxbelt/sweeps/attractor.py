@@ -6,13 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..model.modes import (
-    SMALLEST_DISC,
-    begins_at_rest,
-    disc_margin,
-    mode_acceleration,
-    select,
-)
+from ..cycles.settling import REPEATED, way_left
+from ..model.modes import begins_at_rest, select, settling_margin
 from ..results import Status
 from .events import append, event_kinds
 from .lanes import Observer, once
@@ -50,16 +45,14 @@ class Attractor(Observer):
 
     - A cycle: an orbit that sticks repeats the end of a stick phase; from there it is a function of
       the parameters alone, so it does so to the last bits. One that does not stick converges: its
-      top (a maximum of x1, where x2 = 0) has repeated when what is left of the way to the limit, by
-      the ratio of its last two changes, is below `REPEATED` times the amplitude.
+      top (a maximum of x1, where x2 = 0) repeats, see `settling`.
     - An equilibrium: the run begins on one, or the orbit has entered a disc that is attracted by a
-      fixed point, see `modes.disc_margin`. A pseudo-focus is recognised by `modes.is_captured`.
+      fixed point, see `modes.settling_margin`. A pseudo-focus is recognised by `modes.is_captured`.
     - Stuck for ever: on a belt at rest.
 
     The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
     """
 
-    REPEATED: ClassVar[float] = 1e-7
     #: Motion that is smaller than so many tolerances is the integrator's.
     RESOLVED: ClassVar[float] = 1e3
     #: Until then extrema are left out, unless a stick phase has ended: about two loops.
@@ -106,9 +99,8 @@ class Attractor(Observer):
 
         mark, amplitude = loop.mark, x1_max - x1_min
         change = lanes.x1 - loop.previous
-        ratio = jnp.abs(change / jnp.where(loop.change == 0, 1.0, loop.change))
-        left = jnp.where(ratio < 1, ratio / jnp.where(ratio < 1, 1 - ratio, 1.0), jnp.inf)
-        moved, close = jnp.abs(lanes.x1 - mark.x1), amplitude * self.REPEATED
+        left = way_left(change, loop.change)
+        moved, close = jnp.abs(lanes.x1 - mark.x1), amplitude * REPEATED
         converged = (moved * left <= close) | (moved < 30 * tol * amplitude)
         released = once(passage.released & ~lanes.mode.any_stuck & ~lanes.done, one)
         tops = jnp.where(released, 0, loop.tops + jnp.where(top, 1, 0))
@@ -163,10 +155,7 @@ class Attractor(Observer):
 
     def rest(self, osc, lanes, one):
         loop: _Loop = lanes.memory
-        zero = jnp.zeros_like(lanes.t)
-        x1_rest = mode_acceleration(osc, lanes.mode, zero, zero)
-        radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), SMALLEST_DISC)
-        margin = disc_margin(osc, lanes.mode, x1_rest, radius)
+        margin, x1_rest = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
         margin = jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin) / one
         found = margin > 0
         memory = eqx.tree_at(

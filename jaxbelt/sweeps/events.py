@@ -7,10 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..model.events import Signature, event_between
 from ..model.modes import (
-    TANGENT,
-    Mode,
-    first_of,
+    force_rounding,
     guard_passed,
     leave_slip,
     leave_stick,
@@ -23,8 +22,6 @@ from ..results import EventKind, Status
 from .lanes import Lanes, Passage, Program
 from .step import NO_STEP, first_step
 
-AT_REST = 1e-12
-
 
 def pass_events(
     program: Program, osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array
@@ -34,7 +31,7 @@ def pass_events(
     # A lane may also have landed where x2 = 0, which is no guard.
     number = guard_passed(osc, lanes.mode, lanes.x1, lanes.x2)
     # At rest but for rounding a lane stays, even on a guard.
-    slow = jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < AT_REST * (1 + jnp.abs(lanes.x1))
+    slow = jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < force_rounding(lanes.x1)
     fired = landed & (number >= 0) & ~slow
     rests = landed & slow & ((number >= 0) | (lanes.h >= -NO_STEP))
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
@@ -54,7 +51,7 @@ def pass_events(
 
     # Slip onset is tangent: x2' = 0 there, for a law without a jump, but for rounding.
     a = mode_acceleration(osc, mode, new_x1, x2)
-    a = jnp.where(jnp.abs(a) < TANGENT * (1 + jnp.abs(new_x1)), 0.0, a)
+    a = jnp.where(jnp.abs(a) < force_rounding(new_x1), 0.0, a)
     moved = landed | stuck
     h = jnp.where(fired, first_step(rtol), jnp.abs(lanes.h))
     if program.edges:
@@ -68,7 +65,6 @@ def pass_events(
     passage = Passage(
         landed=landed,
         fired=fired,
-        guard=number,
         before=lanes.mode,
         mode=after.mode,
         t=lanes.t,
@@ -79,7 +75,6 @@ def pass_events(
         stuck=stuck,
         duration=duration,
         released=released,
-        slips=released & phase.slips,
         forever=forever,
     )
     lanes = eqx.tree_at(
@@ -105,25 +100,10 @@ def pass_events(
 def event_kinds(lanes: Lanes, passage: Passage) -> tuple[tuple[Array, Array, Array], ...]:
     """(happened, kind, belt) of the event that ended a step, and of that which ended a stick phase
     after it."""
-    sticks = jnp.where(passage.mode.any_stuck, EventKind.STICK.value, EventKind.CROSS.value)
-    at_edge = passage.guard >= len(lanes.mode.codes)
-    kind = jnp.where(at_edge, EventKind.EDGE.value, sticks)
-    release = jnp.where(passage.slips, EventKind.SLIP.value, EventKind.EDGE.value)
     return (
-        (passage.fired, kind, _belt(passage.before, passage.mode, at_edge)),
-        (passage.released, release, _belt(passage.mode, lanes.mode, ~passage.slips)),
+        (passage.fired, *event_between(passage.before.codes, passage.mode.codes)),
+        (passage.released, *event_between(passage.mode.codes, lanes.mode.codes)),
     )
-
-
-def _belt(before: Mode, after: Mode, at_edge: Array) -> Array:
-    """The lowest belt whose contact changed, or, at an edge, that came or went."""
-    numbers = [jnp.asarray(i) for i in range(len(before.codes))]
-
-    def first_change(a, b):
-        return first_of([p != q for p, q in zip(a, b, strict=True)], numbers, jnp.asarray(-1))
-
-    came = first_change(before.touching, after.touching)
-    return jnp.where(at_edge, came, first_change(before.codes, after.codes))
 
 
 def append(word: Array, kind: Array, belt: Array, belts: int) -> Array:
@@ -132,7 +112,7 @@ def append(word: Array, kind: Array, belt: Array, belts: int) -> Array:
     return jnp.where(longer < 2.0**53, longer, jnp.inf)
 
 
-def word_events(word: int, belts: int) -> tuple[tuple[EventKind, int], ...]:
+def word_events(word: int, belts: int) -> Signature:
     """The events, (kind, belt) each, that the word of an attractor's signature stands for.
 
     A word is a number in the base 4 belts + 1: a leading 1, then for each event

@@ -46,7 +46,7 @@ class Lanes(eqx.Module):
 class Passage(eqx.Module):
     """What happened to the lanes in one look at the events, arrays [lanes].
 
-    landed: a step ended on a guard or where x2 = 0. fired: it was a guard, its number is `guard`,
+    landed: a step ended on a guard or where x2 = 0. fired: it was a guard, of the mode `before`,
     and `mode` is what followed, at (t, x1, x2). captured: by a pseudo-focus. rests: it is at rest
     but for rounding. stuck: there was a stick phase, of that duration; released: it ended, by slip
     onset or at an edge.
@@ -54,7 +54,6 @@ class Passage(eqx.Module):
 
     landed: Array
     fired: Array
-    guard: Array
     before: Mode
     mode: Mode
     t: Array
@@ -65,7 +64,6 @@ class Passage(eqx.Module):
     stuck: Array
     duration: Array
     released: Array
-    slips: Array
     forever: Array
 
 

@@ -41,7 +41,7 @@ LANDING = 0.1
 #: Speed over |x2'| below which a slow passage of an edge begins.
 SLOW = 0.1
 #: A lane whose step is to be shorter than this one stands on a bound of its mode; if it is also as
-#: slow as AT_REST and leaves through no guard, it is at rest there.
+#: slow as `modes.force_rounding` and leaves through no guard, it is at rest there.
 NO_STEP = 1e-15
 
 #: Of order eight: twice the stages of order five for a third of the steps at 1e-8, and what a step
