@@ -54,7 +54,7 @@ ARC_STEPS = 8
 
 
 class Chain(eqx.Module):
-    """A closed sequence of arcs: contact codes [arcs, belts], what ends each [arcs], step fractions.
+    """A closed sequence of arcs: contact codes [arcs, belts], ends [arcs], and step fractions.
 
     ends: numbers of `arcs.Ends`. An unused arc is of duration zero.
     """
