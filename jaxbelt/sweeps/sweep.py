@@ -119,9 +119,9 @@ def sweep(
       transient: the time at which it was reached, n_events: of a cycle in one loop, else until it
       was known. Runs end as soon as their attractor is known, see `attractor.Attractor`.
     - an object with three methods for scalars: `init(osc, x1, x2)`, the state of a run, any tree of
-      arrays; `update(state, event)`, the state after an `observers.Event` (t, x1, x2, kind, belt);
-      and `finish(state, end)`, a dictionary of results from the state and an `observers.End` (t,
-      x1, x2, status), numbers or vectors. They are traced, so use `jax.numpy`.
+      arrays; `update(state, event)`, the state after an `observers.RunEvent` (t, x1, x2, kind,
+      belt); and `finish(state, end)`, a dictionary of results, numbers or vectors, from the state
+      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`.
 
     and always status, a `Status` code a run: nothing raises because of one run.
 
