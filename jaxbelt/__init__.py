@@ -13,7 +13,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     presets         the published systems
     motion/         smoothing simulate
     cycles/         shooting orbits cycle attractors functionals
-    sweeps/         lanes step events observers attractor queue threads audit sweep basins
+    sweeps/         lanes step events marks observers attractor queue threads audit sweep basins
     bifurcations/   refine switch_folds scan curves diagrams
     inverse/        selection record fit design
     plotting/       style phase diagrams sweeps model

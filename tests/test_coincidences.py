@@ -9,7 +9,8 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt.results import Status
-from jaxbelt.sweeps import attractor, observers, threads
+from jaxbelt.sweeps import threads
+from jaxbelt.sweeps.marks import Mark, code_of
 from tests.campaign import compare, package
 from tests.campaign.cases import PAPER, Case
 from tests.campaign.engine import Belt, Oscillator
@@ -192,11 +193,10 @@ def test_audits_find_nothing(observe):
 @pytest.mark.parametrize("observe", ["final", "attractor"])
 def test_audits_find_repeats_that_are_none(observe, monkeypatch):
     def in_part(mark, lanes, close):
-        same = observers.code_of(lanes.mode) == mark.code
+        same = code_of(lanes.mode) == mark.code
         return same & (abs(lanes.x1 - mark.x1) <= close)
 
-    for module in (observers, attractor):
-        monkeypatch.setattr(module, "returned", in_part)
+    monkeypatch.setattr(Mark, "met_by", in_part)
     threads.compiled.cache_clear()
     with pytest.warns(UserWarning, match="1 of 9 audited runs differ .* indices \\(2, 0\\)"):
         found = jb.sweep(
