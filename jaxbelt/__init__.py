@@ -1,6 +1,6 @@
 """Belt-driven dry-friction oscillators: exact, batched, differentiable simulation in JAX.
 
-Everything a user needs is `import jaxbelt as jb`. Loop 64-bit floats on first:
+Everything a user needs is `import jaxbelt as jb`. Turn 64-bit floats on first:
 `jax.config.update("jax_enable_x64", True)`.
 
 Inside, data goes one way: parameters, modes, motion, cycles, bifurcations, pictures. The code is a
@@ -8,12 +8,12 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
 
     results         status codes and what to do about them
     checks          arguments, checked at the public edge
-    numerics/       compiling continuation derivatives extrapolation roots
+    numerics/       compiling continuation derivatives extrapolation newton roots
     model/          friction oscillator parameters modes equilibria
     presets         the published systems
     motion/         smoothing simulate
-    cycles/         cycle attractors functionals
-    sweeps/         batch audit sweep basins
+    cycles/         shooting orbits cycle attractors functionals
+    sweeps/         lanes step events observers attractor queue threads audit sweep basins
     bifurcations/   refine switch_folds scan curves diagrams
     inverse/        selection record fit design
     plotting/       style phase diagrams sweeps model draw

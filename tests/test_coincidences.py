@@ -9,7 +9,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt.results import Status
-from jaxbelt.sweeps import batch
+from jaxbelt.sweeps import attractor, observers, threads
 from tests.campaign import compare, package
 from tests.campaign.cases import PAPER, Case
 from tests.campaign.engine import Belt, Oscillator
@@ -192,16 +192,17 @@ def test_audits_find_nothing(observe):
 @pytest.mark.parametrize("observe", ["final", "attractor"])
 def test_audits_find_repeats_that_are_none(observe, monkeypatch):
     def in_part(mark, lanes, close):
-        same = batch._code(lanes.mode) == mark.code
+        same = observers.code_of(lanes.mode) == mark.code
         return same & (abs(lanes.x1 - mark.x1) <= close)
 
-    monkeypatch.setattr(batch, "_returned", in_part)
-    batch._compiled.cache_clear()
+    for module in (observers, attractor):
+        monkeypatch.setattr(module, "returned", in_part)
+    threads.compiled.cache_clear()
     with pytest.warns(UserWarning, match="1 of 9 audited runs differ .* indices \\(2, 0\\)"):
         found = jb.sweep(
             jb.presets.class_b, AXES, t1=60.0, observe=observe, audit=1.0, progress=False
         )
-    batch._compiled.cache_clear()
+    threads.compiled.cache_clear()
     assert found.attrs["audit_differed"] == 1
 
 

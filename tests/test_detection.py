@@ -16,7 +16,7 @@ from jaxbelt import EventKind, Status
 from jaxbelt.bifurcations.refine import leaf_index, vary
 from jaxbelt.bifurcations.scan import Path, search
 from jaxbelt.cycles.attractors import distinct
-from jaxbelt.cycles.cycle import loop_events
+from jaxbelt.cycles.shooting import loop_events
 
 
 def nu0(osc):

@@ -25,25 +25,16 @@ from jaxtyping import Array
 
 from ..checks import as_array, check_finite, require
 from ..cycles.attractors import extent, place_of
-from ..cycles.cycle import (
-    SIZES,
-    Chain,
-    Ends,
-    Loop,
-    admissible,
-    cycle_of,
-    end_guard,
-    follow,
-    meshed,
-    newton,
-    trace_of,
-)
+from ..cycles.cycle import cycle_of
+from ..cycles.orbits import follow
+from ..cycles.shooting import SIZES, Chain, Ends, Loop, admissible, end_guard, meshed, trace_of
 from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.modes import boundary_guards, edge_guards, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index, names_of, parameter, vary
 from ..numerics.compiling import jit
 from ..numerics.continuation import CurvePoint, End, continue_curve, corrected
+from ..numerics.newton import newton
 from ..results import Status, draw
 from .refine import (
     HINT_BUDGET,

@@ -27,7 +27,8 @@ from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, require
 from ..cycles.attractors import Runs, distinct, lead_to_one_cycle, stuck_belts
-from ..cycles.cycle import Cycle, Loop, cut, find_cycle, polish, unstable_cycle
+from ..cycles.cycle import Cycle, find_cycle, polish, unstable_cycle
+from ..cycles.shooting import Loop, cut
 from ..model.equilibria import EquilibriumKind, candidates, equilibria
 from ..model.oscillator import Oscillator
 from ..model.parameters import set_alone

@@ -54,30 +54,21 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import is_concrete, number, require
-from ..cycles.cycle import (
-    AT_REST,
-    NEWTON_STEPS,
+from ..cycles.cycle import Cycle, cycle_of, separating_loop
+from ..cycles.orbits import AT_REST, Orbit, first_loop, follow, last_loop, loop_of
+from ..cycles.shooting import (
     SIZES,
     Chain,
-    Cycle,
     Ends,
     Loop,
-    Orbit,
     closure,
-    cycle_of,
     end_guard,
-    first_loop,
-    follow,
     following_codes,
     jacobian,
-    last_loop,
-    loop_of,
     meshed,
     multiplier_and_slopes,
-    newton,
     residual,
     residual_and_blocks,
-    separating_loop,
     trace_of,
 )
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
@@ -99,6 +90,7 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index, parameter, vary
 from ..numerics.compiling import each, jit
+from ..numerics.newton import NEWTON_STEPS, newton
 from ..results import Status, describe
 
 #: Arcs for which the orbit from slip onset is followed in search of the signature.

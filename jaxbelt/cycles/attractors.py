@@ -20,7 +20,8 @@ import numpy as np
 from ..model.modes import ABOVE
 from ..model.oscillator import Oscillator
 from ..results import EventKind, Status, of_one_loop
-from .cycle import Chain, Cycle, Ends, Loop, event_between, find_cycle, modes_of
+from .cycle import Cycle, find_cycle
+from .shooting import Chain, Ends, Loop, event_between, modes_of
 
 if TYPE_CHECKING:
     import xarray
