@@ -9,9 +9,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     results         status codes and what to do about them
     checks          arguments, checked at the public edge
     numerics/       compiling continuation derivatives extrapolation newton roots
-    model/          friction oscillator parameters modes equilibria
+    model/          friction oscillator parameters modes events equilibria
     presets         the published systems
-    motion/         smoothing simulate
+    motion/         integrators arcs smoothing simulate
     cycles/         shooting orbits cycle attractors functionals
     sweeps/         lanes step events marks observers attractor queue threads audit sweep basins
     bifurcations/   refine switch_folds scan curves diagrams

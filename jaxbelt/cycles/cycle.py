@@ -16,11 +16,12 @@ from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, check_finite, is_concrete, number, pick, require
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
+from ..model.events import Signature
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import Arcs
 from ..numerics.compiling import each, jit
-from ..results import EventKind, Status, describe
+from ..results import Status, describe
 from .orbits import BUDGET, first_loop, follow, last_loop, loop_of
 from .shooting import (
     SIZES,
@@ -111,7 +112,7 @@ class Cycle(eqx.Module):
         return arcs
 
     @property
-    def signature(self) -> tuple[tuple[EventKind, int], ...]:
+    def signature(self) -> Signature:
         """The events of one loop, (kind, belt) each; outside of transformations only."""
         require(
             is_concrete(self.chain) and self.chain.ends.ndim == 1,

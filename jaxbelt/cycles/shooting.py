@@ -28,6 +28,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from ..model.events import Signature, events_of
 from ..model.modes import (
     Mode,
     boundary_guards,
@@ -40,10 +41,11 @@ from ..model.modes import (
     stick_velocity,
 )
 from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
+from ..motion.integrators import density
 from ..numerics.compiling import one_kernel
 from ..numerics.extrapolation import Scheme, increments, scheme
 from ..numerics.newton import newton
-from ..results import EventKind
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
@@ -51,21 +53,10 @@ SIZES = (16, 32, 64)
 STEPS = 8
 
 
-class Ends:
-    """Numbers for what ends an arc, for n belts."""
-
-    def __init__(self, n: int):
-        self.extremum_x2, self.extremum_x1, self.onset, self.unused, self.tangent = range(
-            3 * n, 3 * n + 5
-        )
-
-
 class Chain(eqx.Module):
     """A signature: contact codes [arcs, belts], what ends each arc [arcs], and the step fractions.
 
-    ends: i < n the boundary of belt i; n <= i < 3n the edge i - n of `modes.edges`; then the loop
-    x2' = 0, the loop x2 = 0, slip onset, an unused arc, of duration zero, and from there on a
-    tangency to the boundary of belt i (see `_arc_equations`).
+    ends: numbers of `arcs.Ends`. An unused arc is of duration zero.
     """
 
     codes: Array
@@ -107,27 +98,9 @@ def modes_of(loop: Chain | Loop) -> np.ndarray:
     return codes[ends != Ends(codes.shape[-1]).unused].astype(int)
 
 
-def loop_events(loop: Chain | Loop) -> tuple[tuple[EventKind, int], ...]:
+def loop_events(loop: Chain | Loop) -> Signature:
     """The events of one loop, (kind, belt) each; for EDGE the lowest belt that comes or goes."""
-    modes = modes_of(loop).tolist()
-    pairs = zip(modes, modes[1:] + modes[:1], strict=True)
-    return tuple(event_between(before, after) for before, after in pairs if before != after)
-
-
-def event_between(before: Sequence[int], after: Sequence[int]) -> tuple[EventKind, int]:
-    """The event, (kind, belt), that leads from one mode to another one, by their contact codes.
-
-    Of several belts concerned the lowest.
-    """
-    pairs = list(zip(before, after, strict=True))
-    changes = {
-        EventKind.EDGE: [(abs(a) < 2) != (abs(b) < 2) for a, b in pairs],
-        EventKind.STICK: [a != 0 and b == 0 for a, b in pairs],
-        EventKind.SLIP: [a == 0 and b != 0 for a, b in pairs],
-        EventKind.CROSS: [a != b for a, b in pairs],
-    }
-    kind = next(kind for kind, changed in changes.items() if any(changed))
-    return kind, changes[kind].index(True)
+    return events_of(modes_of(loop))
 
 
 def following_codes(chain: Chain | Loop) -> Array:
@@ -150,9 +123,8 @@ def cut(loops: Sequence[Loop], *, more: int = 0) -> list[Loop]:
     return [jax.tree.map(lambda leaf: leaf[room], loop) for loop in loops]
 
 
-# Of order 12 for the arcs, of order 8 for following an orbit, of order 4 for placing the steps.
+# Of order 12 for the arcs, of order 4 for placing the steps.
 _FINE = scheme((2, 4, 6, 8, 10, 12))
-_MEDIUM = scheme((2, 4, 6, 8))
 _COARSE = scheme((2, 4))
 
 
@@ -171,26 +143,6 @@ def _field(osc: Oscillator, codes: Array, y: Array) -> Array:
     return jnp.stack([y[1], mode_acceleration(osc, mode_of(codes), y[0], y[1])])
 
 
-def density(osc: Oscillator, codes: Array, y: Array) -> Array:
-    """How many steps per unit of time an orbit at y wants: more where the friction law bends.
-
-    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0.
-    """
-    a = mode_acceleration(osc, mode_of(codes), y[0], y[1])
-    bend = jnp.zeros(())
-    for i, belt in enumerate(osc.belts):
-        speed = jnp.maximum(jnp.sign(codes[i]) * (belt.velocity - osc.omega * y[1]), 0.0)
-
-        def slope(r, belt=belt):
-            return jax.jvp(belt.friction.mu, (r,), (jnp.ones_like(r),))[1]
-
-        curvature = jax.jvp(slope, (speed,), (jnp.ones_like(speed),))[1]
-        slips = jnp.abs(codes[i]) == 1
-        bend = bend + jnp.where(slips, jnp.sqrt(jnp.abs(belt.load * curvature)), 0.0)
-    turning = jnp.sqrt(bend * jnp.abs(osc.omega * y[1]))  # where x2' = 0, x2'' = -x2
-    return 1 + 0.4 * bend * jnp.abs(osc.omega * a) + turning
-
-
 def meshed(osc: Oscillator, loop: Loop, steps: int = STEPS) -> tuple[Chain, Array]:
     """The chain of a loop with its mesh, and the guess of its unknowns."""
     stuck = jnp.any(loop.codes == 0, axis=-1)
@@ -207,10 +159,10 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
 
     def advance(y, _):
         y = _step(functools.partial(_field, osc, codes), y, h, _COARSE)
-        return y, density(osc, codes, y)
+        return y, density(osc, mode_of(codes), *y)
 
     _, rest = lax.scan(advance, y, None, length=n)
-    rho = jnp.concatenate([density(osc, codes, y)[None], rest])
+    rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
     # Clipped: where a guess is poor the mesh is only less good.
     rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
     share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
