@@ -13,10 +13,10 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     presets         the published systems
     motion/         integrators arcs smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
-    sweeps/         lanes step events observers attractor queue threads audit sweep basins
+    sweeps/         lanes step events marks observers attractor queue threads audit sweep basins
     bifurcations/   refine switch_folds scan curves diagrams
     inverse/        selection record fit design
-    plotting/       style phase diagrams sweeps model
+    plotting/       style phase diagrams sweeps model draw
     paper           the paper's table and figures
     __init__        the public names
     commands/       options reproduce simulate diagram map sweep basins
@@ -69,7 +69,7 @@ from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_
 from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck
 from .model.oscillator import Belt, Oscillator
 from .motion.simulate import Arcs, Events, Trajectory, simulate
-from .results import EventKind, Status, describe
+from .results import EventKind, Status, describe, draw_with
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.sweep import sweep
 
@@ -151,8 +151,19 @@ __all__ = [
 ]
 
 
+# Matplotlib is imported when something is drawn, not before.
+
+
+def _draw(result: Any, ax: Any, **options: Any) -> Any:
+    from .plotting.draw import draw
+
+    return draw(result, ax, **options)
+
+
+draw_with(_draw)
+
+
 def __getattr__(name: str) -> Any:
-    # Matplotlib is imported when something is drawn, not before.
     if name.startswith("plot_") and name in __all__:
         from .plotting import model, phase, sweeps
 

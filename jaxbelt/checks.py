@@ -6,7 +6,6 @@ shape are checked there; results then carry a status and NaN instead of an excep
 """
 
 import os
-import sys
 from typing import Any
 
 import jax
@@ -49,8 +48,9 @@ def _note() -> None:
     global _forked
     # JAX's own list of its backends, empty while they are not in use; the public function that
     # asks for them starts them.
-    in_use = getattr(sys.modules.get("jax._src.xla_bridge"), "_backends", True)
-    _forked = _forked or bool(in_use)
+    from jax._src import xla_bridge
+
+    _forked = _forked or bool(getattr(xla_bridge, "_backends", True))
 
 
 if hasattr(os, "register_at_fork"):

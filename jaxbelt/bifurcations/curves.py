@@ -13,7 +13,6 @@ and the curve goes on from there with the signature that is found.
 """
 
 import functools
-import importlib
 from collections.abc import Callable
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -36,7 +35,7 @@ from ..model.parameters import leaf_index, names_of, parameter, vary
 from ..numerics.compiling import jit
 from ..numerics.continuation import CurvePoint, Stop, continue_curve, corrected
 from ..numerics.newton import newton
-from ..results import Status
+from ..results import Status, draw
 from .refine import (
     HINT_BUDGET,
     AbstractCondition,
@@ -180,8 +179,7 @@ class BifurcationCurve(eqx.Module):
 
     def plot(self, ax: Any = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned."""
-        plotting = importlib.import_module("jaxbelt.plotting.diagrams")
-        return plotting.plot_curves([self], ax)
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         first, last = (f"({p:.6g}, {q:.6g})" for p, q in self.values[[0, -1]])

@@ -26,7 +26,7 @@ from ..numerics.compiling import one_kernel
 from ..results import Status
 from .events import pass_events
 from .lanes import Lanes, Program, choose
-from .step import first_step, take_step, window_of
+from .step import SAFETY, first_step, take_step, window_of
 
 #: Steps between two looks at the events, and events between two refills.
 STEPS, ROUNDS = 4, 4
@@ -72,7 +72,7 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
         x2=x2,
         a=mode_acceleration(osc, mode, x1, x2) + zero,
         h=zero + first_step(rtol),
-        pace=zero + 0.9 / first_step(rtol),
+        pace=zero + SAFETY / first_step(rtol),
         mode=Mode(tuple(code + zero for code in mode.codes)),
         events=jnp.zeros_like(run),
         status=status.astype(run.dtype),
@@ -137,7 +137,7 @@ def _refill(program: Program, shared, rtol, limit, block, begun, available, desk
     slots = jnp.arange(one.size, dtype=jnp.int32)
     lanes, passes = desk.stream.lanes, desk.stream.passes
     osc = _oscillator(program, shared, desk.stream.rows)
-    lanes = _give_up(observer.rest(osc, lanes, one), passes, limit)
+    lanes = _give_up(observer.watch_rarely(osc, lanes, one), passes, limit)
     finished = lanes.done & (lanes.run >= 0)
     finished = finished & (_rank(finished) < one.size - desk.filled)
     # In order, behind what is there.

@@ -82,8 +82,8 @@ TYPES = {
     "n_events": "int32",
     "status": "int8",
 }
-#: Where attractors are looked for until then unless t1 is given.
-LONG_ENOUGH = 3000.0
+#: Default t1 of attractor runs.
+LONG_ENOUGH = 30_000.0
 
 
 def sweep(
@@ -112,16 +112,16 @@ def sweep(
     observe: what is wanted, and the variables of the dataset, over the axes:
 
     - `"final"`: x1_end, x2_end, mode_end(belt) (contact codes as in `Trajectory.modes`), n_events.
-    - `"attractor"`: kind ("equilibrium", "cycle", "stuck", or "undecided" at t1, which is 3000
+    - `"attractor"`: kind ("equilibrium", "cycle", "stuck", or "undecided" at t1, which is 30,000
       unless given), signature (the events of one loop, kind and belt: a number, with its meaning in
       the attributes flag_values and flag_meanings), sticks(belt), period, stick_duration(belt) in
       a loop (inf where stuck for ever), x1_min, x1_max, x2_min, x2_max on the attractor,
       transient: the time at which it was reached, n_events: of a cycle in one loop, else until it
       was known. Runs end as soon as their attractor is known, see `attractor.Attractor`.
     - an object with three methods for scalars: `init(osc, x1, x2)`, the state of a run, any tree of
-      arrays; `update(state, event)`, the state after an `observers.Event` (t, x1, x2, kind, belt);
-      and `finish(state, end)`, a dictionary of results from the state and an `observers.End` (t,
-      x1, x2, status), numbers or vectors. They are traced, so use `jax.numpy`.
+      arrays; `update(state, event)`, the state after an `observers.RunEvent` (t, x1, x2, kind,
+      belt); and `finish(state, end)`, a dictionary of results, numbers or vectors, from the state
+      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`.
 
     and always status, a `Status` code a run: nothing raises because of one run.
 
