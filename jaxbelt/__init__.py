@@ -8,11 +8,11 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
 
     results         status codes and what to do about them
     checks          arguments, checked at the public edge
-    numerics/       compiling continuation derivatives extrapolation newton roots
+    numerics/       compiling derivatives extrapolation newton continuation roots
     model/          friction oscillator parameters modes events equilibria
     presets         the published systems
     motion/         integrators arcs smoothing simulate
-    cycles/         shooting orbits cycle attractors functionals
+    cycles/         settling shooting orbits cycle attractors functionals
     sweeps/         lanes step events marks observers attractor queue threads audit sweep basins
     bifurcations/   refine switch_folds scan curves diagrams
     inverse/        selection record fit design

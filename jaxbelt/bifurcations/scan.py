@@ -44,7 +44,7 @@ from ..cycles.attractors import (
     without_idle,
 )
 from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
-from ..cycles.orbits import AT_REST
+from ..cycles.settling import AT_REST
 from ..cycles.shooting import SIZES, Loop, cut
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.events import events_of

@@ -31,8 +31,8 @@ from ..checks import (
     require,
     require_usable_jax,
 )
+from ..model.events import signature_name
 from ..model.oscillator import Oscillator, check_scalars
-from ..results import of_one_loop
 from .attractor import KINDS, Attractor
 from .audit import chosen, differing
 from .events import word_events
@@ -410,8 +410,7 @@ def _meaning(word: int, belts: int) -> str:
     """A signature as one word; -1 stands for one that is too long to be told."""
     if word < 1:
         return "none" if word == 0 else "long"
-    loop = of_one_loop(word_events(word, belts))
-    return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in loop) or "smooth"
+    return signature_name(word_events(word, belts))
 
 
 def _position(name: str) -> tuple[int, str]:
