@@ -24,7 +24,6 @@ from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,7 +49,7 @@ from ..model.modes import (
     stick_velocity,
 )
 from ..model.oscillator import Oscillator, check_oscillator
-from ..numerics.compiling import jit, one_kernel
+from ..numerics.compiling import any_lane, jit, one_kernel
 from ..numerics.derivatives import forward_jacobian
 from ..numerics.extrapolation import increments, scheme
 from ..numerics.roots import first_root
@@ -487,7 +486,7 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
             return jax.tree.map(keep, state, new), jax.tree.map(keep, blank, record)
 
         # A true branch under vmap too: once every lane is done nothing more is computed.
-        return lax.cond(eqxi.unvmap_any(~state.done), advance, lambda: (state, blank))
+        return lax.cond(any_lane(~state.done), advance, lambda: (state, blank))
 
     # In blocks, because stepping over what is left of the budget is not free.
     length = min(BLOCK, max_segments)
@@ -501,7 +500,7 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
 
     def block(state, _):
         return lax.cond(
-            eqxi.unvmap_any(~state.done),
+            any_lane(~state.done),
             lambda: segments((osc, t1, rtol, atol), state),
             lambda: (state, blank),
         )
