@@ -12,7 +12,6 @@ from jax import lax
 import jaxbelt as jb
 from jaxbelt.numerics import compiling
 
-
 #: Whether the tricks are used, which are those of the CPU's compiler.
 TRICKS = jax.default_backend() == "cpu" and not compiling.PLAIN
 needs_tricks = pytest.mark.skipif(not TRICKS, reason="needs what is not promised")
