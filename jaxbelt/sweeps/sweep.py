@@ -27,12 +27,12 @@ from ..checks import (
     as_array,
     check_finite,
     check_positive,
-    is_concrete,
     require,
     require_usable_jax,
 )
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator, check_scalars
+from ..numerics.compiling import depends
 from .attractor import KINDS, Attractor
 from .audit import chosen, differing
 from .events import word_events
@@ -264,15 +264,7 @@ class _Grid:
 
     def _varying(self) -> tuple[bool, ...]:
         """For each leaf of the oscillator whether it depends on an axis."""
-        found = []
-
-        def probe(values):
-            # What does not depend on the mapped values is computed on the spot.
-            found.extend(not is_concrete(leaf) for leaf in jax.tree.leaves(self.make(**values)))
-            return 0
-
-        jax.vmap(probe, axis_size=2, out_axes=None)({name: np.zeros(2) for name in self.names})
-        return tuple(found)
+        return depends(lambda values: self.make(**values), dict.fromkeys(self.names, 0.0))
 
     def program(self, observer: Observer) -> Program:
         leaves = jax.tree.unflatten(self.structure, self.mapped)

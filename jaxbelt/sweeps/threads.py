@@ -5,14 +5,13 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..numerics.compiling import wide
 from .lanes import Program
 from .queue import ROUNDS, STEPS, advance, idle
 
@@ -27,14 +26,14 @@ WIDTH = {"cpu": 128}
 
 def _kernel(program: Program, derivatives: int) -> Callable:
     """The compiled kernel of a program, one for all threads and all sweeps."""
-    return compiled(program, derivatives > 0, _options())
+    return compiled(program, derivatives > 0)
 
 
 @functools.lru_cache(maxsize=32)
-def compiled(program, derivatives, options):
+def compiled(program, derivatives):
     """The kernel, compiled when it is first called."""
     function = advance_with_derivatives if derivatives else advance
-    return jax.jit(functools.partial(function, program), compiler_options=dict(options) or None)
+    return wide(functools.partial(function, program))
 
 
 def advance_with_derivatives(
@@ -54,25 +53,6 @@ def advance_with_derivatives(
     out = jax.vmap(column, out_axes=(None, 0, None))(queue[1:])
     results, columns, (stream_out, numbers) = out
     return stream_out, numbers, jnp.concatenate([results[None], columns])
-
-
-@functools.lru_cache(maxsize=1)
-def _options() -> tuple[tuple[str, Any], ...]:
-    """Compiler options of the kernel: wide vectors where the processor has them."""
-    if jax.default_backend() != "cpu":
-        return ()
-    try:
-        wide = "avx512f" in Path("/proc/cpuinfo").read_text()
-    except OSError:
-        return ()
-    options = {"xla_cpu_prefer_vector_width": 512}
-    try:
-        if wide:
-            jax.jit(lambda: 0, compiler_options=options)()
-            return tuple(options.items())
-    except jax.errors.JaxRuntimeError:
-        pass  # a version of XLA that does not know the option
-    return ()
 
 
 def workers() -> int:
