@@ -7,8 +7,9 @@ Inside, data goes one way: parameters, modes, motion, cycles, bifurcations, pict
 ladder that shows it. Read from top to bottom, a module imports only what stands before it:
 
     results         status codes and what to do about them
+    numerics/       compiling
     checks          arguments, checked at the public edge
-    numerics/       compiling derivatives extrapolation newton continuation roots
+    numerics/       derivatives extrapolation newton continuation roots
     model/          friction oscillator parameters modes events equilibria
     presets         the published systems
     motion/         integrators arcs smoothing simulate

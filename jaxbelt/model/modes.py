@@ -473,14 +473,16 @@ DISC = tuple(sign * j / 8 for j in range(1, 9) for sign in (1, -1))
 
 
 def settling_margin(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
-    """Positive where an orbit of a slip mode has entered a disc that its fixed point attracts.
+    """Positive where an orbit of a slip mode has entered a disc that its fixed point attracts, or
+    is there up to rounding: a node on an edge, or on the boundary of a belt at rest, has no disc.
 
     And that fixed point's x1.
     """
     zero = jnp.zeros_like(x1)
     x1_rest = mode_acceleration(osc, mode, zero, zero)
     radius = jnp.maximum(jnp.hypot(x1 - x1_rest, x2), SMALLEST_DISC)
-    return disc_margin(osc, mode, x1_rest, radius), x1_rest
+    at_rest = jnp.maximum(jnp.abs(x1 - x1_rest), jnp.abs(x2)) < force_rounding(x1)
+    return jnp.where(at_rest, radius, disc_margin(osc, mode, x1_rest, radius)), x1_rest
 
 
 def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:

@@ -17,7 +17,6 @@ import math
 from dataclasses import replace
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +27,7 @@ from ..checks import as_numbers, check_finite, check_positive, is_concrete, requ
 from ..model.events import event_between
 from ..model.modes import Mode, at_focus, contact, has_edges, mode_of_state, select, stick_velocity
 from ..model.oscillator import Oscillator, check_oscillator
-from ..numerics.compiling import jit, one_kernel
+from ..numerics.compiling import any_lane, jit, one_kernel
 from ..numerics.derivatives import forward_jacobian
 from ..results import EventKind, Status, describe
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
@@ -221,7 +220,7 @@ def _arcs_of_run(
             return jax.tree.map(keep, state, new), jax.tree.map(keep, blank, record)
 
         # A true branch under vmap too: once every lane is done nothing more is computed.
-        return lax.cond(eqxi.unvmap_any(~state.done), advance, lambda: (state, blank))
+        return lax.cond(any_lane(~state.done), advance, lambda: (state, blank))
 
     # In blocks, because stepping over what is left of the budget is not free.
     length = min(BLOCK, max_segments)
@@ -235,7 +234,7 @@ def _arcs_of_run(
 
     def block(state, _):
         return lax.cond(
-            eqxi.unvmap_any(~state.done),
+            any_lane(~state.done),
             lambda: segments((osc, t1, rtol, atol), state),
             lambda: (state, blank),
         )

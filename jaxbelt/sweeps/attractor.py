@@ -11,7 +11,7 @@ from ..cycles.settling import REPEATED, way_left
 from ..model.modes import begins_at_rest, select, settling_margin
 from ..model.oscillator import Oscillator
 from ..results import Status
-from .events import append, are_at_rest, event_kinds
+from .events import append, event_kinds
 from .lanes import Lanes, Observer, Passage, materialise
 from .marks import Mark
 
@@ -70,7 +70,8 @@ class Attractor(Observer):
     The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
     """
 
-    #: What `settling.REPEATED` is at the end of a stick phase, which repeats up to rounding.
+    #: Distance to the last state at the end of a stick phase, which repeats up to rounding, over
+    #: the amplitude.
     EXACT: ClassVar[float] = 1e-9
     #: A top that moved by fewer tolerances than this, over the amplitude, moves by rounding alone.
     STANDS: ClassVar[float] = 30.0
@@ -174,8 +175,6 @@ class Attractor(Observer):
     def watch_rarely(self, osc, lanes, one):
         loop: _Loop = lanes.memory
         margin, x1_rest = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
-        # A node on the boundary of a belt at rest is at rest within no disc, and lands on nothing.
-        margin = jnp.where(are_at_rest(lanes), 1.0, margin)
         found = materialise(jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin), one) > 0
         memory = replace(
             loop,

@@ -26,11 +26,6 @@ from .lanes import Lanes, Passage, Program
 from .step import NO_STEP, SAFETY, first_step
 
 
-def are_at_rest(lanes: Lanes) -> Array:
-    """Whether x2 and x2' are zero up to rounding."""
-    return jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < force_rounding(lanes.x1)
-
-
 def pass_events(
     program: Program, osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array
 ) -> tuple[Lanes, Passage]:
@@ -39,7 +34,7 @@ def pass_events(
     # A lane may also have landed where x2 = 0, which is no guard.
     number = guard_passed(osc, lanes.mode, lanes.x1, lanes.x2)
     # At rest a lane stays, even on a guard.
-    at_rest = are_at_rest(lanes)
+    at_rest = jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < force_rounding(lanes.x1)
     fired = landed & (number >= 0) & ~at_rest
     rests = landed & at_rest & ((number >= 0) | (lanes.h >= -NO_STEP))
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
@@ -106,8 +101,8 @@ def _set_off(program, osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> 
 
 
 def event_kinds(lanes: Lanes, passage: Passage) -> tuple[tuple[Array, Array, Array], ...]:
-    """(happened, kind, belt) of two events: that which ended a step, and the end of a stick phase
-    that followed at once."""
+    """(happened, kind, belt) of the event that ended a step, and of that which ended a stick phase
+    after it."""
     return (
         (passage.fired, *event_between(passage.before.codes, passage.mode.codes)),
         (passage.released, *event_between(passage.mode.codes, lanes.mode.codes)),
