@@ -18,7 +18,7 @@ or arrays of lanes (the kernel of `sweeps.queue`), belts are unrolled.
 
 import functools
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -65,8 +65,8 @@ class Mode(eqx.Module):
         )
 
 
-def any_of(flags: Sequence[Array]) -> Array:
-    """Elementwise `or` of at least one array of booleans."""
+def any_of(flags: Sequence[Any]) -> Any:
+    """Elementwise `or` of at least one array of booleans, of JAX or of NumPy."""
     out = flags[0]
     for flag in flags[1:]:
         out = out | flag
