@@ -5,8 +5,6 @@ tells its signature as it begins; where two are compared, or one is named, it is
 order first, by `of_one_loop`.
 """
 
-import functools
-import operator
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
@@ -14,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..results import EventKind
+from .modes import any_of
 
 Step = TypeVar("Step")
 #: The events of one loop of a cycle, (kind, belt) each.
@@ -42,7 +41,7 @@ def event_between(before: Sequence[Any], after: Sequence[Any]) -> tuple[Any, Any
         lowest = -1
         for number, flag in reversed(list(enumerate(changed))):
             lowest = where(flag, number, lowest)
-        happens = functools.reduce(operator.or_, changed)
+        happens = any_of(changed)
         kind, belt = where(happens, one.value, kind), where(happens, lowest, belt)
     return kind, belt
 

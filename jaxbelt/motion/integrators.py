@@ -31,7 +31,7 @@ Field = Callable[[Any], State]
 MAX_FRACTION, FIRST_FRACTION = 0.5, 0.2
 #: Steps of `Adaptive` before an arc is given up.
 MAX_ADAPTIVE_STEPS = 100_000
-#: A step of `Graded` times the wanted density of steps: errors of about 1e-11 a loop.
+#: A step of `Graded` times the wanted density. From there Newton's method takes two steps, mostly.
 STRIDE = 0.2
 #: Steps of `Graded` before an arc, a quarter of a loop at most, is given up.
 MAX_GRADED_STEPS = 200
