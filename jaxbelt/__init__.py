@@ -15,6 +15,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     motion/         smoothing simulate
     cycles/         cycle attractors functionals
     sweeps/         batch audit sweep basins
+    bifurcations/   systems conditions guesses tangencies crossings edges folds rests
     bifurcations/   refine switch_folds scan curves diagrams
     inverse/        inverse
     plotting/       plotting
@@ -27,6 +28,8 @@ import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 from . import presets
+from .bifurcations.conditions import BifurcationPoint
+from .bifurcations.crossings import CrossingSliding, SlidingExchange
 from .bifurcations.curves import BifurcationCurve, SpecialPoint, bifurcation_curve
 from .bifurcations.diagrams import (
     BifurcationDiagram,
@@ -34,23 +37,12 @@ from .bifurcations.diagrams import (
     bifurcation_diagram,
     region_map,
 )
-from .bifurcations.refine import (
-    BeltAtRest,
-    BifurcationPoint,
-    BoundaryEquilibrium,
-    CornerCollision,
-    CrossingSliding,
-    FoldOfCycles,
-    GrazingEdge,
-    GrazingSliding,
-    Hopf,
-    NonsmoothFold,
-    PseudoHopf,
-    SlidingExchange,
-    SuddenSliding,
-    refine,
-)
+from .bifurcations.edges import CornerCollision, GrazingEdge
+from .bifurcations.folds import FoldOfCycles
+from .bifurcations.refine import refine
+from .bifurcations.rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
 from .bifurcations.scan import scan
+from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, find_cycle, unstable_cycle
 from .cycles.functionals import (
     amplitude,

@@ -18,16 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .bifurcations.conditions import AbstractCondition
+from .bifurcations.crossings import SlidingExchange
 from .bifurcations.diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
-from .bifurcations.refine import (
-    AbstractCondition,
-    GrazingSliding,
-    Hopf,
-    NonsmoothFold,
-    SlidingExchange,
-    SuddenSliding,
-)
+from .bifurcations.rests import Hopf, SuddenSliding
 from .bifurcations.scan import refined
+from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, unstable_cycle
 from .model.equilibria import Equilibria, equilibria
 from .model.oscillator import Belt, Oscillator

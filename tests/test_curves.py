@@ -10,8 +10,8 @@ from scipy.optimize import brentq
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.curves import _departure
-from jaxbelt.bifurcations.refine import leaf_index, vary
 from jaxbelt.bifurcations.scan import refined
+from jaxbelt.model.parameters import leaf_index, vary
 from jaxbelt.numerics.continuation import End
 
 

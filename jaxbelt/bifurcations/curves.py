@@ -46,35 +46,23 @@ from ..model.parameters import leaf_index, names_of, parameter, vary
 from ..numerics.compiling import jit
 from ..numerics.continuation import CurvePoint, End, continue_curve, corrected
 from ..results import Status
-from .refine import (
-    HINT_BUDGET,
-    AbstractCondition,
+from .conditions import AbstractCondition, BifurcationPoint
+from .crossings import CrossingSliding, SlidingExchange, StickLimit, arrival_near_limit
+from .edges import CornerCollision, EdgeContact, GrazingEdge, end_near_edge
+from .folds import FoldOfCycles, UnitMultiplier
+from .guesses import HINT_BUDGET, least_push
+from .rests import (
     BeltAtRest,
-    BifurcationPoint,
     BoundaryEquilibrium,
-    CornerCollision,
-    CrossingSliding,
-    EdgeContact,
-    Encounter,
-    FoldOfCycles,
-    GrazingEdge,
-    GrazingSliding,
     Hopf,
-    NonsmoothFold,
     PseudoHopf,
-    SlidingExchange,
-    StickLimit,
     SuddenSliding,
-    UnitMultiplier,
-    arrival_near_limit,
     edge_balance,
     edge_rest,
-    end_near_edge,
-    least_push,
-    small_newton,
-    stick_phase_from,
 )
 from .scan import refined, sudden_sliding
+from .systems import Encounter, small_newton
+from .tangencies import GrazingSliding, NonsmoothFold, stick_phase_from
 
 #: Unknowns of a cycle count this much in the length of a step, beside the two parameters; large
 #: ones less, for durations of stick phases go to infinity where a belt comes to rest.

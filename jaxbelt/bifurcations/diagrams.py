@@ -35,16 +35,11 @@ from ..model.parameters import set_alone
 from ..numerics.compiling import jit
 from ..results import Status
 from ..sweeps.sweep import sweep
+from .conditions import AbstractCondition, BifurcationPoint
 from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere, place_at
-from .refine import (
-    AbstractCondition,
-    BeltAtRest,
-    BifurcationPoint,
-    GrazingSliding,
-    NonsmoothFold,
-    SuddenSliding,
-)
+from .rests import BeltAtRest, SuddenSliding
 from .scan import Label, Path, by_value, edges_touched, search
+from .tangencies import GrazingSliding, NonsmoothFold
 
 #: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
 SAME = 1e-2

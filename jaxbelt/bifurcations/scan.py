@@ -60,38 +60,28 @@ from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index, names_of, vary
 from ..numerics.compiling import each, jit
 from ..results import EventKind, Status
-from .refine import (
-    AbstractCondition,
-    BeltAtRest,
-    BifurcationPoint,
-    BoundaryEquilibrium,
-    CornerCollision,
+from .conditions import AbstractCondition, BifurcationPoint, unexplained_point
+from .crossings import (
     CrossingSliding,
-    FoldOfCycles,
-    GrazingEdge,
-    GrazingSliding,
-    Hopf,
-    NonsmoothFold,
-    PseudoHopf,
     SlidingExchange,
-    SuddenSliding,
     at_crossing,
+    at_exchange,
+    crossing_near,
+    exchange_near,
+)
+from .edges import (
+    CornerCollision,
+    GrazingEdge,
     at_edge,
     at_edge_unstable,
-    at_exchange,
-    at_fold_of_cycles,
-    at_tangency,
-    crossing_near,
     edge_contact,
     end_near_edge,
-    exchange_near,
-    fold_near,
-    room_for,
-    settled_loops,
-    solver_of,
-    tangency_near,
-    unexplained_point,
 )
+from .folds import FoldOfCycles, at_fold_of_cycles, fold_near
+from .guesses import settled_loops
+from .refine import room_for, solver_of
+from .rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
+from .tangencies import GrazingSliding, NonsmoothFold, at_tangency, tangency_near
 
 #: Values of the parameter in one batch.
 BATCH = 32
