@@ -15,8 +15,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     motion/         smoothing simulate
     cycles/         cycle attractors functionals
     sweeps/         batch audit sweep basins
-    bifurcations/   systems conditions guesses tangencies crossings edges folds rests
-    bifurcations/   refine switch_folds scan curves diagrams
+    bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
+    bifurcations/   refine path scan curves diagrams switch_folds
     inverse/        inverse
     plotting/       plotting
     paper           the paper's table and figures
@@ -28,9 +28,9 @@ import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 from . import presets
-from .bifurcations.conditions import BifurcationPoint
+from .bifurcations.conditions import BifurcationPoint, SpecialPoint
 from .bifurcations.crossings import CrossingSliding, SlidingExchange
-from .bifurcations.curves import BifurcationCurve, SpecialPoint, bifurcation_curve
+from .bifurcations.curves import BifurcationCurve, bifurcation_curve
 from .bifurcations.diagrams import (
     BifurcationDiagram,
     RegionMap,

@@ -13,7 +13,8 @@ from laws import BELL, NESTED, bell, nested
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
-from jaxbelt.bifurcations.scan import Path, search
+from jaxbelt.bifurcations.path import Path
+from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import distinct
 from jaxbelt.cycles.cycle import loop_events
 from jaxbelt.model.parameters import leaf_index, vary

@@ -1,16 +1,28 @@
-"""Cycles that touch a contact edge."""
+"""Cycles that touch a contact edge: `GrazingEdge` and `CornerCollision`.
+
+An arc of a cycle ends on a contact edge and in something else at once. With an extremum of x1, the
+orbit is tangent to the edge, x2 = 0; with a boundary r_k = 0 or slip onset, it runs into the corner
+of that and the edge. To one side of the point the edge ends the arc, to the other that does: the
+equation is that the other's guard vanishes, which is linear in the unknowns. A cycle that passes
+the edge and turns back soon after has that excursion left out: with it the equation is of second
+order in the velocity at the edge.
+
+Grazing and corner collision are the names of M. di Bernardo, C. Budd, A. Champneys, P. Kowalczyk,
+Piecewise-smooth Dynamical Systems, 2008.
+"""
+
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array
 
 from ..cycles.cycle import (
     AT_REST,
+    SIZES,
     Chain,
-    Cycle,
     Ends,
     Loop,
     end_guard,
@@ -19,21 +31,120 @@ from ..cycles.cycle import (
     separating_loop,
 )
 from ..model.equilibria import candidates
-from ..model.modes import (
-    edges,
-    mode_acceleration,
-    mode_of,
-    onset_position,
-)
+from ..model.modes import edges, mode_acceleration, mode_of, onset_position
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
+from ..numerics.continuation import End
 from ..results import Status
-from .conditions import BeltCondition, BifurcationPoint, solved_point
+from .conditions import AbstractCycleCondition, Line
+from .crossings import arrival_tests
 from .guesses import nearest, settled_loops, without_arcs
-from .systems import System
+from .rests import check_edge, hopf_limit
+from .systems import CycleSystem
 
 
-class GrazingEdge(BeltCondition):
+class EdgeContact(CycleSystem):
+    """A cycle of which an arc, `row`, ends on an edge and in something else at once.
+
+    One of the two ends the arc; of the other one, `end`, the guard vanishes there in the mode of
+    `codes`. repels: whether the cycle is to be unstable.
+    """
+
+    chain: Chain
+    row: Array
+    end: Array
+    codes: Array
+    repels: Array
+
+    def condition(self, osc, z, miss):
+        following = (self.row + 1) % z.shape[0]  # unused arcs hand the state on
+        return end_guard(osc, self.codes, self.end, z[following, :2])
+
+    def judge(self, osc, z, cycle, slope):
+        # A loop at once after the edge is passed solves the equations, too, but they are singular;
+        # and a cycle that has shrunk to a pseudo-focus meets everything there.
+        loops = cycle.chain.ends[self.row] == Ends(len(osc.belts)).extremum_x1
+        shrunk = jnp.ptp(z[:, 0]) < AT_REST
+        fails = loops & (z[self.row, 2] < 1e-6) | shrunk
+        solved = cycle.status == Status.OK
+        status = jnp.where(solved & fails, Status.NO_CONVERGENCE.value, cycle.status)
+        none = solved & ~(slope > 1) | shrunk & (status == Status.NO_CONVERGENCE)
+        status = jnp.where(self.repels & none, Status.NO_UNSTABLE_CYCLE.value, status)
+        return status, jnp.asarray(jnp.nan)
+
+    def watch(self, osc, z, slope):
+        return arrival_tests(osc, self.chain, z, self.row), True, jnp.nan
+
+
+class AbstractEdgeTouch(AbstractCycleCondition):
+    """An arc of a cycle ends on an edge of a belt and in something else at once.
+
+    wanted: 1 an extremum of x1 (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
+    attracting cycles that which comes nearest to this is taken; unstable: of the cycle from
+    `unstable_cycle`, not of an attracting one.
+    """
+
+    belt: int | Array
+    wanted: eqx.AbstractVar[float | Array]
+    unstable: eqx.AbstractVar[bool]
+
+    @property
+    def room(self):
+        return SIZES[0] if self.unstable else SIZES[1]
+
+    @property
+    def sought(self):
+        return EdgeTouch(self.belt, unstable=self.unstable)
+
+    def check(self, osc):
+        super().check(osc)
+        check_edge(osc, self.belt)
+
+    def as_data(self):
+        # One program serves both kinds.
+        belt, wanted = (jnp.asarray(np.array(one)) for one in (self.belt, self.wanted))
+        return EdgeTouch(belt, wanted, self.unstable)
+
+    def named(self, point):
+        if self.unstable:
+            return GrazingEdge(self.belt, unstable=True)
+        chain, z = point.cycle.chain, point.cycle.unknowns
+        loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
+        belt, either = jnp.asarray(self.belt), jnp.zeros(())
+        near = end_near_edge(point.oscillator, loop, belt, either)
+        return (GrazingEdge if near.grazes else CornerCollision)(self.belt)
+
+    def guess(self, osc, size):
+        if self.unstable:
+            return separating_loop(osc, size)[:2]
+        return nearest(osc, *settled_loops(osc, candidates(osc), size), self)
+
+    def guess_near(self, loop):
+        # In as many rows as those of the guess, so that one program serves both.
+        return loop, jnp.asarray(Status.OK.value)
+
+    def distance(self, osc: Oscillator, loop: Loop) -> Array:
+        """How far the nearest end of an arc is from both at once."""
+        return end_near_edge(osc, loop, self.belt, self.wanted).distance
+
+    def system(self, osc, loop, status):
+        near = end_near_edge(osc, loop, self.belt, self.wanted)
+        exists = (status != Status.OK) | jnp.isfinite(near.distance)
+        status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
+        loop, row = _without_excursion(osc, loop, near)
+        chain, z = meshed(osc, loop)
+        repels = jnp.asarray(np.array(self.unstable))
+        return EdgeContact(chain, row, near.end, near.codes, repels), z, status
+
+
+class EdgeTouch(AbstractEdgeTouch):
+    """Such an end of whichever kind, and what programs know of both."""
+
+    wanted: float | Array = 0.0
+    unstable: bool = eqx.field(static=True, default=False)
+
+
+class GrazingEdge(AbstractEdgeTouch):
     """The cycle is tangent to a contact edge of a belt: a loop, an extremum of x1, touches it.
 
     Beyond, the cycle passes the edge; or there is none, where the edge pushes away to both sides.
@@ -43,8 +154,30 @@ class GrazingEdge(BeltCondition):
 
     unstable: bool = eqx.field(static=True, default=False)
 
+    caption: ClassVar[str] = "edge grazing, belt {belt}"
+    line: ClassVar[Line] = Line("edge grazing", "#56B4E9")
 
-class CornerCollision(BeltCondition):
+    @property
+    def wanted(self):
+        return 1.0
+
+    @classmethod
+    def between(cls, before, after, edged):
+        # Whether an end of an arc on an edge is a loop or a corner is seen when it is found.
+        return [cls(belt) for belt in edged] if before.cycles != after.cycles else []
+
+    @classmethod
+    def of_unstable_cycles(cls, edged):
+        return [cls(belt, unstable=True) for belt in edged]
+
+    def limit(self, trail):
+        """Where the cycle has shrunk to an equilibrium on the edge."""
+        if trail.end is End.POINT_COUNT:
+            return None
+        return hopf_limit("BoundaryHopf", trail, _guard_at_rest, trail.system.end)
+
+
+class CornerCollision(AbstractEdgeTouch):
     """The cycle runs into a corner of a contact edge of a belt and a boundary r_k = 0.
 
     It begins, or ceases, to stick to a belt there, or crosses its boundary: beyond, these come in
@@ -52,22 +185,23 @@ class CornerCollision(BeltCondition):
     A guess has to lie on a side where there is a cycle; `scan` tries both.
     """
 
+    caption: ClassVar[str] = "corner, belt {belt}"
+    line: ClassVar[Line] = Line("corner", "#56B4E9", (0, (3, 1, 1, 1)))
 
-class EdgeContact(System):
-    """A cycle of which an arc, `row`, ends on an edge and in something else at once.
+    @property
+    def wanted(self):
+        return -1.0
 
-    One of the two ends the arc; of the other one, `end`, the guard vanishes there in the mode of
-    `codes`.
-    """
+    @property
+    def unstable(self):
+        return False
 
-    chain: Chain
-    row: Array
-    end: Array
-    codes: Array
 
-    def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
-        following = (self.row + 1) % z.shape[0]  # unused arcs hand the state on
-        return end_guard(osc, self.codes, self.end, z[following, :2])
+def _guard_at_rest(osc: Oscillator, codes: Array, x1: Array, end: Array) -> Array:
+    return end_guard(osc, codes, end, jnp.stack([x1, jnp.zeros(())]))
+
+
+# --- the end of an arc nearest to an edge and something else --------------------------------------
 
 
 class EdgeEnd(eqx.Module):
@@ -85,7 +219,7 @@ class EdgeEnd(eqx.Module):
 
 
 @jit
-def end_near_edge(osc: Oscillator, loop: Loop, belt: Array, wanted: Array) -> EdgeEnd:
+def end_near_edge(osc: Oscillator, loop: Loop, belt: int | Array, wanted: float | Array) -> EdgeEnd:
     """Of the ends of the arcs of a loop that nearest to an edge of the belt and something else.
 
     wanted: 1 tangent to the edge, -1 in a corner, 0 either.
@@ -162,60 +296,3 @@ def _without_excursion(osc: Oscillator, loop: Loop, near: EdgeEnd) -> tuple[Loop
     without = eqx.tree_at(lambda t: t.ends, without, without.ends.at[last].set(names.extremum_x1))
     loop = jax.tree.map(lambda a, b: jnp.where(is_excursion, a, b), without, loop)
     return loop, jnp.where(is_excursion, last, row)
-
-
-def at_edge(osc: Oscillator, index: int | Array, belts: Array, wanted: Array, size: int):
-    """An attracting cycle of which an arc ends on an edge of the first belt, not by that edge.
-
-    wanted: 1 a loop ends it (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
-    these cycles that which comes nearest to this is taken.
-    """
-    distance = eqx.Partial(_distance_to_edge, belts, wanted)
-    loop, status = nearest(osc, *settled_loops(osc, candidates(osc), size), distance)
-    return edge_contact(osc, index, belts, wanted, loop, status, repels=False)
-
-
-def _distance_to_edge(belts, wanted, osc: Oscillator, loop: Loop) -> Array:
-    return end_near_edge(osc, loop, belts[0], wanted).distance
-
-
-def at_edge_unstable(osc: Oscillator, index: int | Array, belts: Array, wanted, size: int):
-    """The unstable cycle around a stable equilibrium, with a loop on an edge of the first belt."""
-    loop, status, _ = separating_loop(osc, size)
-    return edge_contact(osc, index, belts, wanted, loop, status, repels=True)
-
-
-def edge_contact(
-    osc: Oscillator, index: int | Array, belts, wanted, loop: Loop, status: Array, *, repels: bool
-) -> BifurcationPoint:
-    """The cycle near a loop of which an arc ends on an edge of the first belt.
-
-    wanted: as for `at_edge`; status: of the loop; repels: whether the cycle is to be unstable.
-    """
-    unstable = jnp.asarray(np.array(repels))
-    return solved_point(osc, index, *_touching_edge(osc, belts, wanted, loop, status, unstable))
-
-
-@jit
-def _touching_edge(osc: Oscillator, belts: Array, wanted, loop: Loop, status: Array, repels):
-    """The system of `edge_contact` with a guess of its unknowns, a status, and the judge."""
-    still = lax.stop_gradient(osc)
-    near = end_near_edge(still, loop, belts[0], wanted)
-    exists = (status != Status.OK) | jnp.isfinite(near.distance)
-    status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
-    loop, row = _without_excursion(still, loop, near)
-    chain, z = meshed(still, loop)
-    system = EdgeContact(chain, row, near.end, near.codes)
-    return system, z, status, eqx.Partial(_judge_contact, row, repels)
-
-
-def _judge_contact(row, repels, osc: Oscillator, z, cycle: Cycle, slope):
-    # A loop at once after the edge is passed solves the equations, too, but they are singular;
-    # and a cycle that has shrunk to a pseudo-focus meets everything there.
-    loops = cycle.chain.ends[row] == Ends(len(osc.belts)).extremum_x1
-    shrunk = jnp.ptp(z[:, 0]) < AT_REST
-    fails = loops & (z[row, 2] < 1e-6) | shrunk
-    solved = cycle.status == Status.OK
-    status = jnp.where(solved & fails, Status.NO_CONVERGENCE.value, cycle.status)
-    none = repels & (solved & ~(slope > 1) | shrunk & (status == Status.NO_CONVERGENCE))
-    return jnp.where(none, Status.NO_UNSTABLE_CYCLE.value, status), jnp.asarray(jnp.nan)

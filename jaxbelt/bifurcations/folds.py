@@ -1,32 +1,66 @@
-"""Folds of cycles that do not stick."""
+"""Folds of cycles that do not stick: `FoldOfCycles`.
 
-from collections.abc import Callable
+The multiplier of such a cycle is one. There the equations of the cycle alone are singular; with
+this one, and the parameter, they are not. (A cycle that sticks has the multiplier zero and takes
+part in nonsmooth folds only.) Yu. Kuznetsov, Elements of Applied Bifurcation Theory, chapter 5, has
+the fold of a cycle in smooth systems.
+"""
 
-import equinox as eqx
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..cycles.cycle import (
-    Chain,
-    Cycle,
-    Loop,
-    closure,
-    first_loop,
-    loop_of,
-    meshed,
-    multiplier_and_slopes,
-)
+from ..cycles.attractors import sticks
+from ..cycles.cycle import Chain, closure, first_loop, loop_of, meshed, multiplier_and_slopes
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
+from ..numerics.continuation import End
 from ..results import Status
-from .conditions import AbstractCondition, BifurcationPoint, solved_point
-from .systems import System
+from .conditions import AbstractCycleCondition, Line
+from .rests import hopf_limit, third_derivative
+from .systems import CycleSystem, contact_tests, nearest_contacts
+
+#: Starts of which the first loops are compared.
+STARTS = 48
 
 
-class FoldOfCycles(AbstractCondition):
+class UnitMultiplier(CycleSystem):
+    """A cycle with multiplier one; width: from its smallest to its largest x1, in the guess."""
+
+    chain: Chain
+    width: Array
+
+    def condition(self, osc, z, miss):
+        return closure(osc, self.chain, z)[1] - 1
+
+    def condition_and_slopes(self, osc_of, z, p, miss):
+        along = jax.jacfwd(osc_of)(p)
+        product, by_z, by_p = multiplier_and_slopes(osc_of(p), along, self.chain, z)
+        return product - 1, (by_z, by_p, jnp.zeros_like(miss))
+
+    def judge(self, osc, z, cycle, slope):
+        # A cycle that has shrunk to the equilibrium has multiplier one too: a Hopf point.
+        shrunk = jnp.ptp(z[:, 0]) < 0.2 * self.width
+        other = (cycle.status == Status.OK) & ~(jnp.abs(slope - 1) < 1e-6)
+        solved = (cycle.status == Status.OK) | (cycle.status == Status.NO_CONVERGENCE)
+        fails = other | (shrunk & solved)
+        return jnp.where(fails, Status.NO_FOLD.value, cycle.status), jnp.asarray(jnp.nan)
+
+    def watch(self, osc, z, slope):
+        sticks = self.chain.used & jnp.any(self.chain.codes == 0, axis=-1)
+        nearest, _ = nearest_contacts(osc, self.chain, z, sticks)
+        tests = contact_tests("FoldGrazing", nearest, jnp.ones(nearest.shape, bool))
+        # Largest x1 less its mean. Beyond an equilibrium the equations go on, what is largest and
+        # smallest exchanged.
+        size = z[0, 0] - jnp.mean(z[:, 0], where=self.chain.used)
+        return tests, size > 0, jnp.where(jnp.any(sticks), 0.0, slope)
+
+
+class FoldOfCycles(AbstractCycleCondition):
     """Two cycles that do not stick, a stable and an unstable one, meet and vanish.
 
     Near a degenerate Hopf point, where both shrink to the equilibrium, small ones are not found. In
@@ -34,39 +68,43 @@ class FoldOfCycles(AbstractCondition):
     as far from the point as that is from the Hopf point.
     """
 
+    caption: ClassVar[str] = "fold of cycles"
+    line: ClassVar[Line] = Line("fold of cycles", "#E69F00")
+    #: Beyond a fold orbits pass the place of the cycles slowly, as if they were there.
+    slow: ClassVar[bool] = True
+    ends_at_contact: ClassVar[bool] = True
 
-#: Starts of which the first loops are compared.
-STARTS = 48
+    def guess(self, osc, size):
+        return _extremal_loop(osc, candidates(osc), size)
 
+    def system(self, osc, loop, status):
+        chain, z = meshed(osc, loop)
+        return UnitMultiplier(chain, jnp.ptp(z[:, 0])), z, status
 
-class UnitMultiplier(System):
-    """A cycle with multiplier one."""
+    @classmethod
+    def between(cls, before, after, edged):
+        return [cls()] if before.smooth != after.smooth else []
 
-    chain: Chain
+    def beginnings(self, cycles):
+        return [*(one.loop for one in cycles if not sticks(one.path)), None]
 
-    def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
-        return closure(osc, self.chain, z)[1] - 1
-
-    def condition_and_slopes(self, osc_of: Callable[[Array], Oscillator], z, p: Array, miss):
-        along = jax.jacfwd(osc_of)(p)
-        product, by_z, by_p = multiplier_and_slopes(osc_of(p), along, self.chain, z)
-        return product - 1, (by_z, by_p, jnp.zeros_like(miss))
-
-
-def at_fold_of_cycles(osc: Oscillator, index: int | Array, belts, wanted, size) -> BifurcationPoint:
-    """Two cycles meet where a loop neither grows nor shrinks, and neither do its neighbours.
-
-    So the guess is the first loop whose growth is extremal among its neighbours'; of several the
-    one that closes best. Near a fixed point with eigenvalues rate +- i frequency the growth tends
-    to 2 pi rate/frequency, and it has an extremum there that is no more than an effect of where
-    loops begin: it differs from that limit by a term of second order in the rate.
-    """
-    return fold_near(osc, index, *_extremal_loop(osc, candidates(osc), size))
+    def limit(self, trail):
+        """Where the cycle has shrunk to an equilibrium, at a degenerate Hopf point."""
+        if trail.end is End.POINT_COUNT:
+            return None
+        return hopf_limit("DegenerateHopf", trail, third_derivative)
 
 
 @jit
 def _extremal_loop(osc: Oscillator, rests: Equilibria, size: int):
-    """The loop of `at_fold_of_cycles`, and a status."""
+    """A loop that neither grows nor shrinks, nearly, nor do its neighbours; and a status.
+
+    So it is where two cycles meet. It is the first loop whose growth is extremal among its
+    neighbours'; of several the one that closes best. Near a fixed point with eigenvalues rate +- i
+    frequency the growth tends to 2 pi rate/frequency, and it has an extremum there that is no more
+    than an effect of where loops begin: it differs from that limit by a term of second order in the
+    rate.
+    """
     still, rests = lax.stop_gradient((osc, rests))
     eligible = (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
     row = jnp.argmax(eligible)
@@ -96,24 +134,3 @@ def _extremal_loop(osc: Oscillator, rests: Equilibria, size: int):
     orbit, found = jax.tree.map(lambda leaf: leaf[-1], (orbits, found))
     status = jnp.where(jnp.any(eligible) & found, Status.OK.value, Status.NO_FOLD.value)
     return loop_of(orbit, size, len(osc.belts)), status
-
-
-def fold_near(osc: Oscillator, index: int | Array, loop: Loop, status: Array) -> BifurcationPoint:
-    """The cycle near a loop that is to have multiplier one; status: of the loop."""
-    return solved_point(osc, index, *_closing(osc, loop, status))
-
-
-@jit
-def _closing(osc: Oscillator, loop: Loop, status: Array):
-    """The system of `fold_near` with a guess of its unknowns, a status, and the judge."""
-    chain, z = meshed(lax.stop_gradient(osc), loop)
-    return UnitMultiplier(chain), z, status, eqx.Partial(_judge_fold, jnp.ptp(z[:, 0]))
-
-
-def _judge_fold(width, osc: Oscillator, z, cycle: Cycle, slope):
-    # A cycle that has shrunk to the equilibrium has multiplier one too: a Hopf point.
-    shrunk = jnp.ptp(z[:, 0]) < 0.2 * width
-    other = (cycle.status == Status.OK) & ~(jnp.abs(slope - 1) < 1e-6)
-    solved = (cycle.status == Status.OK) | (cycle.status == Status.NO_CONVERGENCE)
-    fails = other | (shrunk & solved)
-    return jnp.where(fails, Status.NO_FOLD.value, cycle.status), jnp.asarray(jnp.nan)

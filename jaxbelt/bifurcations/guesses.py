@@ -1,7 +1,11 @@
-"""Loops near which a condition is looked for."""
+"""Loops of cycles near which a condition is looked for.
+
+Orbits are followed from where stick phases end, and from a few places beside an equilibrium, until
+a loop repeats.
+"""
 
 import functools
-from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -140,17 +144,19 @@ def settled_loops(osc: Oscillator, rests: Equilibria, size: int) -> tuple[Loop, 
 
 
 @jit
-def nearest(osc: Oscillator, loops: Loop, status: Array, distance: Callable) -> tuple[Loop, Array]:
-    """Of the loops that were found the one for which distance(osc, loop) is least, and a status."""
-    distances = jax.vmap(functools.partial(distance, lax.stop_gradient(osc)))(loops)
-    distances = jnp.where(status == Status.OK, distances, jnp.inf)
+def nearest(osc: Oscillator, loops: Loop, status: Array, condition: Any) -> tuple[Loop, Array]:
+    """Of the loops that were found the one with the least condition.distance(osc, loop), and a
+    status."""
+    distances = jax.vmap(functools.partial(condition.distance, lax.stop_gradient(osc)))(loops)
+    known = (status == Status.OK) & ~jnp.isnan(distances)
+    distances = jnp.where(known, distances, jnp.inf)
     at, large = jnp.argmin(distances), jnp.any(status == Status.TOO_MANY_ARCS)
     none = jnp.where(large, Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
     found = jnp.isfinite(distances[at])
     return jax.tree.map(lambda x: x[at], loops), jnp.where(found, Status.OK.value, none)
 
 
-def least_push(osc: Oscillator, loop: Loop, belt: Array) -> tuple[Array, Array]:
+def least_push(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Array, Array]:
     """The arc that arrives to stick to a belt with the least x2': its row, and the size of that.
 
     From the side on which that vanishes where the orbit is tangent to the boundary; inf: none.
@@ -166,29 +172,29 @@ def least_push(osc: Oscillator, loop: Loop, belt: Array) -> tuple[Array, Array]:
 
 
 @jit
-def orbit_after_stick(osc: Oscillator, belts: Array) -> tuple[Oscillator, Array, Orbit]:
-    """The orbit from where a stick phase on the first of the belts ends, its start, the oscillator.
+def orbit_after_stick(osc: Oscillator, belt: int | Array) -> tuple[Oscillator, Array, Orbit]:
+    """The orbit from where a stick phase on a belt ends, its start, the oscillator.
 
     Of several the one that comes back most nearly tangent to its boundary to stick there; if none
     does, the one that comes nearest to it. The oscillator is the one given but for the velocity of
     that belt: where it is at rest, no orbit leaves.
     """
     velocities = [
-        jnp.where((belts[0] == i) & (one.velocity == 0), 1e-2, one.velocity)
+        jnp.where((belt == i) & (one.velocity == 0), 1e-2, one.velocity)
         for i, one in enumerate(osc.belts)
     ]
     moving = eqx.tree_at(lambda o: [one.velocity for one in o.belts], osc, velocities)
     moving = lax.stop_gradient(moving)
     n = len(osc.belts)
-    velocity, extremum_x2 = velocity_of(moving, belts[0]), Ends(n).extremum_x2
-    states = before_stick_ends(moving, belts[0])
+    velocity, extremum_x2 = velocity_of(moving, belt), Ends(n).extremum_x2
+    states = before_stick_ends(moving, belt)
     exists = jnp.isfinite(states[:, 0])
     states = states[jnp.argsort(~exists)]
 
     def attempt(tried):
         number, best, kept = tried
         orbit = follow(moving, states[number], HINT_BUDGET)
-        _, push = least_push(moving, loop_of(orbit, HINT_BUDGET, n), belts[0])
+        _, push = least_push(moving, loop_of(orbit, HINT_BUDGET, n), belt)
         x2 = jnp.roll(orbit.entries[:, 1], -1).at[orbit.count - 1].set(orbit.y[1])
         loops = (orbit.ends == extremum_x2) & (x2 * velocity > 0) & (jnp.arange(HINT_BUDGET) > 0)
         gap = jnp.min(jnp.where(loops, jnp.abs(velocity - osc.omega * x2), jnp.inf))

@@ -451,22 +451,6 @@ SYMBOLS = {
     "steepness": r"p_{3,%}",
 }
 WORDS = {"damping": "damping", "velocity": "belt velocity", "load": "load"}
-#: What is said of a special point above it.
-POINT_NAMES = {
-    "Hopf": "Hopf",
-    "NonsmoothFold": "fold, belt {belt}",
-    "GrazingSliding": "grazing, belt {belt}",
-    "CrossingSliding": "crossing-sliding, belt {belt}",
-    "SlidingExchange": "sliding exchange",
-    "SuddenSliding": "belt {belt} at rest",
-    "BeltAtRest": "belt {belt} at rest",
-    "FoldOfCycles": "fold of cycles",
-    "GrazingEdge": "edge grazing, belt {belt}",
-    "CornerCollision": "corner, belt {belt}",
-    "BoundaryEquilibrium": "rest on edge, belt {belt}",
-    "PseudoHopf": "pseudo-Hopf, belt {belt}",
-    "Unexplained": "unexplained",
-}
 
 
 def parameter_symbol(name: str) -> str:
@@ -569,9 +553,8 @@ def _name_points(ax: Axes, diagram: BifurcationDiagram) -> None:
     shifts = _spread(at, matplotlib.rcParams["font.size"]) - at
     for point, value, shift in zip(diagram.points, values, shifts, strict=True):
         ax.axvline(value, color="0.45", linewidth=0.6, linestyle=":", zorder=1)
-        name = POINT_NAMES[point.kind].format(belt=getattr(point.condition, "belt", ""))
         ax.annotate(
-            name,
+            point.condition.words,
             (value, 1.0),
             xycoords=ax.get_xaxis_transform(),
             xytext=(shift, 9),
@@ -616,26 +599,6 @@ def _spread(wanted: np.ndarray, gap: float) -> np.ndarray:
 
 # --- curves and region maps ---------------------------------------------------------------------
 
-#: How the curve of each kind of point is drawn.
-CURVE_STYLES: dict[str, dict[str, Any]] = {
-    "Hopf": {"color": "#009E73", "linestyle": (0, (5, 1.5)), "label": "Hopf"},
-    "NonsmoothFold": {"color": "black", "linestyle": "-", "label": "nonsmooth fold"},
-    "GrazingSliding": {"color": "#CC79A7", "linestyle": "-", "label": "grazing"},
-    "CrossingSliding": {
-        "color": "#CC79A7",
-        "linestyle": (0, (5, 1.5)),
-        "label": "crossing-sliding",
-    },
-    "SlidingExchange": {"color": "black", "linestyle": (0, (3, 1, 1, 1)), "label": "exchange"},
-    "SuddenSliding": {"color": "black", "linestyle": (0, (1, 1.2)), "label": "belt at rest"},
-    "BeltAtRest": {"color": "black", "linestyle": (0, (1, 1.2)), "label": "belt at rest"},
-    "FoldOfCycles": {"color": "#E69F00", "linestyle": "-", "label": "fold of cycles"},
-    "GrazingEdge": {"color": "#56B4E9", "linestyle": "-", "label": "edge grazing"},
-    "CornerCollision": {"color": "#56B4E9", "linestyle": (0, (3, 1, 1, 1)), "label": "corner"},
-    "BoundaryEquilibrium": {"color": "#D55E00", "linestyle": "-", "label": "rest on edge"},
-    "PseudoHopf": {"color": "#D55E00", "linestyle": (0, (5, 1.5)), "label": "pseudo-Hopf"},
-}
-
 
 def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> Axes:
     """Curves of bifurcation points in the plane of their parameters, special points as dots.
@@ -647,10 +610,11 @@ def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> A
     for curve in curves:
         path = curve.path
         # Rows and special points in order; a special point has the kind of the row before it.
-        kinds = _kinds_along(curve, path)
+        kinds: Any = _kinds_along(curve, path)
         for rows in _stretches_of(kinds):
             rows = slice(rows.start, min(rows.stop + 1, len(path)))
-            style = CURVE_STYLES[str(kinds[rows.start])]
+            line = kinds[rows.start].line
+            style = {"color": line.colour, "linestyle": line.style, "label": line.name}
             ax.plot(*path[rows].T, linewidth=1.3, zorder=4, **style)
         for point in curve.special:
             if point.kind not in ("EqualVelocities", "BeltAtRest"):
@@ -668,7 +632,7 @@ def _kinds_along(curve: BifurcationCurve, path: np.ndarray) -> np.ndarray:
     kinds, row = [], 0
     for at in path:
         is_row = row < len(curve) and bool(np.all(at == curve.values[row]))
-        kinds.append(curve.kinds[min(row, len(curve) - 1)] if is_row or not kinds else kinds[-1])
+        kinds.append(curve.classes[min(row, len(curve) - 1)] if is_row or not kinds else kinds[-1])
         row += is_row
     return np.array(kinds)
 
