@@ -11,6 +11,7 @@ Grazing and corner collision are the names of M. di Bernardo, C. Budd, A. Champn
 Piecewise-smooth Dynamical Systems, 2008.
 """
 
+import abc
 from typing import ClassVar
 
 import equinox as eqx
@@ -80,21 +81,29 @@ class AbstractEdgeTouch(AbstractCycleCondition):
     """An arc of a cycle ends on an edge of a belt and in something else at once.
 
     wanted: 1 an extremum of x1 (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
-    attracting cycles that which comes nearest to this is taken; unstable: of the cycle from
+    attracting cycles that which comes nearest to this is taken; repels: of the cycle from
     `unstable_cycle`, not of an attracting one.
     """
 
     belt: int | Array
-    wanted: eqx.AbstractVar[float | Array]
-    unstable: eqx.AbstractVar[bool]
+
+    @property
+    @abc.abstractmethod
+    def wanted(self) -> float | Array:
+        """Which of the two kinds is meant."""
+
+    @property
+    def repels(self) -> bool:
+        """Whether it is about the unstable cycle."""
+        return False
 
     @property
     def room(self):
-        return SIZES[0] if self.unstable else SIZES[1]
+        return SIZES[0] if self.repels else SIZES[1]
 
     @property
     def sought(self):
-        return EdgeTouch(self.belt, unstable=self.unstable)
+        return EdgeTouch(self.belt, unstable=self.repels)
 
     def check(self, osc):
         super().check(osc)
@@ -103,10 +112,10 @@ class AbstractEdgeTouch(AbstractCycleCondition):
     def as_data(self):
         # One program serves both kinds.
         belt, wanted = (jnp.asarray(np.array(one)) for one in (self.belt, self.wanted))
-        return EdgeTouch(belt, wanted, self.unstable)
+        return EdgeTouch(belt, wanted, self.repels)
 
     def named(self, point):
-        if self.unstable:
+        if self.repels:
             return GrazingEdge(self.belt, unstable=True)
         chain, z = point.cycle.chain, point.cycle.unknowns
         loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
@@ -115,7 +124,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
         return (GrazingEdge if near.grazes else CornerCollision)(self.belt)
 
     def guess(self, osc, size):
-        if self.unstable:
+        if self.repels:
             return separating_loop(osc, size)[:2]
         return nearest(osc, *settled_loops(osc, candidates(osc), size), self)
 
@@ -133,15 +142,23 @@ class AbstractEdgeTouch(AbstractCycleCondition):
         status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
         loop, row = _without_excursion(osc, loop, near)
         chain, z = meshed(osc, loop)
-        repels = jnp.asarray(np.array(self.unstable))
+        repels = jnp.asarray(np.array(self.repels))
         return EdgeContact(chain, row, near.end, near.codes, repels), z, status
 
 
 class EdgeTouch(AbstractEdgeTouch):
     """Such an end of whichever kind, and what programs know of both."""
 
-    wanted: float | Array = 0.0
+    meant: float | Array = 0.0
     unstable: bool = eqx.field(static=True, default=False)
+
+    @property
+    def wanted(self):
+        return self.meant
+
+    @property
+    def repels(self):
+        return self.unstable
 
 
 class GrazingEdge(AbstractEdgeTouch):
@@ -160,6 +177,10 @@ class GrazingEdge(AbstractEdgeTouch):
     @property
     def wanted(self):
         return 1.0
+
+    @property
+    def repels(self):
+        return self.unstable
 
     @classmethod
     def between(cls, before, after, edged):
@@ -191,10 +212,6 @@ class CornerCollision(AbstractEdgeTouch):
     @property
     def wanted(self):
         return -1.0
-
-    @property
-    def unstable(self):
-        return False
 
 
 def _guard_at_rest(osc: Oscillator, codes: Array, x1: Array, end: Array) -> Array:

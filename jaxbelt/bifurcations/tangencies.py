@@ -14,6 +14,7 @@ With a nonsmooth fold the paper's cycles end (its section 3); grazing-sliding is
 Bernardo, C. Budd, A. Champneys, P. Kowalczyk, Piecewise-smooth Dynamical Systems, 2008.
 """
 
+import abc
 import functools
 from typing import ClassVar
 
@@ -112,11 +113,14 @@ class AbstractTangency(AbstractCycleCondition):
     """
 
     belt: int | Array
-    wanted: eqx.AbstractVar[float | Array]
-
     family: ClassVar[str] = "tangency"
     more_arcs: ClassVar[int] = 1
     bends: ClassVar[bool] = True
+
+    @property
+    @abc.abstractmethod
+    def wanted(self) -> float | Array:
+        """Which of the two kinds is meant."""
 
     @property
     def sought(self):
@@ -183,7 +187,11 @@ class AbstractTangency(AbstractCycleCondition):
 class Tangency(AbstractTangency):
     """A tangency of whichever kind, and what programs know of both."""
 
-    wanted: float | Array = 0.0
+    meant: float | Array = 0.0
+
+    @property
+    def wanted(self):
+        return self.meant
 
 
 class NonsmoothFold(AbstractTangency):
