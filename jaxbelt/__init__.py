@@ -1,26 +1,26 @@
 """Belt-driven dry-friction oscillators: exact, batched, differentiable simulation in JAX.
 
-Everything a user needs is `import jaxbelt as jb`. Loop 64-bit floats on first:
+Everything a user needs is `import jaxbelt as jb`. Turn 64-bit floats on first:
 `jax.config.update("jax_enable_x64", True)`.
 
 Inside, data goes one way: parameters, modes, motion, cycles, bifurcations, pictures. The code is a
 ladder that shows it. Read from top to bottom, a module imports only what stands before it:
 
     results         status codes and what to do about them
-    processes       processes in which JAX cannot compute
     checks          arguments, checked at the public edge
-    numerics/       compiling continuation derivatives extrapolation roots
-    model/          friction oscillator parameters modes equilibria
+    numerics/       compiling continuation derivatives extrapolation newton roots
+    model/          friction oscillator parameters modes events equilibria
     presets         the published systems
-    motion/         smoothing simulate
-    cycles/         cycle attractors functionals
-    sweeps/         batch audit sweep basins
+    motion/         integrators arcs smoothing simulate
+    cycles/         shooting orbits cycle attractors functionals
+    sweeps/         lanes step events marks observers attractor queue threads audit sweep basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   refine path scan curves diagrams switch_folds
-    inverse/        inverse
-    plotting/       plotting
+    inverse/        selection record fit design
+    plotting/       style phase diagrams sweeps model draw
     paper           the paper's table and figures
     __init__        the public names
+    commands/       options reproduce simulate diagram map sweep basins
     cli             the command line
 """
 
@@ -55,23 +55,20 @@ from .cycles.functionals import (
     stick_duration,
     stick_fraction,
 )
-from .inverse.inverse import Design, Fit, design, distance_to, fit
+from .inverse.design import Design, design, distance_to
+from .inverse.fit import Fit, fit
 from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
 from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck
 from .model.oscillator import Belt, Oscillator
 from .motion.simulate import Arcs, Events, Trajectory, simulate
-from .results import EventKind, Status, describe
+from .results import EventKind, Status, describe, draw_with
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.sweep import sweep
 
 if TYPE_CHECKING:
-    from .plotting.plotting import (
-        plot_basins,
-        plot_friction_law,
-        plot_phase_portrait,
-        plot_time_history,
-        plot_vector_field,
-    )
+    from .plotting.model import plot_friction_law
+    from .plotting.phase import plot_phase_portrait, plot_time_history, plot_vector_field
+    from .plotting.sweeps import plot_basins
 
 __version__ = importlib.metadata.version("jaxbelt")
 
@@ -146,12 +143,23 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    # Matplotlib is imported when something is drawn, not before.
-    if name.startswith("plot_") and name in __all__:
-        from .plotting import plotting
+# Matplotlib is imported when something is drawn, not before.
 
-        return getattr(plotting, name)
+
+def _draw(result: Any, ax: Any, **options: Any) -> Any:
+    from .plotting.draw import draw
+
+    return draw(result, ax, **options)
+
+
+draw_with(_draw)
+
+
+def __getattr__(name: str) -> Any:
+    if name.startswith("plot_") and name in __all__:
+        from .plotting import model, phase, sweeps
+
+        return next(getattr(m, name) for m in (model, phase, sweeps) if hasattr(m, name))
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

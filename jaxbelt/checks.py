@@ -1,10 +1,11 @@
-"""What a user may pass in, checked once at the public edge.
+"""What a user may pass in, and where from, checked once at the public edge.
 
 Every check runs before tracing and raises a `ValueError` that names the field, what was expected
 and what came. Under `jit`, `vmap` and derivatives values are not known, so only their dtype and
 shape are checked there; results then carry a status and NaN instead of an exception.
 """
 
+import os
 from typing import Any
 
 import jax
@@ -12,8 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
-
-from .processes import require_own_threads
 
 TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
 
@@ -38,6 +37,35 @@ def require(condition: Any, field: str, expected: str, got: Any) -> None:
     """
     if not condition:
         raise ValueError(f"{field} must be {expected}, got {got}")
+
+
+# A fork copies the memory of a process but none of its threads, and JAX waits for its threads: most
+# of what it is asked to do in the child never ends. So the child is told at once.
+_forked = False
+
+
+def _note() -> None:
+    global _forked
+    # JAX's own list of its backends, empty while they are not in use; the public function that
+    # asks for them starts them.
+    from jax._src import xla_bridge
+
+    _forked = _forked or bool(getattr(xla_bridge, "_backends", True))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note)
+
+
+def require_own_threads() -> None:
+    """Raise a `RuntimeError` in a process that was forked after JAX was used."""
+    if _forked:
+        raise RuntimeError(
+            "jaxbelt cannot compute in a process that was forked after JAX was used: JAX's threads "
+            "are not in it, so it would wait for ever. Start processes by the method spawn, such "
+            'as multiprocessing.get_context("spawn").Pool() or '
+            'ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
+        )
 
 
 def require_usable_jax() -> None:

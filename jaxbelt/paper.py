@@ -28,7 +28,10 @@ from .model.equilibria import Equilibria, equilibria
 from .model.oscillator import Belt, Oscillator
 from .model.parameters import leaf_index
 from .motion.simulate import Trajectory, simulate
-from .plotting import plotting
+from .plotting.diagrams import draw_region_map, plot_diagram
+from .plotting.model import draw_mechanical_model, plot_convergence, plot_friction_law
+from .plotting.phase import ClosedOrbit, plot_phase_portrait, plot_vector_field
+from .plotting.style import Figure, draw_key, journal_figure, journal_style, save
 from .presets import (
     PUBLISHED,
     PUBLISHED_NU1,
@@ -259,10 +262,10 @@ def find_unstable_cycles(panels: Sequence[Panel]) -> list[Cycle]:
     return [unstable_cycle(_with_two_belts(panel.oscillator)) for panel in panels]
 
 
-def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> plotting.Figure:
+def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> Figure:
     """The portraits side by side: transients thin, the steady cycle thick, equilibria."""
     orbits, unstable = simulate_panels(panels), find_unstable_cycles(panels)
-    figure = plotting.journal_figure(7.2, 2.75 if len(panels) == 3 else 4.9)
+    figure = journal_figure(7.2, 2.75 if len(panels) == 3 else 4.9)
     if len(panels) == 3:
         axes = figure.subplots(1, 3, sharey=True)
     else:
@@ -271,12 +274,12 @@ def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> plotting.Fi
         steady = [cycle for cycle in map(steady_cycle, trajectories) if cycle is not None]
         cycle = steady[0] if steady else None
         exists = int(repelling.status) == Status.OK
-        cycles: list[plotting.ClosedOrbit] = [repelling] if exists else []
+        cycles: list[ClosedOrbit] = [repelling] if exists else []
         if panel.cycle is not None:
             cycles.append(panel.cycle)
         elif cycle is not None:
             cycles.append(cycle)
-        plotting.plot_phase_portrait(
+        plot_phase_portrait(
             panel.oscillator,
             [_transient(trajectory, cycle) for trajectory in trajectories],
             cycles=cycles,
@@ -287,7 +290,7 @@ def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> plotting.Fi
         )
         ax.set_title(panel.title, loc="left")
         ax.label_outer()
-    plotting.draw_key(figure, note=_with_symbols(portraits.note))
+    draw_key(figure, note=_with_symbols(portraits.note))
     return figure
 
 
@@ -306,13 +309,13 @@ def _equilibria(osc: Oscillator) -> Equilibria:
 # --- the other figures --------------------------------------------------------------------------
 
 
-def draw_model() -> plotting.Figure:
+def draw_model() -> Figure:
     """Fig. 1: the double-belt oscillator and Conti's friction law, eq. (7)."""
-    figure = plotting.journal_figure(7.2, 2.9)
+    figure = journal_figure(7.2, 2.9)
     model, law = figure.subplots(1, 2, width_ratios=(1.5, 1))
-    plotting.draw_mechanical_model(model)
+    draw_mechanical_model(model)
     friction = paper_friction()
-    plotting.plot_friction_law(friction, law)
+    plot_friction_law(friction, law)
     mus, p1 = float(friction.static), float(friction.residual)
     for level in (-p1, p1):
         law.axhline(level, color="0.6", linewidth=0.6, linestyle=":", zorder=0)
@@ -322,9 +325,9 @@ def draw_model() -> plotting.Figure:
     return figure
 
 
-def draw_classes() -> plotting.Figure:
+def draw_classes() -> Figure:
     """Fig. 2: the discontinuity boundaries of the four classes, here with the vector field."""
-    figure = plotting.journal_figure(7.2, 5.0)
+    figure = journal_figure(7.2, 5.0)
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     nu0, nu1 = 0.3, 0.7
     classes = (
@@ -351,7 +354,7 @@ def draw_classes() -> plotting.Figure:
     )
     white = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
     for ax, (osc, title, names) in zip(axes.flat, classes, strict=True):
-        plotting.plot_vector_field(osc, xlim=(-2.0, 3.0), ylim=(-1.5, 1.5), ax=ax)
+        plot_vector_field(osc, xlim=(-2.0, 3.0), ylim=(-1.5, 1.5), ax=ax)
         for name, (x1, x2) in names.items():
             ax.text(x1, x2, name, ha="center", va="center", bbox=white)
         ax.set_title(title, loc="left")
@@ -403,14 +406,14 @@ def study_formulations() -> list[Study]:
     ]
 
 
-def draw_formulations(studies: Sequence[Study]) -> plotting.Figure:
+def draw_formulations(studies: Sequence[Study]) -> Figure:
     """The errors of both over the width of their band."""
-    figure = plotting.journal_figure(4.2, 3.2)
+    figure = journal_figure(4.2, 3.2)
     curves = {
         f"{study.formulation}, {study.symbol}: order {study.order:.2f}": study.errors
         for study in studies
     }
-    plotting.plot_convergence(WIDTHS, curves, figure.subplots())
+    plot_convergence(WIDTHS, curves, figure.subplots())
     return figure
 
 
@@ -433,18 +436,18 @@ def map_b() -> RegionMap:
     return region_map(class_b, {"nu0": nu0, "nu1": nu1}, step=0.02, lines=4)
 
 
-def draw_map(regions: RegionMap) -> plotting.Figure:
+def draw_map(regions: RegionMap) -> Figure:
     """Fig. 6, with the regions that the paper does not list."""
-    figure = plotting.journal_figure(7.2, 9.0)
-    plotting.draw_region_map(regions, figure)
+    figure = journal_figure(7.2, 9.0)
+    draw_region_map(regions, figure)
     return figure
 
 
-def draw_diagram(diagram: BifurcationDiagram, note: str) -> plotting.Figure:
+def draw_diagram(diagram: BifurcationDiagram, note: str) -> Figure:
     """Fig. 3 or 7."""
-    figure = plotting.journal_figure(7.2, 4.2)
-    plotting.plot_diagram(diagram, figure.subplots())
-    plotting.draw_key(figure, note=_with_symbols(note))
+    figure = journal_figure(7.2, 4.2)
+    plot_diagram(diagram, figure.subplots())
+    draw_key(figure, note=_with_symbols(note))
     return figure
 
 
@@ -551,11 +554,11 @@ def reproduce(
     with ThreadPoolExecutor(1) as beside:
         drawings: list[Future] = []
 
-        def draw(name: str, figure: Callable[..., plotting.Figure], *given: Any) -> None:
+        def draw(name: str, figure: Callable[..., Figure], *given: Any) -> None:
             def drawn():
                 progress(name)
-                with plotting.journal_style():
-                    plotting.save(figure(*given), folder / f"{name}.png")
+                with journal_style():
+                    save(figure(*given), folder / f"{name}.png")
 
             drawings.append(beside.submit(drawn))
 

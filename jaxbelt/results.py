@@ -1,10 +1,11 @@
-"""Status codes. Nothing raises inside jit or vmap: every result says how it ended.
+"""What all results share: status codes, kinds of events, and the way to their pictures.
 
-`describe(status)` gives a sentence of advice for a code.
+Nothing raises inside jit or vmap: every result says how it ended, and `describe(status)` gives a
+sentence of advice for a code.
 """
 
 import enum
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -131,3 +132,20 @@ def of_one_loop(steps: Sequence[Step]) -> tuple[Step, ...]:
     loop = tuple(steps)
     orders: Any = (loop[i:] + loop[:i] for i in range(len(loop)))
     return min(orders, default=())
+
+
+#: What draws results. It stands above everything that computes them, in `plotting`, and the package
+#: hands it down when it is imported.
+_drawing: Callable[..., Any] | None = None
+
+
+def draw_with(drawing: Callable[..., Any]) -> None:
+    """From now on results are drawn by `drawing(result, ax, **options)`."""
+    global _drawing
+    _drawing = drawing
+
+
+def draw(result: Any, ax: Any, **options: Any) -> Any:
+    """The one way from a result to its picture, taken by the method `plot` of every result."""
+    assert _drawing is not None, "jaxbelt/__init__.py hands it down"
+    return _drawing(result, ax, **options)

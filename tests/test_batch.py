@@ -9,7 +9,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.sweeps import batch
+from jaxbelt.sweeps.events import append, word_events
 from jaxbelt.sweeps.sweep import _signatures
 
 SPAN = 40.0
@@ -195,9 +195,9 @@ def test_signatures_that_are_not_of_one_turn():
     assert np.array_equal(flags["flag_values"], [0, 1, 2])
     word = jnp.ones(())
     for _ in range(16):
-        word = batch._append(word, jnp.asarray(4), jnp.asarray(1), 2)
-    assert batch.word_events(int(word), 2) == ((jb.EventKind.EDGE, 1),) * 16
-    assert np.isinf(batch._append(word, jnp.asarray(4), jnp.asarray(1), 2))
+        word = append(word, jnp.asarray(4), jnp.asarray(1), 2)
+    assert word_events(int(word), 2) == ((jb.EventKind.EDGE, 1),) * 16
+    assert np.isinf(append(word, jnp.asarray(4), jnp.asarray(1), 2))
 
 
 class Late:

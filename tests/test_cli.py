@@ -14,7 +14,9 @@ from typer.testing import CliRunner
 
 import jaxbelt as jb
 from jaxbelt import paper as reproduce
-from jaxbelt.cli import _belts_of_class, app, parse_belt, write_rows
+from jaxbelt.cli import app
+from jaxbelt.commands.map import write_rows
+from jaxbelt.commands.options import belts_of_class, parse_belt
 
 runner = CliRunner()
 
@@ -72,7 +74,7 @@ def test_simulate_takes_belts_in_full(tmp_path):
 
 def test_classes_are_those_of_the_presets():
     def belts(system, **given):
-        return repr(_belts_of_class(system, given))
+        return repr(belts_of_class(system, given))
 
     assert belts("a", nu0=0.1) == repr(jb.presets.class_a(0.1).belts)
     assert belts("c", nu0=0.1, nu1=-0.2, sigma=0.3) == repr(

@@ -16,7 +16,7 @@ from jaxbelt import EventKind, Status
 from jaxbelt.bifurcations.path import Path
 from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import distinct
-from jaxbelt.cycles.cycle import loop_events
+from jaxbelt.cycles.shooting import loop_events
 from jaxbelt.model.parameters import leaf_index, vary
 
 

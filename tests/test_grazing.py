@@ -11,7 +11,10 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.sweeps import batch
+from jaxbelt.sweeps.lanes import Program
+from jaxbelt.sweeps.observers import Final
+from jaxbelt.sweeps.queue import layout
+from jaxbelt.sweeps.threads import run
 
 AXES = {f.name: 0 if f.name in ("damping", "omega") else 1 for f in fields(grazing.Oscillators)}
 #: Distances of the cases, on both sides.
@@ -134,19 +137,17 @@ def sweep_all(case, kind, tolerance, along=()):
     table, n = np.stack(rows), case.belt.size
     one = oscillator({k: part[..., 0] for k, part in parts.items()}, kind == "jump")
     mapped = (True,) * (table.shape[1] - 2)
-    program = batch.Program(jax.tree.structure(one), mapped, batch.Final(), True)
-    layout = batch.layout(program, [])
-    out = np.zeros((len(table), sum(int(np.prod(shape)) for shape in layout.values()), n))
+    program = Program(jax.tree.structure(one), mapped, Final(), True)
+    shapes = layout(program, [])
+    out = np.zeros((len(table), sum(int(np.prod(shape)) for shape in shapes.values()), n))
 
     def put(numbers, results):
         out[:, :, numbers] = results
 
     settings = {"t1": case.t1, "rtol": tolerance, "atol": tolerance}
-    batch.run(
-        program, [], lambda i, j: table[:, :, i:j], n, put, derivatives=len(along), **settings
-    )
-    ends = np.cumsum([int(np.prod(shape)) for shape in layout.values()])
-    return dict(zip(layout, np.split(out, ends[:-1], axis=1), strict=True))
+    run(program, [], lambda i, j: table[:, :, i:j], n, put, derivatives=len(along), **settings)
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
+    return dict(zip(shapes, np.split(out, ends[:-1], axis=1), strict=True))
 
 
 def sweep(case, kind, tolerance):

@@ -9,7 +9,9 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.inverse.inverse import Selection, _inverse, _local_cubics
+from jaxbelt.inverse.fit import _inverse
+from jaxbelt.inverse.record import local_cubics
+from jaxbelt.inverse.selection import Selection
 
 TS = np.arange(400) * 0.1
 START = (0.0, -2.0)
@@ -160,7 +162,7 @@ def test_what_a_record_does_not_tell_has_an_infinite_standard_error():
 
 def test_local_cubics_are_exact_for_cubics():
     ts = np.sort(np.random.default_rng(1).uniform(0, 10, 200))
-    value, slope, noise = _local_cubics(ts, ts**3 - 2 * ts)
+    value, slope, noise = local_cubics(ts, ts**3 - 2 * ts)
     np.testing.assert_allclose(value, ts**3 - 2 * ts, rtol=1e-9, atol=1e-8)
     np.testing.assert_allclose(slope, 3 * ts**2 - 2, rtol=1e-7, atol=1e-6)
     assert noise < 1e-9

@@ -79,6 +79,22 @@ def test_module_imports_only_from_above_it(module: str):
     assert [name for name in inside if rung(name) not in above] == []
 
 
+#: Ways to import a module, or to reach an imported one, that import statements do not show.
+HIDDEN_WAYS = {"__import__", "eval", "exec", "import_module", "importlib", "modules", "pkgutil"}
+
+
+@pytest.mark.parametrize("module", LADDER)
+def test_modules_are_imported_by_statements_only(module: str):
+    """So that the test above sees every import."""
+    used = set(".".join(set(imported_names(module)) - {"importlib.metadata"}).split("."))
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Name) and node.id != "importlib":
+            used.add(node.id)
+        elif isinstance(node, ast.Attribute):
+            used.add(node.attr)
+    assert used.isdisjoint(HIDDEN_WAYS)
+
+
 @pytest.mark.parametrize(
     "module", [module for module in LADDER if not module.startswith("plotting.")]
 )

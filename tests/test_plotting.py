@@ -10,7 +10,8 @@ from matplotlib.colors import to_hex
 
 import jaxbelt as jb
 from jaxbelt import paper as reproduce
-from jaxbelt.plotting import plotting
+from jaxbelt.plotting.phase import _field, draw_overview, stick_phases
+from jaxbelt.plotting.style import BELT_COLOURS, journal_style, save
 
 
 def run(nu0: float, start=(3.0, 0.0)) -> jb.Trajectory:
@@ -53,7 +54,7 @@ def test_stick_phases_are_those_of_the_events(two_sided):
     sticks = np.flatnonzero(events.kind == jb.EventKind.STICK)
     # Both belts always touch, so what follows STICK is its SLIP, or the end of the run.
     ends = np.append(np.asarray(events.t), trajectory.ts[-1])[sticks + 1]
-    phases = plotting.stick_phases(trajectory)
+    phases = stick_phases(trajectory)
     assert {belt for belt, *_ in phases} == {0, 1}
     assert [belt for belt, *_ in phases] == events.belt[sticks].tolist()
     np.testing.assert_allclose([begin for _, begin, _ in phases], events.t[sticks], atol=1e-12)
@@ -64,7 +65,7 @@ def test_stick_phases_are_those_of_the_events(two_sided):
 def test_time_history_shades_every_stick_phase_in_the_colour_of_its_belt(two_sided):
     _, trajectory = two_sided
     axes = jb.plot_time_history(trajectory)
-    phases = plotting.stick_phases(trajectory)
+    phases = stick_phases(trajectory)
     for ax in axes:
         np.testing.assert_allclose(spans(ax), [phase[1:] for phase in phases])
     labels = set(axes[0].get_legend_handles_labels()[1])
@@ -84,7 +85,7 @@ def test_a_stick_phase_across_a_contact_edge_is_one(two_sided):
     )
     _, trajectory = two_sided
     made = eqx.tree_at(lambda run: run.arcs, trajectory, arcs)
-    assert plotting.stick_phases(made) == [(0, 0.0, 3.0), (1, 4.0, 4.5)]
+    assert stick_phases(made) == [(0, 0.0, 3.0), (1, 4.0, 4.5)]
 
 
 def test_padding_is_not_drawn(two_sided):
@@ -100,7 +101,7 @@ def test_padding_is_not_drawn(two_sided):
         trajectory,
         jax.tree.map(pad, (trajectory.events, trajectory.arcs)),
     )
-    assert plotting.stick_phases(lane) == plotting.stick_phases(trajectory)
+    assert stick_phases(lane) == stick_phases(trajectory)
     alone, padded = (jb.plot_phase_portrait(osc, drawn) for drawn in (trajectory, lane))
     np.testing.assert_array_equal(states(line(padded, "orbit")), states(line(alone, "orbit")))
     assert len(states(line(alone, "orbit"))) == 401 + trajectory.events.t.size
@@ -111,8 +112,8 @@ def test_without_arcs_the_samples_tell_what_sticks(two_sided):
     nothing = jax.tree.map(lambda leaf: leaf[:0], exact.arcs)
     trajectory = eqx.tree_at(lambda run: run.arcs, exact, nothing)
     np.testing.assert_allclose(
-        [phase[1:] for phase in plotting.stick_phases(trajectory)],
-        [phase[1:] for phase in plotting.stick_phases(exact)],
+        [phase[1:] for phase in stick_phases(trajectory)],
+        [phase[1:] for phase in stick_phases(exact)],
         atol=50.0 / 400,
     )
 
@@ -126,10 +127,10 @@ def test_phase_portrait_draws_boundaries_over_their_contact_intervals():
             for artist in ax.get_lines()
             if artist.get_color() == colour and len(states(artist)) == 2
         ]
-        for colour in plotting.BELT_COLOURS[:2]
+        for colour in BELT_COLOURS[:2]
     }
-    assert boundaries[plotting.BELT_COLOURS[0]] == [[[-2.0, 0.2], [0.5, 0.2]]]
-    assert boundaries[plotting.BELT_COLOURS[1]] == [[[0.0, -0.3], [2.0, -0.3]]]
+    assert boundaries[BELT_COLOURS[0]] == [[[-2.0, 0.2], [0.5, 0.2]]]
+    assert boundaries[BELT_COLOURS[1]] == [[[0.0, -0.3], [2.0, -0.3]]]
     names = {text.get_text() for text in ax.texts}
     assert {r"$\Sigma_{\mathrm{F}0}$", r"$\Sigma_{\mathrm{F}1}$"} <= names
     assert {r"$\sigma_{0}$", r"$\sigma_{1}$"} <= names
@@ -192,7 +193,7 @@ def test_vector_field_jumps_at_the_boundary_and_slides_on_it(kind):
     ax = jb.plot_vector_field(osc, kind=kind, xlim=(-2.0, 2.0), ylim=(-1.0, 1.0))
     assert ax.collections
     x2 = jnp.array([0.3 - 1e-9, 0.3, 0.3 + 1e-9])
-    x1_dot, x2_dot = plotting._field(osc, jnp.zeros(3), x2)
+    x1_dot, x2_dot = _field(osc, jnp.zeros(3), x2)
     np.testing.assert_array_equal(x1_dot, x2)
     # -zeta nu0 + mus, stuck, -zeta nu0 - mus
     np.testing.assert_allclose(x2_dot, [0.85, 0.0, -1.15], atol=1e-7)
@@ -214,9 +215,9 @@ def test_friction_law():
 def test_pictures_leave_the_settings_and_windows_of_matplotlib_alone(two_sided, tmp_path):
     osc, trajectory = two_sided
     before = dict(plt.rcParams)
-    with plotting.journal_style():
-        figure = plotting.draw_overview(osc, trajectory)
-        plotting.save(figure, tmp_path / "overview.png")
+    with journal_style():
+        figure = draw_overview(osc, trajectory)
+        save(figure, tmp_path / "overview.png")
     assert (tmp_path / "overview.png").read_bytes().startswith(b"\x89PNG")
     assert dict(plt.rcParams) == before
     assert plt.get_fignums() == []
@@ -242,7 +243,7 @@ def test_no_steady_cycle_where_the_mass_comes_to_rest():
 def test_class_a_is_the_limit_of_two_belts():
     osc = jb.presets.class_a(0.23)
     x1, x2 = np.random.default_rng(0).uniform(-3, 3, (2, 50))
-    alone, beside = (plotting._field(o, x1, x2) for o in (osc, reproduce._with_two_belts(osc)))
+    alone, beside = (_field(o, x1, x2) for o in (osc, reproduce._with_two_belts(osc)))
     np.testing.assert_array_equal(alone, beside)
 
 

@@ -16,7 +16,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
-from jaxbelt.sweeps import batch
+from jaxbelt.sweeps import threads as sweep_threads
 
 #: Time of the runs, and at which times they are compared.
 T1, SAMPLES = 15.0, 33
@@ -561,5 +561,5 @@ def test_a_lane_does_not_know_of_the_others(observe, monkeypatch):
         one.drop_vars("signature", errors="ignore")
     )
     for threads in (1, 3):
-        monkeypatch.setattr(batch, "workers", lambda threads=threads: threads)
+        monkeypatch.setattr(sweep_threads, "workers", lambda threads=threads: threads)
         assert swept(oscillators, observe).equals(whole)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.cli import app
-from jaxbelt.sweeps import batch
+from jaxbelt.sweeps.threads import CHUNK
 
 NU0, NU1 = np.linspace(-0.6, 0.55, 4), np.array([0.35, -0.2])
 AXES = {"nu0": NU0, "nu1": NU1}
@@ -61,7 +61,7 @@ def test_a_mass_at_rest_is_near_no_edge():
 
 
 def test_many_chunks_lose_no_run():
-    n = 2 * batch.CHUNK + 1000
+    n = 2 * CHUNK + 1000
     many = jb.sweep(jb.presets.class_b, {"nu0": np.linspace(-0.7, 0.7, n), "nu1": [0.35]}, t1=2.0)
     assert np.sum(many.status == Status.OK) == n
     assert np.all(np.isfinite(many.x1_end))

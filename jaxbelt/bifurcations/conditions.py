@@ -33,12 +33,15 @@ from jaxtyping import Array
 
 from ..checks import is_concrete, number, require
 from ..cycles.attractors import place_of
-from ..cycles.cycle import NEWTON_STEPS, SIZES, Chain, Cycle, Ends, Loop, cut, cycle_of, meshed
+from ..cycles.cycle import Cycle, cycle_of
+from ..cycles.shooting import SIZES, Chain, Loop, cut, meshed
 from ..model.equilibria import candidates
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index, parameter, vary
+from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.continuation import End
+from ..numerics.newton import NEWTON_STEPS
 from ..results import Status, describe
 from .guesses import nearest, settled_loops
 from .labels import Found, Label

@@ -16,10 +16,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..cycles.cycle import SIZES, Chain, Ends, Loop, meshed
+from ..cycles.shooting import SIZES, Chain, Loop, meshed
 from ..model.equilibria import candidates
 from ..model.modes import mode_of, stick_limit
 from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
 from ..results import EventKind, Status
 from .conditions import AbstractCycleCondition, Line, SpecialPoint
 from .guesses import nearest, orbit_after_stick, repeated_loop, settled_loops, without_arcs

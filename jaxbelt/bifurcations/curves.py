@@ -10,7 +10,6 @@ beyond, and the curve goes on from there with the signature that is found.
 """
 
 import functools
-import importlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -24,7 +23,7 @@ from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index, names_of, parameter, vary
 from ..numerics.compiling import jit
 from ..numerics.continuation import CurvePoint, End, continue_curve, corrected
-from ..results import Status
+from ..results import Status, draw
 from .conditions import AbstractCondition, BifurcationPoint, SpecialPoint, Trail
 from .systems import AbstractSystem, Seen
 
@@ -116,8 +115,7 @@ class BifurcationCurve(eqx.Module):
 
     def plot(self, ax: Any = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned."""
-        plotting = importlib.import_module("jaxbelt.plotting.plotting")
-        return plotting.plot_curves([self], ax)
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         first, last = (f"({p:.6g}, {q:.6g})" for p, q in self.values[[0, -1]])

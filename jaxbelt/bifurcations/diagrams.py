@@ -14,7 +14,6 @@ lead to and by the stability of its equilibria. What bounds the regions is not r
 points are found by `scan` along a few lines across the map, and their curves are followed.
 """
 
-import importlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations, pairwise
@@ -28,12 +27,13 @@ from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, require
 from ..cycles.attractors import Runs, distinct, lead_to_one_cycle, stuck_belts
-from ..cycles.cycle import Cycle, Loop, cut, find_cycle, polish, unstable_cycle
+from ..cycles.cycle import Cycle, find_cycle, polish, unstable_cycle
+from ..cycles.shooting import Loop, cut
 from ..model.equilibria import EquilibriumKind, candidates, equilibria
 from ..model.oscillator import Oscillator
 from ..model.parameters import set_alone
 from ..numerics.compiling import jit
-from ..results import Status
+from ..results import Status, draw
 from ..sweeps.sweep import sweep
 from .conditions import BifurcationPoint
 from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere
@@ -98,9 +98,7 @@ class BifurcationDiagram(eqx.Module):
         quantity: "x2", the paper's Figs. 3 and 7: equilibria at x2 = 0, sticking cycles by the
         velocity of the belt, others by their largest x2; or "x1" (smallest and largest), "period".
         """
-        # By its name: the modules are a ladder, in which pictures come last.
-        plotting = importlib.import_module("jaxbelt.plotting.plotting")
-        return plotting.plot_diagram(self, ax, quantity=quantity)
+        return draw(self, ax, quantity=quantity)
 
     def __repr__(self) -> str:
         names = " | ".join(name for _, _, name in self.regions)
@@ -243,8 +241,7 @@ class RegionMap(eqx.Module):
         None: new ones, and a sketch of the phase portrait of each region in its example beside
         them, as in the paper's Fig. 6.
         """
-        plotting = importlib.import_module("jaxbelt.plotting.plotting")
-        return plotting.plot_region_map(self, ax)
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         sizes = " x ".join(str(len(values)) for values in self.values)

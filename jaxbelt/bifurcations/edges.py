@@ -20,20 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..cycles.cycle import (
-    AT_REST,
-    SIZES,
-    Chain,
-    Ends,
-    Loop,
-    end_guard,
-    following_codes,
-    meshed,
-    separating_loop,
-)
+from ..cycles.cycle import separating_loop
+from ..cycles.orbits import AT_REST
+from ..cycles.shooting import SIZES, Chain, Loop, end_guard, following_codes, meshed
 from ..model.equilibria import candidates
 from ..model.modes import edges, mode_acceleration, mode_of, onset_position
 from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.continuation import End
 from ..results import Status

@@ -14,7 +14,8 @@ from jax import lax
 from jaxtyping import Array
 
 from ..cycles.attractors import sticks
-from ..cycles.cycle import Chain, closure, first_loop, loop_of, meshed, multiplier_and_slopes
+from ..cycles.orbits import first_loop, loop_of
+from ..cycles.shooting import Chain, closure, meshed, multiplier_and_slopes
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit

@@ -13,15 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..cycles.cycle import (
-    Ends,
-    Loop,
-    Orbit,
-    follow,
-    following_codes,
-    last_loop,
-    loop_of,
-)
+from ..cycles.orbits import Orbit, follow, last_loop, loop_of
+from ..cycles.shooting import Loop, following_codes
 from ..model.equilibria import Equilibria
 from ..model.modes import (
     STUCK,
@@ -34,6 +27,7 @@ from ..model.modes import (
     select,
 )
 from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .systems import velocity_of

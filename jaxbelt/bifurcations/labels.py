@@ -4,9 +4,10 @@ from collections import Counter
 from collections.abc import Hashable
 from typing import NamedTuple
 
-from ..cycles.attractors import Itinerary, events_of, sticks
-from ..cycles.cycle import Loop
+from ..cycles.attractors import Itinerary, sticks
+from ..cycles.shooting import Loop
 from ..model.equilibria import EquilibriumKind
+from ..model.events import events_of
 from ..results import EventKind
 
 

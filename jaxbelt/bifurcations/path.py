@@ -31,17 +31,9 @@ from ..cycles.attractors import (
     sticks,
     without_idle,
 )
-from ..cycles.cycle import (
-    AT_REST,
-    SIZES,
-    Cycle,
-    Loop,
-    as_loop,
-    cut,
-    find_cycle,
-    polish,
-    unstable_cycle,
-)
+from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
+from ..cycles.orbits import AT_REST
+from ..cycles.shooting import SIZES, Loop, cut
 from ..model.equilibria import equilibria
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index, names_of, vary

@@ -27,7 +27,8 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import is_concrete, require
-from ..cycles.cycle import Orbit, trace_of
+from ..cycles.orbits import Orbit
+from ..cycles.shooting import trace_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.modes import (
     Mode,

@@ -21,9 +21,7 @@ from ..cycles.attractors import (
     is_same,
     itinerary,
 )
-from ..cycles.cycle import (
-    as_loop,
-)
+from ..cycles.cycle import as_loop
 from ..model.oscillator import Oscillator
 from ..results import Status
 from .conditions import AbstractCondition, BifurcationPoint, unexplained_point

@@ -27,7 +27,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, check_positive, require
-from ..cycles.cycle import flow
+from ..cycles.shooting import flow
 from ..model.modes import Mode, capacity, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index, vary

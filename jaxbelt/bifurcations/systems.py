@@ -21,20 +21,12 @@ from jax import lax
 from jaxtyping import Array
 
 from ..cycles.attractors import extent
-from ..cycles.cycle import (
-    Chain,
-    Cycle,
-    Ends,
-    Loop,
-    cycle_of,
-    jacobian,
-    meshed,
-    newton,
-    residual,
-    residual_and_blocks,
-)
+from ..cycles.cycle import Cycle, cycle_of
+from ..cycles.shooting import Chain, Loop, jacobian, meshed, residual, residual_and_blocks
 from ..model.oscillator import Oscillator
 from ..model.parameters import vary
+from ..motion.arcs import Ends
+from ..numerics.newton import newton
 from ..results import Status
 
 #: Unknowns of a cycle count this much in the length of a step along a curve, beside the two

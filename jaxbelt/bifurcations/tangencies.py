@@ -24,24 +24,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..cycles.cycle import (
-    SIZES,
-    Chain,
-    Ends,
-    Loop,
-    Orbit,
-    admissible,
-    follow,
-    last_loop,
-    loop_of,
-    meshed,
-    newton,
-    trace_of,
-)
+from ..cycles.orbits import Orbit, follow, last_loop, loop_of
+from ..cycles.shooting import SIZES, Chain, Loop, admissible, meshed, trace_of
 from ..model.modes import STUCK, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.parameters import vary
+from ..motion.arcs import Ends
 from ..numerics.compiling import jit
+from ..numerics.newton import newton
 from ..results import EventKind, Status
 from .conditions import AbstractCycleCondition, Line, SpecialPoint
 from .guesses import HINT_BUDGET, least_push, orbit_after_stick

@@ -19,8 +19,9 @@ import numpy as np
 
 from ..model.modes import ABOVE
 from ..model.oscillator import Oscillator
-from ..results import EventKind, Status, of_one_loop
-from .cycle import Chain, Cycle, Ends, Loop, event_between, find_cycle, modes_of
+from ..results import Status, of_one_loop
+from .cycle import Cycle, find_cycle
+from .shooting import Chain, Ends, Loop, modes_of
 
 if TYPE_CHECKING:
     import xarray
@@ -51,13 +52,6 @@ def without_idle(osc: Oscillator, modes: np.ndarray) -> np.ndarray:
     """Contact codes, [.., belts], in which a belt without load, which does nothing, is absent."""
     idle = np.array([float(belt.load) == 0 for belt in osc.belts])
     return np.where(idle, int(ABOVE), modes)
-
-
-def events_of(path: Itinerary) -> tuple[tuple[EventKind, int], ...]:
-    """The events of one loop, (kind, belt) each."""
-    if len(path) == 1:
-        return ()
-    return tuple(event_between(*pair) for pair in zip(path, path[1:] + path[:1], strict=True))
 
 
 def sticks(path: Itinerary) -> bool:

@@ -13,7 +13,8 @@ from ..checks import require
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
-from .cycle import Chain, Cycle, flow
+from .cycle import Cycle
+from .shooting import Chain, flow
 
 _COORDINATES = {"x1": 0, "x2": 1}
 

@@ -13,7 +13,7 @@ by `leave_slip` and `leave_stick`, and both leave the question "stuck or not" to
 the contacts that are to be stuck can hold the force needed.
 
 Everything here is elementwise: codes and states may be scalars (the trajectories of `simulate`)
-or arrays of lanes (the kernel of `batch`), belts are unrolled.
+or arrays of lanes (the kernel of `sweeps.queue`), belts are unrolled.
 """
 
 import functools
@@ -117,7 +117,8 @@ def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
     held = capacity(osc, mode)
     rounding = TANGENT * (held + jnp.abs(x1))
     slips = (jnp.abs(needed) > held + rounding) | (held == 0)
-    sign = jnp.where(needed == 0, jnp.where(x2 < 0, -1.0, 1.0), -jnp.sign(needed))
+    onward = jnp.where(x2 < 0, -1.0, 1.0)
+    sign = jnp.where(jnp.abs(needed) <= rounding, onward, -jnp.sign(needed))
     codes = tuple(
         jnp.where(stuck & slips, sign, code)
         for code, stuck in zip(mode.codes, mode.stuck, strict=True)
@@ -307,7 +308,8 @@ def stick_limit(osc: Oscillator, mode: Mode, side: Array) -> Array:
 def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
     """How the stick phase of `mode` that is at x1 goes on: x1 moves with x2 = nu_k/omega.
 
-    It ends at slip onset or at the first contact edge ahead.
+    It ends at slip onset or at the first contact edge ahead. Where both are at one place but for
+    rounding it ends at the edge, and `pass_edge` tells whether the mass sticks beyond.
     """
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
     moves = v != 0
@@ -319,11 +321,10 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
         jnp.where(is_ahead, guard, jnp.inf)
         for is_ahead, guard in zip(edges_ahead(mode, v), edge_guards(osc, mode, x1), strict=True)
     ]
-    distance = onset_distance
-    for edge_distance in edge_distances:
-        distance = jnp.minimum(distance, edge_distance)
-    slips = onset_distance <= distance
-    at_edge = [~slips & (edge_distance <= distance) for edge_distance in edge_distances]
+    to_edge = functools.reduce(jnp.minimum, edge_distances)
+    rounding = ON_GUARD * (1 + jnp.abs(x1_onset) + capacity(osc, mode))
+    slips = (onset_distance + rounding < to_edge) | jnp.isinf(to_edge)
+    at_edge = [~slips & (distance <= to_edge) for distance in edge_distances]
     x1_end = first_of([slips, *at_edge], [x1_onset, *edges(osc)], x1)
     # Not distance/|v|: x1_end does not depend on x1, and so neither do its derivatives.
     duration = jnp.where(moves, jnp.maximum((x1_end - x1) / v_or_one, 0.0), jnp.inf)

@@ -35,9 +35,9 @@ from ..checks import (
     is_concrete,
     number,
     require,
+    require_own_threads,
 )
 from ..numerics.compiling import traced_once
-from ..processes import require_own_threads
 from .friction import AbstractFriction
 
 

@@ -14,8 +14,7 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from ..checks import is_concrete
-from ..processes import require_own_threads
+from ..checks import is_concrete, require_own_threads
 
 #: XLA's newer emitter of fused loops takes half as long again to compile programs like these, many
 #: small operations on few numbers, and its code is no faster.

@@ -1,6 +1,6 @@
 """Audits of sweeps: some runs once more the long way, without any shortcut, and compared.
 
-The kernel of `batch` takes three: a run of final states skips the loops that it has seen repeat; a
+The kernel of `queue` takes three: a run of final states skips the loops that it has seen repeat; a
 run that looks for its attractor ends as soon as it knows it; and a run that is captured by a
 pseudo-focus ends at rest there. The long way takes none of them to t1. From the state at t1 the
 attractor is then looked for again: it has to be the same one.
@@ -15,12 +15,17 @@ import numpy as np
 
 from ..model.modes import FOCUS_RADIUS
 from ..results import Status, of_one_loop
-from . import batch
+from .attractor import CYCLE, UNDECIDED
+from .events import word_events
+from .lanes import Program
+from .observers import Final
+from .queue import by_name, layout
+from .threads import CHUNK, run
 
 #: States and extrema may differ by so many times the tolerance of a step: errors add up over a run.
 CLOSE = 1e4
 #: Share of the usual budget of steps on the long way, where no pseudo-focus ends a run.
-BUDGET = 0.1
+BUDGET = 0.025
 
 Results = dict[str, np.ndarray]
 
@@ -32,7 +37,7 @@ def chosen(runs: int, share: float) -> np.ndarray:
 
 
 def differing(
-    program: batch.Program,
+    program: Program,
     shared: list[Any],
     rows_of: Callable[[np.ndarray], np.ndarray],
     runs: np.ndarray,
@@ -45,11 +50,11 @@ def differing(
     the audited ones, a row each, in the form of the kernel's results.
     """
     rows = np.concatenate(
-        [rows_of(part) for part in np.array_split(runs, -(-len(runs) // batch.CHUNK))], axis=1
+        [rows_of(part) for part in np.array_split(runs, -(-len(runs) // CHUNK))], axis=1
     )
-    long_way = dataclasses.replace(program, observer=batch.Final(skip=False), captures=False)
+    long_way = dataclasses.replace(program, observer=Final(skip=False), captures=False)
     final = _results(long_way, shared, rows, numbers)
-    if isinstance(program.observer, batch.Final):
+    if isinstance(program.observer, Final):
         return runs[~_same_ends(known, final, numbers)]
     rows[:2] = final["x1_end"], final["x2_end"]
     again = _results(program, shared, rows, numbers)
@@ -58,14 +63,14 @@ def differing(
 
 def _results(program, shared, rows: np.ndarray, numbers: dict[str, Any]) -> Results:
     """The kernel's results for the rows, in their order."""
-    layout = batch.layout(program, shared)
+    shapes = layout(program, shared)
     runs = rows.shape[1]
-    columns = np.full((sum(map(math.prod, layout.values())), runs), np.nan)
+    columns = np.full((sum(map(math.prod, shapes.values())), runs), np.nan)
 
     def put(done: np.ndarray, results: np.ndarray) -> None:
         columns[:, done] = results[0]
 
-    batch.run(
+    run(
         program,
         shared,
         lambda first, last: rows[None, :, first:last],
@@ -74,7 +79,7 @@ def _results(program, shared, rows: np.ndarray, numbers: dict[str, Any]) -> Resu
         **numbers,
         budget=BUDGET,
     )
-    return batch.by_name(layout, columns)
+    return by_name(shapes, columns)
 
 
 def _close(a: np.ndarray, b: np.ndarray, numbers: dict[str, float]) -> np.ndarray:
@@ -102,16 +107,16 @@ def _same_attractors(
     known: Results, final: Results, again: Results, numbers: dict[str, float]
 ) -> np.ndarray:
     """Whether attractors agree, each with its place. What is undecided claims nothing."""
-    decided = (known["kind"] != batch.UNDECIDED) & (again["kind"] != batch.UNDECIDED)
+    decided = (known["kind"] != UNDECIDED) & (again["kind"] != UNDECIDED)
     same = known["kind"] == again["kind"]
     for name in ("x1_min", "x1_max", "x2_min", "x2_max"):
         same &= _close(known[name], again[name], numbers)
-    cycle = same & (known["kind"] == batch.CYCLE)
+    cycle = same & (known["kind"] == CYCLE)
     same &= ~cycle | _close(known["period"], again["period"], numbers)
     belts = known["sticks"].shape[1]
     for i in np.flatnonzero(cycle):
         loops = (
-            of_one_loop(batch.word_events(int(word), belts))
+            of_one_loop(word_events(int(word), belts))
             for word in (known["signature"][i], again["signature"][i])
         )
         same[i] &= len(set(loops)) == 1

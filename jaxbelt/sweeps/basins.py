@@ -20,8 +20,11 @@ from ..cycles.attractors import Runs, is_same
 from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator, check_oscillator
-from . import batch
+from .attractor import KINDS, Attractor
+from .lanes import Program
+from .queue import layout
 from .sweep import LONG_ENOUGH, sweep
+from .threads import run
 
 if TYPE_CHECKING:
     import xarray
@@ -216,19 +219,19 @@ def basin_stability(
     require(isinstance(n, int) and n > 0, "n", "a positive integer", n)
     starts = jax.random.uniform(key, (2, n), minval=corners[:, :1], maxval=corners[:, 1:])
     kinds = _kinds(oscillator, np.asarray(starts), t1, rtol, atol)
-    fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(batch.KINDS)}
+    fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(KINDS)}
     errors = {name: float(np.sqrt(f * (1 - f) / n)) for name, f in fractions.items()}
     return BasinStability(fractions, errors, n)
 
 
 def _kinds(osc: Oscillator, starts: np.ndarray, t1, rtol, atol) -> np.ndarray:
-    """Numbers of `batch.KINDS` for starts [2, n], in the order of the starts."""
+    """Numbers of `attractor.KINDS` for starts [2, n], in the order of the starts."""
     leaves, structure = jax.tree.flatten(osc)
     edges = bool(np.any([np.isfinite([belt.lower, belt.upper]) for belt in osc.belts]))
-    program = batch.Program(structure, (False,) * len(leaves), batch.Attractor(), edges)
-    layout = batch.layout(program, leaves)
-    names = list(layout)
-    column = sum(int(np.prod(layout[name])) for name in names[: names.index("kind")])
+    program = Program(structure, (False,) * len(leaves), Attractor(), edges)
+    shapes = layout(program, leaves)
+    names = list(shapes)
+    column = sum(int(np.prod(shapes[name])) for name in names[: names.index("kind")])
     kinds = np.zeros(starts.shape[1], int)
 
     def put(runs: np.ndarray, results: np.ndarray) -> None:
@@ -238,5 +241,5 @@ def _kinds(osc: Oscillator, starts: np.ndarray, t1, rtol, atol) -> np.ndarray:
         return starts[None, :, first:last]
 
     n = starts.shape[1]
-    batch.run(program, leaves, rows_of, n, put, t1=t1, rtol=rtol, atol=atol)
+    run(program, leaves, rows_of, n, put, t1=t1, rtol=rtol, atol=atol)
     return kinds

@@ -1,7 +1,7 @@
 """Sweeps: named axes in, a labelled `xarray.Dataset` out.
 
 `sweep` runs an oscillator from every point of a grid of parameters and starts, in the kernel of
-`batch`, and puts the results where they belong.
+`queue`, and puts the results where they belong.
 """
 
 import functools
@@ -33,8 +33,13 @@ from ..checks import (
 )
 from ..model.oscillator import Oscillator, check_scalars
 from ..results import of_one_loop
-from . import batch
+from .attractor import KINDS, Attractor
 from .audit import chosen, differing
+from .events import word_events
+from .lanes import Observer, Program
+from .observers import Final, Reduce
+from .queue import by_name, layout
+from .threads import CHUNK, run
 
 if TYPE_CHECKING:
     import xarray
@@ -77,8 +82,8 @@ TYPES = {
     "n_events": "int32",
     "status": "int8",
 }
-#: Where attractors are looked for until then unless t1 is given.
-LONG_ENOUGH = 3000.0
+#: Default t1 of attractor runs.
+LONG_ENOUGH = 30_000.0
 
 
 def sweep(
@@ -107,16 +112,16 @@ def sweep(
     observe: what is wanted, and the variables of the dataset, over the axes:
 
     - `"final"`: x1_end, x2_end, mode_end(belt) (contact codes as in `Trajectory.modes`), n_events.
-    - `"attractor"`: kind ("equilibrium", "cycle", "stuck", or "undecided" at t1, which is 3000
+    - `"attractor"`: kind ("equilibrium", "cycle", "stuck", or "undecided" at t1, which is 30,000
       unless given), signature (the events of one loop, kind and belt: a number, with its meaning in
       the attributes flag_values and flag_meanings), sticks(belt), period, stick_duration(belt) in
       a loop (inf where stuck for ever), x1_min, x1_max, x2_min, x2_max on the attractor,
       transient: the time at which it was reached, n_events: of a cycle in one loop, else until it
-      was known. Runs end as soon as their attractor is known, see `batch.Attractor`.
+      was known. Runs end as soon as their attractor is known, see `attractor.Attractor`.
     - an object with three methods for scalars: `init(osc, x1, x2)`, the state of a run, any tree of
-      arrays; `update(state, event)`, the state after a `batch.Event` (t, x1, x2, kind, belt); and
-      `finish(state, end)`, a dictionary of results from the state and a `batch.End` (t, x1, x2,
-      status), numbers or vectors. They are traced, so use `jax.numpy`.
+      arrays; `update(state, event)`, the state after an `observers.RunEvent` (t, x1, x2, kind,
+      belt); and `finish(state, end)`, a dictionary of results, numbers or vectors, from the state
+      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`.
 
     and always status, a `Status` code a run: nothing raises because of one run.
 
@@ -148,7 +153,7 @@ def sweep(
     audit = float(as_array(audit, "audit"))
     require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
     require(
-        audit == 0 or not isinstance(observer, batch.Reduce),
+        audit == 0 or not isinstance(observer, Reduce),
         "audit",
         '0 but for observe="final" and "attractor"',
         audit,
@@ -167,9 +172,7 @@ def sweep(
             table.put(todo[done], results)
             advance(len(done))
 
-        batch.run(
-            program, grid.shared, rows_of, len(todo), put, **numbers, derivatives=len(derivatives)
-        )
+        run(program, grid.shared, rows_of, len(todo), put, **numbers, derivatives=len(derivatives))
     if audit:
         attributes |= _audited(program, grid, table, audit, numbers)
     return table.dataset(attributes)
@@ -190,15 +193,15 @@ def _audited(program, grid: "_Grid", table: "_Table", share: float, numbers) -> 
     return {"audited": len(runs), "audit_differed": len(differ)}
 
 
-def _observer(observe: Any) -> batch.Observer:
-    named = {"final": batch.Final, "attractor": batch.Attractor}
+def _observer(observe: Any) -> Observer:
+    named = {"final": Final, "attractor": Attractor}
     if isinstance(observe, str):
         require(observe in named, "observe", '"final", "attractor" or a reducer', repr(observe))
         return named[observe]()
     methods = ("init", "update", "finish")
     fits = all(callable(getattr(observe, name, None)) for name in methods)
     require(fits, "observe", '"final", "attractor" or an object with init, update, finish', observe)
-    return batch.Reduce(observe)
+    return Reduce(observe)
 
 
 # --- the grid -------------------------------------------------------------------------------------
@@ -271,19 +274,19 @@ class _Grid:
         jax.vmap(probe, axis_size=2, out_axes=None)({name: np.zeros(2) for name in self.names})
         return tuple(found)
 
-    def program(self, observer: batch.Observer) -> batch.Program:
+    def program(self, observer: Observer) -> Program:
         leaves = jax.tree.unflatten(self.structure, self.mapped)
         edges = any(
             varies or np.isfinite(value)
             for belt, which in zip(self.example.belts, leaves.belts, strict=True)
             for varies, value in ((which.lower, belt.lower), (which.upper, belt.upper))
         )
-        return batch.Program(self.structure, self.mapped, observer, bool(edges))
+        return Program(self.structure, self.mapped, observer, bool(edges))
 
     def rows(self, runs: np.ndarray, derivatives: tuple[str, ...] = ()) -> np.ndarray:
         """Starts and varying parameters of some runs, [1 + derivatives, columns, runs]."""
         # Of one size, for one compiled program.
-        padded = np.concatenate([runs, np.zeros(batch.CHUNK - len(runs), runs.dtype)])
+        padded = np.concatenate([runs, np.zeros(CHUNK - len(runs), runs.dtype)])
         places = np.unravel_index(padded, self.shape)
         values = {
             name: axis[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)
@@ -316,8 +319,8 @@ class _Table:
 
     def __init__(self, program, grid: _Grid, derivatives, store, attributes):
         self.grid, self.derivatives = grid, derivatives
-        self.finds_attractors = isinstance(program.observer, batch.Attractor)
-        self.layout = batch.layout(program, grid.shared)
+        self.finds_attractors = isinstance(program.observer, Attractor)
+        self.layout = layout(program, grid.shared)
         runs = math.prod(grid.shape)
         self.arrays: dict[str, np.ndarray] = {}
         folder = None if store is None else _open_store(Path(store), grid, attributes)
@@ -345,7 +348,7 @@ class _Table:
 
     def put(self, runs: np.ndarray, results: np.ndarray) -> None:
         """Store results of runs, [1 + derivatives, columns, runs]; the status last of all."""
-        parts = batch.by_name(self.layout, results)
+        parts = by_name(self.layout, results)
         status = parts.pop("status")[0]
         for name, part in parts.items():
             # Codes of runs that are not finite are not numbers: 0.
@@ -364,7 +367,7 @@ class _Table:
             values = self.arrays[name]
             attributes_of = _attributes(name)
             if self.finds_attractors and name == "kind":
-                values = np.array(batch.KINDS)[values]
+                values = np.array(KINDS)[values]
             if self.finds_attractors and name == "signature":
                 values, flags = _signatures(values, belts)
                 attributes_of |= flags
@@ -407,7 +410,7 @@ def _meaning(word: int, belts: int) -> str:
     """A signature as one word; -1 stands for one that is too long to be told."""
     if word < 1:
         return "none" if word == 0 else "long"
-    loop = of_one_loop(batch.word_events(word, belts))
+    loop = of_one_loop(word_events(word, belts))
     return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in loop) or "smooth"
 
 

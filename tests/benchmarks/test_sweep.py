@@ -18,7 +18,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
-from jaxbelt.sweeps import batch
+from jaxbelt.sweeps import threads as sweep_threads
 
 SPAN, TOLERANCE = 100.0, 1e-8
 
@@ -192,7 +192,7 @@ def numba_runs(n):
 
 def test_w1_side_by_side(benchmark, tmp_path, monkeypatch):
     """A table: runs per second of one core, the ratio to Boost.odeint, and the sum of |x1(T)|."""
-    monkeypatch.setattr(batch, "workers", lambda: 1)
+    monkeypatch.setattr(sweep_threads, "workers", lambda: 1)
     n = 256
     rows = []
     peer = built("sweep_peer.cpp", tmp_path)
@@ -237,7 +237,7 @@ def test_growth(benchmark):
     """How the cost grows, one table: processor time a run, on one core unless said otherwise."""
     print()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch, "workers", lambda: 1)
+        patch.setattr(sweep_threads, "workers", lambda: 1)
         for n in (10, 32, 100, 316):
             seconds, _ = processor_time(functools.partial(swept, n))
             print(f"batch of {n * n:7d}      {1e6 * seconds / n**2:9.1f} us a run")
@@ -254,9 +254,9 @@ def test_growth(benchmark):
             cost = f"{1e6 * seconds / 64**2:9.1f} us a run"
             print(f"belts {belts}              {cost}, first call {first:.1f} s")
     times = {}
-    for threads in (1, batch.workers()):
+    for threads in (1, sweep_threads.workers()):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(batch, "workers", lambda n=threads: n)
+            patch.setattr(sweep_threads, "workers", lambda n=threads: n)
             swept(256)
             start = time.perf_counter()
             swept(256)

@@ -484,12 +484,14 @@ def _balance(z, w, B, s, x1, x2):
     rest = _force(z, w, B, s, x1, x2)
     if not any_zero:
         return False, np.inf, np.sign(rest)
-    if abs(rest) <= held:
+    if abs(rest) <= held and held > 0:
         return True, held - abs(rest), 0.0
+    # A belt that exerts no force holds nothing; where nothing pulls, either, x2'' = -x2 decides.
+    onward = np.sign(rest) if rest != 0 else -np.sign(x2)
     for i in range(B.shape[0]):
         if s[i] == 0:
-            s[i] = -1 if rest > 0 else 1
-    return False, abs(rest) - held, np.sign(rest)
+            s[i] = -1 if onward > 0 else 1
+    return False, abs(rest) - held, onward
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -662,7 +664,9 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         else:
             # ---------------- a slip arc
             a = _force(z, w, B, s, x1, x2)
-            if turns and abs(x2) + abs(a) < 1e-14:  # at rest, but for rounding
+            if abs(x2) + abs(a) < (
+                1e-14 if turns else 1e-300
+            ):  # at rest, for labels but for rounding
                 t = T
                 break
             if turns:

@@ -1,6 +1,6 @@
-"""Inverse problems by gradients: `fit` parameters to a measured record, `design` a cycle.
+"""`fit`: parameters from a measured record, by gradients.
 
-**Fitting.** A record of stick-slip motion is hard to fit from afar: a guess with a wrong period
+A record of stick-slip motion is hard to fit from afar: a guess with a wrong period
 slips by whole loops against the record, and the sum of squares has a minimum for each of them. So
 
 1. *search*: the record is cut into windows shorter than half a loop, over which no phase is lost.
@@ -18,8 +18,6 @@ slips by whole loops against the record, and the sum of squares has a minimum fo
    record as one motion from one unknown start. Its Gauss-Newton matrix gives the standard errors.
 
 All derivatives of 2 and 3 are those of `simulate`, through every stick, slip and crossing.
-
-**Design** is Newton's method on functionals of the cycle, damped, within bounds.
 """
 
 import functools
@@ -33,181 +31,24 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from ..bifurcations.conditions import AbstractCondition
-from ..bifurcations.refine import refine
 from ..checks import as_array, check_finite, require
-from ..cycles.cycle import Cycle, find_cycle
 from ..model.oscillator import Oscillator, check_oscillator
-from ..model.parameters import leaf_groups, leaf_index, names_of, parameter
 from ..motion.simulate import simulate
 from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
 from ..results import Status, describe
+from .record import WINDOW, Record, record_of
+from .selection import ITERATIONS, LONGEST, Selection, select
 
-#: Length of the first windows, less than half a loop: no phase is lost over it.
-WINDOW = 2.5
 #: Each stage joins so many neighbouring windows.
 JOIN = 3
 #: Steps of the search, and its learning rate in units of a parameter's size.
 SEARCH_STEPS, LEARNING_RATE = 200, 0.05
-#: Steps of one damped Gauss-Newton iteration, and how far one may move a parameter.
-ITERATIONS, LONGEST = 40, 0.4
 #: A start whose windows are further off than this (chi^2 per datum) is not followed further.
 HOPELESS = 6.0
 #: A fit as bad as this happens once in a million records, by noise.
 IMPLAUSIBLE = 1e-6
 TOLERANCE = 1e-8
-
-
-# --- which parameters, within which bounds --------------------------------------------------------
-
-
-class Selection(eqx.Module):
-    """Parameters of an oscillator: for each the numbers of the leaves that it sets, and bounds.
-
-    Each is a function of an unbounded variable u: lower + exp(u), upper - exp(-u), between two
-    bounds a logistic function of u, without bounds size u.
-    """
-
-    leaves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
-    lower: Array
-    upper: Array
-    size: Array
-
-    def values(self, u: Array) -> Array:
-        has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
-        low, high = jnp.where(has_lower, self.lower, 0.0), jnp.where(has_upper, self.upper, 0.0)
-        one_sided = jnp.where(has_lower, low + jnp.exp(u), high - jnp.exp(-u))
-        between = low + (high - low) * jax.nn.sigmoid(u)
-        bounded = jnp.where(has_lower & has_upper, between, one_sided)
-        return jnp.where(has_lower | has_upper, bounded, self.size * u)
-
-    def unbounded(self, values: ArrayLike) -> Array:
-        """The u that belong to values within the bounds."""
-        has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
-        above = jnp.log(jnp.where(has_lower, values - self.lower, 1.0))
-        below = -jnp.log(jnp.where(has_upper, self.upper - values, 1.0))
-        return jnp.where(has_lower | has_upper, above + below, values / self.size)
-
-    def put(self, osc: Oscillator, values: Array) -> Oscillator:
-        """The oscillator with the parameters set to these values."""
-        leaves, structure = jax.tree.flatten(osc)
-        for i, numbers in enumerate(self.leaves):
-            for leaf in numbers:
-                leaves[leaf] = values[i]
-        return jax.tree.unflatten(structure, leaves)
-
-
-def _select(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, np.ndarray]:
-    """What `where` selects, a leaf or a tuple of leaves kept equal for each parameter; and u."""
-    groups, leaves = leaf_groups(osc, where), jax.tree.leaves(osc)
-    if bounds is None:
-        bounds = [None] * len(groups)
-    require(len(bounds) == len(groups), "bounds", f"{len(groups)} pairs or None", repr(bounds))
-    named = names_of(osc)
-    names = tuple(" = ".join(named[leaf] for leaf in group) for group in groups)
-    values = np.array([float(leaves[group[0]]) for group in groups])
-    pairs = []
-    for group, name, value, pair in zip(groups, names, values, bounds, strict=True):
-        lower, upper = (_least(osc, group[0]), np.inf) if pair is None else map(float, pair)
-        require(lower < value < upper, name, f"inside of its bounds {lower}, {upper}", value)
-        pairs.append((lower, upper))
-    lower, upper = jnp.asarray(pairs).T
-    size = jnp.asarray(np.maximum(np.abs(values), 0.1))
-    selection = Selection(groups, names, lower, upper, size)
-    return selection, np.asarray(selection.unbounded(jnp.asarray(values)))
-
-
-def _least(osc: Oscillator, leaf: int) -> float:
-    """0 for a leaf that may not be negative, by the oscillator's own checks, else -inf."""
-    leaves, structure = jax.tree.flatten(osc)
-    leaves[leaf] = jnp.asarray(-1.0)
-    try:
-        jax.tree.unflatten(structure, leaves).check()
-    except ValueError:
-        return 0.0
-    return -np.inf
-
-
-# --- the record -----------------------------------------------------------------------------------
-
-
-class Record(eqx.Module):
-    """Data in pieces of equal number, the first windows.
-
-    times: since the start of the piece, the last one the start of the next, [pieces, samples + 1];
-    values: x1 and x2, [pieces, samples, 2]; weights: 1/noise, 0 where there is no datum, the same;
-    starts: states at the starts of the pieces as the record has them, [pieces, 2]; scale: of each
-    component, [2]; lacks: 1.0 where only velocities are known, so that the x1 of the starts lack a
-    common constant, else 0.0.
-    """
-
-    times: Array
-    values: Array
-    weights: Array
-    starts: Array
-    scale: Array
-    lacks: Array
-
-
-def _record_of(ts: np.ndarray, values: np.ndarray, noise: Sequence[float | None]) -> Record:
-    """values: [samples, 2], NaN where there is no datum; noise: None to be estimated."""
-    n = len(ts)
-    step = (ts[-1] - ts[0]) / (n - 1)
-    size = int(np.clip(round(WINDOW / step), 1, n))
-    pieces = -(-n // size)
-    begin = np.arange(pieces) * size
-    smoothed = [_local_cubics(ts, column) for column in values.T]
-    known = np.isfinite(values)
-    given = [i for i in (0, 1) if np.any(known[:, i])]
-    if 0 in given:
-        states = np.stack(smoothed[0][:2], axis=1)
-    else:
-        v = smoothed[1][0]
-        steps = 0.5 * (v[1:] + v[:-1]) * np.diff(ts)
-        states = np.stack([np.concatenate([[0.0], np.cumsum(steps)]), v], axis=1)
-    if 1 in given:
-        states[:, 1] = smoothed[1][0]
-    weights = np.zeros_like(values)
-    for i in given:
-        sigma = noise[i]
-        sigma = smoothed[i][2] if sigma is None else sigma
-        weights[:, i] = np.where(known[:, i], 1 / sigma, 0.0)
-
-    missing = pieces * size - n
-    ts = np.concatenate([ts, np.full(missing, ts[-1]), [ts[-1] + step]])
-    padding = ((0, missing), (0, 0))
-    return Record(
-        times=jnp.asarray(np.stack([ts[i : i + size + 1] - ts[i] for i in begin])),
-        values=jnp.asarray(np.pad(np.where(known, values, 0.0), padding).reshape(pieces, size, 2)),
-        weights=jnp.asarray(np.pad(weights, padding).reshape(pieces, size, 2)),
-        starts=jnp.asarray(states[begin]),
-        scale=jnp.asarray(np.std(states, axis=0)),
-        lacks=jnp.asarray(float(0 not in given)),
-    )
-
-
-def _local_cubics(ts: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Value and slope at every time of a cubic through the data near it; their noise.
-
-    Near: a third of a time unit on either side, at least seven data.
-    """
-    known = np.isfinite(column)
-    if np.sum(known) < 7:
-        return np.zeros_like(ts), np.zeros_like(ts), np.nan
-    t, x = ts[known], column[known]
-    half = max(3, round(0.35 / np.median(np.diff(t))))
-    half = min(half, (len(t) - 1) // 2)
-    centre = np.searchsorted(t, ts)
-    rows = np.clip(centre - half, 0, len(t) - 2 * half - 1)[:, None] + np.arange(2 * half + 1)
-    powers = (t[rows] - ts[:, None])[..., None] ** np.arange(4)
-    inverse = np.linalg.pinv(powers)
-    cubics = np.einsum("tpi,ti->tp", inverse, x[rows])
-    off = x[rows] - np.einsum("tip,tp->ti", powers, cubics)
-    # The median: corners of the motion are no noise.
-    noise = np.sqrt(np.median(np.sum(off**2, axis=1) / (2 * half - 3)))
-    return cubics[:, 0], cubics[:, 1], float(noise)
 
 
 # --- 1: the search --------------------------------------------------------------------------------
@@ -495,10 +336,10 @@ def fit(
     check_oscillator(oscillator, "oscillator")
     times, values, sigmas = _checked_record(ts, x1, x2, noise)
     require(isinstance(starts, int) and starts > 0, "starts", "a positive integer", starts)
-    selection, u = _select(oscillator, where, bounds)
+    selection, u = select(oscillator, where, bounds)
     tell = report or (lambda text: None)
 
-    record = _record_of(times, values, sigmas)
+    record = record_of(times, values, sigmas)
     linearized = functools.partial(_linearized, selection, oscillator, record)
     data = int(np.sum(np.isfinite(values)))
     freedom = data - u.size - 2
@@ -628,167 +469,3 @@ def _autocorrelation(off: np.ndarray) -> float:
     products = np.where(pairs, off[1:] * off[:-1], 0.0)
     squares = np.where(pairs, 0.5 * (off[1:] ** 2 + off[:-1] ** 2), 0.0)
     return float(np.sum(products) / np.sum(squares))
-
-
-# --- design ---------------------------------------------------------------------------------------
-
-#: Targets are met to this fraction of their size (or of one, where they are smaller).
-MET = 1e-9
-
-
-class Design(eqx.Module):
-    """What `design` returns.
-
-    oscillator: the one designed; cycle: its cycle; names, values, [p]: of the parameters in the
-    order of `where`; achieved, targets, [targets]: the functionals, and what they were to be (the
-    nearer end of an interval, or the value itself inside of it); iterations; status: OK,
-    UNREACHABLE, where the nearest that was found is given, or why there is no cycle to begin with.
-    """
-
-    oscillator: Oscillator
-    cycle: Cycle
-    names: tuple[str, ...] = eqx.field(static=True)
-    values: Array
-    achieved: Array
-    targets: Array
-    iterations: int
-    status: Array
-
-    def __repr__(self) -> str:
-        status = Status(int(self.status))
-        chosen = ", ".join(f"{n} = {float(v):.12g}" for n, v in zip(self.names, self.values))
-        rows = [
-            f"  achieved {float(a):.12g}, wanted {float(b):.12g}, off by {float(a - b):+.1e}"
-            for a, b in zip(self.achieved, self.targets)
-        ]
-        advice = [] if status == Status.OK else [f"  {describe(status)}"]
-        head = f"Design({status.name}: {chosen}; {self.iterations} iterations)"
-        return "\n".join([head, *rows, *advice])
-
-
-def distance_to(
-    *conditions: AbstractCondition, where: Callable[[Oscillator], Any]
-) -> Callable[[Cycle], Array]:
-    """A functional for `design`: how far a parameter is from the nearest of some bifurcations.
-
-    conditions: such as `jb.NonsmoothFold(belt=1)`; where: selects the parameter. Each point is
-    found by `refine` from the oscillator of the cycle; one that is not there is infinitely far.
-    """
-
-    def distance(cycle: Cycle) -> Array:
-        osc = cycle.oscillator
-        value = parameter(osc, leaf_index(osc, where))
-        distances = []
-        for condition in conditions:
-            point = refine(condition, osc, where=where)
-            found = point.status == Status.OK
-            distances.append(
-                jnp.where(found, jnp.abs(jnp.where(found, point.value, 0.0) - value), jnp.inf)
-            )
-        return functools.reduce(jnp.minimum, distances)
-
-    return distance
-
-
-def design(
-    oscillator: Oscillator,
-    targets: Sequence[Any],
-    *,
-    where: Callable[[Oscillator], Any],
-    bounds: Sequence[Any] | None = None,
-    y0: ArrayLike | tuple = (3.0, 0.0),
-    report: Callable[[str], None] | None = print,
-) -> Design:
-    """Parameters for which functionals of the cycle have wanted values.
-
-    oscillator: where to begin; it has to have a cycle. targets: pairs of a functional of the
-    `Cycle`, such as `jb.amplitude` or `lambda c: jb.stick_duration(c, 1)`, and its value, or an
-    interval (lower, upper) that it is to lie in; `distance_to` is the functional that keeps a
-    bifurcation away. where, bounds: the parameters that may be changed, as for `fit`. y0: the
-    start (x1, x2) that leads to the cycle. report: is told of the progress; None for silence.
-
-    Damped Newton steps with exact derivatives; with fewer targets than parameters, the shortest
-    ones. What no choice within the bounds reaches ends with the status UNREACHABLE, and so does
-    what lies behind a bifurcation at which the cycle vanishes. `ValueError` names an argument that
-    is impossible.
-    """
-    check_oscillator(oscillator, "oscillator")
-    y0 = as_array(y0, "y0", (2,))
-    check_finite(y0, "y0")
-    functionals, intervals = _checked_targets(targets)
-    selection, u = _select(oscillator, where, bounds)
-    tell = report or (lambda text: None)
-
-    def evaluate(u):
-        return _achieved(functionals, selection, oscillator, y0, jnp.asarray(u))
-
-    def off(achieved):
-        wanted = np.clip(achieved, *intervals.T)
-        return (achieved - wanted) / np.maximum(1.0, np.abs(wanted)), wanted
-
-    def improved(slopes, miss, wanted, damping):
-        size = np.maximum(1.0, np.abs(wanted))[:, None]
-        matrix = np.nan_to_num(np.where(miss[:, None] != 0, slopes / size, 0.0))
-        gram = matrix @ matrix.T
-        # Damping vanishes with the miss, for quadratic convergence.
-        damping = damping * np.max(gram) * np.max(np.abs(miss)) + 1e-14
-        step = -matrix.T @ np.linalg.solve(gram + damping * np.eye(len(miss)), miss)
-        return u + step * min(1.0, LONGEST / max(np.max(np.abs(step)), 1e-300))
-
-    achieved, slopes, cycle = evaluate(u)
-    miss, wanted = off(np.asarray(achieved))
-    damping, iterations, idle = 1e-3, 0, 0
-    while iterations < 2 * ITERATIONS and idle < 5:
-        if not np.all(np.isfinite(miss)) or np.max(np.abs(miss)) < MET or damping > 1e8:
-            break
-        new = improved(np.asarray(slopes), miss, wanted, damping)
-        trial = evaluate(new)
-        new_miss, new_wanted = off(np.asarray(trial[0]))
-        iterations += 1
-        gain = 1 - np.linalg.norm(new_miss) / np.linalg.norm(miss)
-        if gain > 0:
-            u, (achieved, slopes, cycle), miss, wanted = new, trial, new_miss, new_wanted
-            damping, idle = max(damping / 4, 1e-12), idle + 1 if gain < 1e-5 else 0
-            tell(f"step {iterations}: off by {np.max(np.abs(miss)):.1e}")
-        else:
-            damping *= 10
-    values = selection.values(jnp.asarray(u))
-    met = np.all(np.isfinite(miss)) and np.max(np.abs(miss)) < MET
-    status = int(cycle.status) or (Status.OK if met else Status.UNREACHABLE).value
-    return Design(
-        oscillator=selection.put(oscillator, values),
-        cycle=cycle,
-        names=selection.names,
-        values=values,
-        achieved=jnp.asarray(achieved),
-        targets=jnp.asarray(wanted),
-        iterations=iterations,
-        status=jnp.asarray(status),
-    )
-
-
-@jit
-def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
-    """The functionals of the cycle, NaN where there is none, their derivatives, and the cycle."""
-
-    def achieved(u):
-        cycle = find_cycle(selection.put(osc, selection.values(u)), y0)
-        values = jnp.stack([functional(cycle) for functional in functionals])
-        values = jnp.where(cycle.status == Status.OK, values, jnp.nan)
-        return values, (values, cycle)
-
-    slopes, (values, cycle) = jax.jacfwd(achieved, has_aux=True)(u)
-    return values, slopes, cycle
-
-
-def _checked_targets(targets):
-    pairs = list(targets)
-    require(len(pairs) > 0, "targets", "at least one pair (functional, value)", targets)
-    intervals = []
-    for pair in pairs:
-        fine = isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])
-        require(fine, "targets", "pairs (functional, value)", repr(pair))
-        lower, upper = pair[1] if isinstance(pair[1], tuple) else (pair[1], pair[1])
-        require(float(lower) <= float(upper), "targets", "intervals (lower, upper)", repr(pair[1]))
-        intervals.append((float(lower), float(upper)))
-    return tuple(functional for functional, _ in pairs), np.array(intervals)

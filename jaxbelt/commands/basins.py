@@ -1,0 +1,99 @@
+"""`jaxbelt basins`: which start leads where."""
+
+import csv
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import typer
+
+import jaxbelt as jb
+
+from .options import (
+    Belts,
+    Class,
+    Damping,
+    Nu0,
+    Nu1,
+    Omega,
+    Sigma,
+    Sigma0,
+    Sigma1,
+    make_console,
+    oscillator,
+    plain_errors,
+)
+
+
+def basins(
+    system: Class = "b",
+    nu0: Nu0 = None,
+    nu1: Nu1 = None,
+    sigma: Sigma = None,
+    sigma0: Sigma0 = None,
+    sigma1: Sigma1 = None,
+    belt: Belts = None,
+    damping: Damping = 0.5,
+    omega: Omega = 1.0,
+    x1: Annotated[
+        tuple[float, float], typer.Option(metavar="FROM TO", help="Displacements of the starts.")
+    ] = (0.0, 3.0),
+    x2: Annotated[
+        tuple[float, float], typer.Option(metavar="FROM TO", help="Velocities of the starts.")
+    ] = (-1.0, 1.0),
+    points: Annotated[
+        int, typer.Option(help="Starts along each side of the grid; their square is run.")
+    ] = 201,
+    starts: Annotated[
+        int, typer.Option(help="Random starts for the basin stability of the window; 0: none.")
+    ] = 10_000,
+    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
+    out: Annotated[
+        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv.")
+    ] = Path("basins"),
+) -> None:
+    """Where each start leads: basins of attraction, and the unstable cycle between them.
+
+    - **OUT.png**: a window of the phase plane, coloured by the attractor that a start leads to,
+      with the stable cycles, and the unstable one dashed.
+
+    - **OUT.csv**: x1, x2 and label of every start of the grid.
+
+    Prints the fraction of the window that leads to each kind of attractor, with its standard error
+    (basin stability), from random starts. An oscillator is described as for **simulate**.
+
+    Examples:
+
+    - jaxbelt basins --nu0 0.45 --nu1 0.35 --x1 0.5 2.5 --x2 -0.8 0.8
+
+    - jaxbelt basins --belt 1.4,law=stribeck,static=1,kinetic=0.5,stribeck_velocity=0.5
+      --damping 0.1 --x1 -2 2 --x2 0 2
+    """
+    from ..plotting.style import journal_style, save
+    from ..plotting.sweeps import draw_basins
+
+    console = make_console()
+    with plain_errors():
+        if points < 2:
+            raise ValueError(f"points must be at least 2, got {points}")
+        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
+        osc = oscillator(system, arguments, belt, damping, omega)
+        grid = [np.linspace(*span, points) for span in (x1, x2)]
+        with console.status("following the starts (the first seconds are compilation)"):
+            found = jb.basins(osc, x1=grid[0], x2=grid[1], progress=False)
+            lines = [repr(found)]
+            if starts:
+                key = jax.random.key(seed)
+                lines.append(repr(jb.basin_stability(osc, box=(x1, x2), n=starts, key=key)))
+        out.parent.mkdir(parents=True, exist_ok=True)
+        written = [out.with_name(out.name + end) for end in (".png", ".csv")]
+        with journal_style():
+            save(draw_basins(found), written[0])
+        with written[1].open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["x1", "x2", "label"])
+            for (i, j), label in np.ndenumerate(np.asarray(found.label)):
+                writer.writerow([float(grid[0][i]), float(grid[1][j]), int(label)])
+    for line in (*lines, f"Written: {', '.join(map(str, written))}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,73 @@
+"""`jaxbelt reproduce`: the paper's table and figures, recomputed."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from .options import make_console, plain_errors
+
+
+def reproduce(
+    out: Annotated[
+        Path, typer.Option(help="Folder for the files; made where it is not there.")
+    ] = Path("reproduction"),
+) -> None:
+    """Recompute the table and the figures of Casini and Vestroni (2004).
+
+    Writes **critical_values.json** (the critical belt velocities of sections 3.2 and 3.3
+    of the paper: printed, computed, residual, iterations) and the figures as **figNN.png**,
+    numbered as in the paper, and prints the table. Takes one to two minutes, most of them
+    compilation.
+
+    Example: **jaxbelt reproduce --out results**
+    """
+    # Imported late, with matplotlib behind it, to keep `--help` quick.
+    from .. import paper
+
+    console = make_console()
+    columns = (
+        TextColumn("{task.description:<32}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with plain_errors(), Progress(*columns, console=console) as progress:
+        task = progress.add_task("", total=paper.steps())
+        started = False
+
+        def report(description: str) -> None:
+            nonlocal started
+            progress.update(task, advance=int(started), description=description)
+            started = True
+
+        values = paper.reproduce(out, report)
+        progress.update(task, advance=1, description="done")
+    console.print(_table_of(values))
+    for line in (
+        *paper.REMARKS,
+        f"Written to {out}: critical_values.json, {', '.join(paper.FIGURES)}",
+    ):
+        console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
+
+
+def _table_of(values) -> Table:
+    table = Table(title="Critical velocities nu0 of the paper, recomputed")
+    for name in ("class", "point", "kind"):
+        table.add_column(name)
+    for name in ("printed", "computed", "difference", "residual", "iterations"):
+        table.add_column(name, justify="right")
+    for value in values:
+        table.add_row(
+            value.system,
+            value.point,
+            value.kind,
+            f"{value.printed:.5g}",
+            f"{value.computed:.12f}",
+            f"{value.computed - value.printed:+.1e}",
+            f"{value.residual:.0e}",
+            str(value.iterations),
+        )
+    return table

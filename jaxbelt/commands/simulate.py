@@ -1,0 +1,147 @@
+"""`jaxbelt simulate`: one oscillator from one start."""
+
+import csv
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+import jaxbelt as jb
+
+from .options import (
+    Belts,
+    Class,
+    Damping,
+    Nu0,
+    Nu1,
+    Omega,
+    Sigma,
+    Sigma0,
+    Sigma1,
+    make_console,
+    oscillator,
+    plain_errors,
+)
+
+
+def simulate(
+    system: Class = "b",
+    nu0: Nu0 = None,
+    nu1: Nu1 = None,
+    sigma: Sigma = None,
+    sigma0: Sigma0 = None,
+    sigma1: Sigma1 = None,
+    belt: Belts = None,
+    damping: Damping = 0.5,
+    omega: Omega = 1.0,
+    start: Annotated[
+        tuple[float, float],
+        typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0."),
+    ] = (3.0, 0.0),
+    t1: Annotated[float, typer.Option(help="End of the time span, which begins at 0.")] = 100.0,
+    samples: Annotated[
+        int, typer.Option(help="How many times, evenly spread over the span, are written.")
+    ] = 2001,
+    formulation: Annotated[
+        str,
+        typer.Option(
+            help="filippov (exact), switch (the paper's switch model) or smooth (tanh for sgn)."
+        ),
+    ] = "filippov",
+    v_star: Annotated[float, typer.Option(help="Half-width of the switch model's band.")] = 1e-3,
+    eps: Annotated[float, typer.Option(help="Width of the smooth model's tanh.")] = 1e-3,
+    tolerance: Annotated[
+        float, typer.Option(help="Relative and absolute tolerance of the integrator.")
+    ] = 1e-10,
+    out: Annotated[
+        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
+    ] = Path("trajectory"),
+) -> None:
+    """Follow one oscillator from one start; write a picture and the numbers.
+
+    - **OUT.png**: time histories with the stick phases shaded, and the phase portrait.
+
+    - **OUT.csv**: t, x1, x2 and the contact of each belt: 1 or -1 slip with that sign of the
+      relative velocity nu - omega x2, 0 stuck, -2 or 2 the mass below or above the belt's interval.
+
+    - **OUT_events.csv**: t, x1, x2, kind (STICK, SLIP, CROSS, EDGE) and belt of every event.
+
+    The classes have the friction of the paper (Conti's law, mus = 1, p1 = 0.6, p3 = 10):
+
+    - a: one belt. Give --nu0.
+
+    - b: two belts that always touch. Give --nu0 --nu1.
+
+    - c: belt 0 below sigma, belt 1 above it. Give --nu0 --nu1 --sigma.
+
+    - d: belt 0 below sigma1, belt 1 above sigma0. Give --nu0 --nu1 --sigma0 --sigma1.
+
+    The laws of a --belt are conti (static, residual, steepness, quadratic; those of the paper
+    unless given), coulomb (static, kinetic) and stribeck (static, kinetic, stribeck_velocity).
+
+    Examples:
+
+    - jaxbelt simulate --class a --nu0 0.2 --start 1.5 0 --t1 60
+
+    - jaxbelt simulate --class d --nu1 -0.3 --sigma0 0 --sigma1 0.5 --out overlap
+
+    - jaxbelt simulate --belt 0.3 --belt 0.5,law=coulomb,static=0.8,kinetic=0.5,lower=0.2
+    """
+    from ..paper import steady_cycle
+    from ..plotting.phase import draw_overview
+    from ..plotting.style import journal_style, save
+
+    console = make_console()
+    with plain_errors():
+        if samples < 2:
+            raise ValueError(f"samples must be at least 2, got {samples}")
+        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
+        osc = oscillator(system, arguments, belt, damping, omega)
+        with console.status("simulating (the first seconds are compilation)"):
+            trajectory = jb.simulate(
+                osc,
+                start,
+                t1,
+                ts=np.array([t1 * i / (samples - 1) for i in range(samples)]),
+                rtol=tolerance,
+                atol=tolerance,
+                formulation=formulation,
+                v_star=v_star,
+                eps=eps,
+            )
+        out.parent.mkdir(parents=True, exist_ok=True)
+        written = [out.with_name(out.name + end) for end in (".png", ".csv", "_events.csv")]
+        cycle = steady_cycle(trajectory)
+        with journal_style():
+            figure = draw_overview(osc, trajectory, cycles=[cycle] if cycle else [])
+            save(figure, written[0])
+        write_samples(trajectory, written[1])
+        write_events(trajectory, written[2])
+    for line in (repr(trajectory), f"Written: {', '.join(map(str, written))}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    if int(trajectory.status) >= jb.Status.TOO_MANY_SEGMENTS:
+        raise typer.Exit(1)
+
+
+def write_samples(trajectory: jb.Trajectory, path: Path) -> None:
+    """t, x1, x2 and the contact code of every belt, a row a sample; numbers to the last digit."""
+    modes = np.asarray(trajectory.modes)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "x1", "x2", *(f"mode{i}" for i in range(modes.shape[1]))])
+        ts, ys = np.asarray(trajectory.ts).tolist(), np.asarray(trajectory.ys).tolist()
+        for t, y, mode in zip(ts, ys, modes.tolist(), strict=True):
+            writer.writerow([t, *y, *mode])
+
+
+def write_events(trajectory: jb.Trajectory, path: Path) -> None:
+    """t, x1, x2, kind and belt, a row an event."""
+    events = trajectory.events
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "x1", "x2", "kind", "belt"])
+        columns = (np.asarray(events.t).tolist(), np.asarray(events.y).tolist())
+        kinds = [jb.EventKind(kind).name for kind in np.asarray(events.kind).tolist()]
+        for t, y, kind, belt in zip(*columns, kinds, np.asarray(events.belt).tolist(), strict=True):
+            writer.writerow([t, *y, kind, belt])

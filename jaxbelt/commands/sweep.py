@@ -1,0 +1,109 @@
+"""`jaxbelt sweep`: a class of the paper from every point of a grid."""
+
+import functools
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+import jaxbelt as jb
+
+from .options import CLASSES, Class, make_console, plain_errors
+
+
+def sweep(
+    axes: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="AXIS...",
+            help="One axis or more, NAME=FROM:TO:COUNT or NAME=VALUE: arguments of the class, and "
+            "x1 and x2 for starts.",
+        ),
+    ],
+    system: Class = "b",
+    observe: Annotated[
+        str, typer.Option(help="attractor (what each run leads to) or final (where it ends).")
+    ] = "attractor",
+    variable: Annotated[
+        str | None, typer.Option(help="What the picture shows [kind, or x1_end]")
+    ] = None,
+    start: Annotated[
+        tuple[float, float],
+        typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0."),
+    ] = (3.0, 0.0),
+    t1: Annotated[
+        float | None, typer.Option(help="End of each run [3000 for attractors, 100]")
+    ] = None,
+    tolerance: Annotated[
+        float, typer.Option(help="Relative and absolute tolerance of the integrator.")
+    ] = 1e-8,
+    out: Annotated[
+        Path, typer.Option(help="Where to write: NetCDF if it ends in .nc, Zarr if in .zarr.")
+    ] = Path("sweep.nc"),
+) -> None:
+    """Run one of the paper's classes from every point of a grid; write the data and a picture.
+
+    - **OUT**: the dataset, labelled, with what it came from in its attributes.
+
+    - the same name with **.png**: a picture, for one or two axes.
+
+    The other arguments of the class have the values that **simulate** takes for them.
+
+    Examples:
+
+    - jaxbelt sweep nu0=-0.7:0.7:512 nu1=-0.7:0.7:512 --out plane.nc
+
+    - jaxbelt sweep x1=-2:2:200 x2=-2:2:200 --observe final --t1 50 --out starts.zarr
+    """
+    from ..plotting.style import journal_figure, journal_style, save
+    from ..plotting.sweeps import plot_sweep
+
+    console = make_console()
+    with plain_errors():
+        if system not in CLASSES:
+            raise ValueError(f"class must be a, b, c or d, got {system}")
+        if out.suffix not in (".nc", ".zarr"):
+            raise ValueError(f"out must end in .nc or .zarr, got {out}")
+        values = dict(map(parse_axis, axes))
+        for name in values:
+            if name not in (*CLASSES[system], "x1", "x2"):
+                known = ", ".join((*CLASSES[system], "x1", "x2"))
+                raise ValueError(f"axes of class {system} must be among {known}, got {name}")
+        fixed = {name: value for name, value in CLASSES[system].items() if name not in values}
+        make = functools.partial(getattr(jb.presets, f"class_{system}"), **fixed)
+        if t1 is None and observe != "attractor":
+            t1 = 100.0
+        dataset = jb.sweep(
+            make, values, y0=start, t1=t1, rtol=tolerance, atol=tolerance, observe=observe
+        )
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if out.suffix == ".nc":
+            # Version 3 of the format, which needs no library but SciPy.
+            dataset.to_netcdf(out, engine="scipy")
+        else:
+            dataset.to_zarr(out, mode="w")
+        written = [out]
+        if sum(len(axis) > 1 for axis in values.values()) in (1, 2):
+            written.append(out.with_suffix(".png"))
+            shown = variable or ("kind" if observe == "attractor" else "x1_end")
+            with journal_style():
+                figure = journal_figure(4.6, 4.4)
+                plot_sweep(dataset, shown, figure.subplots())
+                save(figure, written[1])
+    for line in (repr(dataset), f"Written: {', '.join(map(str, written))}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def parse_axis(text: str) -> tuple[str, np.ndarray]:
+    """The name and the values that a text such as `nu0=-0.7:0.7:512` or `nu1=0.35` describes."""
+    name, equals, words = text.partition("=")
+    parts = words.split(":")
+    try:
+        if equals and len(parts) == 1:
+            return name, np.array([float(words)])
+        if equals and len(parts) == 3 and int(parts[2]) > 0:
+            return name, np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
+    except ValueError:
+        pass
+    raise ValueError(f"an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got {text!r}")

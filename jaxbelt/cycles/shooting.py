@@ -1,0 +1,442 @@
+"""Shooting with a fixed signature: a closed chain of arcs as a square system of equations.
+
+A signature, (the mode, what ends it) arc by arc, is all that has to be known to compute a cycle:
+the numbers follow without any event detection (fixed-signature multiple shooting). An arc ends at a
+boundary r_k = 0, at a contact edge, at slip onset, or at an extremum, x2' = 0 or x2 = 0. The
+extrema make x1 and x2 monotone on every arc, so all extrema of a cycle are ends of arcs. Counted
+for N arcs:
+
+    3N unknowns    entry state (x1, x2) and duration T of every arc
+     N equations   the guard of the arc's end vanishes at its end
+    2N equations   the end of an arc is the entry of the next, after the last comes the first
+
+The number N is padded to a few fixed sizes and modes are data, so that one compiled program serves
+all signatures. Slip arcs are integrated by a fixed number of steps of a scheme of order
+twelve, spread over the arc so that they are short where the friction law bends; all arcs at
+once, each step smooth in everything. Derivatives of a solution come from the implicit function
+theorem and work in forward and reverse mode and under `jax.vmap`.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..model.events import Signature, events_of
+from ..model.modes import (
+    Mode,
+    boundary_guards,
+    capacity,
+    edge_guards,
+    edges,
+    mode_acceleration,
+    mode_of,
+    onset_position,
+    stick_velocity,
+)
+from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
+from ..motion.integrators import density
+from ..numerics.compiling import one_kernel
+from ..numerics.extrapolation import Scheme, increments, scheme
+from ..numerics.newton import newton
+
+#: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
+SIZES = (16, 32, 64)
+#: Integration steps per slip arc (an arc is about a quarter of a loop at most).
+STEPS = 8
+
+
+class Chain(eqx.Module):
+    """A signature: contact codes [arcs, belts], what ends each arc [arcs], and the step fractions.
+
+    ends: numbers of `arcs.Ends`. An unused arc is of duration zero.
+    """
+
+    codes: Array
+    ends: Array
+    mesh: Array
+
+    @property
+    def used(self) -> Array:
+        return self.ends != Ends(self.codes.shape[-1]).unused
+
+    @property
+    def halved(self) -> "Chain":
+        """The same chain with every integration step halved."""
+        return replace(self, mesh=jnp.repeat(self.mesh / 2, 2, axis=-1))
+
+
+class Loop(eqx.Module):
+    """One loop of an orbit, arc by arc, padded: a signature, and a guess of the unknowns."""
+
+    codes: Array
+    ends: Array
+    entries: Array
+    durations: Array
+
+    @property
+    def used(self) -> Array:
+        return self.ends != Ends(self.codes.shape[-1]).unused
+
+    @property
+    def exits(self) -> Array:
+        """The states at the ends of the arcs; after the last used one comes the first."""
+        last = jnp.arange(self.ends.size) == jnp.sum(self.used) - 1
+        return jnp.where(last[:, None], self.entries[0], jnp.roll(self.entries, -1, axis=0))
+
+
+def modes_of(loop: Chain | Loop) -> np.ndarray:
+    """The contact codes of the arcs of one loop, [arcs, belts], without those that are unused."""
+    codes, ends = np.asarray(loop.codes), np.asarray(loop.ends)
+    return codes[ends != Ends(codes.shape[-1]).unused].astype(int)
+
+
+def loop_events(loop: Chain | Loop) -> Signature:
+    """The events of one loop, (kind, belt) each; for EDGE the lowest belt that comes or goes."""
+    return events_of(modes_of(loop))
+
+
+def following_codes(chain: Chain | Loop) -> Array:
+    """Contact codes of the arc after each; after the last used one comes the first."""
+    following = jnp.roll(chain.codes, -1, axis=0)
+    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
+    return jnp.where(last[:, None], chain.codes[0], following)
+
+
+def room_of(arcs: int) -> int:
+    """The size of a chain that so many arcs, SIZES[-1] at most, are given."""
+    return next(size for size in SIZES if size >= arcs)
+
+
+def cut(loops: Sequence[Loop], *, more: int = 0) -> list[Loop]:
+    """The loops, known ones, with no more room than the longest of them needs, and some more."""
+    unused = Ends(loops[0].codes.shape[-1]).unused
+    longest = max(int(np.sum(np.asarray(loop.ends) != unused)) for loop in loops)
+    room = slice(room_of(min(longest + more, SIZES[-1])))
+    return [jax.tree.map(lambda leaf: leaf[room], loop) for loop in loops]
+
+
+# Of order 12 for the arcs, of order 4 for placing the steps.
+_FINE = scheme((2, 4, 6, 8, 10, 12))
+_COARSE = scheme((2, 4))
+
+
+def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -> Array:
+    """One step of size h, for states in one array."""
+
+    def apart(state):
+        slopes = field(jnp.stack(state))
+        return tuple(slopes[i] for i in range(y.size))
+
+    (change,) = increments(apart, tuple(y[i] for i in range(y.size)), h, scheme)
+    return y + jnp.stack(change)
+
+
+def _field(osc: Oscillator, codes: Array, y: Array) -> Array:
+    return jnp.stack([y[1], mode_acceleration(osc, mode_of(codes), y[0], y[1])])
+
+
+def meshed(osc: Oscillator, loop: Loop, steps: int = STEPS) -> tuple[Chain, Array]:
+    """The chain of a loop with its mesh, and the guess of its unknowns."""
+    stuck = jnp.any(loop.codes == 0, axis=-1)
+    slip = jnp.where(stuck, 0.0, loop.durations)
+    mesh = jax.vmap(functools.partial(_mesh, osc, steps))(loop.codes, loop.entries, slip)
+    z = jnp.concatenate([loop.entries, loop.durations[:, None]], axis=1)
+    return lax.stop_gradient((Chain(loop.codes, loop.ends, mesh), z))
+
+
+def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
+    """Steps as fractions of the duration, [steps], so that each has about the same share of it."""
+    n = 24
+    h = duration / n
+
+    def advance(y, _):
+        y = _step(functools.partial(_field, osc, codes), y, h, _COARSE)
+        return y, density(osc, mode_of(codes), *y)
+
+    _, rest = lax.scan(advance, y, None, length=n)
+    rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
+    # Clipped: where a guess is poor the mesh is only less good.
+    rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
+    share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
+    grid = jnp.interp(
+        jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
+    )
+    return jnp.diff(grid)
+
+
+def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, extra=None):
+    """End of one arc, (x1, x2), and the integrals of `extra(osc, mode, x1, x2)`, a vector, over it.
+
+    A stick arc is a straight line; Simpson's rule is exact there for what is at most cubic.
+    """
+    mode = mode_of(codes)
+    stuck = mode.any_stuck
+    n_extra = 0 if extra is None else extra(osc, mode, y[0], y[1]).size
+
+    def field(state):
+        smooth = _field(osc, codes, state[:2])
+        if extra is None:
+            return smooth
+        return jnp.concatenate([smooth, extra(osc, mode, state[0], state[1])])
+
+    start = jnp.concatenate([y, jnp.zeros(n_extra)])
+    slip_time = jnp.where(stuck, 0.0, duration)
+
+    def advance(state, fraction):
+        return _step(field, state, slip_time * fraction, _FINE), None
+
+    slipped, _ = lax.scan(advance, start, mesh)
+    v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
+    stuck_end = jnp.stack([y[0] + v * duration, v])
+    if extra is not None:
+        values = [
+            weight * extra(osc, mode, y[0] + fraction * v * duration, v)
+            for fraction, weight in ((0.0, 1 / 6), (0.5, 4 / 6), (1.0, 1 / 6))
+        ]
+        stuck_end = jnp.concatenate([stuck_end, duration * (values[0] + values[1] + values[2])])
+    return jnp.where(stuck, stuck_end, slipped)
+
+
+def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
+    """What vanishes at y if an arc ends there by `end`; zero for an unused one."""
+    mode = mode_of(codes)
+    values = [
+        *[belt.velocity - osc.omega * y[1] for belt in osc.belts],
+        *[jnp.where(jnp.isfinite(edge), y[0] - edge, 1.0) for edge in edges(osc)],
+        mode_acceleration(osc, mode, y[0], y[1]),
+        y[1],
+        y[0] - onset_position(osc, mode),
+    ]
+    return sum((jnp.where(end == i, value, 0.0) for i, value in enumerate(values)), jnp.zeros(()))
+
+
+def _arc_equations(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
+    """(x1, x2, guard, 0) at the end of one arc, from its unknowns (x1, x2, T).
+
+    An unused arc ends as it begins, and its guard is its duration. One that is to end tangent to
+    the boundary of a belt ends at the point of it with x2' = 0. Trial arcs that run past there meet
+    the pole of the friction law, so this one is followed backwards, from that point, to where it
+    begins: (x1, x2) are the point's, the last two the misses of x1 and of x2. That is one equation
+    more, a condition on the oscillator.
+    """
+    is_unused = end == Ends(len(osc.belts)).unused
+    follow = functools.partial(_followed, osc, codes, end, mesh)
+    return lax.cond(is_unused, lambda u: jnp.append(u, 0.0), follow, unknown)
+
+
+def _followed(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
+    """`_arc_equations` of an arc that is used."""
+    names = Ends(len(osc.belts))
+    is_tangent = end >= names.tangent
+    velocity = jnp.zeros(())
+    for i, belt in enumerate(osc.belts):
+        velocity = velocity + jnp.where(end == names.tangent + i, belt.velocity / osc.omega, 0.0)
+    x1 = mode_acceleration(osc, mode_of(codes), jnp.zeros(()), velocity)
+    point = jnp.stack([x1, velocity])
+    start = jnp.where(is_tangent, point, unknown[:2])
+    duration = jnp.where(is_tangent, -unknown[2], unknown[2])
+    after = flow(osc, codes, jnp.where(is_tangent, jnp.flip(mesh), mesh), start, duration)
+    guard = end_guard(osc, codes, end, after)
+    ordinary = jnp.concatenate([after, guard[None], jnp.zeros(1)])
+    return jnp.where(is_tangent, jnp.concatenate([point, after - unknown[:2]]), ordinary)
+
+
+@one_kernel
+def _equations(osc: Oscillator, chain: Chain, z: Array) -> Array:
+    """`_arc_equations` of all arcs, [N, 4]."""
+
+    def one(row):
+        codes, end, mesh, unknown = row
+        return _arc_equations(osc, codes, end, mesh, unknown)
+
+    return lax.map(one, (chain.codes, chain.ends, chain.mesh, z))
+
+
+@one_kernel
+def _equations_and_blocks(osc: Oscillator, along: Oscillator | None, chain: Chain, z: Array):
+    """`_arc_equations` of all arcs, [N, 4], and their derivatives, [N, 4, 3 + k]."""
+    more = 0 if along is None else jax.tree.leaves(along)[0].size
+
+    def one(row):
+        codes, end, mesh, unknown = row
+
+        def equations(osc, u):
+            return _arc_equations(osc, codes, end, mesh, u)
+
+        def column(direction):
+            if along is None:
+                of_unknown = functools.partial(equations, osc)
+                return jax.jvp(of_unknown, (unknown,), (direction,))
+            moved = jax.tree.map(lambda slopes: jnp.sum(slopes * direction[3:]), along)
+            return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
+
+        return jax.vmap(column, out_axes=(None, -1))(jnp.eye(3 + more))
+
+    return lax.map(one, (chain.codes, chain.ends, chain.mesh, z))
+
+
+def residual(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
+    """The 3N equations at the unknowns z, [N, 3]: mismatch of x1, of x2, guard, for every arc; and
+    the miss of the tangent arcs, zero where there is none."""
+    out = _equations(osc, chain, z)
+    return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3])
+
+
+def _next_entries(z):
+    return jnp.roll(z, -1, axis=0).at[:, 2].set(0.0)
+
+
+def residual_and_blocks(
+    osc: Oscillator, along: Oscillator | None, chain: Chain, z: Array
+) -> tuple[Array, Array, Array]:
+    """`residual`, and its derivatives: those of the equations of each arc with respect to its
+    (x1, x2, T), and along the k directions `along` in the space of oscillators, if they are given
+    (an oscillator of arrays [k]), [N, 4, 3 + k]."""
+    out, blocks = _equations_and_blocks(osc, along, chain, z)
+    return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3]), blocks
+
+
+def jacobian(blocks: Array) -> Array:
+    """The 3N x 3N matrix of the system: the blocks, and minus one at the next arc's entry."""
+    n = blocks.shape[0]
+    following = jnp.asarray(np.roll(np.eye(n), 1, axis=1))
+    same = jnp.eye(n)[:, None, :, None] * blocks[:, :, None, :]
+    then = following[:, None, :, None] * jnp.asarray(np.diag([1.0, 1.0, 0.0]))[None, :, None, :]
+    return (same - then).reshape(3 * n, 3 * n)
+
+
+@eqx.filter_custom_jvp
+def _solve(osc: Oscillator, chain: Chain, z0: Array) -> tuple[Array, Array]:
+    """Unknowns that solve the system, [N, 3], and the number of Newton steps."""
+    solved = newton(functools.partial(_newton_step, osc, chain), z0)
+    return solved.z, solved.iterations
+
+
+def _newton_step(osc, chain, z):
+    value, _, blocks = residual_and_blocks(osc, None, chain, z)
+    matrix = jacobian(blocks[:, :3])
+    step = jnp.linalg.solve(matrix, -value.reshape(-1))
+    return step.reshape(z.shape), jnp.max(jnp.abs(value)), matrix
+
+
+@_solve.def_jvp
+def _(primals, tangents):
+    osc, chain, z0 = primals
+    z, iterations = _solve(osc, chain, z0)
+    moved, fixed = eqx.partition(
+        osc, jax.tree.map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
+    )
+    _, shift = jax.jvp(
+        lambda moved: residual(eqx.combine(moved, fixed), chain, z)[0], (moved,), (tangents[0],)
+    )
+    _, _, blocks = residual_and_blocks(osc, None, chain, z)
+    z_dot = jnp.linalg.solve(jacobian(blocks[:, :3]), -shift.reshape(-1)).reshape(z.shape)
+    return (z, iterations), (z_dot, None)
+
+
+def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """Divergence of the field of a slip mode, d(x2')/d(x2), as a vector of one."""
+    _, slope = jax.jvp(lambda v: mode_acceleration(osc, mode, x1, v), (x2,), (jnp.ones_like(x2),))
+    return slope[None]
+
+
+def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
+    """The largest error in the shooting equations, and the determinant of the monodromy matrix with
+    stick phases left out: exp of the mean divergence, and at each crossing of a boundary the
+    determinant of its saltation matrix, x2' after over before.
+
+    One multiplier of a planar cycle is 1, so this is the other one. Contact edges have determinant
+    one: their saltation matrix is [[1, 0], [jump of x2' / x2, 1]].
+    """
+    entries = jnp.roll(z[:, :2], -1, axis=0)
+    errors, factors = _errors_and_factors(osc, chain, following_codes(chain), z, entries)
+    return jnp.max(errors), jnp.prod(factors)
+
+
+@one_kernel
+def _errors_and_factors(osc: Oscillator, chain: Chain, following: Array, z: Array, entries: Array):
+    """What each arc contributes to `closure`."""
+    return lax.map(
+        lambda row: _error_and_factor(osc, *row),
+        (chain.codes, chain.ends, chain.mesh, following, z, entries),
+    )
+
+
+def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, entry):
+    after = flow(osc, codes, mesh, unknown[:2], unknown[2], trace_of)
+    guard = end_guard(osc, codes, end, after[:2])
+    before_crossing = mode_acceleration(osc, mode_of(codes), after[0], after[1])
+    after_crossing = mode_acceleration(osc, mode_of(following), entry[0], entry[1])
+    slips = jnp.all(codes != 0) & (unknown[2] != 0)
+    crosses = (end < len(osc.belts)) & jnp.all(following != 0)
+    ratio = after_crossing / jnp.where(crosses, before_crossing, 1.0)
+    growth = jnp.where(slips, jnp.exp(jnp.where(slips, after[2], 0.0)), 1.0)
+    error = jnp.maximum(jnp.max(jnp.abs(after[:2] - entry)), jnp.abs(guard))
+    return error, growth * jnp.where(crosses, ratio, 1.0)
+
+
+def multiplier_and_slopes(
+    osc: Oscillator, along: Oscillator, chain: Chain, z: Array
+) -> tuple[Array, Array, Array]:
+    """The determinant that `closure` gives, and its derivatives: with respect to z, [N, 3], and
+    along the k directions `along`, as for `residual_and_blocks`, [k].
+
+    Arc by arc: backwards through all of them the program takes three times as long to compile.
+    """
+    entries = jnp.roll(z[:, :2], -1, axis=0)
+    factors, slopes = _factors_and_slopes(osc, along, chain, following_codes(chain), z, entries)
+    product = jnp.prod(factors)
+    slopes = slopes * (product / factors)[:, None]
+    by_z = slopes[:, :3].at[:, :2].add(jnp.roll(slopes[:, 3:5], 1, axis=0))
+    return product, by_z, jnp.sum(slopes[:, 5:], axis=0)
+
+
+@one_kernel
+def _factors_and_slopes(osc, along: Oscillator, chain: Chain, following, z: Array, entries: Array):
+    """The factor of each arc, [N], and its derivatives with respect to its unknowns, the entry of
+    the next one, and along the directions, [N, 5 + k]."""
+    more = jax.tree.leaves(along)[0].size
+
+    def one(row):
+        codes, end, mesh, following, unknown, entry = row
+
+        def factor(osc, unknown, entry):
+            return _error_and_factor(osc, codes, end, mesh, following, unknown, entry)[1]
+
+        def column(direction):
+            moved = jax.tree.map(lambda slopes: jnp.sum(slopes * direction[5:]), along)
+            tangents = moved, direction[:3], direction[3:5]
+            return jax.jvp(factor, (osc, unknown, entry), tangents)
+
+        return jax.vmap(column, out_axes=(None, -1))(jnp.eye(5 + more))
+
+    return lax.map(one, (chain.codes, chain.ends, chain.mesh, following, z, entries))
+
+
+def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
+    """Whether every arc stays inside its mode and has a duration >= 0, up to rounding.
+
+    Both ends are looked at; between them x1, x2 and the needed force are monotone.
+    """
+    slack = 1e-9
+
+    def one(codes, unknown, following):
+        mode = mode_of(codes)
+        fine = unknown[2] >= -slack
+        for y in (unknown, following):
+            inside = jnp.stack([*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])])
+            needed = mode_acceleration(osc, mode, y[0], y[1])
+            held = ~mode.any_stuck | (jnp.abs(needed) <= capacity(osc, mode) + slack)
+            fine = fine & jnp.all(inside >= -slack) & held
+        return fine
+
+    each = jax.vmap(one)(chain.codes, z, jnp.roll(z, -1, axis=0))
+    return jnp.all(each | ~chain.used)

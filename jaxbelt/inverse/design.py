@@ -1,0 +1,185 @@
+"""`design`: parameters for a wanted cycle.
+
+Newton's method on functionals of the cycle, damped, within bounds.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from ..bifurcations.conditions import AbstractCondition
+from ..bifurcations.refine import refine
+from ..checks import as_array, check_finite, require
+from ..cycles.cycle import Cycle, find_cycle
+from ..model.oscillator import Oscillator, check_oscillator
+from ..model.parameters import leaf_index, parameter
+from ..numerics.compiling import jit
+from ..results import Status, describe
+from .selection import ITERATIONS, LONGEST, Selection, select
+
+#: Targets are met to this fraction of their size (or of one, where they are smaller).
+MET = 1e-9
+
+
+class Design(eqx.Module):
+    """What `design` returns.
+
+    oscillator: the one designed; cycle: its cycle; names, values, [p]: of the parameters in the
+    order of `where`; achieved, targets, [targets]: the functionals, and what they were to be (the
+    nearer end of an interval, or the value itself inside of it); iterations; status: OK,
+    UNREACHABLE, where the nearest that was found is given, or why there is no cycle to begin with.
+    """
+
+    oscillator: Oscillator
+    cycle: Cycle
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: Array
+    achieved: Array
+    targets: Array
+    iterations: int
+    status: Array
+
+    def __repr__(self) -> str:
+        status = Status(int(self.status))
+        chosen = ", ".join(f"{n} = {float(v):.12g}" for n, v in zip(self.names, self.values))
+        rows = [
+            f"  achieved {float(a):.12g}, wanted {float(b):.12g}, off by {float(a - b):+.1e}"
+            for a, b in zip(self.achieved, self.targets)
+        ]
+        advice = [] if status == Status.OK else [f"  {describe(status)}"]
+        head = f"Design({status.name}: {chosen}; {self.iterations} iterations)"
+        return "\n".join([head, *rows, *advice])
+
+
+def distance_to(
+    *conditions: AbstractCondition, where: Callable[[Oscillator], Any]
+) -> Callable[[Cycle], Array]:
+    """A functional for `design`: how far a parameter is from the nearest of some bifurcations.
+
+    conditions: such as `jb.NonsmoothFold(belt=1)`; where: selects the parameter. Each point is
+    found by `refine` from the oscillator of the cycle; one that is not there is infinitely far.
+    """
+
+    def distance(cycle: Cycle) -> Array:
+        osc = cycle.oscillator
+        value = parameter(osc, leaf_index(osc, where))
+        distances = []
+        for condition in conditions:
+            point = refine(condition, osc, where=where)
+            found = point.status == Status.OK
+            distances.append(
+                jnp.where(found, jnp.abs(jnp.where(found, point.value, 0.0) - value), jnp.inf)
+            )
+        return functools.reduce(jnp.minimum, distances)
+
+    return distance
+
+
+def design(
+    oscillator: Oscillator,
+    targets: Sequence[Any],
+    *,
+    where: Callable[[Oscillator], Any],
+    bounds: Sequence[Any] | None = None,
+    y0: ArrayLike | tuple = (3.0, 0.0),
+    report: Callable[[str], None] | None = print,
+) -> Design:
+    """Parameters for which functionals of the cycle have wanted values.
+
+    oscillator: where to begin; it has to have a cycle. targets: pairs of a functional of the
+    `Cycle`, such as `jb.amplitude` or `lambda c: jb.stick_duration(c, 1)`, and its value, or an
+    interval (lower, upper) that it is to lie in; `distance_to` is the functional that keeps a
+    bifurcation away. where, bounds: the parameters that may be changed, as for `fit`. y0: the
+    start (x1, x2) that leads to the cycle. report: is told of the progress; None for silence.
+
+    Damped Newton steps with exact derivatives; with fewer targets than parameters, the shortest
+    ones. What no choice within the bounds reaches ends with the status UNREACHABLE, and so does
+    what lies behind a bifurcation at which the cycle vanishes. `ValueError` names an argument that
+    is impossible.
+    """
+    check_oscillator(oscillator, "oscillator")
+    y0 = as_array(y0, "y0", (2,))
+    check_finite(y0, "y0")
+    functionals, intervals = _checked_targets(targets)
+    selection, u = select(oscillator, where, bounds)
+    tell = report or (lambda text: None)
+
+    def evaluate(u):
+        return _achieved(functionals, selection, oscillator, y0, jnp.asarray(u))
+
+    def off(achieved):
+        wanted = np.clip(achieved, *intervals.T)
+        return (achieved - wanted) / np.maximum(1.0, np.abs(wanted)), wanted
+
+    def improved(slopes, miss, wanted, damping):
+        size = np.maximum(1.0, np.abs(wanted))[:, None]
+        matrix = np.nan_to_num(np.where(miss[:, None] != 0, slopes / size, 0.0))
+        gram = matrix @ matrix.T
+        # Damping vanishes with the miss, for quadratic convergence.
+        damping = damping * np.max(gram) * np.max(np.abs(miss)) + 1e-14
+        step = -matrix.T @ np.linalg.solve(gram + damping * np.eye(len(miss)), miss)
+        return u + step * min(1.0, LONGEST / max(np.max(np.abs(step)), 1e-300))
+
+    achieved, slopes, cycle = evaluate(u)
+    miss, wanted = off(np.asarray(achieved))
+    damping, iterations, idle = 1e-3, 0, 0
+    while iterations < 2 * ITERATIONS and idle < 5:
+        if not np.all(np.isfinite(miss)) or np.max(np.abs(miss)) < MET or damping > 1e8:
+            break
+        new = improved(np.asarray(slopes), miss, wanted, damping)
+        trial = evaluate(new)
+        new_miss, new_wanted = off(np.asarray(trial[0]))
+        iterations += 1
+        gain = 1 - np.linalg.norm(new_miss) / np.linalg.norm(miss)
+        if gain > 0:
+            u, (achieved, slopes, cycle), miss, wanted = new, trial, new_miss, new_wanted
+            damping, idle = max(damping / 4, 1e-12), idle + 1 if gain < 1e-5 else 0
+            tell(f"step {iterations}: off by {np.max(np.abs(miss)):.1e}")
+        else:
+            damping *= 10
+    values = selection.values(jnp.asarray(u))
+    met = np.all(np.isfinite(miss)) and np.max(np.abs(miss)) < MET
+    status = int(cycle.status) or (Status.OK if met else Status.UNREACHABLE).value
+    return Design(
+        oscillator=selection.put(oscillator, values),
+        cycle=cycle,
+        names=selection.names,
+        values=values,
+        achieved=jnp.asarray(achieved),
+        targets=jnp.asarray(wanted),
+        iterations=iterations,
+        status=jnp.asarray(status),
+    )
+
+
+@jit
+def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
+    """The functionals of the cycle, NaN where there is none, their derivatives, and the cycle."""
+
+    def achieved(u):
+        cycle = find_cycle(selection.put(osc, selection.values(u)), y0)
+        values = jnp.stack([functional(cycle) for functional in functionals])
+        values = jnp.where(cycle.status == Status.OK, values, jnp.nan)
+        return values, (values, cycle)
+
+    slopes, (values, cycle) = jax.jacfwd(achieved, has_aux=True)(u)
+    return values, slopes, cycle
+
+
+def _checked_targets(targets):
+    pairs = list(targets)
+    require(len(pairs) > 0, "targets", "at least one pair (functional, value)", targets)
+    intervals = []
+    for pair in pairs:
+        fine = isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])
+        require(fine, "targets", "pairs (functional, value)", repr(pair))
+        lower, upper = pair[1] if isinstance(pair[1], tuple) else (pair[1], pair[1])
+        require(float(lower) <= float(upper), "targets", "intervals (lower, upper)", repr(pair[1]))
+        intervals.append((float(lower), float(upper)))
+    return tuple(functional for functional, _ in pairs), np.array(intervals)

@@ -1,0 +1,88 @@
+"""A measured record of a motion, cut into the windows that a fit begins with."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+#: Length of the first windows, less than half a loop: no phase is lost over it.
+WINDOW = 2.5
+
+
+class Record(eqx.Module):
+    """Data in pieces of equal number, the first windows.
+
+    times: since the start of the piece, the last one the start of the next, [pieces, samples + 1];
+    values: x1 and x2, [pieces, samples, 2]; weights: 1/noise, 0 where there is no datum, the same;
+    starts: states at the starts of the pieces as the record has them, [pieces, 2]; scale: of each
+    component, [2]; lacks: 1.0 where only velocities are known, so that the x1 of the starts lack a
+    common constant, else 0.0.
+    """
+
+    times: Array
+    values: Array
+    weights: Array
+    starts: Array
+    scale: Array
+    lacks: Array
+
+
+def record_of(ts: np.ndarray, values: np.ndarray, noise: Sequence[float | None]) -> Record:
+    """values: [samples, 2], NaN where there is no datum; noise: None to be estimated."""
+    n = len(ts)
+    step = (ts[-1] - ts[0]) / (n - 1)
+    size = int(np.clip(round(WINDOW / step), 1, n))
+    pieces = -(-n // size)
+    begin = np.arange(pieces) * size
+    smoothed = [local_cubics(ts, column) for column in values.T]
+    known = np.isfinite(values)
+    given = [i for i in (0, 1) if np.any(known[:, i])]
+    if 0 in given:
+        states = np.stack(smoothed[0][:2], axis=1)
+    else:
+        v = smoothed[1][0]
+        steps = 0.5 * (v[1:] + v[:-1]) * np.diff(ts)
+        states = np.stack([np.concatenate([[0.0], np.cumsum(steps)]), v], axis=1)
+    if 1 in given:
+        states[:, 1] = smoothed[1][0]
+    weights = np.zeros_like(values)
+    for i in given:
+        sigma = noise[i]
+        sigma = smoothed[i][2] if sigma is None else sigma
+        weights[:, i] = np.where(known[:, i], 1 / sigma, 0.0)
+
+    missing = pieces * size - n
+    ts = np.concatenate([ts, np.full(missing, ts[-1]), [ts[-1] + step]])
+    padding = ((0, missing), (0, 0))
+    return Record(
+        times=jnp.asarray(np.stack([ts[i : i + size + 1] - ts[i] for i in begin])),
+        values=jnp.asarray(np.pad(np.where(known, values, 0.0), padding).reshape(pieces, size, 2)),
+        weights=jnp.asarray(np.pad(weights, padding).reshape(pieces, size, 2)),
+        starts=jnp.asarray(states[begin]),
+        scale=jnp.asarray(np.std(states, axis=0)),
+        lacks=jnp.asarray(float(0 not in given)),
+    )
+
+
+def local_cubics(ts: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Value and slope at every time of a cubic through the data near it; their noise.
+
+    Near: a third of a time unit on either side, at least seven data.
+    """
+    known = np.isfinite(column)
+    if np.sum(known) < 7:
+        return np.zeros_like(ts), np.zeros_like(ts), np.nan
+    t, x = ts[known], column[known]
+    half = max(3, round(0.35 / np.median(np.diff(t))))
+    half = min(half, (len(t) - 1) // 2)
+    centre = np.searchsorted(t, ts)
+    rows = np.clip(centre - half, 0, len(t) - 2 * half - 1)[:, None] + np.arange(2 * half + 1)
+    powers = (t[rows] - ts[:, None])[..., None] ** np.arange(4)
+    inverse = np.linalg.pinv(powers)
+    cubics = np.einsum("tpi,ti->tp", inverse, x[rows])
+    off = x[rows] - np.einsum("tip,tp->ti", powers, cubics)
+    # The median: corners of the motion are no noise.
+    noise = np.sqrt(np.median(np.sum(off**2, axis=1) / (2 * half - 3)))
+    return cubics[:, 0], cubics[:, 1], float(noise)

@@ -1,0 +1,84 @@
+"""Which parameters an inverse problem may change, and within which bounds."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from ..checks import require
+from ..model.oscillator import Oscillator
+from ..model.parameters import leaf_groups, names_of
+
+#: Steps of one damped Gauss-Newton iteration, and how far one may move a parameter.
+ITERATIONS, LONGEST = 40, 0.4
+
+
+class Selection(eqx.Module):
+    """Parameters of an oscillator: for each the numbers of the leaves that it sets, and bounds.
+
+    Each is a function of an unbounded variable u: lower + exp(u), upper - exp(-u), between two
+    bounds a logistic function of u, without bounds size u.
+    """
+
+    leaves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    lower: Array
+    upper: Array
+    size: Array
+
+    def values(self, u: Array) -> Array:
+        has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
+        low, high = jnp.where(has_lower, self.lower, 0.0), jnp.where(has_upper, self.upper, 0.0)
+        one_sided = jnp.where(has_lower, low + jnp.exp(u), high - jnp.exp(-u))
+        between = low + (high - low) * jax.nn.sigmoid(u)
+        bounded = jnp.where(has_lower & has_upper, between, one_sided)
+        return jnp.where(has_lower | has_upper, bounded, self.size * u)
+
+    def unbounded(self, values: ArrayLike) -> Array:
+        """The u that belong to values within the bounds."""
+        has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
+        above = jnp.log(jnp.where(has_lower, values - self.lower, 1.0))
+        below = -jnp.log(jnp.where(has_upper, self.upper - values, 1.0))
+        return jnp.where(has_lower | has_upper, above + below, values / self.size)
+
+    def put(self, osc: Oscillator, values: Array) -> Oscillator:
+        """The oscillator with the parameters set to these values."""
+        leaves, structure = jax.tree.flatten(osc)
+        for i, numbers in enumerate(self.leaves):
+            for leaf in numbers:
+                leaves[leaf] = values[i]
+        return jax.tree.unflatten(structure, leaves)
+
+
+def select(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, np.ndarray]:
+    """What `where` selects, a leaf or a tuple of leaves kept equal for each parameter; and u."""
+    groups, leaves = leaf_groups(osc, where), jax.tree.leaves(osc)
+    if bounds is None:
+        bounds = [None] * len(groups)
+    require(len(bounds) == len(groups), "bounds", f"{len(groups)} pairs or None", repr(bounds))
+    named = names_of(osc)
+    names = tuple(" = ".join(named[leaf] for leaf in group) for group in groups)
+    values = np.array([float(leaves[group[0]]) for group in groups])
+    pairs = []
+    for group, name, value, pair in zip(groups, names, values, bounds, strict=True):
+        lower, upper = (_least(osc, group[0]), np.inf) if pair is None else map(float, pair)
+        require(lower < value < upper, name, f"inside of its bounds {lower}, {upper}", value)
+        pairs.append((lower, upper))
+    lower, upper = jnp.asarray(pairs).T
+    size = jnp.asarray(np.maximum(np.abs(values), 0.1))
+    selection = Selection(groups, names, lower, upper, size)
+    return selection, np.asarray(selection.unbounded(jnp.asarray(values)))
+
+
+def _least(osc: Oscillator, leaf: int) -> float:
+    """0 for a leaf that may not be negative, by the oscillator's own checks, else -inf."""
+    leaves, structure = jax.tree.flatten(osc)
+    leaves[leaf] = jnp.asarray(-1.0)
+    try:
+        jax.tree.unflatten(structure, leaves).check()
+    except ValueError:
+        return 0.0
+    return -np.inf

@@ -1,0 +1,394 @@
+"""One oscillator and its motion: time histories, phase portraits, vector fields.
+
+Every function draws into the matplotlib axes that it is given (`ax=None` makes new ones) and
+returns the axes. What is drawn is shown in the manner of the paper:
+
+- a discontinuity boundary Sigma_Fi, x2 = nu_i/omega, as a line over the contact interval of its
+  belt, in the colour of the belt; the part where the mass sticks (the sliding set) is a wide pale
+  band behind it. Finite contact edges sigma are dotted vertical lines.
+- stable cycles as thick solid, unstable ones as dashed lines, other orbits thin and grey;
+- stable fixed points filled, unstable ones open, pseudo-foci as diamonds in the same way, a segment
+  of pseudo-equilibria as a thick bar.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+import matplotlib
+import matplotlib.colors
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+
+from ..model.equilibria import Equilibria, EquilibriumKind
+from ..model.equilibria import equilibria as find_equilibria
+from ..model.modes import mode_acceleration, mode_of_state
+from ..model.oscillator import Oscillator
+from ..motion.simulate import Trajectory
+from ..numerics.compiling import jit
+from .style import belt_colour, figure_of, journal_figure, new_axes, new_figure, spread
+
+#: A second mark of the belts, for print without colour.
+BELT_HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\")
+ORBIT_COLOUR = "0.55"
+
+
+@runtime_checkable
+class ClosedOrbit(Protocol):
+    """What `plot_phase_portrait` wants of a cycle: its stability, and states all around it."""
+
+    @property
+    def stable(self) -> Any: ...
+
+    def sample(self, n: int, /) -> Any:
+        """About n states (x1, x2) once around, [samples, 2]."""
+        ...
+
+
+# --- time histories -----------------------------------------------------------------------------
+
+
+def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    """Displacement x1 and velocity x2 over time, stick phases shaded in the colour of their belt.
+
+    trajectory: from `simulate`. ax: two axes, for x1 and for x2. Returns the two.
+    """
+    if ax is None:
+        ax = tuple(new_figure().subplots(2, sharex=True))
+    t, ys = _path(trajectory)
+    upper, lower = ax
+    for axes, component, name in ((upper, 0, "displacement $x_1$"), (lower, 1, "velocity $x_2$")):
+        axes.plot(t, ys[:, component], color="black", linewidth=0.9)
+        axes.set_ylabel(name)
+        axes.margins(x=0)
+    for belt, begin, end in stick_phases(trajectory):
+        for axes in ax:
+            axes.axvspan(
+                begin, end, label=f"sticks to belt {belt}", zorder=0, **_belt_shading(belt)
+            )
+    upper.tick_params(labelbottom=False)
+    lower.set_xlabel(r"time $\tau$")
+    figure_of(lower).align_ylabels(ax)
+    handles, labels = upper.get_legend_handles_labels()
+    by_label = dict(sorted(zip(labels, handles, strict=True), key=lambda item: item[0]))
+    if by_label:
+        upper.legend(
+            by_label.values(),
+            by_label.keys(),
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=len(by_label),
+            frameon=False,
+            borderaxespad=0.2,
+        )
+    return ax
+
+
+def stick_phases(trajectory: Trajectory) -> list[tuple[int, float, float]]:
+    """The stick phases of a trajectory as (belt, begin, end), in order of their beginnings."""
+    # Approximate formulations have no arcs; their samples have to do.
+    if trajectory.arcs.t.size:
+        begins = np.asarray(trajectory.arcs.t)
+        ends = begins + np.asarray(trajectory.arcs.duration)
+        modes = np.asarray(trajectory.arcs.mode)
+    else:
+        begins, ends = np.asarray(trajectory.ts)[:-1], np.asarray(trajectory.ts)[1:]
+        modes = np.asarray(trajectory.modes)[:-1]
+    stuck = (modes == 0) & np.isfinite(begins)[:, None]
+    phases: list[tuple[int, float, float]] = []
+    for belt in range(stuck.shape[1]):
+        # A phase is several arcs where another belt comes or goes meanwhile.
+        switches = np.flatnonzero(np.diff(stuck[:, belt], prepend=False, append=False))
+        for first, after in switches.reshape(-1, 2):
+            phases.append((belt, float(begins[first]), float(ends[after - 1])))
+    return sorted(phases, key=lambda phase: phase[1])
+
+
+def _belt_shading(belt: int) -> dict[str, Any]:
+    colour = matplotlib.colors.to_rgba(belt_colour(belt))
+    pale = tuple(1 - 0.28 * (1 - channel) for channel in colour[:3])
+    hatch = BELT_HATCHES[belt % len(BELT_HATCHES)]
+    return {"facecolor": pale, "edgecolor": (*colour[:3], 0.45), "linewidth": 0.0, "hatch": hatch}
+
+
+def _path(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Times and states of a trajectory, its events among the samples so that corners are sharp."""
+    t = np.concatenate([trajectory.ts, trajectory.events.t])
+    ys = np.concatenate([trajectory.ys, trajectory.events.y])
+    known = np.isfinite(t) & np.all(np.isfinite(ys), axis=1)
+    order = np.argsort(t[known], kind="stable")
+    return t[known][order], ys[known][order]
+
+
+# --- phase portraits ----------------------------------------------------------------------------
+
+
+def plot_phase_portrait(
+    osc: Oscillator,
+    trajectories: Trajectory | Sequence[Trajectory] = (),
+    *,
+    cycles: Sequence[ClosedOrbit] = (),
+    equilibria: Equilibria | None = None,
+    xlim: tuple[float, float] | None = None,
+    ylim: tuple[float, float] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Orbits in the plane of displacement x1 and velocity x2, with the boundaries of `osc`.
+
+    trajectories: one or several from `simulate`, thin. cycles: see `ClosedOrbit`; stable ones are
+    thick and solid, unstable ones dashed. equilibria: None takes those of `osc`. xlim, ylim: the
+    window; None fits what is drawn. Returns the axes.
+    """
+    if isinstance(trajectories, Trajectory):
+        trajectories = (trajectories,)
+    ax = new_axes() if ax is None else ax
+    paths = [_path(trajectory)[1] for trajectory in trajectories]
+    loops = [np.asarray(cycle.sample(400)) for cycle in cycles]
+    equilibria = find_equilibria(osc) if equilibria is None else equilibria
+    window = _window(osc, [*paths, *loops], equilibria, xlim, ylim)
+    ax.set(xlim=window[0], ylim=window[1])
+    plot_boundaries(osc, ax)
+    for path in paths:
+        ax.plot(*path.T, color=ORBIT_COLOUR, linewidth=0.7, zorder=2, label="orbit")
+        _draw_arrowheads(ax, path, ORBIT_COLOUR, [_index_at_distance(ax, path, 0.22)])
+    for cycle, loop in zip(cycles, loops, strict=True):
+        if cycle.stable:
+            style = {"linewidth": 1.7, "label": "stable cycle"}
+        else:
+            style = {"linewidth": 1.0, "linestyle": (0, (4, 2.2)), "label": "unstable cycle"}
+        ax.plot(*loop.T, color="black", solid_joinstyle="round", zorder=4, **style)
+        _draw_arrowheads(ax, loop, "black", [int(np.argmin(loop[:, 1]))])
+    for equilibrium in equilibria:
+        draw_equilibrium(ax, equilibrium)
+    ax.set_xlabel("displacement $x_1$")
+    ax.set_ylabel("velocity $x_2$")
+    return ax
+
+
+def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
+    """The discontinuity boundaries and contact edges of `osc`, in the present window of the axes.
+
+    Sigma_Fi, x2 = nu_i/omega, eqs. (8) and (17) of the paper, over the contact interval of belt i,
+    its sliding set as a pale band. A boundary that reaches the right-hand side of the axes has its
+    name outside of them, another one has it at its left end.
+    """
+    left, right = ax.get_xlim()
+    outside: list[tuple[float, int]] = []
+    levels: list[float] = []
+    for i, belt in enumerate(osc.belts):
+        level = float(belt.velocity / osc.omega)
+        ends = np.clip([float(belt.lower), float(belt.upper)], left, right)
+        bottom, top = ax.get_ylim()
+        if ends[0] == ends[1] or not bottom < level < top:
+            continue
+        colour = belt_colour(i)
+        # Where two boundaries are one, both colours show.
+        dashes = (0, (5, 5)) if level in levels else "-"
+        ax.plot(ends, [level, level], color=colour, linewidth=0.9, linestyle=dashes, zorder=1.5)
+        levels.append(level)
+        x1 = np.linspace(ends[0], ends[1], 1201)
+        sticks = _sliding_set(osc, jnp.asarray(x1), jnp.full(x1.size, belt.velocity / osc.omega), i)
+        band = np.where(sticks, level, np.nan)
+        style = {"linewidth": 4.5, "alpha": 0.25, "solid_capstyle": "butt"}
+        ax.plot(x1, band, color=colour, zorder=1.2, label="sliding set", **style)
+        if ends[1] == right:
+            outside.append((level, i))
+        else:
+            _name_boundary(ax, i, (ends[0], level), (3, 2.5), "left", "bottom")
+    _name_boundaries_outside(ax, outside)
+    for edge in {float(e) for b in osc.belts for e in (b.lower, b.upper)}:
+        if left < edge < right:
+            ax.axvline(edge, color="0.25", linewidth=0.8, linestyle=":", zorder=1.4)
+            ax.annotate(
+                _edge_name(osc, edge),
+                (edge, 0.0),
+                xycoords=ax.get_xaxis_transform(),
+                xytext=(3, 4),
+                textcoords="offset points",
+                path_effects=[withStroke(linewidth=2.5, foreground="white")],
+                zorder=6,
+            )
+    return ax
+
+
+@jit
+def _sliding_set(osc, x1, x2, belt):
+    return jnp.stack(mode_of_state(osc, x1, x2).stuck)[belt]
+
+
+def _edge_name(osc: Oscillator, edge: float) -> str:
+    """sigma where all intervals end at one edge, else the paper's sigma0, sigma1 in order."""
+    edges = sorted(
+        {float(e) for b in osc.belts for e in (b.lower, b.upper) if np.isfinite(float(e))}
+    )
+    return r"$\sigma$" if len(edges) == 1 else rf"$\sigma_{{{edges.index(edge)}}}$"
+
+
+def _name_boundary(ax: Axes, belt: int, xy, offset, ha: str, va: str, xycoords: Any = "data"):
+    ax.annotate(
+        rf"$\Sigma_{{\mathrm{{F}}{belt}}}$",
+        xy,
+        xycoords=xycoords,
+        xytext=offset,
+        textcoords="offset points",
+        ha=ha,
+        va=va,
+        color=belt_colour(belt),
+        path_effects=[withStroke(linewidth=2, foreground="white")],
+        annotation_clip=False,
+        zorder=6,
+    )
+
+
+def _name_boundaries_outside(ax: Axes, names: list[tuple[float, int]]) -> None:
+    """Names beside the right-hand side of the axes, at least a line of text apart."""
+    bottom, top = ax.get_ylim()
+    height = ax.get_window_extent().height * 72 / figure_of(ax).dpi
+    line = 1.25 * matplotlib.rcParams["font.size"]
+    names = sorted(names)
+    at = np.array([(level - bottom) / (top - bottom) * height for level, _ in names])
+    for (level, belt), shift in zip(names, spread(at, line) - at, strict=True):
+        _name_boundary(
+            ax, belt, (1.0, level), (3, shift), "left", "center", ax.get_yaxis_transform()
+        )
+
+
+def _window(osc, paths, equilibria, xlim, ylim):
+    """The given limits, or those that hold all that is drawn with a margin."""
+    ends = [] if equilibria is None else [*equilibria.x1_lower, *equilibria.x1_upper]
+    x1 = [float(x) for x in ends]
+    x1 += [x for path in paths for x in (path[:, 0].min(), path[:, 0].max())]
+    if not paths:
+        # Nothing but the oscillator: every fixed point lies within the reach of friction.
+        reach = 1 + sum(float(b.load) * float(b.friction.static) for b in osc.belts)
+        x1 += [-reach, reach]
+    x1 += [float(e) for b in osc.belts for e in (b.lower, b.upper) if np.isfinite(float(e))]
+    x2 = [0.0, *(float(b.velocity) / float(osc.omega) for b in osc.belts)]
+    x2 += [x for path in paths for x in (path[:, 1].min(), path[:, 1].max())]
+    if not paths:
+        x2 += [-1.0, 1.0]
+    return (xlim or _with_margin(x1)), (ylim or _with_margin(x2))
+
+
+def _with_margin(values: Sequence[float]) -> tuple[float, float]:
+    margin = 0.08 * (max(values) - min(values)) or 0.5
+    return min(values) - margin, max(values) + margin
+
+
+def draw_equilibrium(ax: Axes, row: Equilibria) -> None:
+    """One row of equilibria: a fixed point, a pseudo-focus, or a segment; filled where stable."""
+    face = "black" if row.stable else "white"
+    ends = [float(row.x1_lower), float(row.x1_upper)]
+    if row.kind == EquilibriumKind.SEGMENT:
+        bar = {"solid_capstyle": "butt", "zorder": 5}
+        ax.plot(ends, [0, 0], color="black", linewidth=3.5, label="pseudo-equilibria", **bar)
+        ax.plot(ends, [0, 0], color=face, linewidth=1.9, **bar)
+        return
+    is_focus = row.kind == EquilibriumKind.PSEUDO_FOCUS
+    stability = "stable" if row.stable else "unstable"
+    ax.plot(
+        ends[:1],
+        [0.0],
+        label=f"{stability} {'pseudo-focus' if is_focus else 'fixed point'}",
+        linestyle="none",
+        marker="D" if is_focus else "o",
+        markersize=5,
+        markerfacecolor=face,
+        markeredgecolor="black",
+        markeredgewidth=1.0,
+        zorder=6,
+    )
+
+
+def _index_at_distance(ax: Axes, path: np.ndarray, distance: float) -> int:
+    """Where a path has gone so far, as a fraction of the axes, or half its length if shorter."""
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    steps = np.diff(path, axis=0) / [right - left, top - bottom]
+    gone = np.concatenate([[0.0], np.cumsum(np.hypot(*steps.T))])
+    return int(np.searchsorted(gone, min(distance, gone[-1] / 2)))
+
+
+def _draw_arrowheads(ax: Axes, path: np.ndarray, colour: str, indices: Sequence[int]) -> None:
+    for i in indices:
+        before, after = path[max(i - 1, 0)], path[min(i + 1, len(path) - 1)]
+        if np.all(before == after):
+            continue
+        ax.annotate(
+            "",
+            xy=tuple(after),
+            xytext=tuple(before),
+            arrowprops={
+                "arrowstyle": "-|>,head_length=0.55,head_width=0.22",
+                "color": colour,
+                "linewidth": 0.5,
+                "shrinkA": 0,
+                "shrinkB": 0,
+                "mutation_scale": 7.5,
+            },
+            zorder=4,
+        )
+
+
+# --- vector field -------------------------------------------------------------------------------
+
+
+def plot_vector_field(
+    osc: Oscillator,
+    *,
+    kind: str = "streamlines",
+    xlim: tuple[float, float] | None = None,
+    ylim: tuple[float, float] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """The vector field of `osc`, eqs. (2) and (11) of the paper, with its boundaries.
+
+    kind: "streamlines", or "arrows" of one length that show the direction. The field jumps at the
+    boundaries. On a sliding set it points along the boundary. xlim, ylim: the window; None takes
+    one that holds all fixed points. Returns the axes.
+    """
+    if kind not in ("streamlines", "arrows"):
+        raise ValueError(f'kind must be "streamlines" or "arrows", got {kind!r}')
+    ax = new_axes() if ax is None else ax
+    (left, right), (bottom, top) = _window(osc, [], None, xlim, ylim)
+    ax.set(xlim=(left, right), ylim=(bottom, top))
+    columns, rows = (201, 201) if kind == "streamlines" else (21, 17)
+    x1, x2 = np.meshgrid(np.linspace(left, right, columns), np.linspace(bottom, top, rows))
+    v1, v2 = _field(osc, jnp.asarray(x1), jnp.asarray(x2))
+    if kind == "streamlines":
+        ax.streamplot(
+            x1, x2, np.asarray(v1), np.asarray(v2),
+            color="0.65", linewidth=0.6, arrowsize=0.6, density=0.9, zorder=1,
+        )  # fmt: skip
+    else:
+        # One length on paper: scaled by the window, then normed.
+        v1, v2 = v1 / (right - left), v2 / (top - bottom)
+        size = np.hypot(v1, v2)
+        ax.quiver(
+            x1, x2, v1 / size, v2 / size,
+            color="0.6", pivot="mid", scale=28, width=0.003, headwidth=4, zorder=1,
+        )  # fmt: skip
+    plot_boundaries(osc, ax)
+    ax.set_xlabel("displacement $x_1$")
+    ax.set_ylabel("velocity $x_2$")
+    return ax
+
+
+@jit
+def _field(osc, x1, x2):
+    mode = mode_of_state(osc, x1, x2)
+    return x2, jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
+
+
+def draw_overview(
+    osc: Oscillator, trajectory: Trajectory, *, cycles: Sequence[ClosedOrbit] = ()
+) -> Figure:
+    """One trajectory on a page: its time histories, and beside them its phase portrait."""
+    figure = journal_figure(7.2, 3.2)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1))
+    x1 = figure.add_subplot(grid[0, 0])
+    x2 = figure.add_subplot(grid[1, 0], sharex=x1)
+    plot_time_history(trajectory, (x1, x2))
+    plot_phase_portrait(osc, trajectory, cycles=cycles, ax=figure.add_subplot(grid[:, 1]))
+    return figure

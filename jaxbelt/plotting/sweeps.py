@@ -1,0 +1,120 @@
+"""Sweeps, and basins of attraction."""
+
+import itertools
+from collections.abc import Sequence
+
+import matplotlib.colors
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+
+from ..checks import require
+from ..sweeps.basins import Basins
+from .phase import plot_phase_portrait
+from .style import draw_key, figure_of, journal_figure, new_axes
+
+#: Attractors of a sweep, those with the shortest names first (Okabe and Ito).
+ATTRACTOR_COLOURS = ("#F0F0F0", "#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#999999")
+
+
+def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Axes:
+    """A variable of a sweep over its two axes longer than one, or along its one.
+
+    dataset: what `sweep` returned; variable: a name in it. "kind" shows equilibria, and cycles by
+    the belts that they stick to, as the letters of the paper's Fig. 6. `ValueError` if the axes of
+    the sweep are not one or two.
+    """
+    ax = new_axes() if ax is None else ax
+    values = _attractors(dataset) if variable == "kind" else dataset[variable].squeeze(drop=True)
+    require(values.ndim in (1, 2), "dataset", "a sweep with one or two axes", f"{values.ndim}")
+    names = [f"{dataset[name].long_name}  {_math_name(name)}" for name in map(str, values.dims)]
+    if values.ndim == 1:
+        ax.plot(dataset[values.dims[0]], values, color="black", linewidth=0.8)
+        ax.set(xlabel=names[0], ylabel=dataset[variable].long_name)
+        return ax
+    x, y = (dataset[name].values for name in values.dims)
+    if variable != "kind":
+        mesh = ax.pcolormesh(x, y, values.T, cmap="viridis", rasterized=True)
+        figure_of(ax).colorbar(mesh, ax=ax, label=dataset[variable].long_name)
+    else:
+        present, codes = np.unique(values.values.astype(str), return_inverse=True)
+        order = sorted(range(len(present)), key=lambda i: (len(present[i]), present[i]))
+        colours = [ATTRACTOR_COLOURS[rank % len(ATTRACTOR_COLOURS)] for rank in range(len(order))]
+        rank = np.argsort(order)
+        shades = matplotlib.colors.ListedColormap(colours)
+        codes = rank[codes].reshape(values.shape)
+        top = len(order) - 0.5
+        ax.pcolormesh(x, y, codes.T, cmap=shades, rasterized=True, vmin=-0.5, vmax=top)
+        keys = [Patch(color=colour) for colour in colours]
+        figure_of(ax).legend(
+            keys, [present[i] for i in order], loc="outside lower center", ncols=2, fontsize="small"
+        )
+    ax.set(xlabel=names[0], ylabel=names[1])
+    return ax
+
+
+def _math_name(name: str) -> str:
+    """An argument of a class such as nu0 as a formula."""
+    letters, digits = name.rstrip("0123456789"), name[len(name.rstrip("0123456789")) :]
+    greek = {"nu": r"\nu", "sigma": r"\sigma"}
+    return (
+        f"${greek.get(letters, letters)}_{{{digits}}}$" if digits else f"${greek.get(name, name)}$"
+    )
+
+
+def _attractors(dataset: xr.Dataset) -> xr.DataArray:
+    """What each run leads to, in words."""
+    words = dataset.kind.astype(object)
+    for belts in itertools.product((False, True), repeat=dataset.sizes["belt"]):
+        stuck = [str(i) for i, sticks in enumerate(belts) if sticks]
+        where = (
+            f"cycle, sticks to belt {' and '.join(stuck)}" if stuck else "cycle without sticking"
+        )
+        same = (dataset.sticks == np.array(belts)).all("belt") & (dataset.kind == "cycle")
+        words = words.where(~same, where)
+    return words.squeeze(drop=True)
+
+
+def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
+    """Which start leads where, with the cycles, and the unstable one between the basins dashed.
+
+    basins: from `basins`. Basins of cycles are pale blue and green, those of equilibria pale
+    orange, undecided starts white. Returns the axes.
+    """
+    ax = new_axes() if ax is None else ax
+    labels = np.asarray(basins.label)
+    x1, x2 = np.asarray(basins.dataset["x1"]), np.asarray(basins.dataset["x2"])
+    colours = _basin_colours(basins.attractors)
+    palette = matplotlib.colors.ListedColormap(["white", *colours])
+    mesh = ax.pcolormesh(x1, x2, labels.T, cmap=palette, vmin=-1.5, vmax=len(colours) - 0.5)
+    mesh.set_rasterized(True)
+    ax.set(xlim=(x1[0], x1[-1]), ylim=(x2[0], x2[-1]))
+    for colour, name in zip(colours, basins.attractors, strict=True):
+        ax.add_patch(Rectangle((0, 0), 0, 0, facecolor=colour, edgecolor="0.4", label=f"to {name}"))
+    plot_phase_portrait(
+        basins.oscillator,
+        cycles=[c for c in (*basins.cycles, basins.boundary) if int(c.status) == 0],
+        xlim=(x1[0], x1[-1]),
+        ylim=(x2[0], x2[-1]),
+        ax=ax,
+    )
+    return ax
+
+
+def _basin_colours(attractors: Sequence[str]) -> list[str]:
+    """Pale, so that lines stay visible; light enough apart for print without colour."""
+    cycles, others = (
+        iter(["#B5D6EC", "#A9DCC8", "#D5E8F5"]),
+        iter(["#F6C98F", "#F3DCE8", "#F5E9A9"]),
+    )
+    return [next(cycles if name.startswith("cycle") else others, "#DDDDDD") for name in attractors]
+
+
+def draw_basins(basins: Basins) -> Figure:
+    """Basins of attraction on a page, with a key."""
+    figure = journal_figure(4.6, 4.4)
+    plot_basins(basins, ax=figure.subplots())
+    draw_key(figure, ncols=2)
+    return figure

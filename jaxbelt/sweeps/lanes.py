@@ -1,0 +1,134 @@
+"""Lanes: the state of the runs that one kernel advances together, and the base of its observers.
+
+An `Observer` says what is wanted of a run and when it may end. A `Program` is everything that is
+fixed when the kernel is compiled.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..model.modes import Mode
+from ..model.oscillator import Oscillator
+
+
+class Lanes(eqx.Module):
+    """The state of all lanes, arrays [lanes].
+
+    run: number of the run, -1 for none; begun: the pass of the kernel's loop in which it began; t,
+    x1, x2, a: time, state and x2'; h: next step size, negative where the lane has landed on a bound
+    of its mode and waits for `events.pass_events`; pace: inverse of the largest step that the last
+    error would have allowed; mode; events: how many there were; status; done. lower, upper:
+    extrema of x2 since the observer reset them, where it asks for extrema. memory: the observer's.
+    """
+
+    run: Array
+    begun: Array
+    t: Array
+    x1: Array
+    x2: Array
+    a: Array
+    h: Array
+    pace: Array
+    mode: Mode
+    events: Array
+    status: Array
+    done: Array
+    lower: Array
+    upper: Array
+    memory: Any
+
+
+class Passage(eqx.Module):
+    """What one call of `events.pass_events` did to the lanes, arrays [lanes].
+
+    landed: the last step ended on a guard or where x2 = 0. fired: it was a guard, whose number is
+    `guard`; `before` and `mode` are the modes on both sides of it, at (t, x1, x2). captured: by a
+    pseudo-focus. rests: at rest up to rounding. stuck: a stick phase followed, of that duration;
+    released: it ended before t1, by slip onset (slips) or at an edge; forever: it never ends.
+    """
+
+    landed: Array
+    fired: Array
+    guard: Array
+    before: Mode
+    mode: Mode
+    t: Array
+    x1: Array
+    x2: Array
+    captured: Array
+    rests: Array
+    stuck: Array
+    duration: Array
+    released: Array
+    slips: Array
+    forever: Array
+
+
+def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
+    """Lane by lane one of two trees of arrays [lanes, ...]."""
+
+    def pick(a, b):
+        return jnp.where(condition.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(pick, on_true, on_false)
+
+
+def materialise(value: Array, one: Array) -> Array:
+    """The value, computed once; one: an array of ones, an argument of the kernel.
+
+    XLA on the CPU computes cheap values again in each place that uses them, and so what they depend
+    on. It holds a division to be expensive and keeps its result; dividing by ones that it cannot
+    see through changes no bit.
+    """
+    if value.dtype == bool:
+        return jnp.where(value, 1.0, 0.0) / one > 0
+    return value / one
+
+
+class Observer(eqx.Module):
+    """What a run hands in, and when it may end early: subclasses are static settings."""
+
+    def extrema(self, lanes: Lanes) -> Array | None:
+        """The lanes whose extrema of x2 are wanted, so that steps end at them; None: no lanes."""
+        return None
+
+    @abc.abstractmethod
+    def start(self, osc: Oscillator, lanes: Lanes) -> Any:
+        """The memory of runs that begin, a tree of arrays [lanes]."""
+
+    @abc.abstractmethod
+    def watch(
+        self, osc: Oscillator, lanes: Lanes, passage: Passage, one: Array, t1: Array, tol: Array
+    ) -> Lanes:
+        """The lanes after `events.pass_events`, with `memory`, and `done` where a run may end.
+
+        one: an array of ones, for `materialise`; tol: the relative tolerance of a step.
+        """
+
+    def watch_rarely(self, osc: Oscillator, lanes: Lanes, one: Array) -> Lanes:
+        """The lanes before each refill, every dozen steps or so: for what is costly to find out."""
+        return lanes
+
+    @abc.abstractmethod
+    def finish(self, osc: Oscillator, lanes: Lanes) -> dict[str, Any]:
+        """The results of runs that ended, arrays [lanes, ...] or tuples of arrays [lanes]."""
+
+
+class Program(eqx.Module):
+    """Everything that is fixed when the kernel is compiled.
+
+    structure: of the oscillator's tree; mapped: which of its leaves differ from run to run; edges:
+    whether a contact edge may be met; captures: whether a run ends where a pseudo-focus captures
+    it.
+    """
+
+    structure: Any = eqx.field(static=True)
+    mapped: tuple[bool, ...] = eqx.field(static=True)
+    observer: Observer = eqx.field(static=True)
+    edges: bool = eqx.field(static=True)
+    captures: bool = eqx.field(static=True, default=True)

@@ -1,0 +1,97 @@
+"""Observers of whole runs: the state at t1, and what a user's reducer makes of the events."""
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from .events import event_kinds
+from .lanes import Observer, choose
+from .marks import Mark
+
+
+class Final(Observer):
+    """The state at t1.
+
+    At the end of a stick phase the state is a function of the parameters alone. Where it repeats,
+    everything repeats, to the last bit; so the run then skips as many whole loops as there are left
+    (unless `skip` is false).
+    """
+
+    skip: bool = eqx.field(static=True, default=True)
+
+    def start(self, osc, lanes):
+        return Mark.none(lanes)
+
+    def watch(self, osc, lanes, passage, one, t1, tol):
+        if not self.skip:
+            return lanes
+        mark: Mark = lanes.memory
+        released = passage.released & ~lanes.mode.any_stuck
+        period = lanes.t - mark.t
+        repeats = released & mark.met_by(lanes, 0.0) & (period > 0)
+        loops = jnp.floor((t1 - lanes.t) / jnp.where(repeats, period, jnp.inf))
+        loops = lax.stop_gradient(jnp.maximum(loops, 0.0))
+        per_loop = lanes.events - mark.events
+        t = jnp.where(repeats, lanes.t + loops * period, lanes.t)
+        events = lanes.events + jnp.where(repeats, loops.astype(per_loop.dtype) * per_loop, 0)
+        lanes = replace(lanes, t=t, events=events)
+        return replace(lanes, memory=mark.renewed(lanes, released, one)[0])
+
+    def finish(self, osc, lanes):
+        return {
+            "x1_end": lanes.x1,
+            "x2_end": lanes.x2,
+            "mode_end": lanes.mode.codes,
+            "n_events": lanes.events,
+            "status": lanes.status,
+        }
+
+
+class RunEvent(eqx.Module):
+    """An event of a run, as a reducer sees it: scalars t, x1, x2, kind (`EventKind`) and belt."""
+
+    t: Array
+    x1: Array
+    x2: Array
+    kind: Array
+    belt: Array
+
+
+class RunEnd(eqx.Module):
+    """The end of a run, as a reducer sees it: scalars t, x1, x2 and status."""
+
+    t: Array
+    x1: Array
+    x2: Array
+    status: Array
+
+
+class Reduce(Observer):
+    """What a user's reducer makes of the events of a run; see `sweep.sweep`."""
+
+    reducer: Any = eqx.field(static=True)
+
+    def start(self, osc, lanes):
+        axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
+        return jax.vmap(self.reducer.init, in_axes=(axes, 0, 0))(osc, lanes.x1, lanes.x2)
+
+    def watch(self, osc, lanes, passage, one, t1, tol):
+        memory, busy = lanes.memory, lanes.run >= 0
+        (fired, kind, belt), (released, *release) = event_kinds(lanes, passage)
+        event = RunEvent(passage.t, passage.x1, passage.x2, kind, belt)
+        memory = self._update(memory, event, fired & busy)
+        event = RunEvent(lanes.t, lanes.x1, lanes.x2, *release)
+        memory = self._update(memory, event, released & busy)
+        return replace(lanes, memory=memory)
+
+    def _update(self, memory, event, happened):
+        return choose(happened, jax.vmap(self.reducer.update)(memory, event), memory)
+
+    def finish(self, osc, lanes):
+        end = RunEnd(lanes.t, lanes.x1, lanes.x2, lanes.status)
+        return {**jax.vmap(self.reducer.finish)(lanes.memory, end), "status": lanes.status}

@@ -1,0 +1,286 @@
+"""The queue: one compiled loop that works through many runs, a few lanes at a time.
+
+A pass of the loop is
+
+- *refill*: lanes whose run has ended hand in their result and take the next run from the queue;
+- *events*: lanes that stand on a guard of their mode go on by the rules of `modes`, and stick
+  phases are passed in closed form;
+- *steps*: a few Runge-Kutta steps of the lanes that slip.
+"""
+
+import functools
+import math
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..model.modes import Mode, at_focus, mode_acceleration, mode_of_state
+from ..model.oscillator import Oscillator
+from ..numerics.compiling import one_kernel
+from ..results import Status
+from .events import pass_events
+from .lanes import Lanes, Program, choose
+from .step import SAFETY, first_step, take_step, window_of
+
+#: Steps between two looks at the events, and events between two refills.
+STEPS, ROUNDS = 4, 4
+
+
+def _oscillator(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator:
+    """The oscillators of the lanes: leaves that differ from run to run are arrays [lanes]."""
+    leaves, column = [], 2
+    others = iter(shared)
+    for is_mapped in program.mapped:
+        if is_mapped:
+            leaves.append(rows[column])
+            column += 1
+        else:
+            leaves.append(next(others))
+    osc = jax.tree.unflatten(program.structure, leaves)
+    if program.edges:
+        return osc
+    # Known to be infinite while the kernel is compiled; see `modes.has_edges`.
+    with jax.ensure_compile_time_eval():
+        lower, upper = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
+    belts = tuple(
+        eqx.tree_at(lambda b: (b.lower, b.upper), belt, (lower, upper)) for belt in osc.belts
+    )
+    return eqx.tree_at(lambda o: o.belts, osc, belts)
+
+
+def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
+    """Lanes at the start of their runs."""
+    mode = mode_of_state(osc, x1, x2)
+    finite = jnp.isfinite(x1) & jnp.isfinite(x2)
+    for leaf in jax.tree.leaves(osc):
+        finite = finite & ~jnp.isnan(leaf)
+    rests = at_focus(osc, x1, x2) if program.edges else jnp.zeros_like(finite)
+    status = jnp.where(rests, Status.PSEUDO_FOCUS.value, Status.OK.value)
+    status = jnp.where(finite, status, Status.NOT_FINITE.value)
+    zero = jnp.zeros_like(x1)
+    lanes = Lanes(
+        run=run,
+        begun=jnp.full_like(run, passes),
+        t=zero,
+        x1=x1,
+        x2=x2,
+        a=mode_acceleration(osc, mode, x1, x2) + zero,
+        h=zero + first_step(rtol),
+        pace=zero + SAFETY / first_step(rtol),
+        mode=Mode(tuple(code + zero for code in mode.codes)),
+        events=jnp.zeros_like(run),
+        status=status.astype(run.dtype),
+        done=~finite | rests,
+        lower=x2,
+        upper=x2,
+        memory=None,
+    )
+    return replace(lanes, memory=program.observer.start(osc, lanes))
+
+
+class Stream(eqx.Module):
+    """The kernel between two calls: lanes, the rows of the queue that they work on, and passes."""
+
+    lanes: Lanes
+    rows: tuple[Array, ...]
+    passes: Array
+    one: Array
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2, 3))
+def idle(program: Program, shared, width: int, columns: int) -> Stream:
+    """Lanes with nothing to do."""
+    rows = tuple(jnp.zeros(width) for _ in range(columns))
+    osc = _oscillator(program, shared, rows)
+    run = jnp.full(width, -1, dtype=jnp.int32)
+    lanes = _begin(program, osc, run, rows[0], rows[1], jnp.zeros((), jnp.int32), jnp.ones(()))
+    lanes = eqx.tree_at(lambda n: n.done, lanes, jnp.ones(width, dtype=bool))
+    return Stream(lanes, rows, jnp.zeros((), jnp.int32), jnp.ones(width))
+
+
+def _ordered(values: dict[str, Any]) -> list[str]:
+    return sorted(values)
+
+
+def _columns(values: dict[str, Any]) -> list[Array]:
+    """Results as columns [lanes] of floats: what is a tuple has a column each."""
+    columns = []
+    for name in _ordered(values):
+        for value in jax.tree.leaves(values[name]):
+            value = value.astype(jnp.float64)
+            columns += [value] if value.ndim == 1 else list(value.reshape(value.shape[0], -1).T)
+    return columns
+
+
+class _Desk(eqx.Module):
+    """What lies ready for the lanes, and what they have handed in: no more than there are lanes.
+
+    begun: runs taken; filled: rows handed in, of numbers and of columns of results.
+    """
+
+    stream: Stream
+    begun: Array
+    filled: Array
+    numbers: Array
+    columns: list[Array]
+
+
+def _refill(program: Program, shared, rtol, limit, block, begun, available, desk: _Desk) -> _Desk:
+    """Hand in what is done and take new runs, numbered from `begun`."""
+    observer, one = program.observer, desk.stream.one
+    slots = jnp.arange(one.size, dtype=jnp.int32)
+    lanes, passes = desk.stream.lanes, desk.stream.passes
+    osc = _oscillator(program, shared, desk.stream.rows)
+    lanes = _give_up(observer.watch_rarely(osc, lanes, one), passes, limit)
+    finished = lanes.done & (lanes.run >= 0)
+    finished = finished & (_rank(finished) < one.size - desk.filled)
+    # In order, behind what is there.
+    source = jnp.searchsorted(_rank(finished), slots - desk.filled)
+    new = [lanes.run, *_columns(observer.finish(osc, lanes))]
+    pairs = zip([desk.numbers, *desk.columns], new, strict=True)
+    handed = [
+        jnp.where(slots < desk.filled, old, value.at[source].get(mode="fill", fill_value=-1))
+        for old, value in pairs
+    ]
+
+    free = lanes.done & (finished | (lanes.run < 0))
+    place = desk.begun + _rank(free)
+    takes = free & (place < available)
+    place = jnp.where(takes, place, 0)
+    pairs = zip(block, desk.stream.rows, strict=True)
+    rows = tuple(jnp.where(takes, column[place], row) for column, row in pairs)
+    osc = _oscillator(program, shared, rows)
+    fresh = _begin(program, osc, begun + place, rows[0], rows[1], passes, rtol)
+    lanes = choose(takes, fresh, replace(lanes, run=jnp.where(free, -1, lanes.run)))
+    return _Desk(
+        Stream(lanes, rows, passes + 1, one),
+        desk.begun + jnp.sum(takes, dtype=jnp.int32),
+        desk.filled + jnp.sum(finished, dtype=jnp.int32),
+        handed[0],
+        handed[1:],
+    )
+
+
+def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> Lanes:
+    """ROUNDS times: past the events, and some steps."""
+    osc, observer = _oscillator(program, shared, rows), program.observer
+
+    def round_(_, lanes):
+        lanes, passage = pass_events(program, osc, lanes, t1, rtol)
+        lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
+        window = window_of(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
+
+        def step(_, lanes):
+            return take_step(osc, window, one, lanes, t1, rtol, atol)
+
+        return lax.fori_loop(0, STEPS, step, lanes)
+
+    return lax.fori_loop(0, ROUNDS, round_, lanes)
+
+
+def advance(
+    program: Program, shared, t1, rtol, atol, limit, queue, first, count, stream: Stream, drain
+):
+    """Work through the queue; with `drain` until all lanes are idle.
+
+    queue: columns [runs + lanes], the starts and the parameters that differ; the runs are numbered
+    from `first`, `count` of them are real. Returns the lanes, and, in order of completion, numbers
+    (-1 where there is none) and results [columns, runs + 3 lanes].
+
+    Two loops, because on the CPU only loops on small arrays can be one kernel. The inner loop sees
+    small ones only: as many new runs, and as many results, as there are lanes.
+    """
+    width = stream.one.size
+    size = queue[0].size + 2 * width
+
+    def at_work(stream):
+        return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
+
+    @one_kernel
+    def fill(shared, t1, rtol, atol, limit, block, begun, available, last, desk):
+        """Work until the block of runs is taken or the desk is full."""
+
+        def unfinished(desk):
+            left = (desk.begun < available) | (last & at_work(desk.stream))
+            return left & (desk.filled < width)
+
+        def go_on(desk):
+            desk = _refill(program, shared, rtol, limit, block, begun, available, desk)
+            stream = desk.stream
+            lanes = _work(program, shared, stream.rows, stream.lanes, stream.one, t1, rtol, atol)
+            return replace(desk, stream=replace(stream, lanes=lanes))
+
+        return lax.while_loop(unfinished, go_on, desk)
+
+    def outer(state):
+        stream, taken, written, numbers, results = state
+        zero = jnp.zeros_like(taken)
+        block = tuple(lax.dynamic_slice(column, (taken,), (width,)) for column in queue)
+        available = jnp.minimum(count - taken, width)
+        last = drain & (taken + available >= count)
+        nothing = [jnp.zeros_like(stream.one) for _ in results]
+        desk = _Desk(stream, zero, zero, jnp.full(width, -1, dtype=jnp.int32), nothing)
+        desk = fill(shared, t1, rtol, atol, limit, block, first + taken, available, last, desk)
+        numbers = lax.dynamic_update_slice(numbers, desk.numbers, (written,))
+        pairs = zip(results, desk.columns, strict=True)
+        results = [lax.dynamic_update_slice(whole, part, (written,)) for whole, part in pairs]
+        return desk.stream, taken + desk.begun, written + desk.filled, numbers, results
+
+    def unfinished(state):
+        stream, taken, *_ = state
+        return (taken < count) | (drain & at_work(stream))
+
+    n_columns = sum(math.prod(shape) for shape in layout(program, shared).values())
+    none = jnp.zeros((), jnp.int32)
+    numbers = jnp.full(size, -1, dtype=jnp.int32)
+    results = [jnp.full(size, jnp.nan) for _ in range(n_columns)]
+    start = (stream, none, none, numbers, results)
+    stream, _, _, numbers, results = lax.while_loop(unfinished, outer, start)
+    return stream, numbers, jnp.stack(results)
+
+
+def _rank(flags: Array) -> Array:
+    """How many flags are set before each one."""
+    return jnp.cumsum(flags.astype(jnp.int32)) - 1
+
+
+def _give_up(lanes: Lanes, passes, limit) -> Lanes:
+    """End runs that took too many steps, or whose state is not finite."""
+    finite = jnp.isfinite(lanes.x1) & jnp.isfinite(lanes.x2) & jnp.isfinite(lanes.a)
+    lost = ~lanes.done & (~finite | (passes - lanes.begun > limit))
+    reason = jnp.where(finite, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
+    status = jnp.where(lost, reason.astype(lanes.status.dtype), lanes.status)
+    return eqx.tree_at(lambda n: (n.status, n.done), lanes, (status, lanes.done | lost))
+
+
+def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
+    """The results of a run in the order of their columns: the shape of each by name."""
+
+    def finish():
+        stream = idle(program, shared, 1, 2 + sum(program.mapped))
+        osc = _oscillator(program, shared, stream.rows)
+        return program.observer.finish(osc, stream.lanes)
+
+    values = jax.eval_shape(finish)
+    shapes = {}
+    for name in _ordered(values):
+        value = values[name]
+        is_tuple = isinstance(value, tuple)
+        shapes[name] = (len(value),) if is_tuple else value.shape[1:]
+    return shapes
+
+
+def by_name(layout: dict[str, tuple[int, ...]], columns: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns [..., columns, runs] as results by name, [..., runs] and the shape of each."""
+    results, first = {}, 0
+    for name, shape in layout.items():
+        part = np.moveaxis(columns[..., first : first + math.prod(shape), :], -2, -1)
+        results[name] = part.reshape(*part.shape[:-1], *shape)
+        first += math.prod(shape)
+    return results
