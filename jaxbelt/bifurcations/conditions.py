@@ -22,7 +22,7 @@ import abc
 import functools
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -165,7 +165,7 @@ class AbstractCondition(eqx.Module):
         plain = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(self))
         require(plain, "condition", "made of plain numbers", repr(self))
 
-    def as_data(self) -> Self:
+    def as_data(self) -> Any:
         """The same with arrays for its numbers, as compiled programs take it."""
         return jax.tree.map(lambda leaf: jnp.asarray(np.array(leaf)), self)
 
