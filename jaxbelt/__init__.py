@@ -7,12 +7,13 @@ Inside, data goes one way: parameters, modes, motion, cycles, bifurcations, pict
 ladder that shows it. Read from top to bottom, a module imports only what stands before it:
 
     results         status codes and what to do about them
+    numerics/       compiling
     checks          arguments, checked at the public edge
-    numerics/       compiling continuation derivatives extrapolation newton roots
+    numerics/       derivatives extrapolation newton continuation roots
     model/          friction oscillator parameters modes events equilibria
     presets         the published systems
     motion/         integrators arcs smoothing simulate
-    cycles/         shooting orbits cycle attractors functionals
+    cycles/         settling shooting orbits cycle attractors functionals
     sweeps/         lanes step events marks observers attractor queue threads audit sweep basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   refine path scan curves diagrams switch_folds

@@ -1,11 +1,10 @@
-"""What a user may pass in, and where from, checked once at the public edge.
+"""What a user may pass in, checked once at the public edge.
 
 Every check runs before tracing and raises a `ValueError` that names the field, what was expected
 and what came. Under `jit`, `vmap` and derivatives values are not known, so only their dtype and
 shape are checked there; results then carry a status and NaN instead of an exception.
 """
 
-import os
 from typing import Any
 
 import jax
@@ -14,12 +13,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from .numerics.compiling import is_concrete, require_own_threads
+
 TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
-
-
-def is_concrete(value: Any) -> bool:
-    """Whether the numbers in `value` are known now, that is, outside of a trace."""
-    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
 
 def pick(tree: Any, index: Any) -> Any:
@@ -39,42 +35,13 @@ def require(condition: Any, field: str, expected: str, got: Any) -> None:
         raise ValueError(f"{field} must be {expected}, got {got}")
 
 
-# A fork copies the memory of a process but none of its threads, and JAX waits for its threads: most
-# of what it is asked to do in the child never ends. So the child is told at once.
-_forked = False
-
-
-def _note() -> None:
-    global _forked
-    # JAX's own list of its backends, empty while they are not in use; the public function that
-    # asks for them starts them.
-    from jax._src import xla_bridge
-
-    _forked = _forked or bool(getattr(xla_bridge, "_backends", True))
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_note)
-
-
-def require_own_threads() -> None:
-    """Raise a `RuntimeError` in a process that was forked after JAX was used."""
-    if _forked:
-        raise RuntimeError(
-            "jaxbelt cannot compute in a process that was forked after JAX was used: JAX's threads "
-            "are not in it, so it would wait for ever. Start processes by the method spawn, such "
-            'as multiprocessing.get_context("spawn").Pool() or '
-            'ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
-        )
-
-
 def require_usable_jax() -> None:
     """Raise in a forked process, and unless JAX is set to 64-bit floats.
 
     Event times are meaningless in 32 bits.
     """
     require_own_threads()
-    if not jax.config.read("jax_enable_x64"):
+    if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
         raise ValueError(
             "jaxbelt must have 64-bit floats, got JAX set to float32; before anything else, "
             f"call {TURN_ON_FLOAT64}"

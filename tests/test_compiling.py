@@ -1,6 +1,9 @@
 """How functions are compiled: the same results in and out of traces, and nothing needlessly."""
 
+import equinox.internal
 import jax
+import jax.experimental.xla_metadata
+import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +11,10 @@ from jax import lax
 
 import jaxbelt as jb
 from jaxbelt.numerics import compiling
+
+#: Whether the tricks are used, which are those of the CPU's compiler.
+TRICKS = jax.default_backend() == "cpu" and not compiling.PLAIN
+needs_tricks = pytest.mark.skipif(not TRICKS, reason="needs what is not promised")
 
 
 @compiling.jit
@@ -29,12 +36,6 @@ def cubed(x):
 )
 def test_jit_works_inside_of_every_trace(call):
     assert call(jnp.asarray(2.0)) == 8.0
-
-
-def test_options_that_xla_does_not_know_are_left_out():
-    assert compiling.known((("xla_cpu_no_such_option", True),)) is None
-    if jax.default_backend() == "cpu":
-        assert compiling.known(compiling.QUICK) == dict(compiling.QUICK)
 
 
 def test_each_is_vmap():
@@ -87,7 +88,7 @@ def test_a_sweep_compiles_its_kernel_once():
         )
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
-    assert sum("_advance" in name for name in compiled) == 1
+    assert sum("advance" in name for name in compiled) == 1
 
 
 # --- one kernel -----------------------------------------------------------------------------------
@@ -136,7 +137,7 @@ def test_constants_are_no_matter():
     check(jax.jit(lambda r: piece(2.0, {"slow": r, "unused": r}))(0.2), 2.0, 0.2)
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the CPU's compiler")
+@needs_tricks
 def test_it_is_one_piece_of_machine_code():
     assert MARK in program(piece, 2.0, RATES)
     assert MARK not in program(descend, 2.0, RATES)
@@ -154,7 +155,6 @@ def test_in_loops_and_branches():
     assert float(jax.jit(sums)(starts)) == pytest.approx(wanted, rel=1e-12)
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the CPU's compiler")
 def test_a_piece_within_a_piece_is_part_of_it():
     @compiling.one_kernel
     def twice(x, rates):
@@ -217,7 +217,7 @@ def test_what_a_law_may_be_made_of_is_possible():
     x = jnp.array([0.2, 0.41, 0.65])
     piece = compiling.one_kernel(add_up)
     np.testing.assert_allclose(jax.jit(piece)(x), add_up(x), rtol=1e-13)
-    if jax.default_backend() == "cpu":
+    if TRICKS:
         assert MARK in program(piece, x)
 
 
@@ -243,3 +243,111 @@ def test_what_cannot_be_one_piece_is_what_it_was(function):
     np.testing.assert_allclose(jax.jit(compiling.one_kernel(function))(x), function(x), rtol=1e-13)
     if jax.default_backend() == "cpu":
         assert MARK not in program(compiling.one_kernel(function), x)
+
+
+# --- without what is not promised -----------------------------------------------------------------
+
+
+@pytest.fixture
+def untried(monkeypatch):
+    """As in a new process: nothing was tried yet."""
+    monkeypatch.setattr(compiling, "_works", {})
+    return monkeypatch
+
+
+def warned_once(what: str, function, *args):
+    """What a function gives, twice the same, and only the first time with a warning."""
+    with pytest.warns(RuntimeWarning) as warnings:
+        first = function(*args)
+    (warning,) = warnings
+    assert f"jaxbelt goes on without {what}" in str(warning.message)
+    assert jax.tree.all(jax.tree.map(np.array_equal, function(*args), first))
+    return first
+
+
+def broken(*args, **kwargs):
+    raise TypeError("this is of another version")
+
+
+@needs_tricks
+def test_without_an_option_of_the_compiler(untried):
+    untried.setattr(compiling, "QUICK", {"xla_cpu_no_such_option": True})
+    squared = compiling.jit(lambda x: x**2)
+    assert warned_once("XLA's options xla_cpu_no_such_option", squared, jnp.asarray(3.0)) == 9.0
+
+
+@needs_tricks
+@pytest.mark.parametrize(
+    "module, name",
+    [
+        (jax.experimental.xla_metadata, "set_xla_metadata"),
+        (jax.extend.core, "jaxpr_as_fun"),
+        (jax, "make_jaxpr"),
+        (compiling, "_is_possible"),
+        (jax.custom_batching, "custom_vmap"),
+    ],
+)
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit, lambda f: jax.vmap(f, axis_size=2)])
+def test_without_kernels_of_one_piece(untried, module, name, wrap):
+    untried.setattr(module, name, broken)
+    piece = compiling.one_kernel(descend)
+    x, n = warned_once("kernels of one piece", wrap(lambda: piece(2.0, RATES)))
+    for values in zip(np.ravel(x), np.ravel(n), strict=True):
+        check(values, 2.0, 0.2)
+
+
+@needs_tricks
+def test_without_kernels_of_one_piece_that_are_wrong(untried):
+    right = jax.extend.core.jaxpr_as_fun
+
+    def wrong(jaxpr):
+        return lambda *args: [2 * result for result in right(jaxpr)(*args)]
+
+    untried.setattr(jax.extend.core, "jaxpr_as_fun", wrong)
+    piece = compiling.one_kernel(descend)
+    check(warned_once("kernels of one piece", jax.jit(piece), 2.0, RATES), 2.0, 0.2)
+
+
+@needs_tricks
+def test_without_one_branch_for_a_batch(untried):
+    untried.delattr(equinox.internal, "unvmap_any")
+
+    def halved(x):
+        return lax.cond(compiling.any_lane(x > 1), lambda: jnp.where(x > 1, x / 2, x), lambda: x)
+
+    x = jnp.array([0.5, 4.0])
+    found = warned_once("Equinox's reductions of a batch", jax.vmap(halved), x)
+    assert found.tolist() == [0.5, 2.0]
+
+
+@needs_tricks
+def test_without_what_vmap_leaves_alone(untried):
+    untried.setattr(compiling, "is_concrete", lambda value: False)
+    leaves = warned_once(
+        "what vmap leaves alone", compiling.depends, lambda x: [x, 2, 1.0 + x], 0.0
+    )
+    assert leaves == (True, False, True)
+
+
+@needs_tricks
+def test_without_a_look_into_traced_programs(untried):
+    untried.delattr(jax.extend.core, "Var")
+
+    def function(p, q, r, s):
+        return [1.0, s, p, jnp.abs(q), r, 2 * r]
+
+    found = warned_once("a look into traced programs", compiling.passed_through, function, 4)
+    assert found == [2, None, None, 1]
+
+
+@needs_tricks
+def test_without_the_list_of_backends(untried):
+    untried.setattr(compiling, "_is_jax_in_use", broken)
+    untried.setattr(compiling, "_forked", False)
+    untried.setattr(compiling, "_computed", False)
+    compiling._note_fork()
+    assert not compiling._forked
+    warned_once("JAX's list of its backends", compiling.require_own_threads)
+    compiling._note_fork()
+    with pytest.raises(RuntimeError, match="forked after JAX was used"):
+        compiling.require_own_threads()

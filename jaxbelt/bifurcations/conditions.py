@@ -40,7 +40,7 @@ from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index, parameter, vary
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
-from ..numerics.continuation import End
+from ..numerics.continuation import Stop
 from ..numerics.newton import NEWTON_STEPS
 from ..results import Status, describe
 from .guesses import nearest, settled_loops
@@ -98,7 +98,7 @@ class Trail(NamedTuple):
     values: np.ndarray
     system: Any
     x: np.ndarray
-    end: End
+    end: Stop
 
     def stopping(self) -> tuple[int, int] | None:
         """A belt that comes to rest: which parameter its velocity is, 0 or 1, and its number."""

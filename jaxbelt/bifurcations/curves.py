@@ -22,7 +22,7 @@ from ..checks import as_array, check_finite, require
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index, names_of, parameter, vary
 from ..numerics.compiling import jit
-from ..numerics.continuation import CurvePoint, End, continue_curve, corrected
+from ..numerics.continuation import CurvePoint, Stop, continue_curve, corrected
 from ..results import Status, draw
 from .conditions import AbstractCondition, BifurcationPoint, SpecialPoint, Trail
 from .systems import AbstractSystem, Seen
@@ -55,7 +55,7 @@ class BifurcationCurve(eqx.Module):
     residual: np.ndarray
     places: np.ndarray
     special: tuple[SpecialPoint, ...] = eqx.field(static=True)
-    ends: tuple[End, End] = eqx.field(static=True)
+    ends: tuple[Stop, Stop] = eqx.field(static=True)
     names: tuple[str, str] = eqx.field(static=True)
 
     def __len__(self) -> int:
@@ -155,8 +155,8 @@ def bifurcation_curve(
     require(inside, "span", f"around the point {start.tolist()}", limits.tolist())
     problem = _Problem(point.condition, osc, indices, limits, step, max_points)
     ahead = _follow(problem, point, 1.0)
-    closed = ahead.end is End.CLOSED
-    behind = _Side(ahead.rows[:1], [], End.CLOSED) if closed else _follow(problem, point, -1.0)
+    closed = ahead.end is Stop.CLOSED
+    behind = _Side(ahead.rows[:1], [], Stop.CLOSED) if closed else _follow(problem, point, -1.0)
     rows = [*reversed(behind.rows[1:]), *ahead.rows]
     names = [names_of(osc)[number] for number in numbers]
     return BifurcationCurve(
@@ -201,7 +201,7 @@ class _Row(NamedTuple):
 class _Side(NamedTuple):
     rows: list[_Row]
     special: list[SpecialPoint]
-    end: End
+    end: Stop
 
 
 def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
@@ -215,12 +215,12 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
         rows += [_row(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
         special += found
         last = points[-1][0].u if points else u
-        if end is not End.LEFT_SPAN and (limit := _limit(problem, track, rows, last, end)):
+        if end is not Stop.LEFT_SPAN and (limit := _limit(problem, track, rows, last, end)):
             rows += _towards(problem, rows[-1].values, limit)
-            return _Side(rows, [*special, limit], End.STOPPED)
+            return _Side(rows, [*special, limit], Stop.STOPPED)
         if len(rows) >= problem.max_points or not points:
-            return _Side(rows, special, End.POINT_COUNT if points else End.STEP_TOO_SMALL)
-        if beyond is None and end is not End.POINT_COUNT:
+            return _Side(rows, special, Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL)
+        if beyond is None and end is not Stop.POINT_COUNT:
             return _Side(rows, special, end)
         if beyond is None:
             # The same curve, its mesh spread anew.
@@ -232,7 +232,7 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
         place = track.place(last)
         further = None if is_end else _beyond(problem, last[-2:], centre, place)
         if further is None:
-            return _Side(rows, special, End.STOPPED)
+            return _Side(rows, special, Stop.STOPPED)
         track, u = _Track.begun(problem, further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
@@ -246,7 +246,7 @@ class _Piece(NamedTuple):
     points: list[tuple[CurvePoint, Seen]]
     special: list[SpecialPoint]
     beyond: CurvePoint | None
-    end: End
+    end: Stop
 
 
 def _piece(problem: _Problem, track: "_Track", u, direction, origin) -> _Piece:
@@ -259,10 +259,10 @@ def _piece(problem: _Problem, track: "_Track", u, direction, origin) -> _Piece:
             special += _between(problem, track, points[-2], points[-1])
         if not points[-1][1].exists:
             beyond, _ = points.pop()
-            return _Piece(points, special, beyond, End.STOPPED)
+            return _Piece(points, special, beyond, Stop.STOPPED)
         if at.end is not None:
             return _Piece(points, special, None, at.end)
-    return _Piece(points, special, None, End.STEP_TOO_SMALL)
+    return _Piece(points, special, None, Stop.STEP_TOO_SMALL)
 
 
 def _closing(track: "_Track", before: CurvePoint, after: CurvePoint, origin) -> CurvePoint | None:
@@ -276,7 +276,7 @@ def _closing(track: "_Track", before: CurvePoint, after: CurvePoint, origin) -> 
     at = corrected(*track.problem, guess, normal / np.linalg.norm(chord), 0.0)
     if not at.found or np.linalg.norm(at.u[-2:] - origin) > 1e-6 * np.linalg.norm(chord):
         return None
-    return after._replace(u=at.u, tangent=at.tangent, end=End.CLOSED)
+    return after._replace(u=at.u, tangent=at.tangent, end=Stop.CLOSED)
 
 
 def _steps(problem: _Problem, track: "_Track", u: np.ndarray, direction: np.ndarray):
@@ -409,7 +409,7 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np
     return None if best is None else best[1]
 
 
-def _limit(problem: _Problem, track: "_Track", rows: list[_Row], u, end: End):
+def _limit(problem: _Problem, track: "_Track", rows: list[_Row], u, end: Stop):
     """What the curve ends in where there is no such motion, if that is near its point u."""
     values = np.array([row.values for row in rows[-3:]])
     trail = Trail(

@@ -21,14 +21,14 @@ import numpy as np
 from jaxtyping import Array
 
 from ..cycles.cycle import separating_loop
-from ..cycles.orbits import AT_REST
+from ..cycles.settling import AT_REST
 from ..cycles.shooting import SIZES, Chain, Loop, end_guard, following_codes, meshed
 from ..model.equilibria import candidates
 from ..model.modes import edges, mode_acceleration, mode_of, onset_position
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
-from ..numerics.continuation import End
+from ..numerics.continuation import Stop
 from ..results import Status
 from .conditions import AbstractCycleCondition, Line
 from .crossings import arrival_tests
@@ -186,7 +186,7 @@ class GrazingEdge(AbstractEdgeTouch):
 
     def limit(self, trail):
         """Where the cycle has shrunk to an equilibrium on the edge."""
-        if trail.end is End.POINT_COUNT:
+        if trail.end is Stop.POINT_COUNT:
             return None
         return hopf_limit("BoundaryHopf", trail, _guard_at_rest, trail.system.end)
 

@@ -19,7 +19,7 @@ from ..cycles.shooting import Chain, closure, meshed, multiplier_and_slopes
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
-from ..numerics.continuation import End
+from ..numerics.continuation import Stop
 from ..results import Status
 from .conditions import AbstractCycleCondition, Line
 from .rests import hopf_limit, third_derivative
@@ -91,7 +91,7 @@ class FoldOfCycles(AbstractCycleCondition):
 
     def limit(self, trail):
         """Where the cycle has shrunk to an equilibrium, at a degenerate Hopf point."""
-        if trail.end is End.POINT_COUNT:
+        if trail.end is Stop.POINT_COUNT:
             return None
         return hopf_limit("DegenerateHopf", trail, third_derivative)
 

@@ -32,7 +32,7 @@ from ..cycles.attractors import (
     without_idle,
 )
 from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
-from ..cycles.orbits import AT_REST
+from ..cycles.settling import AT_REST
 from ..cycles.shooting import SIZES, Loop, cut
 from ..model.equilibria import equilibria
 from ..model.oscillator import Oscillator, check_oscillator

@@ -313,16 +313,14 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
     def begins(z, p):
         return z[0, :2] - _departure(osc_at(p), codes, resting)
 
-    def step(unknowns):
+    def linearized(unknowns):
         z, p = unknowns
         value, matrix = system(STEPS).linearized(osc_at, z, p)
         _, slope = jax.jvp(lambda p: begins(z, p), (p,), (jnp.ones(1),))
         row = jnp.zeros((2, value.size)).at[:, :2].set(jnp.eye(2)).at[:, -1].set(slope)
-        value, matrix = value.at[closing].set(begins(z, p)), matrix.at[closing].set(row)
-        change = jnp.linalg.solve(matrix, -value)
-        return (change[:-1].reshape(z.shape), change[-1:]), jnp.max(jnp.abs(value)), matrix
+        return value.at[closing].set(begins(z, p)), matrix.at[closing].set(row)
 
-    z, p = newton(step, (z, guess)).z
+    z, p = newton(linearized, (z, guess)).z
     value = system(2 * STEPS).residual(osc_at(p), z).at[closing].set(begins(z, p))
     exists = jnp.any(meets) & (last < SIZES[0]) & admissible(osc_at(p), system(1).ordinary, z)
     return p[0], jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)

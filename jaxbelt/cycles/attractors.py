@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..model.events import of_one_loop
 from ..model.modes import ABOVE
 from ..model.oscillator import Oscillator
-from ..results import Status, of_one_loop
+from ..results import Status
 from .cycle import Cycle, find_cycle
 from .shooting import Chain, Ends, Loop, modes_of
 
@@ -32,9 +33,9 @@ Itinerary = tuple[tuple[int, ...], ...]
 #: hold to 1e-9, and beside a fold a cycle moves by ten thousand times that.
 SOLVED = 1e-5
 #: The same of runs of a sweep, times its tolerance: its errors are ten to a thousand times that.
-#: Where they are further apart, but not as far as FAR, or their events differ, shooting tells.
+#: Where they are further apart, but not as far as APART, or their events differ, shooting tells.
 RUN = 1e3
-FAR = 1e-2
+APART = 1e-2
 
 
 def itinerary(osc: Oscillator, loop: Chain | Loop) -> Itinerary:
@@ -145,4 +146,4 @@ class Runs:
         away = np.max(np.abs(both[0] - both[1]), axis=-1) / np.where(size > 0, size, 1.0)
         fits = self.signatures == others.signatures
         same = fits & (away < self.error)
-        return same, ~same & (away < max(FAR, 10 * self.error))
+        return same, ~same & (away < max(APART, 10 * self.error))

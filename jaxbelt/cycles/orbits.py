@@ -16,14 +16,11 @@ from ..motion.arcs import ArcEnd, Ends, Signs, after_slip, signs_after, slip_arc
 from ..motion.integrators import Graded
 from ..numerics.compiling import one_kernel
 from ..results import Status
+from .settling import AT_REST, has_repeated
 from .shooting import Loop
 
-#: Arcs that an orbit is followed for before it is given up.
-BUDGET = 1024
-#: A loop that repeats to this fraction of the amplitude has repeated; Newton does the rest.
-REPEATED = 1e-7
-#: Amplitudes below this one are an equilibrium, up to what can be told.
-AT_REST = 1e-5
+#: Arcs that an orbit is followed for before it is given up: some 100 loops.
+MOST_ARCS = 1024
 
 
 class Orbit(eqx.Module):
@@ -73,7 +70,7 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     top = jnp.where(is_top, y_end[0], jnp.nan)
     amplitude = top - orbit.low
     rows = jnp.arange(orbit.tops.size)
-    same = jnp.abs(orbit.tops - top) < REPEATED * amplitude
+    same = has_repeated(orbit.tops - top, amplitude)
     same = same & jnp.all(orbit.codes == codes[None], axis=-1)
     repeats = jnp.max(jnp.where(same, rows, -1))
     before = jnp.max(jnp.where(jnp.isnan(orbit.tops), -1, rows))

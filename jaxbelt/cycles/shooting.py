@@ -1,7 +1,7 @@
 """Shooting with a fixed signature: a closed chain of arcs as a square system of equations.
 
-A signature, (the mode, what ends it) arc by arc, is all that has to be known to compute a cycle:
-the numbers follow without any event detection (fixed-signature multiple shooting). An arc ends at a
+The mode of every arc, and what ends it, is all that has to be known to compute a cycle: the
+numbers follow without any event detection (fixed-signature multiple shooting). An arc ends at a
 boundary r_k = 0, at a contact edge, at slip onset, or at an extremum, x2' = 0 or x2 = 0. The
 extrema make x1 and x2 monotone on every arc, so all extrema of a cycle are ends of arcs. Counted
 for N arcs:
@@ -45,16 +45,16 @@ from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import one_kernel
 from ..numerics.extrapolation import Scheme, increments, scheme
-from ..numerics.newton import newton
+from ..numerics.newton import Equations
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
-STEPS = 8
+ARC_STEPS = 8
 
 
 class Chain(eqx.Module):
-    """A signature: contact codes [arcs, belts], what ends each arc [arcs], and the step fractions.
+    """A closed sequence of arcs: contact codes [arcs, belts], ends [arcs], and step fractions.
 
     ends: numbers of `arcs.Ends`. An unused arc is of duration zero.
     """
@@ -74,7 +74,8 @@ class Chain(eqx.Module):
 
 
 class Loop(eqx.Module):
-    """One loop of an orbit, arc by arc, padded: a signature, and a guess of the unknowns."""
+    """One loop of an orbit, arc by arc, padded: codes and ends of a `Chain`, and a guess of its
+    unknowns, the entry states and durations."""
 
     codes: Array
     ends: Array
@@ -139,11 +140,11 @@ def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -
     return y + jnp.stack(change)
 
 
-def _field(osc: Oscillator, codes: Array, y: Array) -> Array:
+def _slip_slopes(osc: Oscillator, codes: Array, y: Array) -> Array:
     return jnp.stack([y[1], mode_acceleration(osc, mode_of(codes), y[0], y[1])])
 
 
-def meshed(osc: Oscillator, loop: Loop, steps: int = STEPS) -> tuple[Chain, Array]:
+def meshed(osc: Oscillator, loop: Loop, steps: int = ARC_STEPS) -> tuple[Chain, Array]:
     """The chain of a loop with its mesh, and the guess of its unknowns."""
     stuck = jnp.any(loop.codes == 0, axis=-1)
     slip = jnp.where(stuck, 0.0, loop.durations)
@@ -158,7 +159,7 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
     h = duration / n
 
     def advance(y, _):
-        y = _step(functools.partial(_field, osc, codes), y, h, _COARSE)
+        y = _step(functools.partial(_slip_slopes, osc, codes), y, h, _COARSE)
         return y, density(osc, mode_of(codes), *y)
 
     _, rest = lax.scan(advance, y, None, length=n)
@@ -182,7 +183,7 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     n_extra = 0 if extra is None else extra(osc, mode, y[0], y[1]).size
 
     def field(state):
-        smooth = _field(osc, codes, state[:2])
+        smooth = _slip_slopes(osc, codes, state[:2])
         if extra is None:
             return smooth
         return jnp.concatenate([smooth, extra(osc, mode, state[0], state[1])])
@@ -250,7 +251,7 @@ def _followed(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
 
 
 @one_kernel
-def _equations(osc: Oscillator, chain: Chain, z: Array) -> Array:
+def _all_arc_equations(osc: Oscillator, chain: Chain, z: Array) -> Array:
     """`_arc_equations` of all arcs, [N, 4]."""
 
     def one(row):
@@ -286,7 +287,7 @@ def _equations_and_blocks(osc: Oscillator, along: Oscillator | None, chain: Chai
 def residual(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
     """The 3N equations at the unknowns z, [N, 3]: mismatch of x1, of x2, guard, for every arc; and
     the miss of the tangent arcs, zero where there is none."""
-    out = _equations(osc, chain, z)
+    out = _all_arc_equations(osc, chain, z)
     return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3])
 
 
@@ -313,33 +314,17 @@ def jacobian(blocks: Array) -> Array:
     return (same - then).reshape(3 * n, 3 * n)
 
 
-@eqx.filter_custom_jvp
-def _solve(osc: Oscillator, chain: Chain, z0: Array) -> tuple[Array, Array]:
-    """Unknowns that solve the system, [N, 3], and the number of Newton steps."""
-    solved = newton(functools.partial(_newton_step, osc, chain), z0)
-    return solved.z, solved.iterations
+class ClosedChain(Equations):
+    """The 3N equations of a chain in the unknowns z, [N, 3], for an oscillator."""
 
+    chain: Chain
 
-def _newton_step(osc, chain, z):
-    value, _, blocks = residual_and_blocks(osc, None, chain, z)
-    matrix = jacobian(blocks[:, :3])
-    step = jnp.linalg.solve(matrix, -value.reshape(-1))
-    return step.reshape(z.shape), jnp.max(jnp.abs(value)), matrix
+    def residual(self, given: Oscillator, z: Array) -> Array:
+        return residual(given, self.chain, z)[0].reshape(-1)
 
-
-@_solve.def_jvp
-def _(primals, tangents):
-    osc, chain, z0 = primals
-    z, iterations = _solve(osc, chain, z0)
-    moved, fixed = eqx.partition(
-        osc, jax.tree.map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
-    )
-    _, shift = jax.jvp(
-        lambda moved: residual(eqx.combine(moved, fixed), chain, z)[0], (moved,), (tangents[0],)
-    )
-    _, _, blocks = residual_and_blocks(osc, None, chain, z)
-    z_dot = jnp.linalg.solve(jacobian(blocks[:, :3]), -shift.reshape(-1)).reshape(z.shape)
-    return (z, iterations), (z_dot, None)
+    def linearized(self, given: Oscillator, z: Array) -> tuple[Array, Array]:
+        value, _, blocks = residual_and_blocks(given, None, self.chain, z)
+        return value.reshape(-1), jacobian(blocks[:, :3])
 
 
 def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:

@@ -13,10 +13,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Var
 from jaxtyping import Array
 
 from ..checks import is_concrete, require
+from ..numerics.compiling import passed_through
 from .oscillator import Oscillator
 
 
@@ -142,25 +142,10 @@ def set_alone(make: Callable[..., Oscillator], names: Sequence[str]) -> list[int
     None where an argument is not one leaf, or another leaf depends on it: an oscillator with this
     leaf changed is then not what `make` gives.
     """
-    number = jax.ShapeDtypeStruct((), jnp.float64)
 
     def leaves(*values):
         every = jax.tree.leaves(make(**dict(zip(names, values, strict=True))))
         return [leaf if eqx.is_array_like(leaf) else 0.0 for leaf in every]
 
-    program = jax.make_jaxpr(leaves)(*[number] * len(names)).jaxpr
-    numbers = []
-    for argument in program.invars:
-        depending = {argument}
-        for equation in program.eqns:
-            if any(isinstance(one, Var) and one in depending for one in equation.invars):
-                depending.update(equation.outvars)
-        places = [
-            place
-            for place, one in enumerate(program.outvars)
-            if isinstance(one, Var) and one in depending
-        ]
-        if len(places) != 1 or program.outvars[places[0]] is not argument:
-            return None
-        numbers += places
-    return numbers
+    numbers = [place for place in passed_through(leaves, len(names)) if place is not None]
+    return numbers if len(numbers) == len(names) else None

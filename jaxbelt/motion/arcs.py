@@ -38,7 +38,7 @@ from ..model.modes import (
 )
 from ..model.oscillator import Oscillator
 from ..numerics.roots import first_root
-from .integrators import AbstractIntegrator, State, velocity
+from .integrators import AbstractIntegrator, State, slip_field
 
 #: Signs of x2' and of x2 on an arc: +1 or -1, as numbers.
 Signs = tuple[Array, Array]
@@ -146,7 +146,7 @@ def slip_arc(
     def left(y):
         return jnp.min(count(osc, mode, signs, _all_guards(osc, mode, signs, y))) < 0
 
-    last = integrator.march(functools.partial(velocity, osc, mode), y, left)
+    last = integrator.march(functools.partial(slip_field, osc, mode), y, left)
     root, fired = _first_guard(osc, mode, signs, last, integrator, count)
     # Where not every extremum ends an arc nothing depends on where exactly one does.
     is_sharp = last.left & (every_extremum | (fired < 3 * len(osc.belts)))
@@ -159,8 +159,8 @@ def slip_arc(
     # Two Newton steps, small ones: the digits that are left, and derivatives to second order.
     def polish(carry, _):
         h = carry[0]
-        y = integrator.step(functools.partial(velocity, osc, mode), last.start, h)
-        guard, slope = jax.jvp(guard_fired, y, velocity(osc, mode, y))
+        y = integrator.step(functools.partial(slip_field, osc, mode), last.start, h)
+        guard, slope = jax.jvp(guard_fired, y, slip_field(osc, mode, y))
         regular = jnp.abs(slope) * 1e-3 * length > jnp.abs(lax.stop_gradient(guard))
         shift = jnp.where(regular, guard / jnp.where(regular, slope, 1.0), 0.0)
         return (h - jnp.where(is_sharp, shift, 0.0), h, y), None
@@ -173,7 +173,7 @@ def slip_arc(
 def _first_guard(osc, mode, signs, last, integrator, count) -> tuple[Array, Array]:
     """When within the last step a guard first vanishes, and which; without derivatives."""
     osc, mode, signs, last, integrator = lax.stop_gradient((osc, mode, signs, last, integrator))
-    field = functools.partial(velocity, osc, mode)
+    field = functools.partial(slip_field, osc, mode)
 
     def guards_at(y):
         def guards(*y):

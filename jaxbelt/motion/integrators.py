@@ -28,9 +28,9 @@ State = tuple[Array, Array]
 Field = Callable[[Any], State]
 
 #: Longest and first step of `Adaptive`, as fractions of its span.
-MAX_STEP, FIRST_STEP = 0.5, 0.2
+MAX_FRACTION, FIRST_FRACTION = 0.5, 0.2
 #: Steps of `Adaptive` before an arc is given up.
-MAX_STEPS = 100_000
+MAX_ADAPTIVE_STEPS = 100_000
 #: A step of `Graded` times the wanted density of steps: errors of about 1e-11 a loop.
 STRIDE = 0.2
 #: Steps of `Graded` before an arc, a quarter of a loop at most, is given up.
@@ -67,7 +67,7 @@ class AbstractIntegrator(eqx.Module):
         return y[0] + change[0], y[1] + change[1]
 
 
-def velocity(osc: Oscillator, mode: Mode, y: State) -> State:
+def slip_field(osc: Oscillator, mode: Mode, y: State) -> State:
     """The field (x1', x2') of a slip mode."""
     x1, x2 = y
     return x2, mode_acceleration(osc, mode, x1, x2)
@@ -149,7 +149,7 @@ class Adaptive(AbstractIntegrator):
             return jnp.where(self.span > 0, jnp.maximum(*(jnp.abs(part) for part in y)), 0.0)
 
         # Where no event is looked for, a step may be as long as its error allows.
-        first, longest = (1.0, 1.0) if outside is None else (FIRST_STEP, MAX_STEP)
+        first, longest = (1.0, 1.0) if outside is None else (FIRST_FRACTION, MAX_FRACTION)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(scaled),
             _Extrapolation(),
@@ -163,7 +163,7 @@ class Adaptive(AbstractIntegrator):
             ),
             event=None if outside is None else diffrax.Event(outside),
             adjoint=diffrax.ForwardMode(),
-            max_steps=MAX_STEPS,
+            max_steps=MAX_ADAPTIVE_STEPS,
             throw=False,
         )
         last: Any = solution.solver_state

@@ -7,7 +7,7 @@ segments, an arc each, so that it works under `jit`, `vmap`, and derivatives for
 Slip arcs are those of `arcs`, integrated by diffrax. The arcs end at extrema where a boundary or an
 edge is within reach, and else after the time MAX_ARC. So no root hides within a step: between two
 zeros of x2' lies a zero of x2, since x2'' = -x2 there, and two extrema of x2 in one step would take
-half a loop around a focus within it, which `MAX_ARC` and `MAX_STEP` exclude.
+half a loop around a focus within it, which `MAX_ARC` and `MAX_FRACTION` exclude.
 
 Samples at given times are taken from the arcs afterwards, in parallel.
 """
@@ -17,7 +17,6 @@ import math
 from dataclasses import replace
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,13 +25,13 @@ from jaxtyping import Array, ArrayLike
 
 from ..checks import as_numbers, check_finite, check_positive, is_concrete, require
 from ..model.events import event_between
-from ..model.modes import Mode, at_focus, contact, mode_of_state, select, stick_velocity
+from ..model.modes import Mode, at_focus, contact, has_edges, mode_of_state, select, stick_velocity
 from ..model.oscillator import Oscillator, check_oscillator
-from ..numerics.compiling import jit, one_kernel
+from ..numerics.compiling import any_lane, jit, one_kernel
 from ..numerics.derivatives import forward_jacobian
 from ..results import EventKind, Status, describe
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
-from .integrators import Adaptive, State, velocity
+from .integrators import Adaptive, State, slip_field
 from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
@@ -110,21 +109,21 @@ class Trajectory(eqx.Module):
 
 @forward_jacobian
 @one_kernel
-def _slip_arc(osc, mode, signs, y, integrator) -> SlipArc:
+def _adaptive_slip_arc(osc, mode, signs, y, integrator) -> SlipArc:
     return slip_arc(osc, mode, signs, y, integrator, every_extremum=False)
 
 
 @forward_jacobian
 @one_kernel
-def _flow(osc, mode, y, integrator):
+def _slip_flow(osc, mode, y, integrator):
     """The state after the integrator's span in the slip field of the mode."""
-    return integrator.flow(functools.partial(velocity, osc, mode), y)
+    return integrator.flow(functools.partial(slip_field, osc, mode), y)
 
 
 # --- segments -------------------------------------------------------------------------------------
 
 
-class _State(eqx.Module):
+class _RunState(eqx.Module):
     """Where a run is: time, state, mode, the signs of x2' and x2, and how it stands."""
 
     t: Array
@@ -135,22 +134,22 @@ class _State(eqx.Module):
     done: Array
 
 
-def _slip_segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[ArcEnd, Array]:
+def _slip_segment(osc: Oscillator, state: _RunState, t1, rtol, atol) -> tuple[ArcEnd, Array]:
     """A slip arc; and whether the run ends at its end."""
     left = t1 - state.t
     span = jnp.minimum(left, MAX_ARC)
     integrator = Adaptive(span, SAFETY * rtol, SAFETY * atol)
-    arc = _slip_arc(osc, state.mode, state.signs, state.y, integrator)
+    arc = _adaptive_slip_arc(osc, state.mode, state.signs, state.y, integrator)
     end = after_slip(osc, state.mode, state.signs, arc)
     return end, end.captured | (end.fired < 0) & (left <= MAX_ARC)
 
 
-def _stick_segment(osc: Oscillator, state: _State, t1) -> tuple[ArcEnd, Array]:
+def _stick_segment(osc: Oscillator, state: _RunState, t1) -> tuple[ArcEnd, Array]:
     end = stick_arc(osc, state.mode, state.y, t1 - state.t)
     return end, end.fired < 0
 
 
-class _Record(eqx.Module):
+class _ArcRecord(eqx.Module):
     """What a segment leaves behind: its arc and the event at its end."""
 
     t: Array
@@ -163,11 +162,11 @@ class _Record(eqx.Module):
     event_y: Array
 
 
-def _codes(mode: Mode) -> Array:
+def _stacked_codes(mode: Mode) -> Array:
     return jnp.stack([jnp.asarray(code, dtype=jnp.int8) for code in mode.codes])
 
 
-def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _Record]:
+def _segment(osc: Oscillator, state: _RunState, t1, rtol, atol) -> tuple[_RunState, _ArcRecord]:
     stuck = state.mode.any_stuck
     # Under vmap both branches run; lanes that are stuck or done then have no slip arc to follow.
     slip_until = jnp.where(stuck | state.done, state.t, t1)
@@ -179,10 +178,10 @@ def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _R
     kind, belt = event_between(state.mode.codes, end.mode.codes)
     # At t1 itself, where no event is before: the sum of the arcs may be short of it by rounding.
     t = jnp.where(done & (kind == 0), t1, state.t + end.duration)
-    record = _Record(
+    record = _ArcRecord(
         t=state.t,
         y=jnp.stack(state.y),
-        mode=_codes(state.mode),
+        mode=_stacked_codes(state.mode),
         duration=end.duration,
         kind=kind,
         belt=belt,
@@ -195,10 +194,12 @@ def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _R
     status = jnp.where(end.failed, Status.TOO_MANY_STEPS, status)
     status = jnp.where(finite, status, Status.NOT_FINITE)
     done = done | (t >= t1) | (status != Status.OK)
-    return _State(t, end.y, end.mode, end.signs, status, done), record
+    return _RunState(t, end.y, end.mode, end.signs, status, done), record
 
 
-def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_State, _Record]:
+def _arcs_of_run(
+    osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int
+) -> tuple[_RunState, _ArcRecord]:
     """The chain of arcs from y0: the final state and the stacked records, NaN where unused."""
     y = (y0[0], y0[1])
     mode = mode_of_state(osc, *y)
@@ -207,7 +208,7 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
         finite = finite & jnp.all(~jnp.isnan(leaf))
     status = jnp.where(at_focus(osc, *y), Status.PSEUDO_FOCUS.value, Status.OK.value)
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
-    start = _State(t0, y, mode, signs_after(osc, mode, y), status, status != Status.OK)
+    start = _RunState(t0, y, mode, signs_after(osc, mode, y), status, status != Status.OK)
 
     def segment(given, state):
         osc, t1, rtol, atol = given
@@ -219,7 +220,7 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
             return jax.tree.map(keep, state, new), jax.tree.map(keep, blank, record)
 
         # A true branch under vmap too: once every lane is done nothing more is computed.
-        return lax.cond(eqxi.unvmap_any(~state.done), advance, lambda: (state, blank))
+        return lax.cond(any_lane(~state.done), advance, lambda: (state, blank))
 
     # In blocks, because stepping over what is left of the budget is not free.
     length = min(BLOCK, max_segments)
@@ -233,7 +234,7 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
 
     def block(state, _):
         return lax.cond(
-            eqxi.unvmap_any(~state.done),
+            any_lane(~state.done),
             lambda: segments((osc, t1, rtol, atol), state),
             lambda: (state, blank),
         )
@@ -242,7 +243,7 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
     records = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), records)
     # A run that begins at a pseudo-focus has one arc, of duration zero.
     blank, zero = _unused(len(osc.belts)), jnp.zeros(())
-    rest = replace(blank, t=t0, y=jnp.stack(y), mode=_codes(mode), duration=zero)
+    rest = replace(blank, t=t0, y=jnp.stack(y), mode=_stacked_codes(mode), duration=zero)
     at_rest = start.status == Status.PSEUDO_FOCUS
     records = jax.tree.map(
         lambda leaf, first: leaf.at[0].set(jnp.where(at_rest, first, leaf[0])), records, rest
@@ -251,14 +252,14 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
     return eqx.tree_at(lambda s: s.status, final, unfinished), records
 
 
-def _unused(belts: int) -> _Record:
+def _unused(belts: int) -> _ArcRecord:
     """The record of a segment that is not needed."""
     nan, pair, none = jnp.full((), jnp.nan), jnp.full(2, jnp.nan), jnp.zeros((), int)
     mode = jnp.zeros(belts, jnp.int8)
-    return _Record(nan, pair, mode, nan, none, none, event_t=nan, event_y=pair)
+    return _ArcRecord(nan, pair, mode, nan, none, none, event_t=nan, event_y=pair)
 
 
-def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
+def _states_at(osc: Oscillator, final: _RunState, records: _ArcRecord, ts, rtol, atol):
     """States and modes at the times ts, each from the arc that it lies in."""
     entries = jnp.where(jnp.isnan(records.t), jnp.inf, lax.stop_gradient(records.t))
     wanted = ts.size
@@ -277,7 +278,7 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
         mode = Mode(tuple(arc.mode[j].astype(float) for j in range(len(osc.belts))))
         start = select(goes_on, (y[0], y[1]), (arc.y[0], arc.y[1]))
         duration = jnp.where(stuck, 0.0, since - jnp.where(goes_on, before, 0.0))
-        flown = _flow(osc, mode, start, Adaptive(duration, rtol, atol))
+        flown = _slip_flow(osc, mode, start, Adaptive(duration, rtol, atol))
         v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
         carried = arc.y[0] + v * since, v
         return jnp.stack(select(stuck, carried, flown))
@@ -301,7 +302,7 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     ys = jnp.swapaxes(ys, 0, 1).reshape(-1, 2)
     afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
     ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)
-    modes = jnp.where(beyond[:, None], _codes(final.mode), arcs.mode)
+    modes = jnp.where(beyond[:, None], _stacked_codes(final.mode), arcs.mode)
     return jnp.where(beyond[:, None], afterwards, ys)[:wanted], modes[:wanted]
 
 
@@ -315,8 +316,8 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
 
     def mode_at(y):
         if formulation == "switch":
-            return _codes(switch_mode(osc, y[0], y[1], width))
-        return _codes(contact(osc, y[0], y[1], rightward=True))
+            return _stacked_codes(switch_mode(osc, y[0], y[1], width))
+        return _stacked_codes(contact(osc, y[0], y[1], rightward=True))
 
     known = jnp.all(jnp.isfinite(ys))
     start_known = jnp.all(jnp.isfinite(y0))
@@ -334,7 +335,7 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
 
 @jit
 def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> Trajectory:
-    final, records = _run(osc, y0, t0, t1, rtol, atol, max_segments)
+    final, records = _arcs_of_run(osc, y0, t0, t1, rtol, atol, max_segments)
     # Events first, in a stable order; the rest is padding.
     has_event = records.kind > 0
     order = jnp.argsort(~has_event, stable=True)
@@ -348,7 +349,7 @@ def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> T
     if ts is None:
         # An even grid, and between its points the entries of the arcs, which are known already.
         grid = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)
-        ys, modes = _sample(osc, final, records, grid, rtol, atol)
+        ys, modes = _states_at(osc, final, records, grid, rtol, atol)
         unused = jnp.isnan(records.t)
         ts = jnp.concatenate([grid, jnp.where(unused, t1, records.t)])
         ys = jnp.concatenate([ys, jnp.where(unused[:, None], ys[-1], records.y)])
@@ -356,7 +357,7 @@ def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> T
         order = jnp.argsort(ts)
         ts, ys, modes = ts[order], ys[order], modes[order]
     else:
-        ys, modes = _sample(osc, final, records, ts, rtol, atol)
+        ys, modes = _states_at(osc, final, records, ts, rtol, atol)
     arcs = Arcs(records.t, records.y, records.mode, records.duration)
     return Trajectory(ts, ys, modes, events, arcs, final.status)
 
@@ -437,7 +438,7 @@ def simulate(
         )
     if max_segments is None:
         # Around a pseudo-focus at a contact edge a run has many short arcs.
-        max_segments = _power_of_two((64 if _has_edges(osc) else 8) * span, 512)
+        max_segments = _power_of_two((64 if has_edges(osc) else 8) * span, 512)
     require(
         isinstance(max_segments, int) and max_segments > 0,
         "max_segments",
@@ -447,20 +448,14 @@ def simulate(
     trajectory = _filippov(
         osc, y0, t0, t1, ts, rtol, atol, max_segments=max_segments, resolution=resolution
     )
-    return _trim(trajectory, trim_samples=ts is None)
-
-
-def _has_edges(osc: Oscillator) -> bool:
-    """Whether a contact edge is finite, or not known to be infinite."""
-    bounds = [(belt.lower, belt.upper) for belt in osc.belts]
-    return not is_concrete(bounds) or bool(np.any(np.isfinite(np.asarray(bounds))))
+    return _without_padding(trajectory, trim_samples=ts is None)
 
 
 def _power_of_two(value: float, least: int) -> int:
     return max(least, 2 ** math.ceil(math.log2(min(value, 2.0**20))))
 
 
-def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
+def _without_padding(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
     """Cut the padding off where lengths are known, that is, outside of transformations."""
     if not is_concrete(trajectory) or trajectory.ts.ndim != 1:
         return trajectory

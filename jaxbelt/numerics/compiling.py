@@ -1,36 +1,91 @@
-"""How functions are compiled so that nobody waits long.
+"""All that leans on what JAX, XLA and Equinox do not promise, behind one switch.
 
-`jit`, `traced_once` and `each` save the time of compiling, `one_kernel` that of running.
+- `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `wide` and `any_lane` save
+  time of running.
+- `depends` and `passed_through` look at what a function does with its arguments.
+- `require_own_threads` looks at whether JAX was in use before a process was forked.
+
+With JAXBELT_PLAIN=1 in the environment nothing unpromised is used, and everything works, slower.
+Without it, each of these ways is tried on a small example before its first use. One that fails is
+left out from then on, with a warning.
 """
 
 import contextvars
 import functools
-from collections.abc import Callable
+import os
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.core import Tracer
 
-from ..checks import is_concrete, require_own_threads
+#: Whether to use only what is promised.
+PLAIN = os.environ.get("JAXBELT_PLAIN", "0") not in ("", "0")
+
+_works: dict[str, bool] = {}
+_trying = threading.RLock()
+
+
+def _usable(name: str, trial: Callable[[], bool]) -> bool:
+    """Whether something unpromised may be used: it passed its trial, which is run once."""
+    if PLAIN:
+        return False
+    if name not in _works:
+        with _trying:
+            if name not in _works:
+                _try(name, trial)
+    return _works[name]
+
+
+def _try(name: str, trial: Callable[[], bool]) -> None:
+    try:
+        # Now, also where the first use is inside of a trace.
+        with jax.ensure_compile_time_eval():
+            _works[name] = trial()
+        reason = "its result is wrong"
+    except Exception as error:
+        _works[name] = False
+        reason = f"{type(error).__name__}: {error}"
+    if not _works[name]:
+        warnings.warn(
+            f"jaxbelt goes on without {name}, which does not work with JAX {jax.__version__} here "
+            f"({reason}): results are the same, some take longer. JAXBELT_PLAIN=1 in the "
+            "environment leaves out everything of this kind, and this warning.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+
+
+def is_concrete(value: Any) -> bool:
+    """Whether the numbers in `value` are known now, that is, outside of a trace."""
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
+
+
+# --- options of the compiler ----------------------------------------------------------------------
 
 #: XLA's newer emitter of fused loops takes half as long again to compile programs like these, many
 #: small operations on few numbers, and its code is no faster.
-QUICK = (("xla_cpu_use_fusion_emitters", False),)
+QUICK = {"xla_cpu_use_fusion_emitters": False}
+#: Vectors as wide as the processor has them, for many lanes side by side.
+WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 
-@functools.cache
-def known(options: tuple[tuple[str, Any], ...]) -> dict[str, Any] | None:
-    """The options where this version of XLA knows them and runs on the CPU, else None."""
-    if jax.default_backend() != "cpu":
-        return None
-    try:
-        jax.jit(lambda: 0, compiler_options=dict(options))()
-    except jax.errors.JaxRuntimeError:
-        return None
-    return dict(options)
+def known(options: dict[str, Any]) -> dict[str, Any] | None:
+    """The options where JAX runs on the CPU and this version of XLA knows them, else None."""
+
+    def trial():
+        return int(jax.jit(lambda: 7, compiler_options=options)()) == 7
+
+    if jax.default_backend() == "cpu" and _usable(f"XLA's options {', '.join(options)}", trial):
+        return options
+    return None
 
 
 @jax.jit
@@ -49,7 +104,8 @@ def jit(function: Callable) -> Any:
 
     @functools.cache
     def quick():
-        return filter_jit(function, compiler_options=known(QUICK))
+        options = known(QUICK)
+        return filter_jit(function, compiler_options=options) if options else plain
 
     @functools.wraps(function)
     def call(*args, **kwargs):
@@ -60,18 +116,44 @@ def jit(function: Callable) -> Any:
     return call
 
 
+def wide(function: Callable) -> Any:
+    """`jax.jit` for many lanes side by side, compiled with the options `WIDE`."""
+    return jax.jit(function, compiler_options=known(WIDE) if _has_wide_vectors() else None)
+
+
+@functools.cache
+def _has_wide_vectors() -> bool:
+    try:
+        return "avx512f" in Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return False
+
+
 def traced_once(function: Callable) -> Any:
     """The function itself, for functions that stand in many places: its trace is kept."""
     filter_jit: Any = eqx.filter_jit
-    return filter_jit(function, inline=True)
+    return filter_jit(function) if PLAIN else filter_jit(function, inline=True)
 
+
+def each(function: Callable) -> Callable:
+    """`jax.vmap` of a function of arrays; on the CPU one row after another.
+
+    There a loop over some dozen rows takes as long as they do together, and compiles in half the
+    time.
+    """
+    if jax.default_backend() != "cpu":
+        return jax.vmap(function)
+    return lambda *rows: lax.map(lambda row: function(*row), rows)
+
+
+# --- one piece of machine code --------------------------------------------------------------------
 
 #: How XLA's CPU compiler is told to put a call into one piece of machine code, and not to dissolve
 #: it before. It does so by itself with loops on less than a kilobyte.
 IN_ONE_PIECE = {"xla_cpu_small_call": "true", "inlineable": "false"}
 #: What is inside of the call would inherit the mark.
 NOT_MARKED = {"xla_cpu_small_call": "false", "inlineable": "true"}
-#: Operations that it can do there, those of Equinox's loops among them. It cannot sort, nor write
+#: Operations that XLA can do there, those of Equinox's loops among them. It cannot sort, nor write
 #: to places that differ in a batch, nor call libraries.
 POSSIBLE = frozenset(
     """abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh broadcast_in_dim
@@ -82,24 +164,12 @@ POSSIBLE = frozenset(
     round rsqrt scan select_if_vmap select_n sign sin sinh slice sqrt square squeeze stack
     stop_gradient sub tan tanh transpose unvmap_any while xor""".split()
 )
-#: Nor share out the work on large arrays among threads; with 3,000 numbers it did not want to, with
-#: 4,096 it did, and failed.
+#: Largest array there. XLA computes large loops on several threads, which fails inside one piece
+#: (seen at 4,096 numbers, not at 3,000).
 LARGEST = 1024
-
 
 #: Whether what is traced becomes part of a piece already.
 _is_part = contextvars.ContextVar("is_part", default=False)
-
-
-def _is_possible(jaxpr: Any) -> bool:
-    for equation in jaxpr.eqns:
-        sizes = [variable.aval.size for variable in equation.outvars]
-        if equation.primitive.name not in POSSIBLE or max(sizes, default=0) > LARGEST:
-            return False
-        parts = [getattr(one, "jaxpr", one) for one in jax.tree.leaves(equation.params)]
-        if not all(_is_possible(part) for part in parts if hasattr(part, "eqns")):
-            return False
-    return True
 
 
 def one_kernel(function: Callable) -> Callable:
@@ -109,7 +179,17 @@ def one_kernel(function: Callable) -> Callable:
     for a few numbers that takes longer than the operations do. In a batch, in derivatives, and
     where something in it is not possible in one piece, the function is as it was.
     """
+    piece = _piece(function)
 
+    @functools.wraps(function)
+    def call(*args):
+        usable = jax.default_backend() == "cpu" and _usable("kernels of one piece", _try_piece)
+        return (piece if usable else function)(*args)
+
+    return call
+
+
+def _piece(function: Callable) -> Callable:
     @jax.custom_jvp
     def in_one_piece(*args):
         if _is_part.get():
@@ -128,15 +208,25 @@ def one_kernel(function: Callable) -> Callable:
     def _(primals, tangents):
         return jax.jvp(function, primals, tangents)
 
-    @functools.wraps(function)
-    def call(*args):
-        return (in_one_piece if jax.default_backend() == "cpu" else function)(*args)
+    return in_one_piece
 
-    return call
+
+def _is_possible(jaxpr: Any) -> bool:
+    for equation in jaxpr.eqns:
+        sizes = [variable.aval.size for variable in equation.outvars]
+        if equation.primitive.name not in POSSIBLE or max(sizes, default=0) > LARGEST:
+            return False
+        parts = [getattr(one, "jaxpr", one) for one in jax.tree.leaves(equation.params)]
+        if not all(_is_possible(part) for part in parts if hasattr(part, "eqns")):
+            return False
+    return True
 
 
 def _in_one_piece(jaxpr: Any, *args) -> list[jax.Array]:
     """What the jaxpr gives, as one piece of machine code where it is not in a batch."""
+    # Imported late: `_try_piece` tells where a version of JAX lacks them.
+    from jax.experimental.xla_metadata import set_xla_metadata
+    from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
     def evaluate(constants, arguments):
         return jaxpr_as_fun(ClosedJaxpr(jaxpr, constants))(*arguments)
@@ -162,12 +252,164 @@ def _in_one_piece(jaxpr: Any, *args) -> list[jax.Array]:
     return alone(*args)
 
 
-def each(function: Callable) -> Callable:
-    """`jax.vmap` of a function of arrays; on the CPU one row after another.
+def _try_piece() -> bool:
+    """A loop, with an argument that it does not use; its batch and derivative are traced only."""
 
-    There a loop over some dozen rows takes as long as they do together, and compiles in half the
-    time.
+    def halve(x, unused):
+        return lax.while_loop(lambda state: state[0] > 1, lambda s: (s[0] / 2, s[1] + 1), (x, 0))
+
+    def derivatives(x):
+        return jax.jvp(lambda x: jax.vmap(_piece(halve), (0, None))(x, x), (x,), (x,))
+
+    jax.eval_shape(derivatives, np.ones(2))
+    x, n = jax.jit(_piece(halve))(40.0, np.ones(2))
+    return (float(x), int(n)) == (0.625, 6)
+
+
+# --- batches and arguments ------------------------------------------------------------------------
+
+
+def any_lane(flag: jax.Array) -> jax.Array:
+    """Whether a flag holds anywhere in a batch, one answer for all lanes.
+
+    With it `lax.cond` has one branch under `vmap`, too. Plain: the lane's own flag, and both
+    branches are computed in a batch.
     """
-    if jax.default_backend() != "cpu":
-        return jax.vmap(function)
-    return lambda *rows: lax.map(lambda row: function(*row), rows)
+
+    def trial():
+        from equinox.internal import unvmap_any
+
+        one = jax.eval_shape(jax.vmap(unvmap_any, out_axes=None), np.array([False, True]))
+        return (one.shape, one.dtype) == ((), bool)
+
+    if _usable("Equinox's reductions of a batch", trial):
+        from equinox.internal import unvmap_any
+
+        return unvmap_any(flag)
+    return flag
+
+
+def depends(function: Callable, *args: Any) -> tuple[bool, ...]:
+    """For each leaf of what a function gives, whether it depends on its arguments, numbers.
+
+    Plain: every float is taken to depend on them.
+    """
+
+    def trial():
+        return _depends(lambda x: [x, lax.neg(np.ones(()))], True, 0.0) == (True, False)
+
+    return _depends(function, _usable("what vmap leaves alone", trial), *args)
+
+
+def _depends(function: Callable, usable: bool, *args: Any) -> tuple[bool, ...]:
+    found = []
+
+    def probe(*args):
+        for leaf in jax.tree.leaves(function(*args)):
+            # What does not depend on the mapped arguments is computed on the spot.
+            found.append(not is_concrete(leaf) if usable else eqx.is_inexact_array(leaf))
+        return 0
+
+    pairs = jax.tree.map(lambda x: np.array([x, x]), args)
+    jax.vmap(probe, axis_size=2, out_axes=None)(*pairs)
+    return tuple(found)
+
+
+def passed_through(function: Callable[..., Sequence[Any]], count: int) -> list[int | None]:
+    """For each of `count` numbers which result of the function it is, where no other depends on it.
+
+    Else None. Plain: by the values that the function gives for many numbers.
+    """
+
+    def trial():
+        return _passed_by_program(lambda p, q, r: [p, jnp.sin(q), 1.0, r, r], 3) == [0, None, None]
+
+    usable = _usable("a look into traced programs", trial)
+    return (_passed_by_program if usable else _passed_by_value)(function, count)
+
+
+def _passed_by_program(function: Callable[..., Sequence[Any]], count: int) -> list[int | None]:
+    from jax.extend.core import Var
+
+    number = jax.ShapeDtypeStruct((), jnp.float64)
+    program = jax.make_jaxpr(function)(*[number] * count).jaxpr
+    numbers = []
+    for argument in program.invars:
+        depending = {argument}
+        for equation in program.eqns:
+            if any(isinstance(one, Var) and one in depending for one in equation.invars):
+                depending.update(equation.outvars)
+        outvars = enumerate(program.outvars)
+        places = [place for place, one in outvars if isinstance(one, Var) and one in depending]
+        unchanged = len(places) == 1 and program.outvars[places[0]] is argument
+        numbers.append(places[0] if unchanged else None)
+    return numbers
+
+
+def _passed_by_value(function: Callable[..., Sequence[Any]], count: int) -> list[int | None]:
+    # Both signs, and sizes from 1e-3 to 1e3: other than a number does whatever is made of it.
+    rng = np.random.default_rng(0)
+    sizes = 10 ** rng.uniform(-3, 3, (2, 64, count))
+    first, second = rng.choice([-1.0, 1.0], sizes.shape) * sizes
+
+    def results(rows):
+        return [np.asarray(result) for result in jax.vmap(function)(*jnp.asarray(rows.T))]
+
+    before, numbers = results(first), []
+    for column in range(count):
+        moved = first.copy()
+        moved[:, column] = second[:, column]
+        after = results(moved)
+        pairs = enumerate(zip(before, after, strict=True))
+        places = [place for place, pair in pairs if not np.array_equal(*pair, equal_nan=True)]
+        unchanged = len(places) == 1 and np.array_equal(after[places[0]], moved[:, column])
+        numbers.append(places[0] if unchanged else None)
+    return numbers
+
+
+# --- forked processes -----------------------------------------------------------------------------
+
+# A fork copies the memory of a process but none of its threads, and JAX waits for its threads: most
+# of what it is asked to do in the child never ends. So the child is told at once.
+
+_forked = False
+#: Whether jaxbelt computed in this process; noted where nothing else tells that JAX is in use.
+_computed = False
+
+
+def _is_jax_in_use() -> bool:
+    # Its own list of its backends is empty before. The public function that asks for them starts
+    # them.
+    from jax._src import xla_bridge
+
+    return len(xla_bridge._backends) > 0
+
+
+def _note_fork() -> None:
+    global _forked
+    try:
+        in_use = not PLAIN and _is_jax_in_use()
+    except Exception:
+        in_use = False
+    _forked = _forked or _computed or in_use
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)
+
+
+def require_own_threads() -> None:
+    """Raise a `RuntimeError` in a process that was forked after JAX was used.
+
+    Plain: after jaxbelt was used.
+    """
+    global _computed
+    if _forked:
+        raise RuntimeError(
+            "jaxbelt cannot compute in a process that was forked after JAX was used: JAX's threads "
+            "are not in it, so it would wait for ever. Start processes by the method spawn, such "
+            'as multiprocessing.get_context("spawn").Pool() or '
+            'ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
+        )
+    if not _usable("JAX's list of its backends", lambda: _is_jax_in_use() in (True, False)):
+        _computed = True

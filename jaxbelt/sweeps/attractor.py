@@ -7,16 +7,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..model.modes import (
-    SMALLEST_DISC,
-    begins_at_rest,
-    disc_margin,
-    mode_acceleration,
-    select,
-)
+from ..cycles.settling import REPEATED, way_left
+from ..model.modes import begins_at_rest, select, settling_margin
 from ..model.oscillator import Oscillator
 from ..results import Status
-from .events import append, are_at_rest, event_kinds
+from .events import append, event_kinds
 from .lanes import Lanes, Observer, Passage, materialise
 from .marks import Mark
 
@@ -67,18 +62,16 @@ class Attractor(Observer):
 
     - A cycle: an orbit that sticks repeats the end of a stick phase; from there it is a function of
       the parameters alone, so it does so to the last bits. One that does not stick converges: its
-      top (a maximum of x1, where x2 = 0) has repeated when what is left of the way to the limit, by
-      the ratio of its last two changes, is below `REPEATED` times the amplitude.
+      top (a maximum of x1, where x2 = 0) repeats, see `settling`.
     - An equilibrium: the run begins on one, or the orbit has entered a disc that is attracted by a
-      fixed point, see `modes.disc_margin`. A pseudo-focus is recognised by `modes.is_captured`.
+      fixed point, see `modes.settling_margin`. A pseudo-focus is recognised by `modes.is_captured`.
     - Stuck for ever: on a belt at rest.
 
     The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
     """
 
-    #: Distance to the limit, over the amplitude, below which a smooth cycle is accepted.
-    REPEATED: ClassVar[float] = 1e-7
-    #: The same at the end of a stick phase, which repeats up to rounding.
+    #: Distance to the last state at the end of a stick phase, which repeats up to rounding, over
+    #: the amplitude.
     EXACT: ClassVar[float] = 1e-9
     #: A top that moved by fewer tolerances than this, over the amplitude, moves by rounding alone.
     STANDS: ClassVar[float] = 30.0
@@ -163,9 +156,8 @@ class Attractor(Observer):
         """What the lanes are found to lead to; section: lanes in a state to compare with marks;
         released: those at the end of a stick phase; change: of x1 since the last top."""
         amplitude = loop.x1_max - loop.x1_min
-        ratio = jnp.abs(change / jnp.where(loop.change == 0, 1.0, loop.change))
-        left = jnp.where(ratio < 1, ratio / jnp.where(ratio < 1, 1 - ratio, 1.0), jnp.inf)
-        moved, close = jnp.abs(lanes.x1 - loop.mark.x1), amplitude * self.REPEATED
+        left = way_left(change, loop.change)
+        moved, close = jnp.abs(lanes.x1 - loop.mark.x1), amplitude * REPEATED
         converged = (moved * left <= close) | (moved < self.STANDS * tol * amplitude)
         exact = self.EXACT * amplitude
         repeats = section & loop.mark.met_by(lanes, jnp.where(released, exact, close))
@@ -182,12 +174,7 @@ class Attractor(Observer):
 
     def watch_rarely(self, osc, lanes, one):
         loop: _Loop = lanes.memory
-        zero = jnp.zeros_like(lanes.t)
-        x1_rest = mode_acceleration(osc, lanes.mode, zero, zero)
-        radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), SMALLEST_DISC)
-        margin = disc_margin(osc, lanes.mode, x1_rest, radius)
-        # A node on the boundary of a belt at rest is at rest within no disc, and lands on nothing.
-        margin = jnp.where(are_at_rest(lanes), 1.0, margin)
+        margin, x1_rest = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
         found = materialise(jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin), one) > 0
         memory = replace(
             loop,

@@ -9,10 +9,10 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..model.events import Signature, event_between
 from ..model.modes import (
-    TANGENT,
     Mode,
-    first_of,
+    force_rounding,
     guard_passed,
     leave_slip,
     leave_stick,
@@ -26,11 +26,6 @@ from .lanes import Lanes, Passage, Program
 from .step import NO_STEP, SAFETY, first_step
 
 
-def are_at_rest(lanes: Lanes) -> Array:
-    """Whether x2 and x2' are zero up to rounding."""
-    return jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < TANGENT * (1 + jnp.abs(lanes.x1))
-
-
 def pass_events(
     program: Program, osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array
 ) -> tuple[Lanes, Passage]:
@@ -39,7 +34,7 @@ def pass_events(
     # A lane may also have landed where x2 = 0, which is no guard.
     number = guard_passed(osc, lanes.mode, lanes.x1, lanes.x2)
     # At rest a lane stays, even on a guard.
-    at_rest = are_at_rest(lanes)
+    at_rest = jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < force_rounding(lanes.x1)
     fired = landed & (number >= 0) & ~at_rest
     rests = landed & at_rest & ((number >= 0) | (lanes.h >= -NO_STEP))
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
@@ -62,7 +57,6 @@ def pass_events(
     passage = Passage(
         landed=landed,
         fired=fired,
-        guard=number,
         before=lanes.mode,
         mode=after.mode,
         t=lanes.t,
@@ -73,7 +67,6 @@ def pass_events(
         stuck=stuck,
         duration=duration,
         released=released,
-        slips=released & phase.slips,
         forever=forever,
     )
     lanes = replace(
@@ -97,7 +90,7 @@ def _set_off(program, osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> 
     """x2' and the step size with which the lanes go on in a mode."""
     a = mode_acceleration(osc, mode, x1, x2)
     # Slip onset is tangent: x2' = 0 there up to rounding, for a law without a jump.
-    a = jnp.where(jnp.abs(a) < TANGENT * (1 + jnp.abs(x1)), 0.0, a)
+    a = jnp.where(jnp.abs(a) < force_rounding(x1), 0.0, a)
     h = jnp.where(fired, first_step(rtol), jnp.abs(lanes.h))
     if program.edges:
         # In a corner one event follows the other at once: a lane that stands on the next guard,
@@ -108,27 +101,12 @@ def _set_off(program, osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> 
 
 
 def event_kinds(lanes: Lanes, passage: Passage) -> tuple[tuple[Array, Array, Array], ...]:
-    """(happened, kind, belt) of two events: that which ended a step, and the end of a stick phase
-    that followed at once."""
-    sticks = jnp.where(passage.mode.any_stuck, EventKind.STICK.value, EventKind.CROSS.value)
-    at_edge = passage.guard >= len(lanes.mode.codes)
-    kind = jnp.where(at_edge, EventKind.EDGE.value, sticks)
-    release = jnp.where(passage.slips, EventKind.SLIP.value, EventKind.EDGE.value)
+    """(happened, kind, belt) of the event that ended a step, and of that which ended a stick phase
+    after it."""
     return (
-        (passage.fired, kind, _belt(passage.before, passage.mode, at_edge)),
-        (passage.released, release, _belt(passage.mode, lanes.mode, ~passage.slips)),
+        (passage.fired, *event_between(passage.before.codes, passage.mode.codes)),
+        (passage.released, *event_between(passage.mode.codes, lanes.mode.codes)),
     )
-
-
-def _belt(before: Mode, after: Mode, at_edge: Array) -> Array:
-    """The lowest belt whose contact changed, or, at an edge, that came or went."""
-    numbers = [jnp.asarray(i) for i in range(len(before.codes))]
-
-    def first_change(a, b):
-        return first_of([p != q for p, q in zip(a, b, strict=True)], numbers, jnp.asarray(-1))
-
-    came = first_change(before.touching, after.touching)
-    return jnp.where(at_edge, came, first_change(before.codes, after.codes))
 
 
 def append(word: Array, kind: Array, belt: Array, belts: int) -> Array:
@@ -137,7 +115,7 @@ def append(word: Array, kind: Array, belt: Array, belts: int) -> Array:
     return jnp.where(longer < 2.0**53, longer, jnp.inf)
 
 
-def word_events(word: int, belts: int) -> tuple[tuple[EventKind, int], ...]:
+def word_events(word: int, belts: int) -> Signature:
     """The events, (kind, belt) each, that the word of an attractor's signature stands for.
 
     A word is a number in the base 4 belts + 1: a leading 1, then for each event

@@ -46,15 +46,14 @@ class Lanes(eqx.Module):
 class Passage(eqx.Module):
     """What one call of `events.pass_events` did to the lanes, arrays [lanes].
 
-    landed: the last step ended on a guard or where x2 = 0. fired: it was a guard, whose number is
-    `guard`; `before` and `mode` are the modes on both sides of it, at (t, x1, x2). captured: by a
-    pseudo-focus. rests: at rest up to rounding. stuck: a stick phase followed, of that duration;
-    released: it ended before t1, by slip onset (slips) or at an edge; forever: it never ends.
+    landed: the last step ended on a guard or where x2 = 0. fired: it was a guard; `before` and
+    `mode` are the modes on both sides of it, at (t, x1, x2). captured: by a pseudo-focus. rests: at
+    rest up to rounding. stuck: a stick phase followed, of that duration; released: it ended before
+    t1, by slip onset or at an edge; forever: it never ends.
     """
 
     landed: Array
     fired: Array
-    guard: Array
     before: Mode
     mode: Mode
     t: Array
@@ -65,7 +64,6 @@ class Passage(eqx.Module):
     stuck: Array
     duration: Array
     released: Array
-    slips: Array
     forever: Array
 
 

@@ -10,6 +10,7 @@ import importlib.metadata
 import inspect
 import json
 import math
+import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -27,12 +28,12 @@ from ..checks import (
     as_array,
     check_finite,
     check_positive,
-    is_concrete,
     require,
     require_usable_jax,
 )
+from ..model.events import signature_name
 from ..model.oscillator import Oscillator, check_scalars
-from ..results import of_one_loop
+from ..numerics.compiling import depends
 from .attractor import KINDS, Attractor
 from .audit import chosen, differing
 from .events import word_events
@@ -133,7 +134,7 @@ def sweep(
     audit_differed say how many, and a warning says so where one differed.
 
     Uses every core (every device, if JAX has others). `ValueError` names the argument that is
-    impossible.
+    impossible. `KeyboardInterrupt` ends the sweep within a second and says what became of its runs.
     """
     require_usable_jax()
     grid = _Grid(make, axes, y0)
@@ -161,7 +162,18 @@ def sweep(
     attributes = _provenance(grid, numbers, observe, derivatives)
     program = grid.program(observer)
     table = _Table(program, grid, derivatives, store, attributes)
-    todo = table.todo()
+    try:
+        _run(program, grid, table, numbers, derivatives, progress)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(table.interrupted()) from None
+    if audit:
+        attributes |= _audited(program, grid, table, audit, numbers)
+    return table.dataset(attributes)
+
+
+def _run(program, grid: "_Grid", table: "_Table", numbers, derivatives, progress) -> None:
+    """Do the runs that the table lacks."""
+    todo, lock = table.todo(), threading.Lock()
 
     def rows_of(first: int, last: int) -> np.ndarray:
         return grid.rows(todo[first:last], derivatives)
@@ -169,13 +181,19 @@ def sweep(
     with _Progress(len(todo), progress) as advance:
 
         def put(done: np.ndarray, results: np.ndarray) -> None:
-            table.put(todo[done], results)
-            advance(len(done))
+            with lock:
+                table.put(todo[done], results)
+                advance(len(done))
 
-        run(program, grid.shared, rows_of, len(todo), put, **numbers, derivatives=len(derivatives))
-    if audit:
-        attributes |= _audited(program, grid, table, audit, numbers)
-    return table.dataset(attributes)
+        run(
+            program,
+            grid.shared,
+            rows_of,
+            len(todo),
+            put,
+            **numbers,
+            derivatives=len(derivatives),
+        )
 
 
 def _audited(program, grid: "_Grid", table: "_Table", share: float, numbers) -> dict[str, int]:
@@ -264,15 +282,7 @@ class _Grid:
 
     def _varying(self) -> tuple[bool, ...]:
         """For each leaf of the oscillator whether it depends on an axis."""
-        found = []
-
-        def probe(values):
-            # What does not depend on the mapped values is computed on the spot.
-            found.extend(not is_concrete(leaf) for leaf in jax.tree.leaves(self.make(**values)))
-            return 0
-
-        jax.vmap(probe, axis_size=2, out_axes=None)({name: np.zeros(2) for name in self.names})
-        return tuple(found)
+        return depends(lambda values: self.make(**values), dict.fromkeys(self.names, 0.0))
 
     def program(self, observer: Observer) -> Program:
         leaves = jax.tree.unflatten(self.structure, self.mapped)
@@ -324,6 +334,7 @@ class _Table:
         runs = math.prod(grid.shape)
         self.arrays: dict[str, np.ndarray] = {}
         folder = None if store is None else _open_store(Path(store), grid, attributes)
+        self.folder = folder
         shapes = dict(self.layout)
         for by in derivatives:
             shapes |= {
@@ -357,6 +368,17 @@ class _Table:
                 for by, derivative in zip(self.derivatives, part[1:], strict=True):
                     self.arrays[f"d_{name}_d_{by}"][runs] = derivative
         self.arrays["status"][runs] = status
+
+    def interrupted(self) -> str:
+        """What becomes of the results of an interrupted sweep."""
+        status = self.arrays["status"]
+        done = f"{np.sum(status >= 0):,} of {status.size:,} runs"
+        if self.folder is None:
+            return (
+                f"interrupted after {done}, which are not kept; with a store "
+                '(store="results.zarr") they are, and the same call goes on from there'
+            )
+        return f"interrupted: {done} are in {self.folder}; the same call goes on from there"
 
     def dataset(self, attributes: dict[str, Any]) -> "xarray.Dataset":
         import xarray  # with pandas, half of what `import jaxbelt` would take
@@ -410,8 +432,7 @@ def _meaning(word: int, belts: int) -> str:
     """A signature as one word; -1 stands for one that is too long to be told."""
     if word < 1:
         return "none" if word == 0 else "long"
-    loop = of_one_loop(word_events(word, belts))
-    return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in loop) or "smooth"
+    return signature_name(word_events(word, belts))
 
 
 def _position(name: str) -> tuple[int, str]:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbelt as jb
+from jaxbelt.model.events import of_one_loop
 
 #: The module, whose name in the package is that of its function.
 _SWEEP = sys.modules[jb.sweep.__module__]
@@ -192,7 +193,7 @@ def cycles(cases):
         found = jb.find_cycle(oscillator(case.oscillator), case.y0)
         status = int(found.status)
         kind = {0: "cycle", 1: "stuck", 2: "equilibrium", 6: "equilibrium"}.get(status, "undecided")
-        loop = jb.results.of_one_loop([(int(k), int(b)) for k, b in found.signature])
+        loop = of_one_loop([(int(k), int(b)) for k, b in found.signature])
         out.append(
             Label(
                 kind,
