@@ -163,7 +163,7 @@ class AbstractCondition(eqx.Module):
         for belt in self.belts_concerned:
             require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
         plain = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(self))
-        require(plain, "condition", "made of plain numbers", repr(self))
+        require(plain, "condition", "made of plain numbers", self)
 
     def as_data(self) -> Any:
         """The same with arrays for its numbers, as compiled programs take it."""
