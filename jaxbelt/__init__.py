@@ -15,7 +15,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     motion/         integrators arcs smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
     sweeps/         lanes step events marks observers attractor queue threads audit sweep basins
-    bifurcations/   refine switch_folds scan curves diagrams
+    bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
+    bifurcations/   refine path scan curves diagrams switch_folds
     inverse/        selection record fit design
     plotting/       style phase diagrams sweeps model draw
     paper           the paper's table and figures
@@ -28,30 +29,21 @@ import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 from . import presets
-from .bifurcations.curves import BifurcationCurve, SpecialPoint, bifurcation_curve
+from .bifurcations.conditions import BifurcationPoint, SpecialPoint
+from .bifurcations.crossings import CrossingSliding, SlidingExchange
+from .bifurcations.curves import BifurcationCurve, bifurcation_curve
 from .bifurcations.diagrams import (
     BifurcationDiagram,
     RegionMap,
     bifurcation_diagram,
     region_map,
 )
-from .bifurcations.refine import (
-    BeltAtRest,
-    BifurcationPoint,
-    BoundaryEquilibrium,
-    CornerCollision,
-    CrossingSliding,
-    FoldOfCycles,
-    GrazingEdge,
-    GrazingSliding,
-    Hopf,
-    NonsmoothFold,
-    PseudoHopf,
-    SlidingExchange,
-    SuddenSliding,
-    refine,
-)
+from .bifurcations.edges import CornerCollision, GrazingEdge
+from .bifurcations.folds import FoldOfCycles
+from .bifurcations.refine import refine
+from .bifurcations.rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
 from .bifurcations.scan import scan
+from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, find_cycle, unstable_cycle
 from .cycles.functionals import (
     amplitude,

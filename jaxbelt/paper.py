@@ -18,16 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .bifurcations.conditions import AbstractCondition
+from .bifurcations.crossings import SlidingExchange
 from .bifurcations.diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
-from .bifurcations.refine import (
-    AbstractCondition,
-    GrazingSliding,
-    Hopf,
-    NonsmoothFold,
-    SlidingExchange,
-    SuddenSliding,
-)
-from .bifurcations.scan import refined
+from .bifurcations.rests import Hopf, SuddenSliding
+from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, unstable_cycle
 from .model.equilibria import Equilibria, equilibria
 from .model.oscillator import Belt, Oscillator
@@ -112,7 +107,7 @@ def critical_values() -> tuple[CriticalValue, ...]:
         wanted = {row: CONDITIONS[system, row.point] for row in rows}
         index = jnp.asarray(np.array(leaf_index(osc, _velocity)))
         for row in rows:
-            point = refined(osc, index, row.printed + AWAY, wanted[row])
+            point = wanted[row].found_from(osc, index, row.printed + AWAY)
             if point is None or point.condition != wanted[row]:
                 values[row] = CriticalValue(*row, math.nan, math.nan, 0, None)
                 continue

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
-from jaxbelt.bifurcations.scan import Path
+from jaxbelt.bifurcations.path import Path
 from jaxbelt.numerics.continuation import Stop
 
 EDGE = EventKind.EDGE

@@ -9,9 +9,8 @@ from laws import BELL, bell
 from scipy.optimize import brentq
 
 import jaxbelt as jb
-from jaxbelt.bifurcations.curves import _departure
-from jaxbelt.bifurcations.refine import leaf_index, vary
-from jaxbelt.bifurcations.scan import refined
+from jaxbelt.bifurcations.tangencies import _departure
+from jaxbelt.model.parameters import leaf_index, vary
 from jaxbelt.numerics.continuation import Stop
 
 
@@ -61,7 +60,7 @@ def errors(curve, osc, where, condition, rows):
         free = int(np.argmin(np.abs(chord)))
         held = vary(osc, indices[1 - free], jnp.asarray(values[1 - free])[None])
         solved = [
-            refined(held, indices[free], float(values[free]) + offset, condition)
+            condition.found_from(held, indices[free], float(values[free]) + offset)
             for offset in (-1e-3, 1e-3)
         ]
         points = [point for point in solved if point is not None]

@@ -13,10 +13,11 @@ from laws import BELL, NESTED, bell, nested
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
-from jaxbelt.bifurcations.refine import leaf_index, vary
-from jaxbelt.bifurcations.scan import Path, search
+from jaxbelt.bifurcations.path import Path
+from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import distinct
 from jaxbelt.cycles.shooting import loop_events
+from jaxbelt.model.parameters import leaf_index, vary
 
 
 def nu0(osc):

@@ -7,8 +7,8 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import EventKind
-from jaxbelt.bifurcations.diagrams import kind_of, region_name
-from jaxbelt.bifurcations.scan import Label
+from jaxbelt.bifurcations.diagrams import region_name
+from jaxbelt.bifurcations.labels import Label
 
 
 def nu0(osc):
@@ -200,8 +200,8 @@ def test_no_curve_is_missing_by_symmetry(bounded):
     mirrored, exchanged = (lambda at: -at), (lambda at: at[::-1])
     paths, special = {}, {}
     for curve in bounded.curves:
-        kind, belts = kind_of(curve.condition)
-        belts = frozenset(np.atleast_1d(belts).tolist() if belts is not None else ())
+        kind, belts = curve.condition.lineage
+        belts = frozenset(belts)
         paths.setdefault((kind, belts), []).append(curve.path)
         points = [np.array(point.values) for point in curve.special]
         special.setdefault((kind, belts), []).extend(points)

@@ -35,16 +35,11 @@ from ..model.parameters import set_alone
 from ..numerics.compiling import jit
 from ..results import Status, draw
 from ..sweeps.sweep import sweep
-from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere, place_at
-from .refine import (
-    AbstractCondition,
-    BeltAtRest,
-    BifurcationPoint,
-    GrazingSliding,
-    NonsmoothFold,
-    SuddenSliding,
-)
-from .scan import Label, Path, by_value, edges_touched, search
+from .conditions import BifurcationPoint
+from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere
+from .labels import Label
+from .path import Path
+from .scan import by_value, edges_touched, search
 
 #: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
 SAME = 1e-2
@@ -404,7 +399,7 @@ def _bounds(make, names, values, numbers, step, lines) -> list[BifurcationCurve]
 
 def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, step: float) -> bool:
     """Whether a point is on a curve that is known."""
-    if kind_of(point.condition) != kind_of(curve.condition):
+    if point.condition.lineage != curve.condition.lineage:
         return False
     a, b = curve.values[:-1], curve.values[1:]
     chord = b - a
@@ -412,20 +407,10 @@ def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, s
     along = np.clip(along, 0, 1)[:, None]
     away = np.hypot(*(at - a - along * chord).T)
     places = curve.places[:-1] + along * (curve.places[1:] - curve.places[:-1])
-    own = place_at(point)
+    own = point.place
     return any(
         not is_elsewhere(own, places[i], FAR) for i in np.flatnonzero(away < 0.3 * step).tolist()
     )
-
-
-def kind_of(condition: AbstractCondition) -> tuple[str, Any]:
-    """What stays the same along a curve: a tangency to a belt is a fold here and grazing there."""
-    name = type(condition).__name__
-    if isinstance(condition, NonsmoothFold | GrazingSliding):
-        name = "tangency"
-    elif isinstance(condition, SuddenSliding | BeltAtRest):
-        name = "rest"
-    return name, getattr(condition, "belt", getattr(condition, "belts", None))
 
 
 # --- pieces of branches ---------------------------------------------------------------------------
@@ -569,7 +554,7 @@ def _joined(pieces: Sequence[_Piece], points: Sequence[BifurcationPoint]) -> lis
     """Branches through the points: two ends of pieces that are one place there belong together."""
     partner: dict[tuple[int, bool], tuple[int, bool]] = {}
     for at, point in enumerate(points):
-        if isinstance(point.condition, SuddenSliding | BeltAtRest):
+        if not point.condition.joins:
             continue
         ends = [
             _end(i, piece, right=piece.stretch == at)

@@ -32,7 +32,9 @@ from ..model.modes import Mode, capacity, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index, vary
 from ..numerics.compiling import jit
-from .refine import BifurcationPoint, NonsmoothFold, small_newton
+from .conditions import BifurcationPoint
+from .systems import small_newton
+from .tangencies import NonsmoothFold
 
 #: Integration steps of order twelve for the slip phase.
 STEPS = 64

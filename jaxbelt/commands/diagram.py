@@ -106,11 +106,6 @@ def _where(osc: jb.Oscillator, name: str) -> Any:
     return lambda osc: jax.tree.leaves(osc)[paths.index(path)]
 
 
-def _belts_of(condition: Any) -> str:
-    belts = getattr(condition, "belts", (condition.belt,) if hasattr(condition, "belt") else ())
-    return " ".join(map(str, belts))
-
-
 def write_points(points, path: Path) -> None:
     """value, kind, belts, error and status, a row a bifurcation point."""
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -118,7 +113,8 @@ def write_points(points, path: Path) -> None:
         writer.writerow(["value", "kind", "belts", "error", "status"])
         for point in points:
             status = jb.Status(int(point.status)).name
-            row = [float(point.value), point.kind, _belts_of(point.condition), float(point.error)]
+            belts = " ".join(map(str, point.condition.belts_concerned))
+            row = [float(point.value), point.kind, belts, float(point.error)]
             writer.writerow([*row, status])
 
 

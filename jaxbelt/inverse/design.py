@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..bifurcations.refine import AbstractCondition, refine
+from ..bifurcations.conditions import AbstractCondition
+from ..bifurcations.refine import refine
 from ..checks import as_array, check_finite, require
 from ..cycles.cycle import Cycle, find_cycle
 from ..model.oscillator import Oscillator, check_oscillator

@@ -1,7 +1,7 @@
 """Bifurcation diagrams, curves of bifurcation points, and region maps.
 
-How each kind of point is named and its curve drawn stands in `POINT_NAMES` and `CURVE_STYLES`, the
-symbols of parameters in `SYMBOLS`.
+How each kind of point is named and its curve drawn its condition tells, see `conditions`; the
+symbols of parameters stand in `SYMBOLS`.
 """
 
 from collections.abc import Sequence
@@ -39,41 +39,6 @@ SYMBOLS = {
     "steepness": r"p_{3,%}",
 }
 WORDS = {"damping": "damping", "velocity": "belt velocity", "load": "load"}
-#: What is said of a special point above it.
-POINT_NAMES = {
-    "Hopf": "Hopf",
-    "NonsmoothFold": "fold, belt {belt}",
-    "GrazingSliding": "grazing, belt {belt}",
-    "CrossingSliding": "crossing-sliding, belt {belt}",
-    "SlidingExchange": "sliding exchange",
-    "SuddenSliding": "belt {belt} at rest",
-    "BeltAtRest": "belt {belt} at rest",
-    "FoldOfCycles": "fold of cycles",
-    "GrazingEdge": "edge grazing, belt {belt}",
-    "CornerCollision": "corner, belt {belt}",
-    "BoundaryEquilibrium": "rest on edge, belt {belt}",
-    "PseudoHopf": "pseudo-Hopf, belt {belt}",
-    "Unexplained": "unexplained",
-}
-#: How the curve of each kind of point is drawn.
-CURVE_STYLES: dict[str, dict[str, Any]] = {
-    "Hopf": {"color": "#009E73", "linestyle": (0, (5, 1.5)), "label": "Hopf"},
-    "NonsmoothFold": {"color": "black", "linestyle": "-", "label": "nonsmooth fold"},
-    "GrazingSliding": {"color": "#CC79A7", "linestyle": "-", "label": "grazing"},
-    "CrossingSliding": {
-        "color": "#CC79A7",
-        "linestyle": (0, (5, 1.5)),
-        "label": "crossing-sliding",
-    },
-    "SlidingExchange": {"color": "black", "linestyle": (0, (3, 1, 1, 1)), "label": "exchange"},
-    "SuddenSliding": {"color": "black", "linestyle": (0, (1, 1.2)), "label": "belt at rest"},
-    "BeltAtRest": {"color": "black", "linestyle": (0, (1, 1.2)), "label": "belt at rest"},
-    "FoldOfCycles": {"color": "#E69F00", "linestyle": "-", "label": "fold of cycles"},
-    "GrazingEdge": {"color": "#56B4E9", "linestyle": "-", "label": "edge grazing"},
-    "CornerCollision": {"color": "#56B4E9", "linestyle": (0, (3, 1, 1, 1)), "label": "corner"},
-    "BoundaryEquilibrium": {"color": "#D55E00", "linestyle": "-", "label": "rest on edge"},
-    "PseudoHopf": {"color": "#D55E00", "linestyle": (0, (5, 1.5)), "label": "pseudo-Hopf"},
-}
 
 
 # --- diagrams -----------------------------------------------------------------------------------
@@ -179,9 +144,8 @@ def _name_points(ax: Axes, diagram: BifurcationDiagram) -> None:
     shifts = spread(at, matplotlib.rcParams["font.size"]) - at
     for point, value, shift in zip(diagram.points, values, shifts, strict=True):
         ax.axvline(value, color="0.45", linewidth=0.6, linestyle=":", zorder=1)
-        name = POINT_NAMES[point.kind].format(belt=getattr(point.condition, "belt", ""))
         ax.annotate(
-            name,
+            point.condition.words,
             (value, 1.0),
             xycoords=ax.get_xaxis_transform(),
             xytext=(shift, 9),
@@ -225,10 +189,11 @@ def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> A
     for curve in curves:
         path = curve.path
         # Rows and special points in order; a special point has the kind of the row before it.
-        kinds = _kinds_along(curve, path)
+        kinds: Any = _kinds_along(curve, path)
         for rows in _stretches_of(kinds):
             rows = slice(rows.start, min(rows.stop + 1, len(path)))
-            style = CURVE_STYLES[str(kinds[rows.start])]
+            line = kinds[rows.start].line
+            style = {"color": line.colour, "linestyle": line.style, "label": line.name}
             ax.plot(*path[rows].T, linewidth=1.3, zorder=4, **style)
         for point in curve.special:
             if point.kind not in ("EqualVelocities", "BeltAtRest"):
@@ -246,7 +211,7 @@ def _kinds_along(curve: BifurcationCurve, path: np.ndarray) -> np.ndarray:
     kinds, row = [], 0
     for at in path:
         is_row = row < len(curve) and bool(np.all(at == curve.values[row]))
-        kinds.append(curve.kinds[min(row, len(curve) - 1)] if is_row or not kinds else kinds[-1])
+        kinds.append(curve.classes[min(row, len(curve) - 1)] if is_row or not kinds else kinds[-1])
         row += is_row
     return np.array(kinds)
 

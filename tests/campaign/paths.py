@@ -19,7 +19,8 @@ from math import inf, isfinite
 
 import numpy as np
 
-from jaxbelt.bifurcations.scan import Path, search
+from jaxbelt.bifurcations.path import Path
+from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import place_of
 
 from . import engine, package

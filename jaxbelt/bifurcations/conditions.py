@@ -1,0 +1,533 @@
+"""What every bifurcation condition is: `AbstractCondition`, and the `BifurcationPoint` it leads to.
+
+A condition is one more equation, in one more unknown: the parameter. It is written so that the
+whole system is regular at the point, which "stick duration of the cycle = 0" is not: solved for
+the cycle at every parameter, the duration goes like a square root and Newton's method fails. In the
+unknowns of fixed-signature shooting (see `cycles`) the same equation is harmless.
+
+Each kind is one class that carries all that is known of it: its theory; a guess and the system of
+equations that Newton's method solves from there, which also judges the solution; what hints at it
+between two values on a path; what to watch along its curve, and where that ends; its names and its
+line in pictures. `refine`, `scan`, `bifurcation_curve`, the diagrams and the pictures ask it and
+know no kind. `AbstractCycleCondition` and `AbstractRestCondition` share what conditions on a cycle
+and on a state of rest have in common; a functional of an attracting cycle that has a given value is
+a `CycleEquation`, for which a class with one method will do.
+
+The numbers in a condition, such as its belt, are data of the compiled programs, so one program
+serves all of them: in `guess` and `system` they are arrays. A field that decides which program runs
+is static.
+"""
+
+import abc
+import functools
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..checks import is_concrete, number, require
+from ..cycles.attractors import place_of
+from ..cycles.cycle import Cycle, cycle_of
+from ..cycles.shooting import SIZES, Chain, Loop, cut, meshed
+from ..model.equilibria import candidates
+from ..model.oscillator import Oscillator
+from ..model.parameters import leaf_index, parameter, vary
+from ..motion.arcs import Ends
+from ..numerics.compiling import jit
+from ..numerics.continuation import Stop
+from ..numerics.newton import NEWTON_STEPS
+from ..results import Status, describe
+from .guesses import nearest, settled_loops
+from .labels import Found, Label
+from .systems import (
+    NOWHERE,
+    AbstractSystem,
+    CycleSystem,
+    RestSystem,
+    Tests,
+    accuracy,
+    small_newton,
+    solve_system,
+)
+
+
+class Line(NamedTuple):
+    """How the curves of a kind are drawn: its name in legends, a colour, a line style (plain data,
+    as Matplotlib takes it)."""
+
+    name: str
+    colour: str
+    style: str | tuple[float, tuple[float, ...]] = "-"
+
+
+class SpecialPoint(NamedTuple):
+    """A point of codimension two on a curve.
+
+    kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
+    "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
+    point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too),
+    "BoundaryHopf" (a Hopf point on a contact edge: there the curves of boundary equilibria and of
+    pseudo-Hopf points meet its own), "BeltAtRest", "EqualVelocities", or what a condition of your
+    own watches; belts: concerned; values: of the two parameters; residual: the largest error in all
+    equations.
+    """
+
+    kind: str
+    belts: tuple[int, ...]
+    values: tuple[float, float]
+    residual: float
+
+
+class Trail(NamedTuple):
+    """The last stretch of a curve, as its condition is asked where it leads.
+
+    osc, indices: the oscillator and the numbers of the two parameters; step: between rows; values:
+    of the parameters in the last rows, three at most, [rows, 2]; system, x: of the last row; end:
+    why the stretch ends there.
+    """
+
+    osc: Oscillator
+    indices: Array
+    step: float
+    values: np.ndarray
+    system: Any
+    x: np.ndarray
+    end: Stop
+
+    def stopping(self) -> tuple[int, int] | None:
+        """A belt that comes to rest: which parameter its velocity is, 0 or 1, and its number."""
+        velocities = [
+            leaf_index(self.osc, lambda osc, k=k: osc.belts[k].velocity)
+            for k in range(len(self.osc.belts))
+        ]
+        for held, index in enumerate(np.asarray(self.indices).tolist()):
+            if index in velocities and len(self.values) == 3:
+                _, before, last = np.abs(self.values[:, held])
+                if 0 < last < min(before, 2 * self.step):
+                    return held, velocities.index(index)
+        return None
+
+
+class AbstractCondition(eqx.Module):
+    """What is to happen at a bifurcation point."""
+
+    #: What is said of a point in a diagram, with {belt} for the number of the belt.
+    caption: ClassVar[str]
+    #: How its curves are drawn.
+    line: ClassVar[Line]
+    #: The name of what stays the same along a curve on which the kind changes; "": its own.
+    family: ClassVar[str] = ""
+    #: Whether orbits beside a point are slow to settle, so that it is seen from farther off only.
+    slow: ClassVar[bool] = False
+    #: Whether branches of a diagram go on through a point.
+    joins: ClassVar[bool] = True
+    #: Whether its curve ends where the signature changes.
+    ends_at_contact: ClassVar[bool] = False
+    #: Whether its curve bends sharply before its limit, so that rows are wanted close to that.
+    bends: ClassVar[bool] = False
+
+    @property
+    def belts_concerned(self) -> tuple[int, ...]:
+        """The numbers of the belts that it is about: those in its field `belt`, or `belts`."""
+        belt = getattr(self, "belt", None)
+        return getattr(self, "belts", ()) if belt is None else (belt,)
+
+    @property
+    def lineage(self) -> tuple[str, tuple[int, ...]]:
+        """What stays the same along a curve: the name of the family, and the belts."""
+        return self.family or type(self).__name__, self.belts_concerned
+
+    @property
+    def words(self) -> str:
+        """What is said of a point in a diagram."""
+        return self.caption.format(belt=" ".join(map(str, self.belts_concerned)))
+
+    @property
+    def sought(self) -> "AbstractCondition":
+        """The condition of whichever kind of its family; what is found is named afterwards."""
+        return self
+
+    def named(self, point: "BifurcationPoint") -> "AbstractCondition":
+        """What a point that was sought is."""
+        return self
+
+    def check(self, osc: Oscillator) -> None:
+        """`ValueError` where the oscillator cannot meet it."""
+        n = len(osc.belts)
+        for belt in self.belts_concerned:
+            require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
+        plain = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(self))
+        require(plain, "condition", "made of plain numbers", self)
+
+    def as_data(self) -> Any:
+        """The same with arrays for its numbers, as compiled programs take it."""
+        return jax.tree.map(lambda leaf: jnp.asarray(np.array(leaf)), self)
+
+    # --- a point ---
+
+    @property
+    def room(self) -> int:
+        """Room for the arcs of one loop."""
+        return SIZES[0]
+
+    @abc.abstractmethod
+    def guess(self, osc: Oscillator, size: int) -> Any:
+        """What its system of equations begins from; `size`: room for the arcs of a loop."""
+
+    @abc.abstractmethod
+    def solve(self, osc: Oscillator, index: int | Array, guess: Any) -> "BifurcationPoint":
+        """The point near a guess, in the parameter of that number, without a name."""
+
+    def point(self, osc: Oscillator, index: int | Array, size: int) -> "BifurcationPoint":
+        """The point near an oscillator, in the parameter of that number."""
+        data = self.as_data()
+        return replace(data.solve(osc, index, data.guess(osc, size)), condition=self)
+
+    def found_from(
+        self, osc: Oscillator, index: Array, value: float, loop: Loop | None = None
+    ) -> "BifurcationPoint | None":
+        """The point that is found from that value of the parameter, or None.
+
+        One of a family is named as what it is. loop: of the cycle that it is about, where that is
+        known.
+        """
+        at, data = vary(osc, index, jnp.asarray(np.array([value]))), self.sought.as_data()
+        guess = data.guess(at, data.room) if loop is None else data.guess_near(loop)
+        point = data.solve(at, index, guess)
+        if int(point.status) != Status.OK:
+            return None
+        return replace(point, condition=self.sought.named(point))
+
+    def guess_near(self, loop: Loop) -> Any:
+        """The guess, where a loop of the cycle is known."""
+        raise NotImplementedError
+
+    # --- on a path ---
+
+    @classmethod
+    def between(
+        cls, before: Label, after: Label, edged: Sequence[int]
+    ) -> Sequence["AbstractCondition"]:
+        """Those of its kind that could make the difference between two labels.
+
+        edged: belts with a finite contact edge, one for each place.
+        """
+        return ()
+
+    @classmethod
+    def at_coincidence(cls, belts: tuple[int, ...]) -> Sequence["AbstractCondition"]:
+        """Those that could hold where a belt is at rest, or two run at one velocity."""
+        return ()
+
+    @classmethod
+    def of_unstable_cycles(cls, edged: Sequence[int]) -> Sequence["AbstractCondition"]:
+        """Those that could make the difference between the modes of two unstable cycles."""
+        return ()
+
+    def mark(self, osc: Oscillator, cycles: Sequence[Loop]) -> Hashable:
+        """What changes where it holds, beside a label; cycles: the attracting ones, in order."""
+        return None
+
+    def beginnings(self, cycles: Sequence[Found]) -> Sequence[Loop | None]:
+        """Of the attracting cycles those to begin from; None: its own guess."""
+        return (None,)
+
+    def values(self, a: float, b: float) -> Sequence[float]:
+        """Where to begin, if it may hold between two values."""
+        return a, b
+
+    # --- along a curve ---
+
+    @abc.abstractmethod
+    def followed(self, point: "BifurcationPoint") -> tuple[AbstractSystem, Any]:
+        """The system to be followed from a point, and its unknowns there."""
+
+    def kind_along(self, osc: Oscillator, multiplier: float) -> type["AbstractCondition"]:
+        """The kind that holds at a point of its curve."""
+        return type(self)
+
+    def limit(self, trail: Trail) -> SpecialPoint | None:
+        """What its curve ends in where there is no such motion, if that is near."""
+        return None
+
+    def place(self, point: "BifurcationPoint") -> np.ndarray:
+        """Where the motion at a point is, see `place_of`; NaN where there is none."""
+        return place_of(point.cycle) if int(point.cycle.status) == Status.OK else NOWHERE
+
+
+class BifurcationPoint(eqx.Module):
+    """What `refine` returns.
+
+    condition: the condition that holds there; value: of the parameter; residual: largest error in
+    the defining equations; iterations: Newton steps; steps: how far each went, NaN padded; error: a
+    bound on |value - exact value|, from the same equations with every integration step halved, and
+    rounding; oscillator: at the point;
+    cycle: at the point, with a status that says why where there is none (at a Hopf point it has
+    shrunk to the equilibrium, at `SuddenSliding` its period is infinite); multiplier: of the cycle
+    on the side where it does not stick to the belt, for `NonsmoothFold` and `GrazingSliding`, else
+    NaN; status: a `Status` code. Where it is not OK the value is NaN.
+    """
+
+    condition: AbstractCondition = eqx.field(static=True)
+    value: Array
+    residual: Array
+    iterations: Array
+    steps: Array
+    error: Array
+    multiplier: Array
+    oscillator: Oscillator
+    cycle: Cycle
+    status: Array
+
+    @property
+    def kind(self) -> str:
+        """Name of the condition."""
+        return type(self.condition).__name__
+
+    @property
+    def place(self) -> np.ndarray:
+        """Where the motion is, see `place_of`; NaN where there is none."""
+        return self.condition.place(self)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.value) or self.value.ndim:
+            return f"BifurcationPoint({self.condition!r}, value={self.value.shape})"
+        if int(self.status) != Status.OK:
+            name = Status(int(self.status)).name
+            return f"BifurcationPoint({self.condition!r}, {name}: {describe(self.status)})"
+        return (
+            f"BifurcationPoint({self.condition!r}, value {number(self.value)}, "
+            f"residual {float(self.residual):.1e}, {int(self.iterations)} iterations, "
+            f"error < {float(self.error):.1e})"
+        )
+
+
+class Unexplained(AbstractCondition):
+    """What the oscillator does changes, and no other condition explains it; from `scan` only."""
+
+    caption: ClassVar[str] = "unexplained"
+
+    def guess(self, osc, size):
+        raise ValueError("condition must be one that can be refined, got Unexplained()")
+
+    def solve(self, osc, index, guess):
+        raise NotImplementedError
+
+    def followed(self, point):
+        raise ValueError(f"point must be of a kind that has curves, got {self!r}")
+
+
+#: A point is named by who asks for it: a name would be a constant of the compiled programs.
+UNNAMED = Unexplained()
+
+
+# --- conditions on a cycle ------------------------------------------------------------------------
+
+
+class AbstractCycleCondition(AbstractCondition):
+    """A condition on a cycle. Its guess is a loop near that, and a status."""
+
+    #: Arcs that `system` may add to a loop.
+    more_arcs: ClassVar[int] = 0
+
+    @abc.abstractmethod
+    def guess(self, osc: Oscillator, size: int) -> tuple[Loop, Array]:
+        """A loop near the cycle, in `size` arcs, and a status."""
+
+    @abc.abstractmethod
+    def system(
+        self, osc: Oscillator, loop: Loop, status: Array
+    ) -> tuple[CycleSystem, Array, Array]:
+        """The system of the cycle near a loop, its unknowns there, and a status; compiled."""
+
+    def solve(self, osc, index, guess):
+        return solved_point(osc, index, *_prepared(self, osc, *guess))
+
+    def guess_near(self, loop):
+        return cut([loop], more=self.more_arcs)[0], jnp.asarray(Status.OK.value)
+
+    def beginnings(self, cycles):
+        return [one.loop for one in cycles]
+
+    def followed(self, point):
+        chain, z = point.cycle.chain, point.cycle.unknowns
+        loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
+        ok, data = jnp.asarray(Status.OK.value), self.sought.as_data()
+        system, x, _ = _prepared(data, point.oscillator, loop, ok)
+        # With the steps of integration with which the point was found.
+        return eqx.tree_at(lambda system: system.chain.mesh, system, chain.mesh), x
+
+
+@jit
+def _prepared(condition: AbstractCycleCondition, osc: Oscillator, loop: Loop, status: Array):
+    return condition.system(lax.stop_gradient(osc), loop, status)
+
+
+@jit
+def solved_point(osc, index, system: CycleSystem, z0, status) -> BifurcationPoint:
+    """The solution near a guess z0 of the unknowns; one program serves a kind of system."""
+    p0 = lax.stop_gradient(parameter(osc, index)[None])
+    # Without a guess Newton's method ends at once.
+    z0 = jnp.where(status == Status.OK, z0, jnp.nan)
+    z, p, steps, matrix = solve_system(osc, index, system, z0, p0)
+    iterations = jnp.sum(~jnp.isnan(steps))
+    at_point = vary(osc, index, p)
+    # By the last steps: the residual costs an integration more, and who asks for it gets it.
+    last, before = steps[jnp.maximum(iterations - 1, 0)], steps[jnp.maximum(iterations - 2, 0)]
+    converged = (status != Status.OK) | (last * jnp.minimum(last / before, 1.0) < 1e-9)
+    status = jnp.where(converged, status, Status.NO_CONVERGENCE.value)
+    size, error = accuracy(*lax.stop_gradient((at_point, system, z, matrix)))
+    cycle, slope = cycle_of(at_point, system.ordinary, z, iterations, status, size)
+    status, multiplier = system.judge(at_point, z, cycle, slope)
+    known = functools.partial(jnp.where, status == Status.OK)
+    return BifurcationPoint(
+        condition=UNNAMED,
+        value=known(p[0], jnp.nan),
+        residual=known(size, jnp.nan),
+        iterations=iterations,
+        steps=steps,
+        error=known(error, jnp.nan),
+        multiplier=known(multiplier, jnp.nan),
+        oscillator=vary(osc, index, known(p, jnp.nan)),
+        cycle=cycle,
+        status=status,
+    )
+
+
+class CycleEquation(AbstractCycleCondition):
+    """A functional of an attracting cycle has a given value: one equation more, in the unknowns of
+    the cycle as it is.
+
+    The guess is the cycle that misses it least. `scan` looks for it where it is asked to, by the
+    sign of the equation in each attracting cycle.
+    """
+
+    @abc.abstractmethod
+    def equation(self, osc: Oscillator, chain: Chain, z: Array) -> Array:
+        """What vanishes, of the cycle with the unknowns z: (x1, x2, duration) of each arc, [N, 3].
+
+        The rows that `chain.used` does not name are padding, with a duration of zero.
+        """
+
+    def judge(self, osc: Oscillator, z: Array, cycle: Cycle, slope: Array) -> tuple[Array, Array]:
+        """As `CycleSystem.judge`."""
+        return cycle.status, jnp.asarray(jnp.nan)
+
+    def watch(self, osc: Oscillator, chain: Chain, z: Array, slope: Array) -> Tests:
+        """Functions to watch along its curve; slope: the multiplier of the cycle."""
+        return {}
+
+    def distance(self, osc: Oscillator, loop: Loop) -> Array:
+        """How far a loop misses it."""
+        return jnp.abs(self.equation(osc, *meshed(osc, loop)))
+
+    def guess(self, osc, size):
+        return nearest(osc, *settled_loops(osc, candidates(osc), size), self)
+
+    def system(self, osc, loop, status):
+        chain, z = meshed(osc, loop)
+        return _Equation(chain, self), z, status
+
+    def mark(self, osc, cycles):
+        misses = (float(_miss(self.as_data(), osc, loop)) for loop in cycles)
+        return tuple(int(np.sign(np.nan_to_num(miss))) for miss in misses)
+
+
+@jit
+def _miss(condition: CycleEquation, osc: Oscillator, loop: Loop) -> Array:
+    return condition.equation(osc, *meshed(osc, loop))
+
+
+class _Equation(CycleSystem):
+    chain: Chain
+    of: CycleEquation
+
+    def condition(self, osc, z, miss):
+        return self.of.equation(osc, self.chain, z)
+
+    def judge(self, osc, z, cycle, slope):
+        return self.of.judge(osc, z, cycle, slope)
+
+    def watch(self, osc, z, slope):
+        return self.of.watch(osc, self.chain, z, slope), True, jnp.nan
+
+
+# --- conditions on a state of rest ----------------------------------------------------------------
+
+
+class AbstractRestCondition(AbstractCondition):
+    """A condition on a state of rest, at which there is no cycle."""
+
+    #: Why there is none.
+    no_cycle: ClassVar[Status] = Status.EQUILIBRIUM
+
+    @abc.abstractmethod
+    def system(self, osc: Oscillator, guess: Any) -> tuple[RestSystem, Any, Array]:
+        """The system near a guess, its unknowns there, and a status; compiled."""
+
+    def solve(self, osc, index, guess):
+        return _solved_rest(self, osc, index, guess)
+
+    def followed(self, point):
+        osc, data = point.oscillator, self.as_data()
+        return _prepared_rest(data, osc, data.guess(osc, self.room))[:2]
+
+
+@jit
+def _prepared_rest(condition: AbstractRestCondition, osc: Oscillator, guess):
+    return condition.system(lax.stop_gradient(osc), guess)
+
+
+@jit
+def _solved_rest(condition: AbstractRestCondition, osc, index, guess) -> BifurcationPoint:
+    system, x, status = condition.system(lax.stop_gradient(osc), guess)
+
+    def equations(osc, u):
+        return system.residual(vary(osc, index, u[-1:]), u[:-1])
+
+    start = jnp.append(x, parameter(osc, index))
+    u, steps, size, error = small_newton(equations, osc, start)
+    exists = system.exists(vary(osc, index, u[-1:]), u[:-1])
+    judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
+    judged = jnp.where(size < 1e-9, judged, Status.NO_CONVERGENCE.value)
+    status = jnp.where(status == Status.OK, judged, status)
+    return _point_without_cycle(osc, index, u[-1], steps, size, error, status, condition.no_cycle)
+
+
+def _point_without_cycle(osc, index, p, steps, size, error, status, why: Status):
+    iterations = jnp.sum(~jnp.isnan(steps))
+    known = functools.partial(jnp.where, status == Status.OK)
+    at_point = vary(osc, index, known(p, jnp.nan)[None])
+    nan = jnp.full((SIZES[0], 3), jnp.nan)
+    n = len(osc.belts)
+    chain = Chain(
+        jnp.ones((SIZES[0], n)), jnp.full(SIZES[0], Ends(n).unused), jnp.zeros((SIZES[0], 1))
+    )
+    none = jnp.asarray(jnp.nan)
+    cycle = Cycle(at_point, chain, nan, none, none, iterations, jnp.asarray(why.value))
+    return BifurcationPoint(
+        condition=UNNAMED,
+        value=known(p, jnp.nan),
+        residual=known(size, jnp.nan),
+        iterations=iterations,
+        steps=steps,
+        error=known(error, jnp.nan),
+        multiplier=none,
+        oscillator=at_point,
+        cycle=cycle,
+        status=status,
+    )
+
+
+def unexplained_point(osc: Oscillator, index: int, value: float, width: float) -> BifurcationPoint:
+    """A point where something changes, within an interval of that width, that nothing explains."""
+    p, error, none = jnp.asarray(value), jnp.asarray(width), jnp.asarray(jnp.nan)
+    ok, steps = jnp.asarray(Status.OK.value), jnp.full(NEWTON_STEPS, jnp.nan)
+    point = _point_without_cycle(osc, index, p, steps, none, error, ok, Status.UNEXPLAINED)
+    return replace(point, status=jnp.asarray(Status.UNEXPLAINED.value))

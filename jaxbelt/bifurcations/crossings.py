@@ -1,0 +1,174 @@
+"""Cycles that cross a boundary beside where they would stick, and belts that change places.
+
+- `CrossingSliding`: the cycle arrives at a boundary r_k = 0 just at an end of the stretch of it on
+  which the mass sticks. To one side of it the mass sticks, to the other the boundary is crossed:
+  a crossing-sliding bifurcation (M. di Bernardo, C. Budd, A. Champneys, P. Kowalczyk,
+  Piecewise-smooth Dynamical Systems, 2008). Linear in the unknowns, x1 = rest +- capacity.
+- `SlidingExchange`: nu_i = nu_j, and a cycle that sticks to i or j. The friction of each mode keeps
+  its sign, so the cycle with its signature fixed goes smoothly through the point. Its name is the
+  paper's.
+"""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..cycles.shooting import SIZES, Chain, Loop, meshed
+from ..model.equilibria import candidates
+from ..model.modes import mode_of, stick_limit
+from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
+from ..results import EventKind, Status
+from .conditions import AbstractCycleCondition, Line, SpecialPoint
+from .guesses import nearest, orbit_after_stick, repeated_loop, settled_loops, without_arcs
+from .systems import CycleSystem, contact_tests, nearest_contacts, stick_phase_from
+from .tangencies import Encounter
+
+# --- crossing a boundary, or sticking to it -------------------------------------------------------
+
+
+class StickLimit(CycleSystem):
+    """A cycle of which the arc `row` arrives at a boundary at an end of where the mass sticks.
+
+    codes: of the mode in which it sticks there; side: 1 the end on the right, -1 on the left.
+    """
+
+    chain: Chain
+    row: Array
+    codes: Array
+    side: Array
+
+    def condition(self, osc, z, miss):
+        x1 = z[(self.row + 1) % z.shape[0], 0]
+        return x1 - stick_limit(osc, mode_of(self.codes), self.side)
+
+    def watch(self, osc, z, slope):
+        return arrival_tests(osc, self.chain, z, self.row), True, jnp.nan
+
+
+def arrival_tests(osc: Oscillator, chain: Chain, z: Array, row: Array):
+    """What to watch of a cycle of which something happens at the end of the arc `row`.
+
+    A stick phase that begins or ends there may have no duration.
+    """
+    others = chain.used & ~stick_phase_from(osc, chain, (row + 1) % jnp.sum(chain.used))
+    others = others & (jnp.arange(others.size) != row) & jnp.any(chain.codes == 0, axis=-1)
+    nearest, _ = nearest_contacts(osc, chain, z, others)
+    return contact_tests("DoubleSliding", nearest, jnp.ones(nearest.shape, bool))
+
+
+class CrossingSliding(AbstractCycleCondition):
+    """The cycle crosses the boundary of a belt, and begins to stick to it where it did.
+
+    It arrives at one end of where the mass sticks: that of slip onset, at which a stick phase
+    begins with no duration, or the other one, from which it then sticks all the way.
+    """
+
+    belt: int | Array
+
+    caption: ClassVar[str] = "crossing-sliding, belt {belt}"
+    line: ClassVar[Line] = Line("crossing-sliding", "#CC79A7", (0, (5, 1.5)))
+
+    @property
+    def room(self):
+        return SIZES[1]  # passing edges takes more of them
+
+    def guess(self, osc, size):
+        return nearest(osc, *settled_loops(osc, candidates(osc), size), self)
+
+    def distance(self, osc: Oscillator, loop: Loop) -> Array:
+        """How far a loop arrives from such an end."""
+        return arrival_near_limit(osc, loop, self.belt).distance
+
+    def system(self, osc, loop, status):
+        near = arrival_near_limit(osc, loop, self.belt)
+        exists = (status != Status.OK) | jnp.isfinite(near.distance)
+        status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
+        # Having crossed, the orbit may come back to the boundary soon and stick. The equations of
+        # that excursion are of second order, and it is left out.
+        count = jnp.maximum(jnp.sum(loop.used), 1)
+        after = (near.row + 1 + jnp.arange(3)) % count
+        returns = (loop.ends[after[0]] == Ends(len(osc.belts)).extremum_x2) & (count > 3)
+        returns = returns & (loop.ends[after[1]] == loop.ends[near.row])
+        returns = returns & (loop.codes[after[2], self.belt] == 0)
+        shorter = without_arcs(loop, near.row, jnp.asarray(2))
+        loop, row = jax.tree.map(lambda a, b: jnp.where(returns, a, b), shorter, (loop, near.row))
+        chain, z = meshed(osc, loop)
+        return StickLimit(chain, row, near.codes, near.side), z, status
+
+    @classmethod
+    def between(cls, before, after, edged):
+        one, other = (label.events(EventKind.CROSS) for label in (before, after))
+        return [cls(belt) for belt in (one - other) + (other - one)]
+
+
+class Arrival(eqx.Module):
+    """An arc that arrives at a boundary: how far from an end of where the mass sticks, its row, and
+    the rest of a `StickLimit`."""
+
+    distance: Array
+    row: Array
+    codes: Array
+    side: Array
+
+
+def arrival_near_limit(osc: Oscillator, loop: Loop, belt: int | Array) -> Arrival:
+    """Of the arcs of a loop that arrive at the boundary of a belt that nearest to such an end.
+
+    At the other end the orbit would arrive tangentially, with the other sign of r.
+    """
+    velocities = jnp.stack([one.velocity for one in osc.belts])
+    same = velocities == velocities[belt]
+
+    def one(codes, end, x1):
+        held = jnp.where(same & (jnp.abs(codes) < 1.5), 0.0, codes)
+        side = -codes[belt]
+        arrives = (end < len(osc.belts)) & same[jnp.clip(end, 0, len(osc.belts) - 1)]
+        distance = jnp.abs(x1 - stick_limit(osc, mode_of(held), side))
+        arrives = arrives & (jnp.abs(codes[belt]) == 1)
+        return jnp.where(arrives, distance, jnp.inf), held, side
+
+    distance, held, side = jax.vmap(one)(loop.codes, loop.ends, loop.exits[:, 0])
+    row = jnp.argmin(distance)
+    return Arrival(distance[row], row, held[row], side[row])
+
+
+# --- belts that change places ---------------------------------------------------------------------
+
+
+class SlidingExchange(AbstractCycleCondition):
+    """Two belts run at one velocity: where both touch, the cycle changes from one to the other.
+
+    With laws that jump, or belts that hold differently, there may be another cycle beyond, or none.
+    """
+
+    belts: tuple[int, int]
+
+    caption: ClassVar[str] = "sliding exchange"
+    line: ClassVar[Line] = Line("exchange", "black", (0, (3, 1, 1, 1)))
+
+    def guess(self, osc, size):
+        _, _, orbit = orbit_after_stick(osc, self.belts[0])
+        return repeated_loop(orbit, size, len(osc.belts))
+
+    def system(self, osc, loop, status):
+        chain, z = meshed(osc, loop)
+        belts = jnp.stack(self.belts)
+        sticks = jnp.any(loop.codes[:, belts] == 0, axis=-1)
+        both_touch = jnp.all(jnp.abs(loop.codes[:, belts]) < 1.5, axis=-1)
+        exchanges = jnp.any(loop.used & sticks & both_touch)
+        meant = (status != Status.OK) | exchanges
+        status = jnp.where(meant, status, Status.NOT_TOUCHED.value)
+        return Encounter(chain, belts, jnp.asarray(-1), jnp.zeros(())), z, status
+
+    @classmethod
+    def at_coincidence(cls, belts):
+        return [cls((min(belts), max(belts)))] if len(belts) == 2 else []
+
+    def limit(self, trail):
+        if trail.stopping() is None:
+            return None
+        return SpecialPoint("BeltAtRest", self.belts, (0.0, 0.0), 0.0)

@@ -1,0 +1,308 @@
+"""Cycles that touch a contact edge: `GrazingEdge` and `CornerCollision`.
+
+An arc of a cycle ends on a contact edge and in something else at once. With an extremum of x1, the
+orbit is tangent to the edge, x2 = 0; with a boundary r_k = 0 or slip onset, it runs into the corner
+of that and the edge. To one side of the point the edge ends the arc, to the other that does: the
+equation is that the other's guard vanishes, which is linear in the unknowns. A cycle that passes
+the edge and turns back soon after has that excursion left out: with it the equation is of second
+order in the velocity at the edge.
+
+Grazing and corner collision are the names of M. di Bernardo, C. Budd, A. Champneys, P. Kowalczyk,
+Piecewise-smooth Dynamical Systems, 2008.
+"""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..cycles.cycle import separating_loop
+from ..cycles.settling import AT_REST
+from ..cycles.shooting import SIZES, Chain, Loop, end_guard, following_codes, meshed
+from ..model.equilibria import candidates
+from ..model.modes import edges, mode_acceleration, mode_of, onset_position
+from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
+from ..numerics.compiling import jit
+from ..numerics.continuation import Stop
+from ..results import Status
+from .conditions import AbstractCycleCondition, Line
+from .crossings import arrival_tests
+from .guesses import nearest, settled_loops, without_arcs
+from .rests import check_edge, hopf_limit
+from .systems import CycleSystem
+
+
+class EdgeContact(CycleSystem):
+    """A cycle of which an arc, `row`, ends on an edge and in something else at once.
+
+    One of the two ends the arc; of the other one, `end`, the guard vanishes there in the mode of
+    `codes`. repels: whether the cycle is to be unstable.
+    """
+
+    chain: Chain
+    row: Array
+    end: Array
+    codes: Array
+    repels: Array
+
+    def condition(self, osc, z, miss):
+        following = (self.row + 1) % z.shape[0]  # unused arcs hand the state on
+        return end_guard(osc, self.codes, self.end, z[following, :2])
+
+    def judge(self, osc, z, cycle, slope):
+        # A loop at once after the edge is passed solves the equations, too, but they are singular;
+        # and a cycle that has shrunk to a pseudo-focus meets everything there.
+        loops = cycle.chain.ends[self.row] == Ends(len(osc.belts)).extremum_x1
+        shrunk = jnp.ptp(z[:, 0]) < AT_REST
+        fails = loops & (z[self.row, 2] < 1e-6) | shrunk
+        solved = cycle.status == Status.OK
+        status = jnp.where(solved & fails, Status.NO_CONVERGENCE.value, cycle.status)
+        none = solved & ~(slope > 1) | shrunk & (status == Status.NO_CONVERGENCE)
+        status = jnp.where(self.repels & none, Status.NO_UNSTABLE_CYCLE.value, status)
+        return status, jnp.asarray(jnp.nan)
+
+    def watch(self, osc, z, slope):
+        return arrival_tests(osc, self.chain, z, self.row), True, jnp.nan
+
+
+class AbstractEdgeTouch(AbstractCycleCondition):
+    """An arc of a cycle ends on an edge of a belt and in something else at once.
+
+    wanted: 1 an extremum of x1 (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
+    attracting cycles that which comes nearest to this is taken; repels: of the cycle from
+    `unstable_cycle`, not of an attracting one.
+    """
+
+    belt: int | Array
+
+    @property
+    @abc.abstractmethod
+    def wanted(self) -> float | Array:
+        """Which of the two kinds is meant."""
+
+    @property
+    def repels(self) -> bool:
+        """Whether it is about the unstable cycle."""
+        return False
+
+    @property
+    def room(self):
+        return SIZES[0] if self.repels else SIZES[1]
+
+    @property
+    def sought(self):
+        return EdgeTouch(self.belt, unstable=self.repels)
+
+    def check(self, osc):
+        super().check(osc)
+        check_edge(osc, self.belt)
+
+    def as_data(self):
+        # One program serves both kinds.
+        belt, wanted = (jnp.asarray(np.array(one)) for one in (self.belt, self.wanted))
+        return EdgeTouch(belt, wanted, self.repels)
+
+    def named(self, point):
+        if self.repels:
+            return GrazingEdge(self.belt, unstable=True)
+        chain, z = point.cycle.chain, point.cycle.unknowns
+        loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
+        belt, either = jnp.asarray(self.belt), jnp.zeros(())
+        near = end_near_edge(point.oscillator, loop, belt, either)
+        return (GrazingEdge if near.grazes else CornerCollision)(self.belt)
+
+    def guess(self, osc, size):
+        if self.repels:
+            return separating_loop(osc, size)[:2]
+        return nearest(osc, *settled_loops(osc, candidates(osc), size), self)
+
+    def guess_near(self, loop):
+        # In as many rows as those of the guess, so that one program serves both.
+        return loop, jnp.asarray(Status.OK.value)
+
+    def distance(self, osc: Oscillator, loop: Loop) -> Array:
+        """How far the nearest end of an arc is from both at once."""
+        return end_near_edge(osc, loop, self.belt, self.wanted).distance
+
+    def system(self, osc, loop, status):
+        near = end_near_edge(osc, loop, self.belt, self.wanted)
+        exists = (status != Status.OK) | jnp.isfinite(near.distance)
+        status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
+        loop, row = _without_excursion(osc, loop, near)
+        chain, z = meshed(osc, loop)
+        repels = jnp.asarray(np.array(self.repels))
+        return EdgeContact(chain, row, near.end, near.codes, repels), z, status
+
+
+class EdgeTouch(AbstractEdgeTouch):
+    """Such an end of whichever kind, and what programs know of both."""
+
+    meant: float | Array = 0.0
+    unstable: bool = eqx.field(static=True, default=False)
+
+    @property
+    def wanted(self):
+        return self.meant
+
+    @property
+    def repels(self):
+        return self.unstable
+
+
+class GrazingEdge(AbstractEdgeTouch):
+    """The cycle is tangent to a contact edge of a belt: a loop, an extremum of x1, touches it.
+
+    Beyond, the cycle passes the edge; or there is none, where the edge pushes away to both sides.
+    There, too, a cycle that passes the edge ends, with the velocity zero on it.
+    unstable: of the cycle from `unstable_cycle`, not of an attracting one.
+    """
+
+    unstable: bool = eqx.field(static=True, default=False)
+
+    caption: ClassVar[str] = "edge grazing, belt {belt}"
+    line: ClassVar[Line] = Line("edge grazing", "#56B4E9")
+
+    @property
+    def wanted(self):
+        return 1.0
+
+    @property
+    def repels(self):
+        return self.unstable
+
+    @classmethod
+    def between(cls, before, after, edged):
+        # Whether an end of an arc on an edge is a loop or a corner is seen when it is found.
+        return [cls(belt) for belt in edged] if before.cycles != after.cycles else []
+
+    @classmethod
+    def of_unstable_cycles(cls, edged):
+        return [cls(belt, unstable=True) for belt in edged]
+
+    def limit(self, trail):
+        """Where the cycle has shrunk to an equilibrium on the edge."""
+        if trail.end is Stop.POINT_COUNT:
+            return None
+        return hopf_limit("BoundaryHopf", trail, _guard_at_rest, trail.system.end)
+
+
+class CornerCollision(AbstractEdgeTouch):
+    """The cycle runs into a corner of a contact edge of a belt and a boundary r_k = 0.
+
+    It begins, or ceases, to stick to a belt there, or crosses its boundary: beyond, these come in
+    another order, or another event comes instead; or, like at a nonsmooth fold, there is no cycle.
+    A guess has to lie on a side where there is a cycle; `scan` tries both.
+    """
+
+    caption: ClassVar[str] = "corner, belt {belt}"
+    line: ClassVar[Line] = Line("corner", "#56B4E9", (0, (3, 1, 1, 1)))
+
+    @property
+    def wanted(self):
+        return -1.0
+
+
+def _guard_at_rest(osc: Oscillator, codes: Array, x1: Array, end: Array) -> Array:
+    return end_guard(osc, codes, end, jnp.stack([x1, jnp.zeros(())]))
+
+
+# --- the end of an arc nearest to an edge and something else --------------------------------------
+
+
+class EdgeEnd(eqx.Module):
+    """The end of an arc that comes nearest to an edge and something else at once.
+
+    distance: from that, inf if there is none; row, end, codes: as for `EdgeContact`; grazes:
+    whether the orbit would be tangent to the edge, else it would run into a corner.
+    """
+
+    distance: Array
+    row: Array
+    end: Array
+    codes: Array
+    grazes: Array
+
+
+@jit
+def end_near_edge(osc: Oscillator, loop: Loop, belt: int | Array, wanted: float | Array) -> EdgeEnd:
+    """Of the ends of the arcs of a loop that nearest to an edge of the belt and something else.
+
+    wanted: 1 tangent to the edge, -1 in a corner, 0 either.
+    """
+    n = len(osc.belts)
+    names = Ends(n)
+    positions = jnp.stack(edges(osc))
+    lower, upper = positions[belt], positions[n + belt]
+    following = following_codes(loop)
+
+    def distances(codes, end, entry, after, at):
+        """From every end that this arc might have as well; those of stick phases in two modes."""
+        x1, x2 = at
+        on_edge = (end >= n) & (end < 3 * n)
+        edge = positions[jnp.clip(end - n, 0, 2 * n - 1)]
+        on_edge = on_edge & ((edge == lower) | (edge == upper))
+        stuck = jnp.any(codes == 0)
+        # What ends it is something else: how far it is to an edge.
+        loops, meets = end == names.extremum_x1, (end < n) | (end == names.onset)
+        to_edges = [jnp.where(loops | meets, jnp.abs(x1 - e), jnp.inf) for e in (lower, upper)]
+        # An edge ends it. If that pushes away to both sides: how much further on the orbit would
+        # loop as it was.
+        # It moves there as x1 does on this arc; x2 itself may be zero.
+        ahead = jnp.sign(x1 - entry[0])
+        push = [ahead * mode_acceleration(osc, mode_of(c), x1, x2) for c in (codes, after)]
+        passes = on_edge & ~stuck & (push[0] < 0) & (push[1] > 0)
+        to_extremum = jnp.where(passes, 0.5 * x2**2 / jnp.where(passes, -push[0], 1.0), jnp.inf)
+        # A boundary may be near that the arc did not begin at: x2 is monotone on it.
+        to_boundaries = []
+        for i, one in enumerate(osc.belts):
+            r, began = (one.velocity - osc.omega * v for v in (x2, entry[1]))
+            touches = (jnp.abs(codes[i]) < 1.5) | (jnp.abs(after[i]) < 1.5)
+            near = on_edge & ~stuck & touches & (jnp.abs(began) > 1e-9)
+            to_boundaries.append(jnp.where(near, jnp.abs(r), jnp.inf))
+        # Slip onset may be: in the mode before the edge, or, if it is left by it, in that after.
+        held = jnp.where((codes == 0) & (jnp.abs(after) < 1.5), 0.0, after)
+        to_onsets = []
+        for one in (codes, held):
+            may = on_edge & stuck & jnp.any(one == 0)
+            away = jnp.abs(x1 - onset_position(osc, mode_of(one)))
+            to_onsets.append(jnp.where(may, away, jnp.inf))
+        found = jnp.stack([*to_edges, to_extremum, *to_boundaries, *to_onsets])
+        grazes = jnp.stack([loops, loops, True, *[False] * (n + 2)])
+        usable = (end != names.unused) & jnp.where(grazes, wanted >= 0, wanted <= 0)
+        return jnp.where(usable & jnp.isfinite(found), found, jnp.inf), grazes, held
+
+    rows = loop.codes, loop.ends, loop.entries, following, loop.exits
+    found, grazes, held = jax.vmap(distances)(*rows)
+    row, which = jnp.divmod(jnp.argmin(found), found.shape[1])
+    own = jnp.stack([n + belt, 2 * n + belt])
+    others = jnp.array([names.extremum_x1, *range(n), names.onset, names.onset])
+    end = jnp.concatenate([own, others])[which]
+    codes = jnp.where(which == found.shape[1] - 1, held[row], loop.codes[row])
+    return EdgeEnd(found[row, which], row, end, codes, grazes[row, which])
+
+
+def _without_excursion(osc: Oscillator, loop: Loop, near: EdgeEnd) -> tuple[Loop, Array]:
+    """The loop without what lies beyond the edge, if all of that is the extremum of x1 that ends a
+    row; and the row that then ends in that extremum."""
+    row = near.row
+    n = len(osc.belts)
+    names = Ends(n)
+    rows, count = jnp.arange(loop.ends.size), jnp.maximum(jnp.sum(loop.used), 1)
+    passes = (loop.ends >= n) & (loop.ends < 3 * n)
+    edge = jnp.stack(edges(osc))[jnp.clip(near.end - n, 0, 2 * n - 1)]
+    passes = passes & (loop.exits[:, 0] == edge)
+    # The events before and after; extremum of x2 are none.
+    events = loop.used & (loop.ends != names.extremum_x2) & (rows != row)
+    before = jnp.argmin(jnp.where(events, (row - rows) % count, rows.size))
+    after = jnp.argmin(jnp.where(events, (rows - row) % count, rows.size))
+    is_excursion = (loop.ends[row] == names.extremum_x1) & passes[before] & passes[after]
+    is_excursion = is_excursion & (before != after)
+    without, last = without_arcs(loop, before, (after - before) % count)
+    without = eqx.tree_at(lambda t: t.ends, without, without.ends.at[last].set(names.extremum_x1))
+    loop = jax.tree.map(lambda a, b: jnp.where(is_excursion, a, b), without, loop)
+    return loop, jnp.where(is_excursion, last, row)

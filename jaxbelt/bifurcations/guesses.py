@@ -1,0 +1,228 @@
+"""Loops of cycles near which a condition is looked for.
+
+Orbits are followed from where stick phases end, and from a few places beside an equilibrium, until
+a loop repeats.
+"""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..cycles.orbits import Orbit, follow, last_loop, loop_of
+from ..cycles.shooting import Loop, following_codes
+from ..model.equilibria import Equilibria
+from ..model.modes import (
+    STUCK,
+    capacity,
+    contact,
+    edges,
+    mode_acceleration,
+    mode_of,
+    onset_position,
+    select,
+)
+from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
+from ..numerics.compiling import each, jit
+from ..results import Status
+from .systems import velocity_of
+
+#: Arcs for which the orbit from slip onset is followed in search of the signature.
+HINT_BUDGET = 32
+#: Arcs for which each orbit is followed that may lead to a cycle.
+FOLLOWED = 96
+#: How often an orbit is followed, from what it approaches, or on, until it has settled.
+ATTEMPTS = 6
+#: Where some of them start to the right of an equilibrium, so far from it.
+DISTANCES = (0.02, 0.3, 3.0)
+
+
+def before_stick_ends(osc: Oscillator, belt: int | Array) -> Array:
+    """States stuck to a belt where stick phases end, one for each zone between contact edges.
+
+    Shortly before slip onset; or, where the zone ends first, on the edge. NaN where neither is, or
+    the belt does not touch. [zones, 2].
+    """
+    v = velocity_of(osc, belt) / osc.omega
+    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
+    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    mode = contact(osc, lower, v, rightward=True)
+    onset, held = onset_position(osc, mode), capacity(osc, mode)
+    before, ahead = select(v > 0, (lower, upper), (upper, lower))
+    slips = (lower < onset) & (onset < upper)
+    # It holds between onset - 2 sgn(v) held and onset.
+    meets = jnp.isfinite(ahead) & ~slips & (jnp.abs(onset - held * jnp.sign(v) - ahead) <= held)
+    near = jnp.minimum(0.01 * held, 0.5 * jnp.abs(onset - before))
+    exists = (jnp.stack(mode.codes)[belt] == STUCK) & (lower < upper)
+    x1 = jnp.where(slips, onset - near * jnp.sign(v), jnp.where(meets, ahead, jnp.nan))
+    states = jnp.stack([x1, jnp.full_like(x1, v)], axis=1)
+    return jnp.where(exists[:, None], states, jnp.nan)
+
+
+def starts(osc: Oscillator, rests: Equilibria) -> Array:
+    """Where the orbits start that find the cycles, [starts, 2].
+
+    Where stick phases end, and at several distances from an equilibrium. NaN: no such start.
+    """
+    exists = rests.kind > 0
+    repels = exists & ~rests.stable
+    row = jnp.where(jnp.any(repels), jnp.argmax(repels), jnp.maximum(jnp.sum(exists) - 1, 0))
+    centre = jnp.where(jnp.any(exists), rests.x1[row], 0.0)
+    ends = [before_stick_ends(osc, belt) for belt in range(len(osc.belts))]
+    others = [jnp.stack([centre + distance, jnp.zeros(())])[None] for distance in DISTANCES]
+    return jnp.concatenate([*ends, *others])
+
+
+def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
+    """The orbit from a start until it settles, with the status OK where that is on a cycle.
+
+    If it has not settled, it is followed on, from what it approaches where that can be told: the
+    differences of the last three tops form a geometric sequence, so its limit is known (Aitken). If
+    that is much nearer to the last top than this is to any equilibrium, the orbit from there is
+    followed next, for on the way there may be a boundary. What even then has not settled counts as
+    settled, its last loop as the one that repeats.
+    """
+
+    def attempt(state):
+        number, start, *_ = state
+        orbit = follow(osc, start, FOLLOWED)
+        rows = jnp.arange(orbit.tops.size)
+        last = jnp.sort(jnp.where(jnp.isnan(orbit.tops), -1, rows))[-3:]
+        tops = orbit.tops[last]
+        before, after = tops[1] - tops[0], tops[2] - tops[1]
+        ratio = after / jnp.where(before == 0, 1.0, before)
+        limit = tops[2] + after * ratio / (1 - ratio)
+        distance = jnp.min(jnp.where(rests.kind > 0, jnp.abs(tops[2] - rests.x1), jnp.inf))
+        away = jnp.abs(limit - tops[2]) < 0.2 * distance
+        pending = orbit.status == Status.NOT_SETTLED
+        is_cycle = pending & (last[0] >= 0) & (before != 0) & (jnp.abs(ratio) < 1) & away
+        start = jnp.where(is_cycle, jnp.stack([limit, jnp.zeros(())]), orbit.y)
+        return number + 1, start, orbit, last, pending, is_cycle
+
+    def unsettled(state):
+        number, *_, pending, _ = state
+        return (number == 0) | (pending & (number < ATTEMPTS))
+
+    none = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(attempt, (jnp.asarray(0), start)),
+    )
+    first = (jnp.asarray(0), start, *none[2:])
+    _, _, orbit, last, _, is_cycle = lax.while_loop(unsettled, attempt, first)
+    ended = eqx.tree_at(
+        lambda o: (o.repeats, o.count, o.status),
+        orbit,
+        (last[1], last[2] + 1, jnp.asarray(Status.OK.value)),
+    )
+    return jax.tree.map(lambda a, b: jnp.where(is_cycle, a, b), ended, orbit)
+
+
+@jit
+def settled_loops(osc: Oscillator, rests: Equilibria, size: int) -> tuple[Loop, Array]:
+    """The loops that the orbits from `starts` repeat, in `size` arcs each, and their status."""
+
+    def run(start):
+        orbit = approach(osc, rests, start)
+        _, count = last_loop(orbit)
+        fits = (orbit.status != Status.OK) | (count <= size)
+        status = jnp.where(fits, orbit.status, Status.TOO_MANY_ARCS.value)
+        return loop_of(orbit, size, len(osc.belts)), status
+
+    osc, rests = lax.stop_gradient((osc, rests))
+    return each(run)(starts(osc, rests))
+
+
+@jit
+def nearest(osc: Oscillator, loops: Loop, status: Array, condition: Any) -> tuple[Loop, Array]:
+    """Of the loops that were found the one with the least condition.distance(osc, loop), and a
+    status."""
+    distances = jax.vmap(functools.partial(condition.distance, lax.stop_gradient(osc)))(loops)
+    known = (status == Status.OK) & ~jnp.isnan(distances)
+    distances = jnp.where(known, distances, jnp.inf)
+    at, large = jnp.argmin(distances), jnp.any(status == Status.TOO_MANY_ARCS)
+    none = jnp.where(large, Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
+    found = jnp.isfinite(distances[at])
+    return jax.tree.map(lambda x: x[at], loops), jnp.where(found, Status.OK.value, none)
+
+
+def least_push(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Array, Array]:
+    """The arc that arrives to stick to a belt with the least x2': its row, and the size of that.
+
+    From the side on which that vanishes where the orbit is tangent to the boundary; inf: none.
+    """
+    side = jnp.sign(velocity_of(osc, belt))
+    arrives = loop.used & (following_codes(loop)[:, belt] == 0) & (loop.codes[:, belt] == side)
+
+    def push(codes, y):
+        return jnp.abs(mode_acceleration(osc, mode_of(codes), y[0], y[1]))
+
+    pushes = jnp.where(arrives, jax.vmap(push)(loop.codes, loop.exits), jnp.inf)
+    return jnp.argmin(pushes), jnp.min(pushes)
+
+
+@jit
+def orbit_after_stick(osc: Oscillator, belt: int | Array) -> tuple[Oscillator, Array, Orbit]:
+    """The orbit from where a stick phase on a belt ends, its start, the oscillator.
+
+    Of several the one that comes back most nearly tangent to its boundary to stick there; if none
+    does, the one that comes nearest to it. The oscillator is the one given but for the velocity of
+    that belt: where it is at rest, no orbit leaves.
+    """
+    velocities = [
+        jnp.where((belt == i) & (one.velocity == 0), 1e-2, one.velocity)
+        for i, one in enumerate(osc.belts)
+    ]
+    moving = eqx.tree_at(lambda o: [one.velocity for one in o.belts], osc, velocities)
+    moving = lax.stop_gradient(moving)
+    n = len(osc.belts)
+    velocity, extremum_x2 = velocity_of(moving, belt), Ends(n).extremum_x2
+    states = before_stick_ends(moving, belt)
+    exists = jnp.isfinite(states[:, 0])
+    states = states[jnp.argsort(~exists)]
+
+    def attempt(tried):
+        number, best, kept = tried
+        orbit = follow(moving, states[number], HINT_BUDGET)
+        _, push = least_push(moving, loop_of(orbit, HINT_BUDGET, n), belt)
+        x2 = jnp.roll(orbit.entries[:, 1], -1).at[orbit.count - 1].set(orbit.y[1])
+        loops = (orbit.ends == extremum_x2) & (x2 * velocity > 0) & (jnp.arange(HINT_BUDGET) > 0)
+        gap = jnp.min(jnp.where(loops, jnp.abs(velocity - osc.omega * x2), jnp.inf))
+        sticks = (orbit.status == Status.OK) & jnp.isfinite(push)
+        size = jnp.where(sticks, push, 1e6 + gap)
+        better = (number == 0) | (size < best)
+        new = (size, (states[number], orbit))
+        best, kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, (best, kept))
+        return number + 1, best, kept
+
+    empty = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(lambda y: (y, follow(moving, y, HINT_BUDGET)), states[0]),
+    )
+    none = jnp.asarray(0), jnp.asarray(jnp.inf), empty
+    several = jnp.maximum(jnp.sum(exists), 1)
+    _, _, (start, orbit) = lax.while_loop(lambda tried: tried[0] < several, attempt, none)
+    return moving, start, orbit
+
+
+@jit
+def repeated_loop(orbit: Orbit, size: int, n: int) -> tuple[Loop, Array]:
+    """The loop that an orbit repeats, and a status."""
+    _, count = last_loop(orbit)
+    status = jnp.where(count <= size, Status.OK.value, Status.TOO_MANY_ARCS.value)
+    status = jnp.where(orbit.status == Status.OK, status, Status.NOT_TOUCHED.value)
+    return loop_of(orbit, size, n), status
+
+
+def without_arcs(loop: Loop, row: Array, removed: Array) -> tuple[Loop, Array]:
+    """The loop without so many arcs after a row; and that row, which is its last one then."""
+    rows, count = jnp.arange(loop.ends.size), jnp.maximum(jnp.sum(loop.used), 1)
+    left, first = count - removed, row + removed + 1
+    source = jnp.where(rows < left, first + rows, first) % count
+    ends = jnp.where(rows < left, loop.ends[source], Ends(loop.codes.shape[-1]).unused)
+    durations = jnp.where(rows < left, loop.durations[source], 0.0)
+    return Loop(loop.codes[source], ends, loop.entries[source], durations), left - 1

@@ -1,0 +1,48 @@
+"""What the oscillator does at one value of a parameter, in short: `Label`, and `Found` cycles."""
+
+from collections import Counter
+from collections.abc import Hashable
+from typing import NamedTuple
+
+from ..cycles.attractors import Itinerary, sticks
+from ..cycles.shooting import Loop
+from ..model.equilibria import EquilibriumKind
+from ..model.events import events_of
+from ..results import EventKind
+
+
+class Label(NamedTuple):
+    """What there is at one value: (kind, stable, contact codes) of the equilibria from left to
+    right, the itineraries of the attracting cycles in order, and the marks of further conditions
+    that `scan` was asked to look for."""
+
+    equilibria: tuple[tuple[int, bool, tuple[int, ...]], ...]
+    cycles: tuple[Itinerary, ...]
+    marks: tuple[Hashable, ...] = ()
+
+    def events(self, kind: EventKind) -> Counter[int]:
+        """How often there is an event of a kind in the cycles, by its belt."""
+        return Counter(belt for path in self.cycles for one, belt in events_of(path) if one == kind)
+
+    @property
+    def foci(self) -> int:
+        """How many equilibria attract, but for segments."""
+        return sum(
+            stable and kind != EquilibriumKind.SEGMENT for kind, stable, _ in self.equilibria
+        )
+
+    @property
+    def smooth(self) -> int:
+        """How many cycles stick to no belt."""
+        return sum(not sticks(path) for path in self.cycles)
+
+
+class Found(NamedTuple):
+    """An attracting cycle: its itinerary, and a loop of it, with room for more arcs.
+
+    The loop of one that does not stick solves the equations of the cycle, but where `approach` did
+    not tell where the orbit settles.
+    """
+
+    path: Itinerary
+    loop: Loop

@@ -1,0 +1,326 @@
+"""A path in one parameter, and what the oscillator does along it: `Path`.
+
+What the oscillator does at one value of the parameter is summed up in a label: the kind and the
+stability of every equilibrium, and the itinerary of every attracting cycle, that is, the modes that
+it passes in one loop, see `attractors`. A cycle that sticks comes by a place where a stick phase
+ends, in slip onset or on a contact edge, so it is found by following the orbits from there; a few
+starts beside the equilibria find the rest. Values are looked at in batches by one compiled program.
+
+Between two values with one label nothing is taken to happen, if each cycle at one of them goes on
+to one at the other. One that sticks does so if they have one itinerary. Of those that do not stick
+several may have it: each is followed to where its derivative by the parameter leads.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..checks import as_array, check_finite, require
+from ..cycles.attractors import (
+    SOLVED,
+    Itinerary,
+    apart,
+    itinerary,
+    place_of,
+    sticks,
+    without_idle,
+)
+from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
+from ..cycles.settling import AT_REST
+from ..cycles.shooting import SIZES, Loop, cut
+from ..model.equilibria import equilibria
+from ..model.oscillator import Oscillator, check_oscillator
+from ..model.parameters import leaf_index, names_of, vary
+from ..numerics.compiling import each, jit
+from ..results import Status
+from .conditions import AbstractCondition
+from .guesses import settled_loops
+from .labels import Found, Label
+
+#: Values of the parameter in one batch.
+BATCH = 32
+#: Room for the arcs of one loop.
+ROOM = SIZES[1]
+#: Nothing closer than this, and this fraction of the span, is told apart.
+CLOSE = 1e-6
+#: The fraction of a step along the path by which the derivative of a cycle is taken.
+DIFFERENCE = 1e-3
+#: A cycle is where it is expected if it is no further from there, relative to its size, or than
+#: a third of the way that it is expected to go. Nearer to a square root, intervals get smaller.
+EXPECTED = 1e-3
+
+
+class Path:
+    """A path in one parameter: its labels, each computed once, and loops of the cycles in them."""
+
+    def __init__(self, osc, where, span, conditions: Sequence[AbstractCondition] = ()):
+        check_oscillator(osc)
+        for condition in conditions:
+            condition.check(osc)
+        self.conditions = tuple(conditions)
+        span = as_array(span, "span", (2,))
+        check_finite(span, "span")
+        self.first, self.last = (float(end) for end in span)
+        require(self.first < self.last, "span", "(first, last) with first < last", tuple(span))
+        # As an array: one program serves all parameters.
+        self.osc, self.index = osc, jnp.asarray(np.array(leaf_index(osc, where)))
+        for value in (self.first, self.last):
+            self.at(value).check()
+        self.length = self.last - self.first
+        self.name = names_of(osc)[int(self.index)]
+        self.labels: dict[float, Label] = {}
+        self.cycles: dict[float, list[Found]] = {}
+        self.unstable_cycles: dict[tuple[float, int], Cycle] = {}
+        # From which value to which other one, from which cycle to which, of those that do not
+        # stick; None where there is none.
+        self._goes_on: dict[tuple[float, float], dict[int, int | None]] = {}
+        self.breaks = self._coincidences()
+
+    def at(self, value: float) -> Oscillator:
+        """The oscillator there."""
+        # Of one type, whichever that of the value: else programs are compiled twice.
+        return vary(self.osc, self.index, jnp.asarray(np.array([value])))
+
+    def unstable(self, value: float, around: int) -> Cycle:
+        """The unstable cycle there around an equilibrium, or why there is none; computed once."""
+        if (value, around) not in self.unstable_cycles:
+            self.unstable_cycles[value, around] = unstable_cycle(self.at(value), around=around)
+        return self.unstable_cycles[value, around]
+
+    def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
+        """The values just below and just above; farther off where motions are slow to settle."""
+        # Not nearer in a short span: a loop counts as repeated when it does so to 1e-7.
+        distance = CLOSE * (1.0 + self.length)
+        # Loops around a pseudo-focus with a velocity below 1e-5 are lost in rounding.
+        if slow or (value in self.breaks and self.edged):
+            distance *= 30.0
+        return value - distance, value + distance
+
+    @property
+    def belt(self) -> int:
+        """The belt whose velocity is varied, or -1."""
+        for belt in range(len(self.osc.belts)):
+            if leaf_index(self.osc, lambda osc, belt=belt: osc.belts[belt].velocity) == self.index:
+                return belt
+        return -1
+
+    @property
+    def edged(self) -> list[int]:
+        """Belts with a finite contact edge; one for each place if they share their edges."""
+        belts: list[int] = []
+        known: set[float] = set()
+        for number, belt in enumerate(self.at(0.5 * (self.first + self.last)).belts):
+            own = {float(edge) for edge in (belt.lower, belt.upper) if np.isfinite(edge)}
+            if own - known:
+                belts.append(number)
+            known |= own
+        return belts
+
+    def _coincidences(self) -> list[float]:
+        """Where the belt that is varied is at rest, or runs with another one."""
+        if self.belt < 0:
+            return []
+        others = [float(b.velocity) for i, b in enumerate(self.osc.belts) if i != self.belt]
+        inside = [v for v in {0.0, *others} if self.first <= v <= self.last]
+        return sorted(inside)
+
+    def coinciding(self, value: float) -> list[tuple[int, ...]]:
+        """The varied belt and each that runs at one velocity with it there; itself, if at rest."""
+        others = enumerate(self.osc.belts)
+        pairs: list[tuple[int, ...]] = [
+            (self.belt, i) for i, b in others if i != self.belt and float(b.velocity) == value
+        ]
+        return [*pairs, (self.belt,)] if value == 0 else pairs
+
+    def look(self, values: Sequence[float] | np.ndarray) -> None:
+        """Find the labels there, in batches."""
+        new = np.array(sorted({float(v) for v in values} - self.labels.keys()))
+        for batch in (new[i : i + BATCH] for i in range(0, new.size, BATCH)):
+            filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
+            seen = jax.tree.map(np.asarray, _look(self.osc, self.index, jnp.asarray(filled)))
+            for lane, value in enumerate(batch.tolist()):
+                self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen))
+        self._share()
+
+    def changes(self, settled: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        """The intervals between values looked at that differ, but for those that are settled."""
+        return [
+            (a, b)
+            for a, b in pairwise(sorted(self.labels))
+            if not any(low <= a and b <= high for low, high in settled)
+            and not (self.labels[a] == self.labels[b] and self._all_go_on(a, b))
+        ]
+
+    def _take(self, value: float, seen: "_Seen") -> None:
+        """Label a value by what was seen there."""
+        exists = seen.kind > 0
+        modes = map(tuple, without_idle(self.at(value), seen.modes[exists]).tolist())
+        rests = tuple(
+            zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), modes, strict=True)
+        )
+        found: list[Found] = []
+        loops = [jax.tree.map(lambda x, i=i: x[i], seen.loop) for i in range(len(seen.status))]
+        for loop, status in zip(loops, seen.status.tolist(), strict=True):
+            one = self._settled(value, loop) if status == Status.OK else None
+            if one is not None and _number(one, found) is None:
+                found.append(one)
+        if not found and not any(stable for _, stable, _ in rests):
+            # Nothing holds the orbits but a cycle that they approach slowly.
+            found.append(self._settled(value, loops[-1], closes=False) or Found((), loops[-1]))
+        self.cycles[value] = found
+        self._name(value, rests)
+
+    def _name(self, value: float, rests) -> None:
+        cycles = sorted(self.cycles[value], key=lambda one: one.path)
+        loops, osc = [one.loop for one in cycles if one.path], self.at(value)
+        marks = tuple(condition.mark(osc, loops) for condition in self.conditions)
+        self.labels[value] = Label(rests, tuple(one.path for one in cycles), marks)
+
+    def _settled(self, value: float, loop: Loop, *, closes: bool = True) -> Found | None:
+        """The attracting cycle that a loop is nearly one of, or else leads to, or None.
+
+        A loop that sticks is one of it. Any other may only seem to repeat. closes: whether it is
+        known to be one loop.
+        """
+        osc, ok = self.at(value), jnp.asarray(Status.OK.value)
+        if closes and sticks(path := itinerary(osc, loop)):
+            return Found(path, loop)
+        # Where the cycle has other loops than those from which it is solved for, or meets a
+        # boundary, it is followed.
+        ways = (lambda: polish(osc, cut([loop])[0], ok), lambda: find_cycle(osc, loop.entries[0]))
+        for cycle in (way() for way in ways[0 if closes else 1 :]):
+            if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
+                # Not the equilibrium, to which a cycle may shrink.
+                if np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST:
+                    loop = jax.tree.map(np.asarray, as_loop(cycle, ROOM))
+                    return Found(itinerary(osc, loop), loop)
+        return None
+
+    def _share(self) -> None:
+        """Let values know cycles that attract at the ones beside them.
+
+        A cycle that sticks is always reached, from where that ends. One that does not may be
+        missed.
+        """
+        values = sorted(self.labels)
+        for pairs in (pairwise(values), pairwise(values[::-1])):
+            for a, b in pairs:
+                known, come = self._goes_on.setdefault((a, b), {}), self._goes_on.get((b, a), {})
+                known |= {i: j for j, i in come.items() if i is not None}
+                for i, one in enumerate(self.cycles[a]):
+                    if i not in known and one.path and not sticks(one.path):
+                        known[i] = self._followed(a, b, i)
+
+    def _all_go_on(self, a: float, b: float) -> bool:
+        """Whether the cycles at one value that do not stick go on to those at another, one each."""
+        ahead = self._goes_on[a, b] | {
+            i: j for j, i in self._goes_on[b, a].items() if i is not None
+        }
+        reached = [j for j in ahead.values() if j is not None]
+        smooth = [i for i, one in enumerate(self.cycles[a]) if one.path and not sticks(one.path)]
+        return len(set(reached)) == len(smooth) and all(ahead.get(i) is not None for i in smooth)
+
+    def _followed(self, known: float, value: float, number: int) -> int | None:
+        """The number of the cycle at one value to which one at another value goes on, or None.
+
+        It is looked for where that is expected to be, by its derivative.
+        """
+        path, loop = self.cycles[known][number]
+        step = value - known
+        nearby = self._settled(known + DIFFERENCE * step, loop)
+        expected = loop
+        if nearby is not None and nearby.path == path and _fits(nearby.loop, loop):
+            parts = ((t.entries, t.durations) for t in (loop, nearby.loop))
+            moved = [a + (b - a) / DIFFERENCE for a, b in zip(*parts, strict=True)]
+            expected = eqx.tree_at(lambda t: (t.entries, t.durations), loop, tuple(moved))
+        found = self._settled(value, expected)
+        if found is None or found.path != path:
+            return None
+        places = [place_of(one) for one in (loop, expected, found.loop)]
+        if apart(places[1], places[2]) > EXPECTED * (1 + 300 * apart(places[0], places[1])):
+            return None
+        at = _number(found, self.cycles[value])
+        if at is None:
+            others = self.cycles[value]
+            # In place of one that was only taken to be there.
+            at = 0 if others and not others[0].path else len(others)
+            others[at : at + 1] = [found]
+            self._name(value, self.labels[value].equilibria)
+        return at
+
+    def followed(self, values: Sequence[float]) -> list[dict[float, Loop]]:
+        """The attracting cycles at these values, in order, in which nothing else happens.
+
+        Of each that goes on from value to value its loops, by the value.
+        """
+        strands: list[dict[float, Loop]] = []
+        sticking: dict[Itinerary, dict[float, Loop]] = {}
+        before, smooth = None, {}
+        for value in sorted(v for v in self.labels if values[0] <= v <= values[-1]):
+            here = {}
+            for number, one in enumerate(self.cycles[value]):
+                origin = self._origin(before, value, number)
+                known = sticking.get(one.path) if sticks(one.path) else smooth.get(origin)
+                strand: dict[float, Loop] = {} if known is None else known
+                if known is None:
+                    strands.append(strand)
+                here[number] = strand
+                if sticks(one.path):
+                    sticking[one.path] = strand
+                if value in values:
+                    strand[value] = one.loop
+            before, smooth = value, here
+        return [strand for strand in strands if strand]
+
+    def _origin(self, before: float | None, value: float, number: int) -> int | None:
+        """The number of the cycle at the value before that goes on to one that does not stick."""
+        if before is None:
+            return None
+        back = self._goes_on[value, before].get(number)
+        ahead = self._goes_on[before, value].items()
+        return back if back is not None else next((i for i, j in ahead if j == number), None)
+
+    def label(self, value: float) -> Label:
+        """The label there, which `look` has found."""
+        return self.labels[float(value)]
+
+
+def _number(cycle: Found, among: Sequence[Found]) -> int | None:
+    """The number of a cycle among others, or None."""
+    for number, other in enumerate(among):
+        if other.path == cycle.path:
+            if sticks(cycle.path) or apart(place_of(cycle.loop), place_of(other.loop)) < SOLVED:
+                return number
+    return None
+
+
+def _fits(loop: Loop, other: Loop) -> bool:
+    """Whether two loops have the same arcs in the same order."""
+    return np.array_equal(loop.codes, other.codes) and np.array_equal(loop.ends, other.ends)
+
+
+class _Seen(NamedTuple):
+    """Equilibria, [rows], and of every orbit its status and last loop, [starts, ROOM]."""
+
+    kind: Any
+    stable: Any
+    modes: Any
+    status: Any
+    loop: Any
+
+
+@jit
+def _look(osc: Oscillator, index: Array, values: Array) -> _Seen:
+    return each(lambda p: _look_at(vary(osc, index, p[None])))(values)
+
+
+def _look_at(osc: Oscillator) -> _Seen:
+    rests = equilibria(osc)
+    loop, status = settled_loops(osc, rests, ROOM)
+    return _Seen(rests.kind, rests.stable, rests.modes, status, loop)

@@ -1,0 +1,444 @@
+"""Equilibria that change, and belts that come to rest.
+
+There is no cycle at these points, and few equations: in x1 of the state of rest, or in none.
+
+- `Hopf`: trace zero at a fixed point (its determinant is always one).
+- `BoundaryEquilibrium`: at rest on an edge, the force on one of its sides is zero, or as large as
+  belts at rest there can hold: a fixed point, or the end of a segment, comes to lie on the edge.
+- `PseudoHopf`: at a pseudo-focus the leading term by which loops grow or shrink is zero.
+- `SuddenSliding`: nu_k = 0, with the mass at rest on the belt, x2' = x2 = 0: an equilibrium lies on
+  the boundary. No cycle can be an unknown here: as nu_k goes to zero the stick phase lasts ever
+  longer, the slip arc takes ever longer to leave the equilibrium, and in the limit there is none.
+- `BeltAtRest`: the same, if no cycle sticks to the belt: an equilibrium jumps.
+
+Hopf's points are eqs. (27), (28) of the paper, and sudden sliding is its name; boundary equilibria
+and the pseudo-Hopf point are those of M. di Bernardo, C. Budd, A. Champneys, P. Kowalczyk,
+Piecewise-smooth Dynamical Systems, 2008.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..checks import is_concrete, require
+from ..cycles.orbits import Orbit
+from ..cycles.shooting import trace_of
+from ..model.equilibria import Equilibria, EquilibriumKind, candidates
+from ..model.modes import (
+    Mode,
+    boundary_guards,
+    capacity,
+    contact,
+    edge_guards,
+    edges,
+    field_at_rest,
+    mode_acceleration,
+    mode_of,
+    select,
+)
+from ..model.oscillator import Oscillator
+from ..model.parameters import leaf_index, vary
+from ..numerics.compiling import jit
+from ..results import Status
+from .conditions import (
+    AbstractRestCondition,
+    Line,
+    SpecialPoint,
+    Trail,
+)
+from .guesses import HINT_BUDGET, orbit_after_stick
+from .systems import RestSystem, small_newton, velocity_of
+
+#: The unknowns of a state of rest of which all is known.
+NOTHING = np.zeros(0)
+#: Where sudden sliding is looked for, relative to where the belt is at rest: orbits that settle
+#: soon first; other points may be nearer than where they do.
+BESIDE = (1e-2, -1e-2, 1e-4, -1e-4)
+
+# --- the Hopf point -------------------------------------------------------------------------------
+
+
+class HopfSystem(RestSystem):
+    """Rest and a trace of zero in the mode of `codes`; the unknown is x1."""
+
+    codes: Array
+
+    def residual(self, osc, x):
+        mode, rest = mode_of(self.codes), jnp.zeros(())
+        needed = mode_acceleration(osc, mode, x[0], rest)
+        return jnp.append(needed[None], trace_of(osc, mode, x[0], rest))
+
+    def exists(self, osc, x):
+        mode = mode_of(self.codes)
+        inside = [*boundary_guards(osc, mode, jnp.zeros(())), *edge_guards(osc, mode, x[0])]
+        return jnp.all(jnp.stack(inside) > 0)
+
+    def tests(self, osc, x):
+        nearest = jnp.min(jnp.stack(edge_guards(osc, mode_of(self.codes), x[0])))
+        return {
+            ("DegenerateHopf", ()): third_derivative(osc, self.codes, x[0]),
+            ("BoundaryHopf", ()): jnp.where(jnp.isfinite(nearest), nearest, jnp.nan),
+        }
+
+    def place(self, x):
+        return np.array([x[0], x[0], 0.0, 0.0, 0.0])
+
+
+class Hopf(AbstractRestCondition):
+    """A fixed point changes its stability: eqs. (27), (28) of the paper, for any friction law."""
+
+    caption: ClassVar[str] = "Hopf"
+    line: ClassVar[Line] = Line("Hopf", "#009E73", (0, (5, 1.5)))
+
+    def guess(self, osc, size):
+        return candidates(osc)
+
+    def system(self, osc, guess: Equilibria):
+        rests = lax.stop_gradient(guess)
+        fixed = rests.kind == EquilibriumKind.FIXED_POINT
+        row = jnp.argmin(jnp.where(fixed, jnp.abs(rests.rate), jnp.inf))
+        x1 = jnp.where(fixed[row], rests.x1[row], 0.0)
+        status = jnp.where(jnp.any(fixed), Status.OK.value, Status.NO_FIXED_POINT.value)
+        return HopfSystem(rests.modes[row].astype(float)), x1[None], status
+
+    @classmethod
+    def between(cls, before, after, edged):
+        return [cls()] if before.equilibria != after.equilibria else []
+
+    def place(self, point):
+        system, x = self.followed(point)
+        return system.place(np.asarray(x))
+
+
+def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
+    """That of x2' by x2 at a fixed point: 16 times the first Lyapunov coefficient."""
+
+    def derivative(fn):
+        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
+
+    def acceleration(x2):
+        return mode_acceleration(osc, mode_of(codes), x1, x2)
+
+    return derivative(derivative(derivative(acceleration)))(jnp.zeros(()))
+
+
+def hopf_limit(kind: str, trail: Trail, vanishes: Callable, *args: Array) -> SpecialPoint | None:
+    """Where the cycle of a curve has shrunk to an equilibrium, if that is near.
+
+    Its own equations are singular there, those of a Hopf point at which vanishes(osc, codes, x1,
+    *args) is zero, too, are not.
+    """
+    x1 = trail.x[:, 0]
+    if np.ptp(x1) > 5 * trail.step:
+        return None
+    guess = jnp.asarray([x1[0], *trail.values[-1]])
+    given = trail.osc, trail.indices, trail.system.chain.codes[0]
+    found, residual = _special_hopf(*given, guess, vanishes, *args)
+    values = np.asarray(found[1:])
+    if not (residual < 1e-9 and np.linalg.norm(values - trail.values[-1]) < 2 * trail.step):
+        return None
+    return SpecialPoint(kind, (), (float(values[0]), float(values[1])), float(residual))
+
+
+@jit
+def _special_hopf(osc: Oscillator, indices, codes, guess: Array, vanishes, *args):
+    """(x1, both parameters) of such a Hopf point, and the error."""
+
+    def equations(osc, u):
+        osc = vary(osc, indices, u[1:])
+        also = vanishes(osc, codes, u[0], *args)
+        return jnp.append(HopfSystem(codes).residual(osc, u[:1]), also)
+
+    u, _, residual, _ = small_newton(equations, osc, guess)
+    return u, residual
+
+
+# --- equilibria on a contact edge -----------------------------------------------------------------
+
+
+class _EdgeSystem(RestSystem):
+    """One equation, of what lies at rest on the edge of this number."""
+
+    edge: eqx.AbstractVar[Array]
+
+    def balance(self, osc: Oscillator) -> Array:
+        """What vanishes."""
+        raise NotImplementedError
+
+    def meets_hopf(self, osc: Oscillator) -> Array:
+        """What vanishes where its curve meets that of a Hopf point, else NaN."""
+        raise NotImplementedError
+
+    def residual(self, osc, x):
+        return self.balance(osc)[None]
+
+    def tests(self, osc, x):
+        return {("BoundaryHopf", ()): self.meets_hopf(osc)}
+
+
+class EdgeRest(_EdgeSystem):
+    """What vanishes where an equilibrium lies on an edge.
+
+    The needed force at rest on one side of it, less what belts at rest there can hold, in one of
+    the two directions (0 where none is at rest).
+    """
+
+    edge: Array
+    rightward: Array
+    limit: Array
+    codes: Array
+
+    def balance(self, osc):
+        at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
+        needed = mode_acceleration(osc, mode, at, jnp.zeros(()))
+        return needed + self.limit * capacity(osc, mode)
+
+    def meets_hopf(self, osc):
+        # There is none for the end of a segment.
+        mode = mode_of(self.codes)
+        _, trace, *_ = field_at_rest(osc, mode, jnp.stack(edges(osc))[self.edge])
+        return jnp.where(mode.any_stuck, jnp.nan, trace)
+
+    def exists(self, osc, x):
+        # Whether the contacts on that side are those.
+        at = jnp.stack(edges(osc))[self.edge]
+        left, right = _beside_edge(osc, at)
+        return jnp.all(jnp.stack(select(self.rightward, right, left).codes) == self.codes)
+
+
+class EdgeBalance(_EdgeSystem):
+    """What vanishes where the pseudo-focus at an edge is neither stable nor unstable."""
+
+    edge: Array
+    left: Mode
+    right: Mode
+
+    def _sides(self, osc: Oscillator):
+        at = jnp.stack(edges(osc))[self.edge]
+        return field_at_rest(osc, self.left, at)[:2], field_at_rest(osc, self.right, at)[:2]
+
+    def balance(self, osc):
+        # The contraction of `modes.edge_focus` times both pushes: regular where one of them is 0.
+        (a_left, trace_left), (a_right, trace_right) = self._sides(osc)
+        return trace_right * a_left - trace_left * a_right
+
+    def exists(self, osc, x):
+        # Whether there is a pseudo-focus, and no belt at rest touches.
+        return (self.meets_hopf(osc) > 0) & ~self.left.any_stuck & ~self.right.any_stuck
+
+    def meets_hopf(self, osc):
+        # The weaker of the two pushes towards the edge, negative where one pushes away.
+        (a_left, _), (a_right, _) = self._sides(osc)
+        return jnp.minimum(a_left, -a_right)
+
+
+class _EdgeCondition(AbstractRestCondition):
+    """A condition on what lies at rest on a contact edge of a belt."""
+
+    belt: int | Array
+
+    def check(self, osc):
+        super().check(osc)
+        check_edge(osc, self.belt)
+
+    def guess(self, osc, size):
+        return None
+
+    def _system_at_edge(self, osc: Oscillator) -> _EdgeSystem:
+        raise NotImplementedError
+
+    def system(self, osc, guess):
+        system = self._system_at_edge(osc)
+        has_edge = jnp.isfinite(jnp.stack(edges(osc))[system.edge])
+        return system, NOTHING, jnp.where(has_edge, Status.OK.value, Status.NOT_TOUCHED.value)
+
+    @classmethod
+    def between(cls, before, after, edged):
+        return [cls(belt) for belt in edged] if before.equilibria != after.equilibria else []
+
+
+class BoundaryEquilibrium(_EdgeCondition):
+    """A fixed point, or the end of a segment, lies on a contact edge of a belt."""
+
+    caption: ClassVar[str] = "rest on edge, belt {belt}"
+    line: ClassVar[Line] = Line("rest on edge", "#D55E00")
+
+    def _system_at_edge(self, osc):
+        return _edge_rest(osc, self.belt)
+
+
+class PseudoHopf(_EdgeCondition):
+    """The pseudo-focus at a contact edge of a belt changes its stability."""
+
+    caption: ClassVar[str] = "pseudo-Hopf, belt {belt}"
+    line: ClassVar[Line] = Line("pseudo-Hopf", "#D55E00", (0, (5, 1.5)))
+
+    def _system_at_edge(self, osc):
+        return _edge_balance(osc, self.belt)
+
+
+def check_edge(osc: Oscillator, belt: Any) -> None:
+    """`ValueError` where a belt has no finite contact edge."""
+    if is_concrete(osc):
+        ends = [osc.belts[belt].lower, osc.belts[belt].upper]
+        require(np.any(np.isfinite(ends)), "belt", "one with a finite edge", repr(belt))
+
+
+def _edges_of(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
+    """The numbers of the lower and the upper edge of a belt."""
+    return jnp.asarray(belt), jnp.asarray(belt + len(osc.belts))
+
+
+def _beside_edge(osc: Oscillator, at: Array) -> tuple[Mode, Mode]:
+    """The contacts at rest to the left and to the right of an edge."""
+    rest = jnp.zeros_like(at)
+    return contact(osc, at, rest, rightward=False), contact(osc, at, rest, rightward=True)
+
+
+def _edge_rest(osc: Oscillator, belt: int | Array) -> EdgeRest:
+    """The equation of a boundary equilibrium at an edge of a belt that is nearest to hold."""
+    cases = []
+    for edge in _edges_of(osc, belt):
+        sides = _beside_edge(osc, jnp.stack(edges(osc))[edge])
+        cases += [
+            EdgeRest(edge, jnp.asarray(rightward), jnp.asarray(limit), jnp.stack(mode.codes))
+            for rightward, mode in zip((False, True), sides, strict=True)
+            for limit in (-1.0, 1.0)
+        ]
+    missing = jnp.stack([jnp.abs(case.balance(osc)) for case in cases])
+    at = jnp.argmin(jnp.where(jnp.isfinite(missing), missing, jnp.inf))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
+
+
+def _edge_balance(osc: Oscillator, belt: int | Array) -> EdgeBalance:
+    """The equation of the pseudo-focus at an edge of a belt, of two the one nearer to balance."""
+    positions = jnp.stack(edges(osc))
+    cases = [
+        EdgeBalance(edge, *_beside_edge(osc, positions[edge])) for edge in _edges_of(osc, belt)
+    ]
+    size = [
+        jnp.where(case.exists(osc, jnp.asarray(NOTHING)), jnp.abs(case.balance(osc)), jnp.inf)
+        for case in cases
+    ]
+    at = jnp.argmin(jnp.stack(size))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
+
+
+# --- belts that come to rest ----------------------------------------------------------------------
+
+
+class RestingBelt(RestSystem):
+    """A belt comes to rest, and the mass rests on it in the mode of `codes`; the unknown is x1.
+
+    side: of the direction in which the belts at rest hold all they can, 0 where they hold nothing;
+    sticks: whether that is what was meant.
+    """
+
+    belt: int | Array
+    codes: Array
+    side: Array
+    sticks: Array
+
+    @property
+    def otherwise(self):
+        return Status.NOT_TOUCHED
+
+    def residual(self, osc, x):
+        mode = mode_of(self.codes)
+        limit = self.side * capacity(osc, mode)
+        needed = mode_acceleration(osc, mode, x[0], jnp.zeros(()))
+        return jnp.stack([needed + limit, velocity_of(osc, self.belt)])
+
+    def exists(self, osc, x):
+        return self.sticks
+
+
+class StoppedBelt(RestSystem):
+    """The velocity of a belt is zero; wherever the mass rests then."""
+
+    belt: int | Array
+
+    def residual(self, osc, x):
+        return velocity_of(osc, self.belt)[None]
+
+    def exists(self, osc, x):
+        return jnp.asarray(True)
+
+    def tests(self, osc, x):
+        # It is at rest all along.
+        return {
+            ("BeltAtRest", (i,)): jnp.where(self.belt == i, jnp.nan, one.velocity)
+            for i, one in enumerate(osc.belts)
+        }
+
+
+class _RestingBeltCondition(AbstractRestCondition):
+    """A belt comes to rest; whether a cycle sticks to it before, or after, tells the kind."""
+
+    belt: int | Array
+
+    family: ClassVar[str] = "rest"
+    line: ClassVar[Line] = Line("belt at rest", "black", (0, (1, 1.2)))
+    caption: ClassVar[str] = "belt {belt} at rest"
+    joins: ClassVar[bool] = False
+
+    @classmethod
+    def at_coincidence(cls, belts):
+        return [cls(*belts)] if len(belts) == 1 else []
+
+    def followed(self, point):
+        return StoppedBelt(jnp.asarray(self.belt)), NOTHING
+
+    def kind_along(self, osc, multiplier):
+        number = leaf_index(osc, lambda osc: osc.belts[int(self.belt)].velocity)
+        index, sudden = jnp.asarray(np.array(number)), SuddenSliding(self.belt)
+        found = (sudden.found_from(osc, index, value) for value in sudden.values(0.0, 0.0))
+        return BeltAtRest if next(filter(None, found), None) is None else SuddenSliding
+
+
+class SuddenSliding(_RestingBeltCondition):
+    """A belt comes to rest: the time that the mass sticks to it in each loop goes to infinity."""
+
+    no_cycle: ClassVar[Status] = Status.STUCK_FOREVER
+
+    def guess(self, osc, size):
+        return orbit_after_stick(osc, self.belt)
+
+    def system(self, osc, guess: tuple[Oscillator, Array, Orbit]):
+        moving, start, orbit = lax.stop_gradient(guess)
+        rows = jnp.arange(HINT_BUDGET)
+        loop = (rows > orbit.repeats) & (rows < orbit.count)
+        sticks = (orbit.status == Status.OK) & jnp.any(loop & (orbit.codes[:, self.belt] == 0))
+        # The contacts at slip onset are those at the equilibrium that it meets.
+        side = jnp.sign(velocity_of(moving, self.belt))
+        system = RestingBelt(self.belt, orbit.codes[0], side, sticks)
+        return system, start[:1], jnp.asarray(Status.OK.value)
+
+    def values(self, a, b):
+        return [0.5 * (a + b) + offset for offset in BESIDE]
+
+
+class BeltAtRest(_RestingBeltCondition):
+    """A belt comes to rest where the mass is at rest on it, too, and no cycle sticks to it.
+
+    On the other side its friction pulls the other way: the equilibrium jumps, or there is none.
+    """
+
+    def guess(self, osc, size):
+        return candidates(osc)
+
+    def system(self, osc, guess: Equilibria):
+        rests = lax.stop_gradient(guess)
+        touches = (rests.kind > 0) & (jnp.abs(rests.modes[:, self.belt]) < 2)
+        row, load = jnp.argmax(touches), jnp.stack([one.load for one in osc.belts])[self.belt]
+        exists = touches[row] & (load > 0)
+        codes, nothing = rests.modes[row].astype(float), jnp.zeros(())
+        system = RestingBelt(self.belt, codes, nothing, exists)
+        status = jnp.where(exists, Status.OK.value, Status.NOT_TOUCHED.value)
+        return system, jnp.where(touches[row], rests.x1[row], jnp.nan)[None], status

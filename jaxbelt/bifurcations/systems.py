@@ -1,0 +1,328 @@
+"""Systems of equations of a motion and one condition, and Newton's method for them.
+
+A `CycleSystem` has 3N + 1 equations: those of a cycle with a fixed signature, see `cycles`, and a
+condition. A `RestSystem` has k + 1 equations in the k unknowns of a state of rest. With one unknown
+more, a parameter, Newton's method finds a point; with two, they are followed along a curve. What
+both say of a solution they say in `look`: whether it is a motion that exists, and the functions to
+be watched along a curve.
+"""
+
+import abc
+import functools
+from collections.abc import Callable
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..cycles.attractors import extent
+from ..cycles.cycle import Cycle, cycle_of
+from ..cycles.shooting import Chain, Loop, jacobian, meshed, residual, residual_and_blocks
+from ..model.oscillator import Oscillator
+from ..model.parameters import vary
+from ..motion.arcs import Ends
+from ..numerics.newton import newton
+from ..results import Status
+
+#: Unknowns of a cycle count this much in the length of a step along a curve, beside the two
+#: parameters; large ones less, for durations of stick phases go to infinity where a belt comes to
+#: rest.
+WEIGHT = 0.1
+#: The place of nothing.
+NOWHERE = np.full(5, np.nan)
+#: Functions by what it means that one vanishes: the name of a special point, the belts concerned.
+Tests = dict[tuple[str, tuple[int, ...]], Any]
+
+
+class Seen(NamedTuple):
+    """What is seen at a point of a curve.
+
+    tests: functions to watch; exists: whether there is such a motion; multiplier: of the cycle, NaN
+    where none is told; residual: the largest error in all equations.
+    """
+
+    tests: Tests
+    exists: Any
+    multiplier: Any
+    residual: Any
+
+
+class AbstractSystem(eqx.Module):
+    """Equations in the unknowns of a motion, one more than these."""
+
+    @abc.abstractmethod
+    def residual(self, osc: Oscillator, x: Array) -> Array:
+        """The equations at the unknowns x, in one array."""
+
+    @abc.abstractmethod
+    def linearized(
+        self, osc_of: Callable[[Array], Oscillator], x: Array, p: Array
+    ) -> tuple[Array, Array]:
+        """The residual at the parameters p, [k], and its Jacobian with respect to (x, p)."""
+
+    @abc.abstractmethod
+    def look(self, osc: Oscillator, x: Array) -> Seen:
+        """What is seen at a solution x."""
+
+    @abc.abstractmethod
+    def place(self, x: np.ndarray) -> np.ndarray:
+        """Where the motion is, as `attractors.place_of`; NaN where that is not to be compared."""
+
+    @abc.abstractmethod
+    def shaped(self, x: Array) -> Array:
+        """The unknowns in their shape, from one row of numbers."""
+
+    @abc.abstractmethod
+    def weights(self, x: Array) -> Array:
+        """How much each unknown counts in the length of a step along a curve."""
+
+    @abc.abstractmethod
+    def remeshed(self, osc: Oscillator, x: Array) -> "AbstractSystem":
+        """The same with the steps of integration spread anew, where there are any."""
+
+
+def velocity_of(osc: Oscillator, belt: int | Array) -> Array:
+    """The velocity of a belt, by its number."""
+    return jnp.stack([one.velocity for one in osc.belts])[belt]
+
+
+def velocity_tests(osc: Oscillator) -> Tests:
+    """The velocities of the belts and their differences, which are watched on every curve."""
+    velocities = [belt.velocity for belt in osc.belts]
+    tests: Tests = {("BeltAtRest", (i,)): nu for i, nu in enumerate(velocities)}
+    for (i, a), (j, b) in combinations(enumerate(velocities), 2):
+        tests["EqualVelocities", (i, j)] = a - b
+    return tests
+
+
+# --- systems of a state of rest -------------------------------------------------------------------
+
+
+class RestSystem(AbstractSystem):
+    """k + 1 equations in the k unknowns of a state of rest: none, or x1."""
+
+    @property
+    def otherwise(self) -> Status:
+        """The status of a solution that does not exist."""
+        return Status.NOT_ADMISSIBLE
+
+    @abc.abstractmethod
+    def exists(self, osc: Oscillator, x: Array) -> Array:
+        """Whether a solution is such a state."""
+
+    def tests(self, osc: Oscillator, x: Array) -> Tests:
+        """What to watch along its curve."""
+        return {}
+
+    def linearized(self, osc_of, x, p):
+        def value(u):
+            return self.residual(osc_of(u[x.size :]), u[: x.size])
+
+        u = jnp.append(x, p)
+        return value(u), jax.jacfwd(value)(u)
+
+    def look(self, osc, x):
+        tests = {**velocity_tests(osc), **self.tests(osc, x)}
+        error = jnp.max(jnp.abs(self.residual(osc, x)))
+        return Seen(tests, self.exists(osc, x), jnp.asarray(jnp.nan), error)
+
+    def place(self, x):
+        return NOWHERE
+
+    def shaped(self, x):
+        return x
+
+    def weights(self, x):
+        return jnp.ones(x.size)
+
+    def remeshed(self, osc, x):
+        return self
+
+
+# --- systems of a cycle ---------------------------------------------------------------------------
+
+
+class CycleSystem(AbstractSystem):
+    """A fixed signature and a condition; the unknowns are those of the cycle, [N, 3]."""
+
+    chain: eqx.AbstractVar[Chain]
+
+    @abc.abstractmethod
+    def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
+        """What vanishes there; miss: that of the tangent arcs, see `cycles.residual`."""
+
+    def judge(self, osc: Oscillator, z: Array, cycle: Cycle, slope: Array) -> tuple[Array, Array]:
+        """The status of a solution and the multiplier to be told; slope: with stick phases left
+        out."""
+        return cycle.status, jnp.asarray(jnp.nan)
+
+    def watch(self, osc: Oscillator, z: Array, slope: Array) -> tuple[Tests, Any, Any]:
+        """What to watch along its curve, whether the solution is meant, its multiplier to tell."""
+        return {}, True, jnp.nan
+
+    def residual(self, osc, x):
+        """The 3N + 1 equations at the unknowns z of the cycle, [N, 3]."""
+        value, miss = residual(osc, self.chain, x)
+        return jnp.append(value.reshape(-1), self.condition(osc, x, miss))
+
+    def linearized(self, osc_of, x, p):
+        osc, along = osc_of(p), jax.jacfwd(osc_of)(p)
+        value, miss, blocks = residual_and_blocks(osc, along, self.chain, x)
+        of_state, of_parameter = blocks[:, :, :3], blocks[:, :, 3:]
+        last, (by_z, by_p, by_miss) = self.condition_and_slopes(osc_of, x, p, miss)
+        by_parameter = of_parameter[:, :3].reshape(-1, p.size)
+        rows = jnp.concatenate([jacobian(of_state[:, :3]), by_parameter], axis=1)
+        row = jnp.append(
+            (by_z + by_miss * of_state[:, 3]).reshape(-1),
+            by_p + by_miss * jnp.sum(of_parameter[:, 3], axis=0),
+        )
+        return jnp.append(value.reshape(-1), last), jnp.concatenate([rows, row[None]])
+
+    def condition_and_slopes(self, osc_of: Callable[[Array], Oscillator], z, p: Array, miss):
+        """The condition at the parameters p, and its derivatives with respect to z, p and miss."""
+
+        def condition(z, p, miss):
+            return self.condition(osc_of(p), z, miss)
+
+        return jax.value_and_grad(condition, (0, 1, 2))(z, p, miss)
+
+    @property
+    def ordinary(self) -> Chain:
+        """The chain with every tangency as an ordinary arrival at the boundary."""
+        tangent = Ends(self.chain.codes.shape[-1]).tangent
+        ends = jnp.where(self.chain.ends >= tangent, self.chain.ends - tangent, self.chain.ends)
+        return Chain(self.chain.codes, ends, self.chain.mesh)
+
+    def look(self, osc, x):
+        ok, error = jnp.asarray(Status.OK.value), jnp.max(jnp.abs(self.residual(osc, x)))
+        cycle, slope = cycle_of(osc, self.ordinary, x, jnp.asarray(0), ok, error)
+        tests, is_meant, multiplier = self.watch(osc, x, slope)
+        exists = (cycle.status == Status.OK) & (error < 1e-9) & is_meant
+        return Seen({**velocity_tests(osc), **tests}, exists, multiplier, error)
+
+    def place(self, x):
+        return extent(x[np.asarray(self.chain.used)])
+
+    def shaped(self, x):
+        return x.reshape(-1, 3)
+
+    def weights(self, x):
+        return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
+
+    def remeshed(self, osc, x):
+        loop = Loop(self.chain.codes, self.chain.ends, x[:, :2], x[:, 2])
+        return eqx.tree_at(lambda system: system.chain, self, meshed(osc, loop)[0])
+
+
+def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
+    """A row, and the arcs after it in the stick phase that it begins: one that passes edges."""
+    stuck = chain.used & jnp.any(chain.codes == 0, axis=-1)
+    rows = jnp.arange(stuck.size)
+    before = (rows - 1) % jnp.maximum(jnp.sum(chain.used), 1)
+    phase, goes_on = rows == row, stuck & stuck[before]
+    for _ in range(2 * len(osc.belts)):
+        phase = phase | (goes_on & phase[before])
+    return phase
+
+
+def nearest_contacts(osc: Oscillator, chain: Chain, z: Array, sticks: Array) -> tuple[Array, Array]:
+    """How near a cycle is to another signature at each belt, and whether it sticks there, [belts].
+
+    The shortest of its stick phases, among the arcs `sticks`; where there is none, the distance of
+    its nearest extremum of x2 from the boundary. inf where there is neither.
+    """
+    following = jnp.roll(z, -1, axis=0)
+    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
+    following = jnp.where(last[:, None], z[0], following)
+    extrema = chain.used & (chain.ends == Ends(len(osc.belts)).extremum_x2)
+    nearest, stuck = [], []
+    for belt, one in enumerate(osc.belts):
+        own = sticks & (chain.codes[:, belt] == 0)
+        shortest = jnp.min(jnp.where(own, z[:, 2], jnp.inf))
+        r = one.velocity - osc.omega * following[:, 1]
+        slips = extrema & (jnp.abs(chain.codes[:, belt]) == 1)
+        gap = jnp.min(jnp.where(slips, chain.codes[:, belt] * r, jnp.inf))
+        stuck.append(jnp.any(own))
+        nearest.append(jnp.where(stuck[-1], shortest, gap))
+    return jnp.stack(nearest), jnp.stack(stuck)
+
+
+def contact_tests(name: str, nearest: Array, watched: Array) -> Tests:
+    """Those distances of the belts that are watched, under a name."""
+    known = jnp.where(watched & jnp.isfinite(nearest), nearest, jnp.nan)
+    return {(name, (belt,)): known[belt] for belt in range(nearest.size)}
+
+
+# --- Newton's method ------------------------------------------------------------------------------
+
+
+@eqx.filter_custom_jvp
+def solve_system(osc, index, system, z0, p0):
+    """Unknowns, the parameter, the steps of Newton's method and the matrix of the last one."""
+
+    def linearized(unknowns):
+        return system.linearized(functools.partial(vary, osc, index), *unknowns)
+
+    solved = newton(linearized, (z0, p0))
+    return (*solved.z, solved.lengths, solved.matrix)
+
+
+@solve_system.def_jvp
+def _(primals, tangents):
+    osc, index, system, z0, p0 = primals
+    z, p, steps, matrix = solve_system(osc, index, system, z0, p0)
+    moved, fixed = eqx.partition(
+        osc, jax.tree.map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
+    )
+    _, shift = jax.jvp(
+        lambda moved: system.residual(vary(eqx.combine(moved, fixed), index, p), z),
+        (moved,),
+        (tangents[0],),
+    )
+    _, slopes = system.linearized(functools.partial(vary, osc, index), z, p)
+    change = jnp.linalg.solve(slopes, -shift)
+    return (z, p, steps, matrix), (change[:-1].reshape(z.shape), change[-1:], None, None)
+
+
+def accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
+    """The residual, and a bound on the error of p: what the residual with halved steps and rounding
+    do to it."""
+    mesh = system.chain.mesh
+    # The steps as they are, and halved; padded by steps of length zero to one shape.
+    meshes = jnp.stack(
+        [jnp.concatenate([mesh, jnp.zeros_like(mesh)], axis=1), jnp.repeat(0.5 * mesh, 2, axis=1)]
+    )
+
+    def value(mesh):
+        return eqx.tree_at(lambda s: s.chain.mesh, system, mesh).residual(osc, z)
+
+    values = lax.map(value, meshes)
+    weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
+    rounding = 1e-15 * (1 + jnp.max(jnp.abs(z))) * jnp.sum(jnp.abs(weights))
+    return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
+
+
+def small_newton(equations, osc, unknowns):
+    """Newton's method for a few equations(osc, unknowns).
+
+    Returns the solution, its steps, its residual and the error of the last unknown.
+    """
+
+    def linearized(u):
+        still = functools.partial(equations, lax.stop_gradient(osc))
+        return still(u), jax.jacfwd(still)(u)
+
+    solved = newton(linearized, lax.stop_gradient(unknowns))
+    u = lax.stop_gradient(solved.z)
+    # One more step carries the derivatives with respect to the other parameters.
+    matrix = jax.jacfwd(lambda u: equations(osc, u))(u)
+    value = equations(osc, u)
+    u = u - jnp.linalg.solve(matrix, value)
+    weights = jnp.linalg.solve(matrix.T, jnp.zeros(u.size).at[-1].set(1.0))
+    error = 1e-15 * (1 + jnp.max(jnp.abs(u))) * jnp.sum(jnp.abs(weights))
+    return u, solved.lengths, jnp.max(jnp.abs(value)), error

@@ -1,0 +1,356 @@
+"""Cycles tangent to the boundary of a belt: `NonsmoothFold` and `GrazingSliding`.
+
+The arc before the stick phase meets the boundary tangentially, r = 0 and x2' = 0, which for a law
+without a jump is the very point of slip onset. That arc is followed backwards from the point of
+tangency, so trial solutions cannot overshoot, and that it meets its entry is one equation more.
+Both kinds are this same event. What tells them apart is the multiplier m of the cycle at the point
+with that stick arc left out. The return map has slope 0 where the cycle sticks and slope m where it
+does not: for m > 1 both its fixed points lie on one side and vanish together (fold); for m < 1, one
+lies on either side, and the cycle goes on (grazing). A cycle with another stick phase has m = 0.
+Where the law jumps, static > mu(0+), the stick phase that begins at the tangency lasts, and without
+it the orbit is another one: the return map jumps, m = inf, and the cycle ends there.
+
+With a nonsmooth fold the paper's cycles end (its section 3); grazing-sliding is the name of M. di
+Bernardo, C. Budd, A. Champneys, P. Kowalczyk, Piecewise-smooth Dynamical Systems, 2008.
+"""
+
+import abc
+import functools
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..cycles.orbits import Orbit, follow, last_loop, loop_of
+from ..cycles.shooting import SIZES, Chain, Loop, admissible, meshed, trace_of
+from ..model.modes import STUCK, mode_acceleration, mode_of
+from ..model.oscillator import Oscillator
+from ..model.parameters import vary
+from ..motion.arcs import Ends
+from ..numerics.compiling import jit
+from ..numerics.newton import newton
+from ..results import EventKind, Status
+from .conditions import AbstractCycleCondition, Line, SpecialPoint
+from .guesses import HINT_BUDGET, least_push, orbit_after_stick
+from .systems import (
+    CycleSystem,
+    contact_tests,
+    nearest_contacts,
+    stick_phase_from,
+    velocity_of,
+)
+
+#: How far from an equilibrium its unstable manifold begins to be followed: the error is some third
+#: power of it over the velocity at which the friction law bends, 1/p3 for Conti's law.
+DEPARTURE = 1e-5
+#: Integration steps for each arc of that orbit; it takes long to leave.
+STEPS = 48
+
+
+class Encounter(CycleSystem):
+    """Two belts run at one velocity; if they are the same, an arc is tangent to its boundary.
+
+    row: of the stick phase that begins at the tangency, else -1; wanted: see `AbstractTangency`.
+    """
+
+    chain: Chain
+    belts: Array
+    row: Array
+    wanted: float | Array
+
+    def condition(self, osc, z, miss):
+        difference = velocity_of(osc, self.belts[0]) - velocity_of(osc, self.belts[1])
+        return jnp.where(self.belts[0] != self.belts[1], difference, miss)
+
+    @property
+    def is_tangency(self) -> Array:
+        """Whether an arc is tangent to the boundary of the one belt."""
+        return self.belts[0] == self.belts[1]
+
+    def _other_phases(self, osc: Oscillator) -> Array:
+        """The arcs of the stick phases that do not begin at the tangency."""
+        others = self.chain.used & ~stick_phase_from(osc, self.chain, self.row)
+        return others & jnp.any(self.chain.codes == 0, axis=-1)
+
+    def judge(self, osc, z, cycle, slope):
+        slope = jnp.where(z[self.row, 2] > 1e-6, jnp.inf, slope)  # sqrt(rounding) is no phase
+        slope = jnp.where(jnp.any(self._other_phases(osc)), 0.0, slope)
+        # A tangency is of one kind.
+        is_wanted = (self.wanted == 0) | (self.wanted * (slope - 1) >= 0)  # it may be infinite
+        fits = ~self.is_tangency | is_wanted
+        other_kind = (cycle.status == Status.OK) & ~fits
+        status = jnp.where(other_kind, Status.OTHER_KIND.value, cycle.status)
+        return status, jnp.where(self.is_tangency, slope, jnp.nan)
+
+    def watch(self, osc, z, slope):
+        sticks = self._other_phases(osc)
+        slope = jnp.where(jnp.any(sticks), 0.0, slope)
+        nearest, stuck = nearest_contacts(osc, self.chain, z, sticks)
+        # An exchange ends where the phase of sticking vanishes.
+        tests = contact_tests("DoubleSliding", nearest, stuck | self.is_tangency)
+        alone = self.is_tangency & ~jnp.any(sticks)
+        tests["FoldGrazing", ()] = jnp.where(alone, slope - 1, jnp.nan)
+        return tests, True, jnp.where(self.is_tangency, slope, jnp.nan)
+
+
+class AbstractTangency(AbstractCycleCondition):
+    """A cycle is tangent to the boundary of a belt.
+
+    wanted: 1 a fold, -1 grazing, 0 either.
+    """
+
+    belt: int | Array
+    family: ClassVar[str] = "tangency"
+    more_arcs: ClassVar[int] = 1
+    bends: ClassVar[bool] = True
+
+    @property
+    @abc.abstractmethod
+    def wanted(self) -> float | Array:
+        """Which of the two kinds is meant."""
+
+    @property
+    def sought(self):
+        return Tangency(self.belt)
+
+    def as_data(self):
+        # One program serves both kinds.
+        belt, wanted = (jnp.asarray(np.array(one)) for one in (self.belt, self.wanted))
+        return Tangency(belt, wanted)
+
+    def named(self, point):
+        return self.kind_along(point.oscillator, float(point.multiplier))(self.belt)
+
+    def kind_along(self, osc, multiplier):
+        return NonsmoothFold if multiplier > 1 else GrazingSliding
+
+    def guess(self, osc, size):
+        _, _, orbit = orbit_after_stick(osc, self.belt)
+        return _nearly_closed(osc, orbit, self.belt, size)
+
+    def system(self, osc, loop, status):
+        fits = jnp.sum(loop.used) < loop.ends.size  # it may need one arc more
+        status = jnp.where(fits | (status != Status.OK), status, Status.TOO_MANY_ARCS.value)
+        loop, row, found = _with_stick(osc, loop, self.belt)
+        chain, z = meshed(osc, loop)
+        status = jnp.where(found | (status != Status.OK), status, Status.NOT_TOUCHED.value)
+        status = jnp.where(velocity_of(osc, self.belt) == 0, Status.STUCK_FOREVER.value, status)
+        # The arc before the stick arc is the one that becomes tangent.
+        before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
+        ends = chain.ends.at[before].set(Ends(len(osc.belts)).tangent + self.belt)
+        chain, belts = Chain(chain.codes, ends, chain.mesh), jnp.stack([self.belt, self.belt])
+        return Encounter(chain, belts, row, self.wanted), z, status
+
+    def beginnings(self, cycles):
+        return [None, *(one.loop for one in cycles)]
+
+    def limit(self, trail):
+        """Where the curve ends at a belt at rest.
+
+        No cycle exists in the limit: slip onset on the belt meets an equilibrium, which the orbit
+        takes ever longer to leave. Of its two unstable directions the stronger one wins, by the
+        power 1 - weak/strong of the velocity. So in the limit the orbit along that direction is
+        tangent to the boundary, which is a regular problem.
+        """
+        stopping = trail.stopping()
+        if stopping is None:
+            return None
+        held, resting = stopping
+        nu, free = trail.values[:, held], trail.values[:, 1 - held]
+        guess = np.polyval(np.polyfit(nu, free, 2), 0.0)
+        still = vary(trail.osc, trail.indices[held], jnp.zeros(1))
+        belts = jnp.asarray(resting), jnp.asarray(self.belt)
+        # A cycle begins at the end of its longest stick phase, which is the one on that belt.
+        codes = jnp.asarray(np.asarray(trail.system.chain.codes)[0])
+        value, residual = _tangent_departure(
+            still, trail.indices[1 - held], codes, *belts, jnp.full(1, guess)
+        )
+        if not (residual < 1e-9 and abs(value - guess) < 3 * trail.step):
+            return None
+        values = (float(value), 0.0) if held else (0.0, float(value))
+        return SpecialPoint("BeltAtRest", (resting,), values, float(residual))
+
+
+class Tangency(AbstractTangency):
+    """A tangency of whichever kind, and what programs know of both."""
+
+    meant: float | Array = 0.0
+
+    @property
+    def wanted(self):
+        return self.meant
+
+
+class NonsmoothFold(AbstractTangency):
+    """The stick phase on a belt shrinks to a point and the cycle vanishes with an unstable one."""
+
+    caption: ClassVar[str] = "fold, belt {belt}"
+    line: ClassVar[Line] = Line("nonsmooth fold", "black")
+
+    @property
+    def wanted(self):
+        return 1.0
+
+
+class GrazingSliding(AbstractTangency):
+    """The cycle touches the boundary of a belt and begins to stick to it there, but goes on."""
+
+    caption: ClassVar[str] = "grazing, belt {belt}"
+    line: ClassVar[Line] = Line("grazing", "#CC79A7")
+
+    @property
+    def wanted(self):
+        return -1.0
+
+    @classmethod
+    def between(cls, before, after, edged):
+        # Whether a tangency is a fold or grazing is seen when it is found.
+        one, other = (label.events(EventKind.STICK) for label in (before, after))
+        return [cls(belt) for belt in (one - other) + (other - one)]
+
+
+# --- guesses --------------------------------------------------------------------------------------
+
+
+@jit
+def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tuple[Loop, Array]:
+    """A loop that is nearly the cycle, from the orbit after a stick phase, and a status.
+
+    Either a cycle was found, or the orbit left the boundary for good: then its first loop from
+    slip onset to the next extremum of x2 on that side, closed there, is nearly the cycle.
+    """
+    n = len(osc.belts)
+    velocity = velocity_of(osc, belt)
+    repeated = orbit.status == Status.OK
+    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
+    rows = jnp.arange(HINT_BUDGET)
+    near = (orbit.ends == Ends(n).extremum_x2) & (exits[:, 1] * jnp.sign(velocity) > 0) & (rows > 0)
+    last = jnp.argmax(near)
+    first_loop = eqx.tree_at(lambda o: (o.repeats, o.count), orbit, (jnp.asarray(0), last + 1))
+    returns = jnp.any(near) & ~jnp.any(
+        (rows > 0) & (rows <= last) & jnp.any(orbit.codes == 0, axis=-1)
+    )
+    orbit = jax.tree.map(lambda a, b: jnp.where(repeated, a, b), orbit, first_loop)
+    _, count = last_loop(orbit)
+    status = jnp.where(repeated | returns, Status.OK.value, Status.NOT_TOUCHED.value)
+    fits = (status != Status.OK) | (count <= size)
+    return loop_of(orbit, size, n), jnp.where(fits, status, Status.TOO_MANY_ARCS.value)
+
+
+def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, Array, Array]:
+    """A loop with a stick arc on the belt, its row, whether there is one.
+
+    Its own that begins most nearly by a tangency, or one of duration zero where x2 comes closest to
+    the boundary from inside.
+    """
+    velocity = velocity_of(osc, belt)
+    rows = jnp.arange(loop.ends.size)
+    names = Ends(len(osc.belts))
+    arrival, push = least_push(osc, loop, belt)
+    has_own = jnp.isfinite(push)
+    own = (arrival + 1) % jnp.maximum(jnp.sum(loop.used), 1)
+
+    following = loop.exits
+    loops = loop.used & (loop.ends == names.extremum_x2)
+    loops = loops & (loop.codes[:, belt] == jnp.sign(velocity))
+    loops = loops & (following[:, 1] * jnp.sign(velocity) > 0)
+    distance = jnp.abs(velocity - osc.omega * following[:, 1])
+    at = jnp.argmin(jnp.where(loops, distance, jnp.inf))
+
+    def inserted(array, new):
+        shifted = jnp.roll(array, 1, axis=0)
+        after = (rows > at + 1).reshape(-1, *[1] * (array.ndim - 1))
+        return jnp.where(after, shifted, array).at[at + 1].set(new)
+
+    # Where all rows are in use the last one is shifted out; the caller knows.
+    new = Loop(
+        codes=inserted(loop.codes, loop.codes[at].at[belt].set(STUCK)),
+        ends=inserted(loop.ends.at[at].set(belt), jnp.asarray(names.onset)),
+        entries=inserted(loop.entries, jnp.stack([following[at, 0], velocity / osc.omega])),
+        durations=inserted(loop.durations, jnp.zeros(())),
+    )
+    loop = jax.tree.map(lambda a, b: jnp.where(has_own, a, b), loop, new)
+    return loop, jnp.where(has_own, own, at + 1), has_own | jnp.any(loops)
+
+
+# --- the limit at a belt at rest ------------------------------------------------------------------
+
+
+@jit
+def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: Array):
+    """Value of a parameter for which the orbit from `_departure` is tangent to another boundary.
+
+    The 3N + 1 equations of an `Encounter`, but that the orbit is not closed: it begins on the
+    unstable manifold. Returns the residual, too, with every integration step halved; nan where
+    there is no such orbit.
+    """
+    osc_at = functools.partial(vary, osc, index)
+    start = _departure(osc_at(guess), codes, resting)
+    orbit = follow(osc_at(guess), start, HINT_BUDGET)
+    names = Ends(len(osc.belts))
+    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
+    side = jnp.sign(jnp.stack([belt.velocity for belt in osc.belts])[touched])
+    loops = (orbit.ends == names.extremum_x2) & (exits[:, 1] * side > 0)
+    meets = (loops | (orbit.ends == touched)) & (jnp.arange(HINT_BUDGET) < orbit.count)
+    last = jnp.argmax(meets)
+
+    rows = jnp.arange(SIZES[0])
+    ends = jnp.where(rows < last, orbit.ends[rows], names.unused)
+    ends = ends.at[last].set(names.tangent + touched)
+    durations = jnp.where(rows <= last, orbit.durations[rows], 0.0)
+    z = jnp.concatenate([orbit.entries[rows], durations[:, None]], axis=1)
+
+    def system(steps):
+        chain = Chain(orbit.codes[rows], ends, jnp.full((rows.size, steps), 1 / steps))
+        belts, either = jnp.stack([touched, touched]), jnp.zeros(())
+        return Encounter(chain, belts, jnp.asarray(-1), either)
+
+    closing = 3 * rows[-1] + jnp.arange(2)  # replaced by where the orbit begins
+
+    def begins(z, p):
+        return z[0, :2] - _departure(osc_at(p), codes, resting)
+
+    def linearized(unknowns):
+        z, p = unknowns
+        value, matrix = system(STEPS).linearized(osc_at, z, p)
+        _, slope = jax.jvp(lambda p: begins(z, p), (p,), (jnp.ones(1),))
+        row = jnp.zeros((2, value.size)).at[:, :2].set(jnp.eye(2)).at[:, -1].set(slope)
+        return value.at[closing].set(begins(z, p)), matrix.at[closing].set(row)
+
+    z, p = newton(linearized, (z, guess)).z
+    value = system(2 * STEPS).residual(osc_at(p), z).at[closing].set(begins(z, p))
+    exists = jnp.any(meets) & (last < SIZES[0]) & admissible(osc_at(p), system(1).ordinary, z)
+    return p[0], jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)
+
+
+def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
+    """A state on the orbit that leaves a belt at rest at slip onset, into a slip mode.
+
+    It is on the strong unstable manifold of the mode's equilibrium.
+
+    With x2' = -(x1 - rest) + trace x2 + bend x2^2 and eigenvalues strong > weak, whose product is
+    one, x1 - rest = weak x2 - weak bend / (2 strong - weak) x2^2 is invariant to third order. NaN
+    where they are negative, as nothing departs then, and where they are complex, a +- i b: the
+    orbit turns back to the belt within half a loop, on a cycle with -exp(pi a/b) times the belt's
+    velocity as its smallest x2. It shrinks with that velocity, so it touches nothing else, and no
+    curve of tangencies to another belt ends here.
+
+    Where the law of the belt jumps, slip onset is not at that equilibrium, and the state is one
+    shortly after it: x2' is the jump.
+    """
+    mode, zero = mode_of(codes), jnp.zeros(())
+    rest = mode_acceleration(osc, mode, zero, zero)
+    trace, twice_bend = jax.jvp(lambda x2: trace_of(osc, mode, rest, x2)[0], (zero,), (zero + 1,))
+    strong = 0.5 * trace + jnp.sqrt(0.25 * trace**2 - 1)
+    weak = 1 / strong
+    x2 = -codes[belt] * DEPARTURE
+    x1 = rest + weak * x2 - 0.5 * weak * twice_bend / (2 * strong - weak) * x2**2
+    jumps = [b.load * (b.friction.static - b.friction.mu(zero)) for b in osc.belts]
+    jump = codes[belt] * jnp.stack(jumps)[belt]
+    is_jump = jnp.abs(jump) > 1e-12
+    onset = rest + jump - 0.5 * x2**2 / jnp.where(is_jump, jump, 1.0)
+    known = is_jump | (strong > 0)
+    return jnp.where(known, jnp.stack([jnp.where(is_jump, onset, x1), x2]), jnp.nan)
