@@ -1,6 +1,8 @@
 """What every test runs under: float64, JAX's strict promotion rules, checked annotations."""
 
 import os
+import random
+import time
 
 import pytest
 
@@ -12,6 +14,29 @@ import jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+START = time.monotonic()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--minutes N`: what has not begun by then is skipped, and another part of it every time."""
+    parser.addoption("--minutes", type=float, help="skip what has not begun after so many minutes")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Files in another order in every run that may be cut short, the same for all its workers."""
+    if config.getoption("minutes") is not None:
+        files = sorted({item.path for item in items})
+        random.Random(getattr(config, "workerinput", {}).get("testrunuid")).shuffle(files)
+        items.sort(key=lambda item: files.index(item.path))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skips what comes too late."""
+    minutes = item.config.getoption("minutes")
+    if minutes is not None and time.monotonic() - START > 60 * minutes:
+        pytest.skip(f"not begun after {minutes:g} minutes")
 
 
 def pytest_configure(config: pytest.Config) -> None:

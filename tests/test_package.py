@@ -147,20 +147,22 @@ def test_examples_of_the_readme_run():
     plt.close("all")
 
 
-def test_ci_runs_the_test_command_of_the_readme():
-    """The lines of .ci/run that read the command find it, its exit code counts, and pytest is
+@pytest.mark.parametrize("mark", ["tests", "slow tests"])
+def test_ci_runs_the_test_commands_of_the_readme(mark):
+    """The line of .ci/run that reads a command finds it, its exit code counts, and pytest is
     started nowhere else."""
     ci = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-    (extraction,) = re.findall(r"^command=.*$", ci, re.MULTILINE)
+    (extraction,) = re.findall(r"^ *command=.*$", ci, re.MULTILINE)
+    assert 'for mark in tests "slow tests"; do' in ci
     run = subprocess.run(
-        ["bash", "-c", f'{extraction}\nprintf %s "$command"'],
+        ["bash", "-c", f'mark={mark!r}\n{extraction}\nprintf %s "$command"'],
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=True,
         timeout=60,
     )
-    assert run.stdout == readme_command("tests")
+    assert run.stdout == readme_command(mark)
     assert ci.count("$command") == 3  # looked at, shown, run
     assert 'bash -euo pipefail -c "$command") || tested=$?' in ci
     assert ci.rstrip().endswith("exit $((tested || linted))")
