@@ -25,11 +25,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Files in another order in every run that may be cut short, the same for all its workers."""
-    if config.getoption("minutes") is not None:
-        files = sorted({item.path for item in items})
-        random.Random(getattr(config, "workerinput", {}).get("testrunuid")).shuffle(files)
-        items.sort(key=lambda item: files.index(item.path))
+    """The order of a run that may be cut short: what is checked nowhere else, `slow(first=True)`,
+    then the other files, another one first in every run; the same for all its workers."""
+    if config.getoption("minutes") is None:
+        return
+    files = sorted({item.path for item in items})
+    random.Random(getattr(config, "workerinput", {}).get("testrunuid")).shuffle(files)
+
+    def order(item):
+        slow = item.get_closest_marker("slow")
+        return not (slow and slow.kwargs.get("first")), files.index(item.path)
+
+    items.sort(key=order)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -7,15 +7,17 @@ import matplotlib.pyplot as plt
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
-#: Quick to compile; what the others run is tested by itself, too.
-QUICK = ("01_first_steps", "02_sweeps")
+#: Quick to compile.
+QUICK = ("02_sweeps",)
 
 
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive:UserWarning")
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(path, marks=[] if path.stem in QUICK else pytest.mark.slow, id=path.stem)
+        pytest.param(
+            path, marks=[] if path.stem in QUICK else pytest.mark.slow(first=True), id=path.stem
+        )
         for path in NOTEBOOKS
     ],
 )

@@ -139,6 +139,7 @@ def test_readme_reproduces_the_paper_in_one_line():
     assert readme_command("reproduce").endswith("&& .venv/bin/jaxbelt reproduce")
 
 
+@pytest.mark.slow(first=True)
 def test_examples_of_the_readme_run():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     examples = re.findall(r"^```python\n(.+?)^```$", readme, re.MULTILINE | re.DOTALL)
