@@ -9,12 +9,12 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     results         status codes and what to do about them
     numerics/       compiling
     checks          arguments, checked at the public edge
-    numerics/       continuation derivatives extrapolation newton roots
-    model/          friction oscillator parameters modes equilibria
+    numerics/       derivatives extrapolation newton continuation roots
+    model/          friction oscillator parameters modes events equilibria
     presets         the published systems
-    motion/         smoothing simulate
-    cycles/         shooting orbits cycle attractors functionals
-    sweeps/         lanes step events observers attractor queue threads audit sweep basins
+    motion/         integrators arcs smoothing simulate
+    cycles/         settling shooting orbits cycle attractors functionals
+    sweeps/         lanes step events marks observers attractor queue threads audit sweep basins
     bifurcations/   refine switch_folds scan curves diagrams
     inverse/        selection record fit design
     plotting/       style phase diagrams sweeps model draw

@@ -5,12 +5,10 @@ sentence of advice for a code.
 """
 
 import enum
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-
-Step = TypeVar("Step")
 
 
 class Status(enum.IntEnum):
@@ -125,13 +123,6 @@ class EventKind(enum.IntEnum):
     SLIP = 2
     CROSS = 3
     EDGE = 4
-
-
-def of_one_loop(steps: Sequence[Step]) -> tuple[Step, ...]:
-    """The steps of a loop, events or modes, wherever it was begun: the least of the orders."""
-    loop = tuple(steps)
-    orders: Any = (loop[i:] + loop[:i] for i in range(len(loop)))
-    return min(orders, default=())
 
 
 #: What draws results. It stands above everything that computes them, in `plotting`, and the package

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
 from jaxbelt.bifurcations.scan import Path
-from jaxbelt.numerics.continuation import End
+from jaxbelt.numerics.continuation import Stop
 
 EDGE = EventKind.EDGE
 
@@ -377,7 +377,7 @@ def test_curves(diagram):
     rests, grazing = (
         jb.bifurcation_curve(diagram.points[i], where, span, step=0.03) for i in (3, 0)
     )
-    assert rests.ends == (End.LEFT_SPAN, End.LEFT_SPAN)
+    assert rests.ends == (Stop.LEFT_SPAN, Stop.LEFT_SPAN)
     sigma, nu = rests.values.T
     assert np.allclose(sigma, 0.6 + 0.4 / (1 + 10 * nu), rtol=0, atol=1e-14)
     for sigma, nu in grazing.values[1:-1:5].tolist():
@@ -385,7 +385,7 @@ def test_curves(diagram):
         assert sigma == pytest.approx(alone.x1_min, abs=1e-11)
     # It ends where the cycle does, which is that of class (a).
     (fold,) = grazing.special
-    assert (fold.kind, fold.belts) == ("DoubleSliding", (1,)) and End.STOPPED in grazing.ends
+    assert (fold.kind, fold.belts) == ("DoubleSliding", (1,)) and Stop.STOPPED in grazing.ends
     assert fold.values[1] == pytest.approx(0.267134534361, abs=1e-11)
 
 
@@ -401,7 +401,7 @@ def test_curve_of_an_unstable_cycle_that_touches_the_edge(diagram):
     assert fold.values[1] == pytest.approx(0.267134534361, abs=1e-11)
     hopf = (np.sqrt(8) - 1) / 10
     assert shrunk.values == pytest.approx((0.6 + 0.4 / (1 + 10 * hopf), hopf), abs=1e-13)
-    assert End.STOPPED in grazing.ends
+    assert Stop.STOPPED in grazing.ends
 
 
 def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
@@ -413,7 +413,7 @@ def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
     expected = [(pull[0], alone), (0.6 + 0.4 / 4.5 + pull[1], both)]
 
     balanced = jb.bifurcation_curve(diagram.points[5], where, span, step=0.03)
-    assert balanced.ends == (End.STOPPED, End.STOPPED)
+    assert balanced.ends == (Stop.STOPPED, Stop.STOPPED)
     found = sorted(point.values for point in balanced.special)
     assert [point.kind for point in balanced.special] == ["BoundaryHopf"] * 2
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)

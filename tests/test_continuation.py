@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbelt.numerics.continuation import End, continue_curve
+from jaxbelt.numerics.continuation import Stop, continue_curve
 
 # Points solve their equation to rounding; Newton's method ends below this.
 ROUNDING = 1e-12
@@ -27,7 +27,7 @@ def test_a_circle_closes_on_itself():
     points = list(continue_curve(circle, (1.9, 0.1), (0.0, 1.0), args=2.0, max_step=0.3))
     u = np.array([point.u for point in points])
     assert np.allclose(np.hypot(*u.T), 2.0, rtol=0, atol=ROUNDING)
-    assert points[-1].end is End.CLOSED and np.all(u[-1] == u[0])
+    assert points[-1].end is Stop.CLOSED and np.all(u[-1] == u[0])
     assert [point.end for point in points[:-1]] == [None] * (len(points) - 1)
     # Once round, no more: the angle grows from one point to the next.
     angle = np.unwrap(np.arctan2(u[:, 1], u[:, 0]))
@@ -41,7 +41,7 @@ def test_folds_are_passed_and_the_span_is_met_exactly():
     u = np.array([point.u for point in points])
     assert np.allclose(u[:, 0] ** 3 - u[:, 0], u[:, 1], rtol=0, atol=ROUNDING)
     assert np.sum(np.diff(np.sign(np.diff(u[:, 1]))) != 0) == 2
-    assert points[-1].end is End.LEFT_SPAN and u[-1, 1] == pytest.approx(2.5, abs=ROUNDING)
+    assert points[-1].end is Stop.LEFT_SPAN and u[-1, 1] == pytest.approx(2.5, abs=ROUNDING)
     # The tangent has unit length, goes the way of the motion, and is vertical at the folds only.
     tangents = np.array([point.tangent for point in points])
     assert np.allclose(np.linalg.norm(tangents, axis=1), 1.0, rtol=0, atol=1e-14)
@@ -62,25 +62,25 @@ def test_a_pitchfork_off_its_axis_is_followed_round_the_bend():
     *_, last = continue_curve(
         imperfect_pitchfork, (-0.7, 0.49), (0.0, 1.0), args=-1e-4, span=(-1, 1)
     )
-    assert last.u[1] == pytest.approx(1.0, abs=ROUNDING) and last.end is End.LEFT_SPAN
+    assert last.u[1] == pytest.approx(1.0, abs=ROUNDING) and last.end is Stop.LEFT_SPAN
 
 
 def test_ends():
     *_, last = continue_curve(circle, (2.0, 0.0), (0.0, 1.0), args=2.0, max_points=7)
-    assert last.end is End.POINT_COUNT
+    assert last.end is Stop.POINT_COUNT
 
     *_, last = continue_curve(
         circle, (2.0, 0.0), (0.0, 1.0), args=2.0, goes_on=lambda u: bool(u[1] < 1)
     )
     # The step is halved down to min_step before the curve is given up.
-    assert last.end is End.STOPPED and last.u[1] == pytest.approx(1, abs=1e-7) and last.u[1] < 1
+    assert last.end is Stop.STOPPED and last.u[1] == pytest.approx(1, abs=1e-7) and last.u[1] < 1
 
     def until_it_stops(u, _):
         return jnp.array([u[1] - jnp.sqrt(1 - u[0])])
 
     *_, last = continue_curve(until_it_stops, (0.0, 1.0), (1.0, 0.0))
     # The square root's branch point ends the real curve.
-    assert last.end is End.STEP_TOO_SMALL and last.u == pytest.approx([1, 0], abs=1e-3)
+    assert last.end is Stop.STEP_TOO_SMALL and last.u == pytest.approx([1, 0], abs=1e-3)
 
     assert list(continue_curve(until_it_stops, (3.0, 1.0), (1.0, 0.0))) == []
 

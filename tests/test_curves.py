@@ -12,7 +12,7 @@ import jaxbelt as jb
 from jaxbelt.bifurcations.curves import _departure
 from jaxbelt.bifurcations.refine import leaf_index, vary
 from jaxbelt.bifurcations.scan import refined
-from jaxbelt.numerics.continuation import End
+from jaxbelt.numerics.continuation import Stop
 
 
 def nu0(osc):
@@ -43,7 +43,7 @@ def test_the_hopf_curve_is_that_of_the_closed_form(points):
     a, b = curve.values.T
     # The trace of two belts, eq. (27): 4 / (1 + 10 nu)^2 each; slopes up to 10 times rounding.
     assert np.allclose(4 / (1 + 10 * a) ** 2 + 4 / (1 + 10 * b) ** 2, 0.5, rtol=0, atol=1e-14)
-    assert curve.ends == (End.LEFT_SPAN, End.LEFT_SPAN) and set(curve.kinds) == {"Hopf"}
+    assert curve.ends == (Stop.LEFT_SPAN, Stop.LEFT_SPAN) and set(curve.kinds) == {"Hopf"}
     assert np.all(np.max(np.abs(curve.values[[0, -1]]), axis=1) == pytest.approx(0.7, abs=1e-12))
     (special,) = curve.special
     assert special.kind == "EqualVelocities" and special.values == pytest.approx((0.3, 0.3))
@@ -96,7 +96,7 @@ def steepness(osc):
 )
 def test_curves_in_other_parameters(points, number, where, span, step):
     curve = jb.bifurcation_curve(points[number], where, span, step=step)
-    assert curve.ends == (End.LEFT_SPAN, End.LEFT_SPAN) and len(curve) > 12
+    assert curve.ends == (Stop.LEFT_SPAN, Stop.LEFT_SPAN) and len(curve) > 12
     rows = range(2, len(curve) - 2, len(curve) // 5)
     found = errors(curve, points[number].oscillator, where, points[number].condition, rows)
     assert max(found) < 1e-9
@@ -107,7 +107,7 @@ def test_a_closed_curve_ends_where_it_began():
     osc = jb.Oscillator(1.2, (jb.Belt(0.2, BELL), jb.Belt(0.2, BELL)))
     point = jb.refine(jb.Hopf(), osc, where=nu0)
     curve = jb.bifurcation_curve(point, (nu0, nu1), ((0.0, 1.0), (0.0, 1.0)), step=0.02)
-    assert curve.ends == (End.CLOSED, End.CLOSED)
+    assert curve.ends == (Stop.CLOSED, Stop.CLOSED)
     x, y = curve.values.T / 0.4
     assert np.allclose(2 * x / (1 + x**2) ** 2 + 2 * y / (1 + y**2) ** 2, 1.2, rtol=0, atol=1e-14)
     assert np.allclose(curve.values[0], curve.values[-1], rtol=0, atol=1e-14)
@@ -122,7 +122,7 @@ def test_folds_of_cycles_end_at_a_degenerate_hopf_point():
     """Where -mu' = zeta and the third derivative is 0: for this law at nu = 0.4 and zeta = 1/2."""
     point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.4, (jb.Belt(0.483, BELL),)), where=nu0)
     curve = jb.bifurcation_curve(point, (nu0, zeta), ((0.3, 0.7), (0.3, 0.6)), step=0.03)
-    assert set(curve.ends) == {End.STOPPED, End.LEFT_SPAN}
+    assert set(curve.ends) == {Stop.STOPPED, Stop.LEFT_SPAN}
     (end,) = curve.special
     assert end.kind == "DegenerateHopf" and end.residual < 1e-13
     assert end.values == pytest.approx((0.4, 0.5), abs=1e-13)
@@ -168,7 +168,7 @@ def test_folds_of_cycles_end_where_the_cycle_touches_a_boundary():
     expected = brentq(growth, grazing.values[1] - 0.004, grazing.values[1] + 0.004, xtol=1e-12)
     # The oracle's growth is good to some 1e-12.
     assert grazing.values == pytest.approx((tangency(expected), expected), abs=1e-9)
-    assert curve.ends == (End.STOPPED, End.STOPPED)
+    assert curve.ends == (Stop.STOPPED, Stop.STOPPED)
 
 
 def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
@@ -193,7 +193,7 @@ def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     # Interpolated by a cubic in steps of 0.02.
     assert found == pytest.approx(expected, abs=1e-5)
     rest = fold.special[1]
-    assert (rest.kind, rest.belts) == ("BeltAtRest", (0,)) and End.STOPPED in fold.ends
+    assert (rest.kind, rest.belts) == ("BeltAtRest", (0,)) and Stop.STOPPED in fold.ends
     expected = brentq(
         lambda nu: oracle_cycles.gap_from_rest(oracle.class_b(0.0, nu), 0, -1, 1),
         0.28,
@@ -327,4 +327,4 @@ def test_a_curve_ends_where_its_cycle_shrinks_to_a_point():
     for special in found.values():
         assert special.residual < 1e-8
         assert special.values == pytest.approx((0.0, 0.0), abs=special.residual)
-    assert curve.ends == (End.STOPPED, End.LEFT_SPAN)
+    assert curve.ends == (Stop.STOPPED, Stop.LEFT_SPAN)

@@ -33,7 +33,7 @@ from ..model.modes import boundary_guards, edge_guards, mode_acceleration, mode_
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index, names_of, parameter, vary
 from ..numerics.compiling import jit
-from ..numerics.continuation import CurvePoint, End, continue_curve, corrected
+from ..numerics.continuation import CurvePoint, Stop, continue_curve, corrected
 from ..numerics.newton import newton
 from ..results import Status, draw
 from .refine import (
@@ -124,7 +124,7 @@ class BifurcationCurve(eqx.Module):
     residual: np.ndarray
     places: np.ndarray
     special: tuple[SpecialPoint, ...] = eqx.field(static=True)
-    ends: tuple[End, End] = eqx.field(static=True)
+    ends: tuple[Stop, Stop] = eqx.field(static=True)
     names: tuple[str, str] = eqx.field(static=True)
 
     def __len__(self) -> int:
@@ -219,8 +219,8 @@ def bifurcation_curve(
     require(inside, "span", f"around the point {start.tolist()}", limits.tolist())
     problem = _Problem(point.condition, osc, indices, limits, step, max_points)
     ahead = _follow(problem, point, 1.0)
-    closed = ahead.end is End.CLOSED
-    behind = _Side(ahead.rows[:1], [], End.CLOSED) if closed else _follow(problem, point, -1.0)
+    closed = ahead.end is Stop.CLOSED
+    behind = _Side(ahead.rows[:1], [], Stop.CLOSED) if closed else _follow(problem, point, -1.0)
     rows = [*reversed(behind.rows[1:]), *ahead.rows]
     names = [names_of(osc)[number] for number in numbers]
     return BifurcationCurve(
@@ -273,7 +273,7 @@ class _Row(NamedTuple):
 class _Side(NamedTuple):
     rows: list[_Row]
     special: list[SpecialPoint]
-    end: End
+    end: Stop
 
 
 def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
@@ -288,12 +288,12 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
         rows += [_row(problem, at, seen) for at, seen in points[min(len(rows), 1) :]]
         special += found
         last = points[-1][0].u if points else u
-        if end is not End.LEFT_SPAN and (limit := _limit(problem, system, rows, last, end)):
+        if end is not Stop.LEFT_SPAN and (limit := _limit(problem, system, rows, last, end)):
             rows += _towards(problem, rows[-1].values, limit)
-            return _Side(rows, [*special, limit], End.STOPPED)
+            return _Side(rows, [*special, limit], Stop.STOPPED)
         if len(rows) >= problem.max_points or not points:
-            return _Side(rows, special, End.POINT_COUNT if points else End.STEP_TOO_SMALL)
-        if beyond is None and end is not End.POINT_COUNT:
+            return _Side(rows, special, Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL)
+        if beyond is None and end is not Stop.POINT_COUNT:
             return _Side(rows, special, end)
         if beyond is None:
             # The same curve, its mesh spread anew.
@@ -305,7 +305,7 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
         place = points[-1][1].place
         further = None if is_end else _beyond(problem, last[-2:], centre, place)
         if further is None:
-            return _Side(rows, special, End.STOPPED)
+            return _Side(rows, special, Stop.STOPPED)
         system = _system_of(problem, further)
         u = system.unknowns(further)
         direction = system.tangent(u)
@@ -320,7 +320,7 @@ class _Piece(NamedTuple):
     points: list[tuple[CurvePoint, "_Seen"]]
     special: list[SpecialPoint]
     beyond: CurvePoint | None
-    end: End
+    end: Stop
 
 
 def _piece(problem: _Problem, system: "_System", u, direction, origin) -> _Piece:
@@ -333,10 +333,10 @@ def _piece(problem: _Problem, system: "_System", u, direction, origin) -> _Piece
             special += _between(problem, system, points[-2], points[-1])
         if not points[-1][1].valid:
             beyond, _ = points.pop()
-            return _Piece(points, special, beyond, End.STOPPED)
+            return _Piece(points, special, beyond, Stop.STOPPED)
         if at.end is not None:
             return _Piece(points, special, None, at.end)
-    return _Piece(points, special, None, End.STEP_TOO_SMALL)
+    return _Piece(points, special, None, Stop.STEP_TOO_SMALL)
 
 
 def _closing(system: "_System", before: CurvePoint, after: CurvePoint, origin) -> CurvePoint | None:
@@ -350,7 +350,7 @@ def _closing(system: "_System", before: CurvePoint, after: CurvePoint, origin) -
     at = corrected(*system.problem, guess, normal / np.linalg.norm(chord), 0.0)
     if not at.found or np.linalg.norm(at.u[-2:] - origin) > 1e-6 * np.linalg.norm(chord):
         return None
-    return after._replace(u=at.u, tangent=at.tangent, end=End.CLOSED)
+    return after._replace(u=at.u, tangent=at.tangent, end=Stop.CLOSED)
 
 
 def _steps(problem: _Problem, system: "_System", u: np.ndarray, direction: np.ndarray):
@@ -490,10 +490,10 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np
     return None if best is None else best[1]
 
 
-def _limit(problem: _Problem, system, rows: list[_Row], u, end: End) -> SpecialPoint | None:
+def _limit(problem: _Problem, system, rows: list[_Row], u, end: Stop) -> SpecialPoint | None:
     """What the curve of a cycle ends in where there is no cycle, if that is near its point u."""
     if isinstance(problem.condition, FoldOfCycles | GrazingEdge):
-        return _limit_at_hopf(problem, system, u) if end is not End.POINT_COUNT else None
+        return _limit_at_hopf(problem, system, u) if end is not Stop.POINT_COUNT else None
     return _limit_at_rest(problem, system, rows)
 
 
@@ -611,16 +611,14 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
     def begins(z, p):
         return z[0, :2] - _departure(osc_at(p), codes, resting)
 
-    def step(unknowns):
+    def linearized(unknowns):
         z, p = unknowns
         value, matrix = system(STEPS).linearized(osc_at, z, p)
         _, slope = jax.jvp(lambda p: begins(z, p), (p,), (jnp.ones(1),))
         row = jnp.zeros((2, value.size)).at[:, :2].set(jnp.eye(2)).at[:, -1].set(slope)
-        value, matrix = value.at[closing].set(begins(z, p)), matrix.at[closing].set(row)
-        change = jnp.linalg.solve(matrix, -value)
-        return (change[:-1].reshape(z.shape), change[-1:]), jnp.max(jnp.abs(value)), matrix
+        return value.at[closing].set(begins(z, p)), matrix.at[closing].set(row)
 
-    z, p = newton(step, (z, guess)).z
+    z, p = newton(linearized, (z, guess)).z
     value = system(2 * STEPS).residual(osc_at(p), z).at[closing].set(begins(z, p))
     exists = jnp.any(meets) & (last < SIZES[0]) & admissible(osc_at(p), system(1).ordinary, z)
     return p[0], jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)

@@ -55,7 +55,8 @@ from jaxtyping import Array
 
 from ..checks import is_concrete, number, require
 from ..cycles.cycle import Cycle, cycle_of, separating_loop
-from ..cycles.orbits import AT_REST, Orbit, first_loop, follow, last_loop, loop_of
+from ..cycles.orbits import Orbit, first_loop, follow, last_loop, loop_of
+from ..cycles.settling import AT_REST
 from ..cycles.shooting import (
     SIZES,
     Chain,
@@ -346,12 +347,10 @@ class Encounter(System):
 def _solve_system(osc, index, system, z0, p0):
     """Unknowns, the parameter, the steps of Newton's method and the matrix of the last one."""
 
-    def step(unknowns):
-        value, matrix = system.linearized(functools.partial(vary, osc, index), *unknowns)
-        change = jnp.linalg.solve(matrix, -value)
-        return (change[:-1].reshape(z0.shape), change[-1:]), jnp.max(jnp.abs(value)), matrix
+    def linearized(unknowns):
+        return system.linearized(functools.partial(vary, osc, index), *unknowns)
 
-    solved = newton(step, (z0, p0))
+    solved = newton(linearized, (z0, p0))
     return (*solved.z, solved.lengths, solved.matrix)
 
 
@@ -1123,12 +1122,11 @@ def small_newton(equations, osc, unknowns):
     Returns the solution, its steps, its residual and the error of the last unknown.
     """
 
-    def step(u):
-        value = equations(lax.stop_gradient(osc), u)
-        matrix = jax.jacfwd(lambda u: equations(lax.stop_gradient(osc), u))(u)
-        return jnp.linalg.solve(matrix, -value), jnp.max(jnp.abs(value)), matrix
+    def linearized(u):
+        still = functools.partial(equations, lax.stop_gradient(osc))
+        return still(u), jax.jacfwd(still)(u)
 
-    solved = newton(step, lax.stop_gradient(unknowns))
+    solved = newton(linearized, lax.stop_gradient(unknowns))
     u = lax.stop_gradient(solved.z)
     # One more step carries the derivatives with respect to the other parameters.
     matrix = jax.jacfwd(lambda u: equations(osc, u))(u)

@@ -37,7 +37,6 @@ from ..cycles.attractors import (
     SOLVED,
     Itinerary,
     apart,
-    events_of,
     is_same,
     itinerary,
     place_of,
@@ -45,9 +44,10 @@ from ..cycles.attractors import (
     without_idle,
 )
 from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
-from ..cycles.orbits import AT_REST
+from ..cycles.settling import AT_REST
 from ..cycles.shooting import SIZES, Loop, cut
 from ..model.equilibria import EquilibriumKind, equilibria
+from ..model.events import events_of
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index, names_of, vary
 from ..numerics.compiling import each, jit

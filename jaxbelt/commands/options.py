@@ -1,5 +1,7 @@
 """What the commands share: options that describe an oscillator, errors in one sentence."""
 
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
@@ -26,9 +28,15 @@ LAWS: dict[str, tuple[type[jb.AbstractFriction], dict[str, float | None]]] = {
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """What a user did wrong is told in its one sentence, with exit code 2."""
+    """What a user did wrong is told in its one sentence, with exit code 2; an interrupt, with the
+    shells' 130."""
     try:
         yield
+    except KeyboardInterrupt as error:
+        typer.secho(str(error) or "interrupted", err=True, fg=typer.colors.RED)
+        # At once: an exit by an exception would wait for a compilation under way.
+        sys.stdout.flush()
+        os._exit(130)
     except (ValueError, OSError) as error:
         typer.secho(f"Error: {error}", err=True, fg=typer.colors.RED)
         raise typer.Exit(2) from None

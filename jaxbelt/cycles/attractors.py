@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..model.events import of_one_loop
 from ..model.modes import ABOVE
 from ..model.oscillator import Oscillator
-from ..results import EventKind, Status, of_one_loop
+from ..results import Status
 from .cycle import Cycle, find_cycle
-from .shooting import Chain, Ends, Loop, event_between, modes_of
+from .shooting import Chain, Ends, Loop, modes_of
 
 if TYPE_CHECKING:
     import xarray
@@ -32,9 +33,9 @@ Itinerary = tuple[tuple[int, ...], ...]
 #: hold to 1e-9, and beside a fold a cycle moves by ten thousand times that.
 SOLVED = 1e-5
 #: The same of runs of a sweep, times its tolerance: its errors are ten to a thousand times that.
-#: Where they are further apart, but not as far as FAR, or their events differ, shooting tells.
+#: Where they are further apart, but not as far as APART, or their events differ, shooting tells.
 RUN = 1e3
-FAR = 1e-2
+APART = 1e-2
 
 
 def itinerary(osc: Oscillator, loop: Chain | Loop) -> Itinerary:
@@ -52,13 +53,6 @@ def without_idle(osc: Oscillator, modes: np.ndarray) -> np.ndarray:
     """Contact codes, [.., belts], in which a belt without load, which does nothing, is absent."""
     idle = np.array([float(belt.load) == 0 for belt in osc.belts])
     return np.where(idle, int(ABOVE), modes)
-
-
-def events_of(path: Itinerary) -> tuple[tuple[EventKind, int], ...]:
-    """The events of one loop, (kind, belt) each."""
-    if len(path) == 1:
-        return ()
-    return tuple(event_between(*pair) for pair in zip(path, path[1:] + path[:1], strict=True))
 
 
 def sticks(path: Itinerary) -> bool:
@@ -152,4 +146,4 @@ class Runs:
         away = np.max(np.abs(both[0] - both[1]), axis=-1) / np.where(size > 0, size, 1.0)
         fits = self.signatures == others.signatures
         same = fits & (away < self.error)
-        return same, ~same & (away < max(FAR, 10 * self.error))
+        return same, ~same & (away < max(APART, 10 * self.error))

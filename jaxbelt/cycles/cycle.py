@@ -16,19 +16,21 @@ from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, check_finite, is_concrete, number, pick, require
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
+from ..model.events import Signature
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import Arcs
 from ..numerics.compiling import each, jit
-from ..results import EventKind, Status, describe
-from .orbits import BUDGET, first_loop, follow, last_loop, loop_of
+from ..numerics.newton import solve
+from ..results import Status, describe
+from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
 from .shooting import (
+    ARC_STEPS,
     SIZES,
-    STEPS,
     Chain,
+    ClosedChain,
     Ends,
     Loop,
-    _solve,
     admissible,
     closure,
     flow,
@@ -44,12 +46,11 @@ FINE_STEPS, EXACT = 32, 1e-11
 class Cycle(eqx.Module):
     """A steady cycle, differentiable with respect to every parameter of its oscillator.
 
-    oscillator: whose cycle it is; chain: its signature, see `Chain`; unknowns: (x1, x2, T) at the
-    entry of every arc, [arcs, 3]; both padded. multiplier: nontrivial Floquet multiplier, the
-    determinant of the monodromy matrix with its saltation matrices, exactly 0 where the cycle
-    sticks. residual: largest error in the shooting
-    equations. iterations: Newton steps. status: a
-    `Status` code; where it is not OK every number is NaN.
+    oscillator: whose cycle it is; chain: its arcs, see `Chain`; unknowns: (x1, x2, T) at the entry
+    of every arc, [arcs, 3]; both padded. multiplier: nontrivial Floquet multiplier, the determinant
+    of the monodromy matrix with its saltation matrices, exactly 0 where the cycle sticks. residual:
+    largest error in the shooting equations. iterations: Newton steps. status: a `Status` code;
+    where it is not OK every number is NaN.
 
     `period`; `stick_durations`, [belts], summed over the phases of one loop; `x1_min`, `x1_max`,
     `x2_min`, `x2_max`; `stable`; `signature`, ((kind, belt), ...) of the events of one loop;
@@ -111,7 +112,7 @@ class Cycle(eqx.Module):
         return arcs
 
     @property
-    def signature(self) -> tuple[tuple[EventKind, int], ...]:
+    def signature(self) -> Signature:
         """The events of one loop, (kind, belt) each; outside of transformations only."""
         require(
             is_concrete(self.chain) and self.chain.ends.ndim == 1,
@@ -123,7 +124,7 @@ class Cycle(eqx.Module):
 
     def sample(self, n: int) -> Array:
         """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
-        return _sample(self, n)
+        return _sample_cycle(self, n)
 
     def __repr__(self) -> str:
         if not is_concrete(self.unknowns) or self.unknowns.ndim != 2:
@@ -149,7 +150,7 @@ def as_loop(cycle: Cycle, size: int) -> Loop:
 
 
 @jit
-def _sample(cycle: Cycle, n: int) -> Array:
+def _sample_cycle(cycle: Cycle, n: int) -> Array:
     durations = cycle.unknowns[:, 2]
     ends = jnp.cumsum(durations)
 
@@ -206,7 +207,7 @@ def _first_failure(status: Array, fine: Array, code: Status) -> Array:
 @jit
 def _loop_reached(osc: Oscillator, y0: Array, size: int) -> tuple[Loop, Array, Array]:
     """The loop that the start leads to, in `size` arcs; how many it has, and a status."""
-    orbit = follow(osc, y0, BUDGET)
+    orbit = follow(osc, y0, MOST_ARCS)
     # Where there is no cycle the first arc still gives finite numbers to calculate with.
     loop = orbit.repeats, orbit.count
     loop = select(orbit.status == Status.OK, loop, (jnp.asarray(-1), jnp.asarray(1)))
@@ -235,11 +236,11 @@ def integration_error(cycle: Cycle) -> Array:
 
 
 @jit
-def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = STEPS) -> Cycle:
+def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -> Cycle:
     """The cycle that a loop nearly is, by Newton's method; one program for all that need it."""
     chain, guess = meshed(lax.stop_gradient(osc), loop, steps)
-    z, iterations = _solve(osc, chain, guess)
-    return cycle_of(osc, chain, z, iterations, status)[0]
+    solved = solve(ClosedChain(chain), osc, guess)
+    return cycle_of(osc, chain, solved.z, solved.iterations, status)[0]
 
 
 def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Cycle:
@@ -266,8 +267,9 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     return exactly(osc, loop, status)
 
 
-#: Starts that are compared in one batch, and how often the interval between two of them is refined.
-STARTS, REFINEMENTS = 32, 3
+#: Loops that are compared in one batch, and how often the interval between two of them is refined:
+#: 32^3 parts of it tell the guess to a thousandth, from where Newton's method converges.
+LOOPS_TRIED, REFINEMENTS = 32, 3
 
 
 def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = None) -> Cycle:
@@ -310,7 +312,7 @@ def _separating_loop(osc: Oscillator, rests: Equilibria, around: Array, size: in
         return orbit, inside
 
     def narrow(bracket, _):
-        distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
+        distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), LOOPS_TRIED))
         orbits, inside = each(loop)(distances)
         first = jnp.argmin(inside)
         bounded = ~inside[-1] & (first > 0)

@@ -1,53 +1,34 @@
 """Orbits followed until a loop repeats: how the signature of a cycle, and a guess of it, are found.
 
-An orbit is followed with the steps of `shooting` and with the transition rules of `modes`.
+An orbit is followed arc by arc, see `arcs`, every extremum the end of one.
 """
 
 import functools
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import (
-    at_focus,
-    begins_at_rest,
-    boundary_guards,
-    bounds_leftward,
-    bounds_rightward,
-    edge_guards,
-    first_of,
-    leave_slip,
-    leave_stick,
-    mode_acceleration,
-    mode_of,
-    mode_of_state,
-    select,
-    settles,
-    stick_phase,
-)
+from ..model.modes import at_focus, begins_at_rest, mode_of, mode_of_state, settles
 from ..model.oscillator import Oscillator
+from ..motion.arcs import ArcEnd, Ends, Signs, after_slip, signs_after, slip_arc, stick_arc
+from ..motion.integrators import Graded
 from ..numerics.compiling import one_kernel
-from ..numerics.roots import first_root
 from ..results import Status
-from .shooting import _MEDIUM, Ends, Loop, _field, _step, density
+from .settling import AT_REST, has_repeated
+from .shooting import Loop
 
-#: Arcs that an orbit is followed for before it is given up.
-BUDGET = 1024
-#: A loop that repeats to this fraction of the amplitude has repeated; Newton does the rest.
-REPEATED = 1e-7
-#: Amplitudes below this one are an equilibrium, up to what can be told.
-AT_REST = 1e-5
+#: Arcs that an orbit is followed for before it is given up: some 100 loops.
+MOST_ARCS = 1024
 
 
 class Orbit(eqx.Module):
     """The arcs of an orbit, in rows up to `count`: entry, duration, codes, and what ended each.
 
     tops: x1 where an arc ended in a maximum of x1, else NaN. repeats: row of the top that the last
-    one repeats, else -1. y, code: where it stands now. low, low_before: the smallest x1 since the
-    last top, and between that and the one before.
+    one repeats, else -1. y, code, signs: where it stands now. low, low_before: the smallest x1
+    since the last top, and between that and the one before.
     """
 
     entries: Array
@@ -58,6 +39,7 @@ class Orbit(eqx.Module):
     count: Array
     y: Array
     code: Array
+    signs: Signs
     low: Array
     low_before: Array
     repeats: Array
@@ -65,95 +47,30 @@ class Orbit(eqx.Module):
     done: Array
 
 
-def _after(osc: Oscillator, codes: Array, y: Array):
-    """Sign of x2' and x2 just after y; where x2' = 0, x2'' = -x2 decides."""
-    a = mode_acceleration(osc, mode_of(codes), y[0], y[1])
-    still, moving = jnp.abs(a) < 1e-9 * (1 + jnp.abs(y[0])), jnp.abs(y[1]) >= 1e-9
-    return jnp.sign(jnp.where(still, -y[1], a)), jnp.sign(jnp.where(moving, y[1], a))
+def _arc(osc: Oscillator, orbit: Orbit) -> ArcEnd:
+    """The next arc of an orbit, to an extremum at most."""
+    mode, y = mode_of(orbit.code), (orbit.y[0], orbit.y[1])
 
+    def slip():
+        arc = slip_arc(osc, mode, orbit.signs, y, Graded(osc, mode), every_extremum=True)
+        return after_slip(osc, mode, orbit.signs, arc)
 
-def _slip_to_guard(osc: Oscillator, codes: Array, y: Array):
-    """Follow a slip arc to the first of its guards: duration, end state, index of the guard."""
-    mode = mode_of(codes)
-    a_sign, v_sign = _after(osc, codes, y)
-    field = functools.partial(_field, osc, codes)
-
-    # Others are moved away from until the next loop.
-    nears_edge = jnp.where(
-        v_sign > 0, jnp.stack(bounds_rightward(mode)), jnp.stack(bounds_leftward(mode))
-    )
-    nears = jnp.concatenate([a_sign * codes > 0, nears_edge])
-
-    def guards(y):
-        a = mode_acceleration(osc, mode, y[0], y[1])
-        values = jnp.stack([*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])])
-        loops = jnp.stack([a_sign * a, v_sign * y[1]])
-        return jnp.append(jnp.where(nears, values, jnp.inf), loops)
-
-    def inside(state):
-        _, _, _, y_end, steps = state
-        # A stuck lane has no slip arc to follow; it must not keep a batch waiting.
-        going = (steps < 200) & ~mode.any_stuck & jnp.all(jnp.isfinite(y_end))
-        return ((steps == 0) | jnp.all(guards(y_end) >= 0)) & going
-
-    def advance(state):
-        t, _, h, y, steps = state
-        h_new = 0.2 / density(osc, codes, y)
-        return t + h, y, h_new, _step(field, y, h_new, _MEDIUM), steps + 1
-
-    zero = jnp.zeros(())
-    t, y0, h, y1, steps = lax.while_loop(inside, advance, (zero, y, zero, y, jnp.asarray(0)))
-
-    def guards_at(y):
-        return jax.jvp(guards, (y,), (field(y),))
-
-    values, slopes = guards_at(y1)
-    h_root, fired = first_root(
-        lambda h: guards_at(_step(field, y0, h, _MEDIUM)),
-        guards_at(y0),
-        h,
-        (jnp.where(mode.any_stuck, jnp.inf, values), slopes),
-        extrema=2,
-    )
-    # Newton's method adds the last digits, but at a tangency.
-    values, slopes = guards_at(_step(field, y0, h_root, _MEDIUM))
-    own = jnp.arange(values.size) == fired
-    value, slope = (jnp.sum(jnp.where(own, part, 0.0)) for part in (values, slopes))
-    regular = jnp.abs(slope) > 1e-6
-    h_root = h_root - jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0)
-    return t + h_root, _step(field, y0, h_root, _MEDIUM), fired, steps >= 200
+    return lax.cond(mode.any_stuck, lambda: stick_arc(osc, mode, y, jnp.asarray(jnp.inf)), slip)
 
 
 def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
-    n = len(osc.belts)
-    names = Ends(n)
-    y, codes = orbit.y, orbit.code
-    mode = mode_of(codes)
-    stuck = mode.any_stuck
+    codes = orbit.code
+    stuck = mode_of(codes).any_stuck
+    end = _arc(osc, orbit)
+    y_end = jnp.stack(end.y)
+    code = jnp.stack([jnp.asarray(c, dtype=orbit.y.dtype) for c in end.mode.codes])
 
-    phase = stick_phase(osc, mode, y[0])
-    stick_end = jnp.stack([phase.x1, y[1]])
-    forever = jnp.isinf(phase.duration)
-    edge_indices = [jnp.asarray(n + i) for i in range(2 * n)]
-    stick_fired = first_of(phase.edge, edge_indices, jnp.asarray(names.onset))
-
-    t_slip, slip_end, fired, lost = _slip_to_guard(osc, codes, y)
-    after = leave_slip(osc, mode, fired, slip_end[0], slip_end[1])
-    slip_end = jnp.stack([after.x1, after.x2])
-
-    y_end = jnp.where(stuck, stick_end, slip_end)
-    end = jnp.where(stuck, stick_fired, fired)
-    new = select(stuck, leave_stick(osc, mode, phase, y[1]), after.mode)
-    code = jnp.stack([jnp.asarray(c, dtype=y.dtype) for c in new.codes])
-    duration = jnp.where(stuck, phase.duration, t_slip)
-
-    # Whatever ends the arc: at the boundary of a belt at rest it is not the guard of loops.
-    falls = ~new.any_stuck & (_after(osc, code, y_end)[1] < 0)
-    is_top = ~stuck & (_after(osc, codes, y)[1] > 0) & falls
+    # Whatever ends the arc: at the boundary of a belt at rest it is not the guard of extrema.
+    is_top = ~stuck & (orbit.signs[1] > 0) & ~end.mode.any_stuck & (end.signs[1] < 0)
     top = jnp.where(is_top, y_end[0], jnp.nan)
     amplitude = top - orbit.low
     rows = jnp.arange(orbit.tops.size)
-    same = jnp.abs(orbit.tops - top) < REPEATED * amplitude
+    same = has_repeated(orbit.tops - top, amplitude)
     same = same & jnp.all(orbit.codes == codes[None], axis=-1)
     repeats = jnp.max(jnp.where(same, rows, -1))
     before = jnp.max(jnp.where(jnp.isnan(orbit.tops), -1, rows))
@@ -161,13 +78,12 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     stuck_since = jnp.any((rows > before) & jnp.any(orbit.codes == 0, axis=-1))
     shrinks = amplitude < orbit.tops[before] - orbit.low_before
     resting = is_top & shrinks & (amplitude < AT_REST) & ~stuck_since
-    resting = resting | settles(osc, new, y_end[0], y_end[1])
+    resting = resting | settles(osc, end.mode, *end.y)
 
-    status = jnp.where(stuck & forever, Status.STUCK_FOREVER.value, Status.OK.value)
-    status = jnp.where(~stuck & after.captured, Status.PSEUDO_FOCUS.value, status)
+    status = jnp.where(end.forever, Status.STUCK_FOREVER.value, Status.OK.value)
+    status = jnp.where(end.captured, Status.PSEUDO_FOCUS.value, status)
+    status = jnp.where(end.failed, Status.NOT_SETTLED.value, status)
     status = jnp.where(resting, Status.EQUILIBRIUM.value, status)
-    astray = ~stuck & lost & ~resting
-    status = jnp.where(astray, Status.NOT_SETTLED.value, status)
     status = jnp.where(jnp.all(jnp.isfinite(y_end)), status, Status.NOT_FINITE.value)
     own = rows == orbit.count
 
@@ -175,14 +91,15 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
         return jnp.where(own.reshape(-1, *[1] * value.ndim), value, column)
 
     return Orbit(
-        entries=put(orbit.entries, y),
-        durations=put(orbit.durations, duration),
+        entries=put(orbit.entries, orbit.y),
+        durations=put(orbit.durations, end.duration),
         codes=put(orbit.codes, codes),
-        ends=put(orbit.ends, end),
+        ends=put(orbit.ends, end.fired),
         tops=put(orbit.tops, top),
         count=orbit.count + 1,
         y=y_end,
         code=code,
+        signs=end.signs,
         low=jnp.where(is_top, y_end[0], jnp.minimum(orbit.low, y_end[0])),
         low_before=jnp.where(is_top, orbit.low, orbit.low_before),
         repeats=repeats,
@@ -217,6 +134,7 @@ def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
         count=jnp.asarray(0),
         y=y0,
         code=jnp.stack([jnp.asarray(c, dtype=y0.dtype) for c in mode.codes]),
+        signs=signs_after(osc, mode, (y0[0], y0[1])),
         low=y0[0],
         low_before=jnp.full_like(y0[0], jnp.inf),
         repeats=jnp.asarray(-1),

@@ -1,7 +1,7 @@
 """Shooting with a fixed signature: a closed chain of arcs as a square system of equations.
 
-A signature, (the mode, what ends it) arc by arc, is all that has to be known to compute a cycle:
-the numbers follow without any event detection (fixed-signature multiple shooting). An arc ends at a
+The mode of every arc, and what ends it, is all that has to be known to compute a cycle: the
+numbers follow without any event detection (fixed-signature multiple shooting). An arc ends at a
 boundary r_k = 0, at a contact edge, at slip onset, or at an extremum, x2' = 0 or x2 = 0. The
 extrema make x1 and x2 monotone on every arc, so all extrema of a cycle are ends of arcs. Counted
 for N arcs:
@@ -28,6 +28,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from ..model.events import Signature, events_of
 from ..model.modes import (
     Mode,
     boundary_guards,
@@ -40,32 +41,22 @@ from ..model.modes import (
     stick_velocity,
 )
 from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
+from ..motion.integrators import density
 from ..numerics.compiling import one_kernel
 from ..numerics.extrapolation import Scheme, increments, scheme
-from ..numerics.newton import newton
-from ..results import EventKind
+from ..numerics.newton import Equations
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
-STEPS = 8
-
-
-class Ends:
-    """Numbers for what ends an arc, for n belts."""
-
-    def __init__(self, n: int):
-        self.extremum_x2, self.extremum_x1, self.onset, self.unused, self.tangent = range(
-            3 * n, 3 * n + 5
-        )
+ARC_STEPS = 8
 
 
 class Chain(eqx.Module):
-    """A signature: contact codes [arcs, belts], what ends each arc [arcs], and the step fractions.
+    """A closed sequence of arcs: contact codes [arcs, belts], ends [arcs], and step fractions.
 
-    ends: i < n the boundary of belt i; n <= i < 3n the edge i - n of `modes.edges`; then the loop
-    x2' = 0, the loop x2 = 0, slip onset, an unused arc, of duration zero, and from there on a
-    tangency to the boundary of belt i (see `_arc_equations`).
+    ends: numbers of `arcs.Ends`. An unused arc is of duration zero.
     """
 
     codes: Array
@@ -83,7 +74,8 @@ class Chain(eqx.Module):
 
 
 class Loop(eqx.Module):
-    """One loop of an orbit, arc by arc, padded: a signature, and a guess of the unknowns."""
+    """One loop of an orbit, arc by arc, padded: codes and ends of a `Chain`, and a guess of its
+    unknowns, the entry states and durations."""
 
     codes: Array
     ends: Array
@@ -107,27 +99,9 @@ def modes_of(loop: Chain | Loop) -> np.ndarray:
     return codes[ends != Ends(codes.shape[-1]).unused].astype(int)
 
 
-def loop_events(loop: Chain | Loop) -> tuple[tuple[EventKind, int], ...]:
+def loop_events(loop: Chain | Loop) -> Signature:
     """The events of one loop, (kind, belt) each; for EDGE the lowest belt that comes or goes."""
-    modes = modes_of(loop).tolist()
-    pairs = zip(modes, modes[1:] + modes[:1], strict=True)
-    return tuple(event_between(before, after) for before, after in pairs if before != after)
-
-
-def event_between(before: Sequence[int], after: Sequence[int]) -> tuple[EventKind, int]:
-    """The event, (kind, belt), that leads from one mode to another one, by their contact codes.
-
-    Of several belts concerned the lowest.
-    """
-    pairs = list(zip(before, after, strict=True))
-    changes = {
-        EventKind.EDGE: [(abs(a) < 2) != (abs(b) < 2) for a, b in pairs],
-        EventKind.STICK: [a != 0 and b == 0 for a, b in pairs],
-        EventKind.SLIP: [a == 0 and b != 0 for a, b in pairs],
-        EventKind.CROSS: [a != b for a, b in pairs],
-    }
-    kind = next(kind for kind, changed in changes.items() if any(changed))
-    return kind, changes[kind].index(True)
+    return events_of(modes_of(loop))
 
 
 def following_codes(chain: Chain | Loop) -> Array:
@@ -150,9 +124,8 @@ def cut(loops: Sequence[Loop], *, more: int = 0) -> list[Loop]:
     return [jax.tree.map(lambda leaf: leaf[room], loop) for loop in loops]
 
 
-# Of order 12 for the arcs, of order 8 for following an orbit, of order 4 for placing the steps.
+# Of order 12 for the arcs, of order 4 for placing the steps.
 _FINE = scheme((2, 4, 6, 8, 10, 12))
-_MEDIUM = scheme((2, 4, 6, 8))
 _COARSE = scheme((2, 4))
 
 
@@ -167,31 +140,11 @@ def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -
     return y + jnp.stack(change)
 
 
-def _field(osc: Oscillator, codes: Array, y: Array) -> Array:
+def _slip_slopes(osc: Oscillator, codes: Array, y: Array) -> Array:
     return jnp.stack([y[1], mode_acceleration(osc, mode_of(codes), y[0], y[1])])
 
 
-def density(osc: Oscillator, codes: Array, y: Array) -> Array:
-    """How many steps per unit of time an orbit at y wants: more where the friction law bends.
-
-    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0.
-    """
-    a = mode_acceleration(osc, mode_of(codes), y[0], y[1])
-    bend = jnp.zeros(())
-    for i, belt in enumerate(osc.belts):
-        speed = jnp.maximum(jnp.sign(codes[i]) * (belt.velocity - osc.omega * y[1]), 0.0)
-
-        def slope(r, belt=belt):
-            return jax.jvp(belt.friction.mu, (r,), (jnp.ones_like(r),))[1]
-
-        curvature = jax.jvp(slope, (speed,), (jnp.ones_like(speed),))[1]
-        slips = jnp.abs(codes[i]) == 1
-        bend = bend + jnp.where(slips, jnp.sqrt(jnp.abs(belt.load * curvature)), 0.0)
-    turning = jnp.sqrt(bend * jnp.abs(osc.omega * y[1]))  # where x2' = 0, x2'' = -x2
-    return 1 + 0.4 * bend * jnp.abs(osc.omega * a) + turning
-
-
-def meshed(osc: Oscillator, loop: Loop, steps: int = STEPS) -> tuple[Chain, Array]:
+def meshed(osc: Oscillator, loop: Loop, steps: int = ARC_STEPS) -> tuple[Chain, Array]:
     """The chain of a loop with its mesh, and the guess of its unknowns."""
     stuck = jnp.any(loop.codes == 0, axis=-1)
     slip = jnp.where(stuck, 0.0, loop.durations)
@@ -206,11 +159,11 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
     h = duration / n
 
     def advance(y, _):
-        y = _step(functools.partial(_field, osc, codes), y, h, _COARSE)
-        return y, density(osc, codes, y)
+        y = _step(functools.partial(_slip_slopes, osc, codes), y, h, _COARSE)
+        return y, density(osc, mode_of(codes), *y)
 
     _, rest = lax.scan(advance, y, None, length=n)
-    rho = jnp.concatenate([density(osc, codes, y)[None], rest])
+    rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
     # Clipped: where a guess is poor the mesh is only less good.
     rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
     share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
@@ -230,7 +183,7 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     n_extra = 0 if extra is None else extra(osc, mode, y[0], y[1]).size
 
     def field(state):
-        smooth = _field(osc, codes, state[:2])
+        smooth = _slip_slopes(osc, codes, state[:2])
         if extra is None:
             return smooth
         return jnp.concatenate([smooth, extra(osc, mode, state[0], state[1])])
@@ -298,7 +251,7 @@ def _followed(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
 
 
 @one_kernel
-def _equations(osc: Oscillator, chain: Chain, z: Array) -> Array:
+def _all_arc_equations(osc: Oscillator, chain: Chain, z: Array) -> Array:
     """`_arc_equations` of all arcs, [N, 4]."""
 
     def one(row):
@@ -334,7 +287,7 @@ def _equations_and_blocks(osc: Oscillator, along: Oscillator | None, chain: Chai
 def residual(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
     """The 3N equations at the unknowns z, [N, 3]: mismatch of x1, of x2, guard, for every arc; and
     the miss of the tangent arcs, zero where there is none."""
-    out = _equations(osc, chain, z)
+    out = _all_arc_equations(osc, chain, z)
     return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3])
 
 
@@ -361,33 +314,17 @@ def jacobian(blocks: Array) -> Array:
     return (same - then).reshape(3 * n, 3 * n)
 
 
-@eqx.filter_custom_jvp
-def _solve(osc: Oscillator, chain: Chain, z0: Array) -> tuple[Array, Array]:
-    """Unknowns that solve the system, [N, 3], and the number of Newton steps."""
-    solved = newton(functools.partial(_newton_step, osc, chain), z0)
-    return solved.z, solved.iterations
+class ClosedChain(Equations):
+    """The 3N equations of a chain in the unknowns z, [N, 3], for an oscillator."""
 
+    chain: Chain
 
-def _newton_step(osc, chain, z):
-    value, _, blocks = residual_and_blocks(osc, None, chain, z)
-    matrix = jacobian(blocks[:, :3])
-    step = jnp.linalg.solve(matrix, -value.reshape(-1))
-    return step.reshape(z.shape), jnp.max(jnp.abs(value)), matrix
+    def residual(self, given: Oscillator, z: Array) -> Array:
+        return residual(given, self.chain, z)[0].reshape(-1)
 
-
-@_solve.def_jvp
-def _(primals, tangents):
-    osc, chain, z0 = primals
-    z, iterations = _solve(osc, chain, z0)
-    moved, fixed = eqx.partition(
-        osc, jax.tree.map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
-    )
-    _, shift = jax.jvp(
-        lambda moved: residual(eqx.combine(moved, fixed), chain, z)[0], (moved,), (tangents[0],)
-    )
-    _, _, blocks = residual_and_blocks(osc, None, chain, z)
-    z_dot = jnp.linalg.solve(jacobian(blocks[:, :3]), -shift.reshape(-1)).reshape(z.shape)
-    return (z, iterations), (z_dot, None)
+    def linearized(self, given: Oscillator, z: Array) -> tuple[Array, Array]:
+        value, _, blocks = residual_and_blocks(given, None, self.chain, z)
+        return value.reshape(-1), jacobian(blocks[:, :3])
 
 
 def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:

@@ -91,11 +91,11 @@ class Equilibria(eqx.Module):
         if not is_concrete(self) or self.kind.ndim > 1:
             return f"Equilibria(kind={self.kind.shape}, x1={self.x1.shape})"
         if self.kind.ndim == 1:
-            return f"Equilibria({'; '.join(map(_describe, self))})"
-        return f"Equilibria({_describe(self)})"
+            return f"Equilibria({'; '.join(map(_row_text, self))})"
+        return f"Equilibria({_row_text(self)})"
 
 
-def _describe(row: Equilibria) -> str:
+def _row_text(row: Equilibria) -> str:
     if row.kind == 0:
         return "none"
     kind = EquilibriumKind(int(row.kind))
@@ -118,10 +118,10 @@ def equilibria(osc: Oscillator) -> Equilibria:
     """
     check_oscillator(osc)
     found = candidates(osc)
-    return _trim(found, found)
+    return _existing(found, found)
 
 
-def _trim(rows, found: Equilibria):
+def _existing(rows, found: Equilibria):
     """Cut the padding off where it is known, that is, outside of transformations."""
     if not is_concrete((rows, found)):
         return rows
@@ -155,7 +155,7 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     is_segment = (held > 0) & (first < last)
     exists = is_fixed | is_segment
 
-    jacobian = jax.vmap(lambda mode, x1: _jacobian(osc, mode, x1))(mode, pull)
+    jacobian = jax.vmap(lambda mode, x1: _field_jacobian(osc, mode, x1))(mode, pull)
     eigenvalues = _eigenvalues(jnp.where(is_fixed[:, None, None], jacobian, jnp.eye(2)[None]))
     rate = jnp.real(eigenvalues[:, 0])
 
@@ -195,7 +195,7 @@ def _codes(mode: Mode, exists: Array) -> Array:
     return jnp.stack(codes, axis=-1)
 
 
-def _jacobian(osc: Oscillator, mode: Mode, x1: Array) -> Array:
+def _field_jacobian(osc: Oscillator, mode: Mode, x1: Array) -> Array:
     """Derivative of the field of a mode, (x1', x2'), by the state at (x1, 0), [2, 2]."""
 
     def field(y):
@@ -271,7 +271,7 @@ def lyapunov_coefficient(osc: Oscillator) -> Array:
     """
     check_oscillator(osc)
     found, coefficients = _lyapunov_coefficients(osc)
-    return _trim(coefficients, found)
+    return _existing(coefficients, found)
 
 
 @jit

@@ -18,7 +18,7 @@ or arrays of lanes (the kernel of `sweeps.queue`), belts are unrolled.
 
 import functools
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -31,11 +31,11 @@ from .oscillator import Oscillator, acceleration
 
 Tree = TypeVar("Tree")
 STUCK, BELOW, ABOVE = 0.0, -2.0, 2.0
-#: Numbers that differ by this fraction of them are the same, but for the rounding of nu/omega, say.
+#: Numbers that differ by less than this fraction are equal: so much do nu and omega (nu/omega).
 ULPS = 4e-16
-#: An orbit this close to a stable pseudo-focus (|x2| at the edge) has converged to it.
+#: Speed at the edge above which no orbit counts as captured by a stable pseudo-focus there.
 FOCUS_RADIUS = 1e-2
-#: Loops with a smaller |x2| than this are smaller than the rounding of x1.
+#: Speed at the edge below which loops around it, as wide as its square, are rounding of x1.
 FOCUS_ROUNDING = 1e-7
 
 
@@ -65,8 +65,8 @@ class Mode(eqx.Module):
         )
 
 
-def any_of(flags: Sequence[Array]) -> Array:
-    """Elementwise `or` of at least one array of booleans."""
+def any_of(flags: Sequence[Any]) -> Any:
+    """Elementwise `or` of at least one array of booleans, of JAX or of NumPy."""
     out = flags[0]
     for flag in flags[1:]:
         out = out | flag
@@ -104,6 +104,15 @@ def capacity(osc: Oscillator, mode: Mode) -> Array:
     return total
 
 
+def force_rounding(x1: Array, scale: Array | float = 1.0) -> Array:
+    """A force, or x2', below this is 0 up to rounding, wherever that is asked.
+
+    Forces at x1 are sums of terms of size `scale` and |x1|, each good to some 1e-16 of itself; but
+    x1 and x2 may come from an integrated arc, whose end is found to about 1e-13.
+    """
+    return 1e-12 * (scale + jnp.abs(x1))
+
+
 def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
     """Keep the stuck belts of `mode` stuck if they can hold the needed force, else let them slip.
 
@@ -115,7 +124,7 @@ def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
     """
     needed = mode_acceleration(osc, mode, x1, x2)
     held = capacity(osc, mode)
-    rounding = TANGENT * (held + jnp.abs(x1))
+    rounding = force_rounding(x1, held)
     slips = (jnp.abs(needed) > held + rounding) | (held == 0)
     onward = jnp.where(x2 < 0, -1.0, 1.0)
     sign = jnp.where(jnp.abs(needed) <= rounding, onward, -jnp.sign(needed))
@@ -189,9 +198,9 @@ def has_edges(osc: Oscillator) -> bool:
 
 # --- transitions ----------------------------------------------------------------------------------
 
-#: Rounding: a guard this small, over 1 + |nu| or 1 + |x1|, and an x2' this small, over 1 + |x1|,
-#: are 0.
-ON_GUARD, TANGENT = 1e-14, 1e-12
+#: A guard this small, over 1 + |nu| or 1 + |x1|, is 0: orbits are put on a guard exactly, so this
+#: is the rounding of a difference.
+ON_GUARD = 1e-14
 
 
 def directions(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
@@ -201,7 +210,7 @@ def directions(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array
     equilibrium only.
     """
     a = mode_acceleration(osc, mode, x1, x2)
-    tangent = (jnp.abs(a) < TANGENT * (1 + jnp.abs(x1))) & (x2 != 0)
+    tangent = (jnp.abs(a) < force_rounding(x1)) & (x2 != 0)
     a_sign = jnp.sign(jnp.where(tangent, -x2, a))
     return a_sign, jnp.where(x2 == 0, a_sign, jnp.sign(x2))
 
@@ -438,7 +447,7 @@ def _sides(osc: Oscillator, x1: Array, x2: Array) -> tuple[Mode, Mode]:
 def _pull_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> Array:
     """x2' at rest, (x1, 0): 0 where a belt holds the mass, and where it is but rounding."""
     a = mode_acceleration(osc, mode, x1, jnp.zeros_like(x1))
-    return jnp.where(mode.any_stuck | (jnp.abs(a) < TANGENT * (1 + jnp.abs(x1))), 0.0, a)
+    return jnp.where(mode.any_stuck | (jnp.abs(a) < force_rounding(x1)), 0.0, a)
 
 
 def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
@@ -457,18 +466,28 @@ def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
 
 # --- orbits that come to rest -------------------------------------------------------------------
 
-#: Radius below which a disc is not made smaller: rounding of x1 counts there.
+#: Radius of the smallest disc that is checked: in smaller ones the rounding of x1 counts.
 SMALLEST_DISC = 1e-6
 #: Speeds, as fractions of the radius, at which an attracting disc is checked.
 DISC = tuple(sign * j / 8 for j in range(1, 9) for sign in (1, -1))
 
 
-def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
-    """Whether an orbit of a slip mode has entered a disc that is attracted by a fixed point."""
+def settling_margin(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
+    """Positive where an orbit of a slip mode has entered a disc that its fixed point attracts, or
+    is there up to rounding: a node on an edge, or on the boundary of a belt at rest, has no disc.
+
+    And that fixed point's x1.
+    """
     zero = jnp.zeros_like(x1)
     x1_rest = mode_acceleration(osc, mode, zero, zero)
     radius = jnp.maximum(jnp.hypot(x1 - x1_rest, x2), SMALLEST_DISC)
-    return ~mode.any_stuck & (disc_margin(osc, mode, x1_rest, radius) > 0)
+    at_rest = jnp.maximum(jnp.abs(x1 - x1_rest), jnp.abs(x2)) < force_rounding(x1)
+    return jnp.where(at_rest, radius, disc_margin(osc, mode, x1_rest, radius)), x1_rest
+
+
+def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """Whether an orbit comes to rest at the fixed point of a slip mode, see `settling_margin`."""
+    return ~mode.any_stuck & (settling_margin(osc, mode, x1, x2)[0] > 0)
 
 
 def disc_margin(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> Array:
@@ -570,7 +589,7 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     )
     a_left, trace_left, *_ = field_at_rest(osc, left, edge)
     a_right, trace_right, *_ = field_at_rest(osc, right, edge)
-    rounding = TANGENT * (1 + jnp.abs(edge))
+    rounding = force_rounding(edge)
     pushed = (a_left > -rounding) & (a_right < rounding) & (a_left - a_right > rounding)
     shrinks = trace_right * jnp.maximum(a_left, 0) - trace_left * jnp.minimum(a_right, 0) < 0
     captured = captured | pushed & (shrinks | (nearest == 0)) & (size < FOCUS_ROUNDING)

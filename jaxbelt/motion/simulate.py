@@ -4,15 +4,10 @@ A trajectory is a chain of arcs. In a slip arc the orbit runs in the smooth fiel
 a guard of the mode vanishes; a stick arc is known in closed form. The chain is a `lax.scan` of
 segments, an arc each, so that it works under `jit`, `vmap`, and derivatives forward and reverse.
 
-Slip arcs are integrated by `diffrax.diffeqsolve` with one scalar event, the smallest guard. It is
-looked at after each step; where it is negative, the step is made once more, shorter, so that it
-ends on the first root of a guard, see `roots`. That root cannot hide within the step: besides the
-boundaries and edges, an arc also ends where the acceleration changes its sign (and, before a
-contact edge, where the velocity does), unless no boundary (no edge) is within reach. Between two
-such extrema x2 (x1) is monotone, so the sign at the end of a step tells all, and the sign at the
-extremum itself whether an orbit that grazes a boundary (an edge) meets it. Between two zeros of x2'
-lies a zero of x2, since x2'' = -x2 there: two extrema of x2 in one step would take half a loop
-around a focus within it, which `MAX_ARC` and `MAX_STEP` exclude.
+Slip arcs are those of `arcs`, integrated by diffrax. The arcs end at extrema where a boundary or an
+edge is within reach, and else after the time MAX_ARC. So no root hides within a step: between two
+zeros of x2' lies a zero of x2, since x2'' = -x2 there, and two extrema of x2 in one step would take
+half a loop around a focus within it, which `MAX_ARC` and `MAX_FRACTION` exclude.
 
 Samples at given times are taken from the arcs afterwards, in parallel.
 """
@@ -20,9 +15,7 @@ Samples at given times are taken from the arcs afterwards, in parallel.
 import functools
 import math
 from dataclasses import replace
-from typing import Any, ClassVar
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -31,33 +24,16 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..checks import as_numbers, check_finite, check_positive, is_concrete, require
-from ..model.modes import (
-    Mode,
-    at_focus,
-    boundary_guards,
-    bounds_leftward,
-    bounds_rightward,
-    contact,
-    edge_guards,
-    first_of,
-    leave_slip,
-    leave_stick,
-    mode_acceleration,
-    mode_of_state,
-    select,
-    stick_phase,
-    stick_velocity,
-)
+from ..model.events import event_between
+from ..model.modes import Mode, at_focus, contact, has_edges, mode_of_state, select, stick_velocity
 from ..model.oscillator import Oscillator, check_oscillator
 from ..numerics.compiling import any_lane, jit, one_kernel
 from ..numerics.derivatives import forward_jacobian
-from ..numerics.extrapolation import increments, scheme
-from ..numerics.roots import first_root
 from ..results import EventKind, Status, describe
+from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
+from .integrators import Adaptive, State, slip_field
 from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
-#: Longest and first step, as fractions of the time that is integrated over, MAX_ARC at most.
-MAX_STEP, FIRST_STEP = 0.5, 0.2
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
 #: because near-grazing events amplify them.
 SAFETY = 0.03
@@ -67,8 +43,6 @@ MAX_ARC = 1.0
 BLOCK = 32
 #: Lanes in which samples are computed.
 SAMPLED = 32
-#: Steps that one segment may take before it is given up.
-MAX_STEPS = 100_000
 
 
 class Events(eqx.Module):
@@ -133,288 +107,49 @@ class Trajectory(eqx.Module):
 # --- slip arcs ------------------------------------------------------------------------------------
 
 
-class _Extrapolation(diffrax.AbstractAdaptiveSolver):
-    """The midpoint rule extrapolated to order eight, the error from the extrapolation to six.
-
-    Its state is where its last step began and where it ended, (t, x1, x2) each.
-    """
-
-    scheme: ClassVar = scheme((2, 4, 6, 8), (2, 4, 6))
-    term_structure = diffrax.ODETerm
-    interpolation_cls = diffrax.LocalLinearInterpolation
-
-    def order(self, terms):
-        return 7  # that of the controlled error
-
-    def init(self, terms, t0, t1, y0, args):
-        return (t0, *y0), (t0, *y0)
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        def field(y):
-            return terms.vf(t0, y, args)
-
-        best, lower = increments(field, y0, t1 - t0, self.scheme)
-        y1 = tuple(a + b for a, b in zip(y0, best, strict=True))
-        error = tuple(a - b for a, b in zip(best, lower, strict=True))
-        last = (t0, *y0), (t1, *y1)
-        return y1, error, {"y0": y0, "y1": y1}, last, diffrax.RESULTS.successful
-
-
-def _velocity(osc, mode, y):
-    x1, x2 = y
-    return x2, mode_acceleration(osc, mode, x1, x2)
-
-
-def _single_step(osc, mode, y, h):
-    """The state one step of size h after y, in the field of the mode."""
-    best, _ = increments(functools.partial(_velocity, osc, mode), y, h, _Extrapolation.scheme)
-    return tuple(a + b for a, b in zip(y, best, strict=True))
-
-
-def _integrate(osc, mode, y, span, rtol, atol, left=None):
-    """From y in the slip field for the time `span`, or until left(t, y, ...).
-
-    Returns the last step's beginning and end, (t, x1, x2) each, t as a fraction of the span, and
-    whether it left. In units of the span the times are plain numbers: where they are not, diffrax
-    checks them with a callback, and that has no place in one kernel. Nor have the writes into
-    arrays that saving a result is in a batch; so the result is the solver's state.
-    """
-
-    def field(t, y, args):
-        return tuple(span * slope for slope in _velocity(osc, mode, y))
-
-    def norm(y):
-        # A lane that has nothing to do, and may be NaN, must not keep a batch waiting.
-        return jnp.where(span > 0, jnp.maximum(*(jnp.abs(part) for part in y)), 0.0)
-
-    # Where no event is looked for, a step may be as long as its error allows.
-    first, longest = (1.0, 1.0) if left is None else (FIRST_STEP, MAX_STEP)
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(field),
-        _Extrapolation(),
-        t0=0.0,
-        t1=1.0,
-        dt0=first,
-        y0=y,
-        saveat=diffrax.SaveAt(solver_state=True),
-        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol, dtmax=longest, norm=norm),
-        event=None if left is None else diffrax.Event(left),
-        adjoint=diffrax.ForwardMode(),
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    last: Any = solution.solver_state
-    return *last, solution.event_mask
-
-
-def _all_guards(osc: Oscillator, mode: Mode, extremum: tuple[Array, Array], y) -> Array:
-    """The guards of a slip mode: boundaries, edges, then the extremum of x2 and of x1."""
-    x1, x2 = y
-    a = mode_acceleration(osc, mode, x1, x2)
-    guards = [*boundary_guards(osc, mode, x2), *edge_guards(osc, mode, x1)]
-    return jnp.stack([*guards, extremum[0] * a, extremum[1] * x2])
-
-
-def _that_count(osc: Oscillator, mode: Mode, extremum: tuple[Array, Array], guards: Array) -> Array:
-    """The same, larger where they do not count.
-
-    A boundary or edge from which the orbit moves away until its next extremum does not, nor does an
-    extremum while what it protects is out of reach of one step.
-    """
-    n = len(osc.belts)
-    boundary, edge, extremum_x2, extremum_x1 = guards[:n], guards[n : 3 * n], guards[-2], guards[-1]
-    reach = jnp.abs(extremum_x2) + jnp.abs(extremum_x1)
-    extremum_x2 = jnp.maximum(extremum_x2, jnp.min(boundary) / osc.omega - reach)
-    extremum_x1 = jnp.maximum(extremum_x1, jnp.min(edge) - reach)
-    nears_boundary = extremum[0] * jnp.stack(mode.codes) > 0
-    rightward, leftward = jnp.stack(bounds_rightward(mode)), jnp.stack(bounds_leftward(mode))
-    nears_edge = jnp.where(extremum[1] > 0, rightward, leftward)
-    nears = jnp.concatenate([nears_boundary, nears_edge])
-    return jnp.append(jnp.where(nears, guards[:-2], jnp.inf), jnp.stack([extremum_x2, extremum_x1]))
-
-
-class _SlipArc(eqx.Module):
-    """End of a slip arc: its duration and state, the guard that fired (-1: none), failure."""
-
-    duration: Array
-    y: tuple[Array, Array]
-    fired: Array
-    failed: Array
+@forward_jacobian
+@one_kernel
+def _adaptive_slip_arc(osc, mode, signs, y, integrator) -> SlipArc:
+    return slip_arc(osc, mode, signs, y, integrator, every_extremum=False)
 
 
 @forward_jacobian
 @one_kernel
-def _slip_arc(osc, mode, extremum, y, span, rtol, atol) -> _SlipArc:
-    """Follow the slip arc from y until a guard fires or the time span is over."""
-
-    def left_mode(t, y, args, **kwargs):
-        # A rejected first step leaves t = 0, where a guard may vanish.
-        guards = _that_count(osc, mode, extremum, _all_guards(osc, mode, extremum, y))
-        return (t > 0) & (jnp.min(guards) < 0)
-
-    started, reached, hit = _integrate(osc, mode, y, span, SAFETY * rtol, SAFETY * atol, left_mode)
-    (t_start, *start), (t_end, *y_end) = started, reached
-    hit = jnp.asarray(hit)
-    finished = hit | (t_end >= 1)
-    t_start, t_end = span * t_start, span * t_end
-
-    # Make the last step once more, to the root instead of beyond it.
-    start, y_end = tuple(start), tuple(y_end)
-    last = lax.stop_gradient(t_end - t_start)
-    still = lax.stop_gradient((osc, mode, start))
-    f_osc, f_mode, f_extremum, f_end = lax.stop_gradient((osc, mode, extremum, y_end))
-
-    def guards_at(y):
-        def guards(*y):
-            return _all_guards(f_osc, f_mode, f_extremum, y)
-
-        values, slopes = jax.jvp(guards, y, _velocity(f_osc, f_mode, y))
-        return _that_count(f_osc, f_mode, f_extremum, values), slopes
-
-    values, slopes = guards_at(f_end)
-    root, fired = first_root(
-        lambda h: guards_at(_single_step(*still, h)),
-        guards_at(still[-1]),
-        last,
-        (jnp.where(hit, values, jnp.inf), slopes),
-        extrema=2,
-    )
-    # An extremum is invisible: nothing depends on where the arc is split.
-    is_event = hit & (fired < 3 * len(osc.belts))
-
-    def guard_fired(*y):
-        guards = _all_guards(osc, mode, extremum, y)
-        return jnp.sum(jnp.where(jnp.arange(guards.size) == fired, guards, 0.0))
-
-    # Two Newton steps, small ones: the digits that are left, and derivatives to second order.
-    def polish(carry, _):
-        h = carry[0]
-        y = _single_step(osc, mode, start, h)
-        guard, slope = jax.jvp(guard_fired, y, _velocity(osc, mode, y))
-        regular = jnp.abs(slope) * 1e-3 * last > jnp.abs(lax.stop_gradient(guard))
-        shift = jnp.where(regular, guard / jnp.where(regular, slope, 1.0), 0.0)
-        return (h - jnp.where(is_event, shift, 0.0), h, y), None
-
-    h = jnp.where(hit, root, jnp.where(finished, span - t_start, last))
-    (_, h, y), _ = lax.scan(polish, (h, h, start), length=3)
-    return _SlipArc(
-        duration=t_start + h,
-        y=y,
-        fired=jnp.where(hit, fired, -1),
-        failed=~finished,
-    )
-
-
-@forward_jacobian
-@one_kernel
-def _flow(osc, mode, y, duration, rtol, atol):
-    """The state after `duration` in the slip field of the mode, no events looked for."""
-    _, (_, *y_end), _ = _integrate(osc, mode, y, duration, rtol, atol)
-    return tuple(y_end)
+def _slip_flow(osc, mode, y, integrator):
+    """The state after the integrator's span in the slip field of the mode."""
+    return integrator.flow(functools.partial(slip_field, osc, mode), y)
 
 
 # --- segments -------------------------------------------------------------------------------------
 
 
-class _State(eqx.Module):
-    """Where a run is: time, state, mode, the extremum signs of x2' and x2, and how it stands."""
+class _RunState(eqx.Module):
+    """Where a run is: time, state, mode, the signs of x2' and x2, and how it stands."""
 
     t: Array
-    y: tuple[Array, Array]
+    y: State
     mode: Mode
-    extremum: tuple[Array, Array]
+    signs: Signs
     status: Array
     done: Array
 
 
-class _Step(eqx.Module):
-    """An arc's end: duration, state, next mode, the event, extremum signs where they are known."""
-
-    duration: Array
-    y: tuple[Array, Array]
-    mode: Mode
-    extremum: tuple[Array, Array]
-    kind: Array
-    status: Array
-    done: Array
-
-
-def _sign(value, tie):
-    return jnp.where(value == 0, tie, jnp.sign(value))
-
-
-def _extremum_signs(osc, mode, y):
-    """Signs of x2' and x2 just after y. Where x2' = 0, as at slip onset, x2'' = -x2 decides."""
-    x1, x2 = y
-    a = mode_acceleration(osc, mode, x1, x2)
-    tangent = jnp.abs(a) < 1e-12 * (1 + jnp.abs(x1))
-    a = jnp.where(tangent, -x2, a)
-    return lax.stop_gradient((_sign(a, 1.0), _sign(x2, _sign(a, 1.0))))
-
-
-def _slip_segment(osc: Oscillator, state: _State, t1, rtol, atol) -> _Step:
-    n = len(osc.belts)
+def _slip_segment(osc: Oscillator, state: _RunState, t1, rtol, atol) -> tuple[ArcEnd, Array]:
+    """A slip arc; and whether the run ends at its end."""
     left = t1 - state.t
     span = jnp.minimum(left, MAX_ARC)
-    arc = _slip_arc(osc, state.mode, state.extremum, state.y, span, rtol, atol)
-    fired = arc.fired
-    ended = (fired < 0) & (left <= MAX_ARC)
-
-    after = leave_slip(osc, state.mode, fired, *arc.y)
-    x1, x2 = after.x1, jnp.where(after.captured, 0.0, after.x2)
-    kind = jnp.where(
-        after.at_boundary,
-        jnp.where(after.mode.any_stuck, EventKind.STICK, EventKind.CROSS),
-        jnp.where(after.at_edge, EventKind.EDGE, 0),
-    )
-    flipped = (
-        jnp.where(fired == 3 * n, -state.extremum[0], state.extremum[0]),
-        jnp.where(fired == 3 * n + 1, -state.extremum[1], state.extremum[1]),
-    )
-    fresh = _extremum_signs(osc, after.mode, (x1, x2))
-    status = jnp.where(after.captured, Status.PSEUDO_FOCUS, Status.OK)
-    status = jnp.where(arc.failed, Status.TOO_MANY_STEPS, status)
-    return _Step(
-        duration=arc.duration,
-        y=(x1, x2),
-        mode=after.mode,
-        extremum=select(after.at_boundary | after.at_edge, fresh, flipped),
-        kind=kind,
-        status=status,
-        done=ended | after.captured,
-    )
+    integrator = Adaptive(span, SAFETY * rtol, SAFETY * atol)
+    arc = _adaptive_slip_arc(osc, state.mode, state.signs, state.y, integrator)
+    end = after_slip(osc, state.mode, state.signs, arc)
+    return end, end.captured | (end.fired < 0) & (left <= MAX_ARC)
 
 
-def _stick_segment(osc: Oscillator, state: _State, t1) -> _Step:
-    x1, x2 = state.y
-    phase = stick_phase(osc, state.mode, x1)
-    left = t1 - state.t
-    ended = phase.duration >= left
-    duration = jnp.where(ended, left, phase.duration)
-    x1_end = jnp.where(ended, x1 + x2 * left, phase.x1)
-    mode = select(ended, state.mode, leave_stick(osc, state.mode, phase, x2))
-    forever = jnp.isinf(phase.duration)
-    return _Step(
-        duration=duration,
-        y=(x1_end, x2),
-        mode=mode,
-        extremum=_extremum_signs(osc, mode, (x1_end, x2)),
-        kind=jnp.where(ended, 0, jnp.where(phase.slips, EventKind.SLIP, EventKind.EDGE)),
-        status=jnp.where(forever, Status.STUCK_FOREVER, Status.OK),
-        done=ended,
-    )
+def _stick_segment(osc: Oscillator, state: _RunState, t1) -> tuple[ArcEnd, Array]:
+    end = stick_arc(osc, state.mode, state.y, t1 - state.t)
+    return end, end.fired < 0
 
 
-def _first_change(before, after) -> Array:
-    """The lowest index of a belt for which two tuples of arrays differ, or -1."""
-    changed = [a != b for a, b in zip(before, after, strict=True)]
-    return first_of(changed, [jnp.asarray(i) for i in range(len(changed))], jnp.asarray(-1))
-
-
-class _Record(eqx.Module):
+class _ArcRecord(eqx.Module):
     """What a segment leaves behind: its arc and the event at its end."""
 
     t: Array
@@ -427,45 +162,44 @@ class _Record(eqx.Module):
     event_y: Array
 
 
-def _codes(mode: Mode) -> Array:
+def _stacked_codes(mode: Mode) -> Array:
     return jnp.stack([jnp.asarray(code, dtype=jnp.int8) for code in mode.codes])
 
 
-def _segment(osc: Oscillator, state: _State, t1, rtol, atol) -> tuple[_State, _Record]:
+def _segment(osc: Oscillator, state: _RunState, t1, rtol, atol) -> tuple[_RunState, _ArcRecord]:
     stuck = state.mode.any_stuck
     # Under vmap both branches run; lanes that are stuck or done then have no slip arc to follow.
     slip_until = jnp.where(stuck | state.done, state.t, t1)
-    step = lax.cond(
+    end, done = lax.cond(
         stuck,
         lambda: _stick_segment(osc, state, t1),
         lambda: _slip_segment(osc, state, slip_until, rtol, atol),
     )
+    kind, belt = event_between(state.mode.codes, end.mode.codes)
     # At t1 itself, where no event is before: the sum of the arcs may be short of it by rounding.
-    out_of_time = step.done & (step.kind == 0)
-    t = jnp.where(out_of_time, t1, state.t + step.duration)
-    finite = jnp.isfinite(t) & jnp.isfinite(step.y[0]) & jnp.isfinite(step.y[1])
-    status = jnp.where(finite, step.status, Status.NOT_FINITE)
-    belt = jnp.where(
-        step.kind == EventKind.EDGE,
-        _first_change(state.mode.touching, step.mode.touching),
-        _first_change(state.mode.codes, step.mode.codes),
-    )
-    record = _Record(
+    t = jnp.where(done & (kind == 0), t1, state.t + end.duration)
+    record = _ArcRecord(
         t=state.t,
         y=jnp.stack(state.y),
-        mode=_codes(state.mode),
-        duration=step.duration,
-        kind=step.kind,
-        belt=jnp.where(step.kind == 0, -1, belt),
+        mode=_stacked_codes(state.mode),
+        duration=end.duration,
+        kind=kind,
+        belt=belt,
         event_t=t,
-        event_y=jnp.stack(step.y),
+        event_y=jnp.stack(end.y),
     )
-    done = step.done | (t >= t1) | (status != Status.OK)
-    new = _State(t, step.y, step.mode, step.extremum, status, done)
-    return new, record
+    finite = jnp.isfinite(t) & jnp.isfinite(end.y[0]) & jnp.isfinite(end.y[1])
+    status = jnp.where(end.captured, Status.PSEUDO_FOCUS, Status.OK)
+    status = jnp.where(end.forever, Status.STUCK_FOREVER, status)
+    status = jnp.where(end.failed, Status.TOO_MANY_STEPS, status)
+    status = jnp.where(finite, status, Status.NOT_FINITE)
+    done = done | (t >= t1) | (status != Status.OK)
+    return _RunState(t, end.y, end.mode, end.signs, status, done), record
 
 
-def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_State, _Record]:
+def _arcs_of_run(
+    osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int
+) -> tuple[_RunState, _ArcRecord]:
     """The chain of arcs from y0: the final state and the stacked records, NaN where unused."""
     y = (y0[0], y0[1])
     mode = mode_of_state(osc, *y)
@@ -474,7 +208,7 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
         finite = finite & jnp.all(~jnp.isnan(leaf))
     status = jnp.where(at_focus(osc, *y), Status.PSEUDO_FOCUS.value, Status.OK.value)
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
-    start = _State(t0, y, mode, _extremum_signs(osc, mode, y), status, status != Status.OK)
+    start = _RunState(t0, y, mode, signs_after(osc, mode, y), status, status != Status.OK)
 
     def segment(given, state):
         osc, t1, rtol, atol = given
@@ -509,7 +243,7 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
     records = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), records)
     # A run that begins at a pseudo-focus has one arc, of duration zero.
     blank, zero = _unused(len(osc.belts)), jnp.zeros(())
-    rest = replace(blank, t=t0, y=jnp.stack(y), mode=_codes(mode), duration=zero)
+    rest = replace(blank, t=t0, y=jnp.stack(y), mode=_stacked_codes(mode), duration=zero)
     at_rest = start.status == Status.PSEUDO_FOCUS
     records = jax.tree.map(
         lambda leaf, first: leaf.at[0].set(jnp.where(at_rest, first, leaf[0])), records, rest
@@ -518,14 +252,14 @@ def _run(osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int) -> tuple[_S
     return eqx.tree_at(lambda s: s.status, final, unfinished), records
 
 
-def _unused(belts: int) -> _Record:
+def _unused(belts: int) -> _ArcRecord:
     """The record of a segment that is not needed."""
     nan, pair, none = jnp.full((), jnp.nan), jnp.full(2, jnp.nan), jnp.zeros((), int)
     mode = jnp.zeros(belts, jnp.int8)
-    return _Record(nan, pair, mode, nan, none, none, event_t=nan, event_y=pair)
+    return _ArcRecord(nan, pair, mode, nan, none, none, event_t=nan, event_y=pair)
 
 
-def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
+def _states_at(osc: Oscillator, final: _RunState, records: _ArcRecord, ts, rtol, atol):
     """States and modes at the times ts, each from the arc that it lies in."""
     entries = jnp.where(jnp.isnan(records.t), jnp.inf, lax.stop_gradient(records.t))
     wanted = ts.size
@@ -544,7 +278,7 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
         mode = Mode(tuple(arc.mode[j].astype(float) for j in range(len(osc.belts))))
         start = select(goes_on, (y[0], y[1]), (arc.y[0], arc.y[1]))
         duration = jnp.where(stuck, 0.0, since - jnp.where(goes_on, before, 0.0))
-        flown = _flow(osc, mode, start, duration, rtol, atol)
+        flown = _slip_flow(osc, mode, start, Adaptive(duration, rtol, atol))
         v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
         carried = arc.y[0] + v * since, v
         return jnp.stack(select(stuck, carried, flown))
@@ -568,7 +302,7 @@ def _sample(osc: Oscillator, final: _State, records: _Record, ts, rtol, atol):
     ys = jnp.swapaxes(ys, 0, 1).reshape(-1, 2)
     afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
     ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)
-    modes = jnp.where(beyond[:, None], _codes(final.mode), arcs.mode)
+    modes = jnp.where(beyond[:, None], _stacked_codes(final.mode), arcs.mode)
     return jnp.where(beyond[:, None], afterwards, ys)[:wanted], modes[:wanted]
 
 
@@ -582,8 +316,8 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
 
     def mode_at(y):
         if formulation == "switch":
-            return _codes(switch_mode(osc, y[0], y[1], width))
-        return _codes(contact(osc, y[0], y[1], rightward=True))
+            return _stacked_codes(switch_mode(osc, y[0], y[1], width))
+        return _stacked_codes(contact(osc, y[0], y[1], rightward=True))
 
     known = jnp.all(jnp.isfinite(ys))
     start_known = jnp.all(jnp.isfinite(y0))
@@ -601,7 +335,7 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
 
 @jit
 def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> Trajectory:
-    final, records = _run(osc, y0, t0, t1, rtol, atol, max_segments)
+    final, records = _arcs_of_run(osc, y0, t0, t1, rtol, atol, max_segments)
     # Events first, in a stable order; the rest is padding.
     has_event = records.kind > 0
     order = jnp.argsort(~has_event, stable=True)
@@ -615,7 +349,7 @@ def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> T
     if ts is None:
         # An even grid, and between its points the entries of the arcs, which are known already.
         grid = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)
-        ys, modes = _sample(osc, final, records, grid, rtol, atol)
+        ys, modes = _states_at(osc, final, records, grid, rtol, atol)
         unused = jnp.isnan(records.t)
         ts = jnp.concatenate([grid, jnp.where(unused, t1, records.t)])
         ys = jnp.concatenate([ys, jnp.where(unused[:, None], ys[-1], records.y)])
@@ -623,7 +357,7 @@ def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> T
         order = jnp.argsort(ts)
         ts, ys, modes = ts[order], ys[order], modes[order]
     else:
-        ys, modes = _sample(osc, final, records, ts, rtol, atol)
+        ys, modes = _states_at(osc, final, records, ts, rtol, atol)
     arcs = Arcs(records.t, records.y, records.mode, records.duration)
     return Trajectory(ts, ys, modes, events, arcs, final.status)
 
@@ -704,7 +438,7 @@ def simulate(
         )
     if max_segments is None:
         # Around a pseudo-focus at a contact edge a run has many short arcs.
-        max_segments = _power_of_two((64 if _has_edges(osc) else 8) * span, 512)
+        max_segments = _power_of_two((64 if has_edges(osc) else 8) * span, 512)
     require(
         isinstance(max_segments, int) and max_segments > 0,
         "max_segments",
@@ -714,20 +448,14 @@ def simulate(
     trajectory = _filippov(
         osc, y0, t0, t1, ts, rtol, atol, max_segments=max_segments, resolution=resolution
     )
-    return _trim(trajectory, trim_samples=ts is None)
-
-
-def _has_edges(osc: Oscillator) -> bool:
-    """Whether a contact edge is finite, or not known to be infinite."""
-    bounds = [(belt.lower, belt.upper) for belt in osc.belts]
-    return not is_concrete(bounds) or bool(np.any(np.isfinite(np.asarray(bounds))))
+    return _without_padding(trajectory, trim_samples=ts is None)
 
 
 def _power_of_two(value: float, least: int) -> int:
     return max(least, 2 ** math.ceil(math.log2(min(value, 2.0**20))))
 
 
-def _trim(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
+def _without_padding(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
     """Cut the padding off where lengths are known, that is, outside of transformations."""
     if not is_concrete(trajectory) or trajectory.ts.ndim != 1:
         return trajectory

@@ -19,7 +19,7 @@ from ..model.oscillator import Oscillator
 from ..numerics.derivatives import forward_jacobian
 
 #: Steps between two samples before a run is given up.
-MAX_STEPS = 1_000_000
+MAX_STEPS_A_SAMPLE = 1_000_000
 
 
 def switch_mode(osc: Oscillator, x1: Array, x2: Array, v_star: Array) -> Mode:
@@ -74,7 +74,7 @@ def smooth_field(osc: Oscillator, y: tuple[Array, Array], eps: Array) -> tuple[A
 
 
 @forward_jacobian
-def _flow(field, osc, width, y, duration, rtol, atol):
+def _smoothed_flow(field, osc, width, y, duration, rtol, atol):
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: field(osc, y, width)),
         diffrax.Tsit5(scan_kind="lax"),
@@ -85,7 +85,7 @@ def _flow(field, osc, width, y, duration, rtol, atol):
         saveat=diffrax.SaveAt(t1=True),
         stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol, dtmax=0.5),
         adjoint=diffrax.ForwardMode(),
-        max_steps=MAX_STEPS,
+        max_steps=MAX_STEPS_A_SAMPLE,
         throw=False,
     )
     t_end, y = jax.tree.map(lambda leaf: leaf[-1], (solution.ts, solution.ys))
@@ -103,7 +103,7 @@ def integrate(field, osc: Oscillator, width: Array, y0, t0, ts, rtol, atol) -> A
         now, y = carry
         # What is not a number would reject every step, and keep a batch waiting.
         goes = known & jnp.isfinite(y[0]) & jnp.isfinite(y[1])
-        y = _flow(field, osc, width, y, jnp.where(goes, t - now, 0.0), rtol, atol)
+        y = _smoothed_flow(field, osc, width, y, jnp.where(goes, t - now, 0.0), rtol, atol)
         y = tuple(jnp.where(goes, part, jnp.nan) for part in y)
         return (t, y), jnp.stack(y)
 

@@ -8,7 +8,7 @@ that is normal to t at the distance of one step. Newton's method solves these n 
 
 which are regular where the curve turns round with respect to any of its coordinates, too. The
 tangent comes from the exact Jacobian, the same one that Newton's method ends with. The step grows
-where Newton's method is quick, and is halved where it is slow, fails, or the tangent loops by more
+where Newton's method is quick, and is halved where it is slow, fails, or the tangent turns by more
 than an angle; that is the control of the error as well, for every point is a solution to rounding.
 Along a regular curve the determinant of the n + 1 equations keeps its sign, so where it does not,
 the step has gone over to another branch, and is halved, too.
@@ -22,21 +22,21 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, check_finite, require
 from .compiling import jit
+from .newton import newton
 
-#: Newton's method may take so many steps; half of it is quick.
-NEWTON_STEPS = 8
-#: A correction or a residual of this size is rounding.
-ROUNDING = 1e-12
+#: Newton's method may take so many steps to correct a point; half of it is quick.
+CORRECTIONS = 8
+#: A correction of this size is rounding, in unknowns of size one and systems that amplify it.
+SMALLEST_CORRECTION = 1e-12
 #: Cosine of the largest angle between the tangents of two neighbours.
 STRAIGHT = 0.95
 
 
-class End(enum.Enum):
+class Stop(enum.Enum):
     """Why a curve ends where it does."""
 
     LEFT_SPAN = "it leaves the given span"
@@ -58,7 +58,7 @@ class CurvePoint(NamedTuple):
     tangent: np.ndarray
     arclength: float
     iterations: int
-    end: End | None
+    end: Stop | None
     orientation: float
 
 
@@ -112,20 +112,20 @@ def continue_curve(
     origin = point
     for count in range(2, max_points + 2):
         if count > max_points:
-            yield point._replace(end=End.POINT_COUNT)
+            yield point._replace(end=Stop.POINT_COUNT)
             return
-        new, step, end = _advance(solve, point, step, (min_step, max_step), goes_on)
+        new, step, end = _next_point(solve, point, step, (min_step, max_step), goes_on)
         if new is None:
             yield point._replace(end=end)
             return
         yield point
         if np.any(new.u < limits[0]) or np.any(new.u > limits[1]):
-            yield _at_limit(solve, point, new, limits)._replace(end=End.LEFT_SPAN)
+            yield _at_limit(solve, point, new, limits)._replace(end=Stop.LEFT_SPAN)
             return
         if count > 2 and _passes(origin, point, new):
             yield origin._replace(
                 arclength=point.arclength + float(np.linalg.norm(origin.u - point.u)),
-                end=End.CLOSED,
+                end=Stop.CLOSED,
             )
             return
         point = new
@@ -136,10 +136,10 @@ def _point(solved, arclength: float) -> CurvePoint:
     return CurvePoint(solved.u, solved.tangent, arclength, iterations, None, orientation)
 
 
-def _advance(solve, point: CurvePoint, step: float, steps, goes_on):
+def _next_point(solve, point: CurvePoint, step: float, steps, goes_on):
     """The next point, the step to try after it; or None, and why there is none."""
     shortest, longest = steps
-    end = End.STEP_TOO_SMALL
+    end = Stop.STEP_TOO_SMALL
     while step >= shortest:
         solved = solve(point.u, point.tangent, step)
         turned = float(solved.tangent @ point.tangent)
@@ -148,9 +148,9 @@ def _advance(solve, point: CurvePoint, step: float, steps, goes_on):
         if allowed and (goes_on is None or goes_on(solved.u)):
             chord = float(np.linalg.norm(solved.u - point.u))
             new = _point(solved, point.arclength + chord)
-            quick = new.iterations <= NEWTON_STEPS // 2 and turned > 0.5 * (1 + STRAIGHT)
+            quick = new.iterations <= CORRECTIONS // 2 and turned > 0.5 * (1 + STRAIGHT)
             return new, min(longest, 1.5 * step if quick else step), None
-        end = End.STOPPED if allowed else End.STEP_TOO_SMALL
+        end = Stop.STOPPED if allowed else Stop.STEP_TOO_SMALL
         step *= 0.5
     return None, step, end
 
@@ -207,25 +207,22 @@ def _correct(residual, jacobian, args, u: Array, tangent: Array, step: Array) ->
             return jacobian(v, args)
         return residual(v, args), jax.jacfwd(lambda v: residual(v, args))(v)
 
-    last_row = jnp.zeros_like(u).at[-1].set(1.0)
-
-    def improve(state):
-        v, _, count, _, _ = state
+    def squared(v):
         value, matrix = linearized(v)
         value = jnp.append(value, tangent @ (v - u) - step)
-        matrix = jnp.concatenate([matrix, tangent[None]])
-        # One factorisation: the correction, and the kernel of the Jacobian for the tangent.
-        solved = jnp.linalg.solve(matrix, jnp.stack([-value, last_row], axis=1))
-        size = jnp.max(jnp.abs(solved[:, 0]))
-        sign, _ = jnp.linalg.slogdet(matrix)
-        return v + solved[:, 0], solved[:, 1], count + 1, sign, size
+        return value, jnp.concatenate([matrix, tangent[None]])
 
-    def unfinished(state):
-        _, _, count, _, size = state
-        return (count < NEWTON_STEPS) & (size > ROUNDING) & jnp.isfinite(size)
-
-    one = jnp.asarray(1.0)
-    start = (u + step * tangent, tangent, jnp.asarray(0), one, one)
-    v, kernel, count, sign, size = lax.while_loop(unfinished, improve, start)
-    found = (size <= 1e3 * ROUNDING) & jnp.all(jnp.isfinite(kernel))
-    return Corrected(v, kernel / jnp.linalg.norm(kernel), count, sign, found)
+    solved = newton(
+        squared,
+        u + step * tangent,
+        steps=CORRECTIONS,
+        longest=jnp.inf,
+        settled=lambda last, before: last <= SMALLEST_CORRECTION,
+    )
+    # The kernel of the Jacobian, for the tangent.
+    kernel = jnp.linalg.solve(solved.matrix, jnp.zeros_like(u).at[-1].set(1.0))
+    sign, _ = jnp.linalg.slogdet(solved.matrix)
+    size = solved.lengths[solved.iterations - 1]
+    found = (size <= 1e3 * SMALLEST_CORRECTION) & jnp.all(jnp.isfinite(kernel))
+    tangent = kernel / jnp.linalg.norm(kernel)
+    return Corrected(solved.z, tangent, solved.iterations, sign, found)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-State = tuple[Array, ...]
+Components = tuple[Array, ...]
 #: One row a substep: its length, whether it is the first of its rule, and the weights of the rule's
 #: result in what is wanted, at its last substep.
 Scheme = tuple[np.ndarray, ...]
@@ -38,8 +38,8 @@ def _weight(n: int, sizes: tuple[int, ...]) -> float:
 
 
 def increments(
-    field: Callable[[State], State], start: State, h: ArrayLike, scheme: Scheme
-) -> tuple[State, ...]:
+    field: Callable[[Components], Components], start: Components, h: ArrayLike, scheme: Scheme
+) -> tuple[Components, ...]:
     """What each result of the scheme adds to the state in one step of size h.
 
     Components of the state are kept apart, as scalars: so a batch is an array for each of them.

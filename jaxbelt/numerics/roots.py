@@ -17,8 +17,8 @@ from jaxtyping import Array
 Guards = tuple[Array, Array]
 #: A root is found to this fraction of the step.
 NEAREST = 5e-13
-#: A guard this small at the start is rounding: the orbit has just left it.
-ROUNDING = 5e-16
+#: A guard this small at the start is rounding of numbers of size one: the orbit has just left it.
+JUST_LEFT = 5e-16
 #: A bracket that interpolation does not narrow in so many steps is halved in every other.
 TRIALS, MOST = 8, 100
 
@@ -96,7 +96,7 @@ def _root(guards, which: Array, at_start: Guards, end: Array, at_end: Guards):
             count + 1,
         )
 
-    f_start = jnp.where(f_start > ROUNDING, f_start, -f_end)
+    f_start = jnp.where(f_start > JUST_LEFT, f_start, -f_end)
     start = (jnp.zeros_like(end), f_start, end, f_end, 0, end, at_end, 0)
     *_, c, at_c, _ = lax.while_loop(unfinished, improve, start)
     value, slope = pick(at_c)

@@ -1,1 +1,12 @@
-"""Many runs at once: the throughput kernel, `sweep` and `basins`."""
+"""Many runs at once: the throughput kernel, `sweep` and `basins`.
+
+- `lanes`: the state of the runs that the kernel advances together, a lane each, and `Observer`,
+  the base of what can be asked of them;
+- `step`: one Runge-Kutta step of all lanes; `events`: what follows where a step lands on a guard;
+- `observers`, `attractor`: what can be asked: final states, a user's reducer, attractors;
+- `queue`: the compiled loop that fills lanes from a queue of runs; `threads`: a loop on each core;
+- `sweep`: named axes in, a labelled dataset out; `audit`: runs again, without shortcuts;
+- `basins`: the same for starts of one oscillator.
+
+A new observable is a subclass of `lanes.Observer` in a file of its own; `sweep` takes it as it is.
+"""

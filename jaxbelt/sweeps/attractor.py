@@ -1,22 +1,19 @@
-"""The observer of attractors: where each run leads."""
+"""The observer of attractors: where each run leads, found as early as it is certain."""
 
+from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..model.modes import (
-    SMALLEST_DISC,
-    begins_at_rest,
-    disc_margin,
-    mode_acceleration,
-    select,
-)
+from ..cycles.settling import REPEATED, way_left
+from ..model.modes import begins_at_rest, select, settling_margin
+from ..model.oscillator import Oscillator
 from ..results import Status
 from .events import append, event_kinds
-from .lanes import Observer, once
-from .observers import Mark, no_mark, renew, returned
+from .lanes import Lanes, Observer, Passage, materialise
+from .marks import Mark
 
 #: What a run leads to, in the order of their codes.
 KINDS = ("undecided", "equilibrium", "cycle", "stuck")
@@ -24,11 +21,12 @@ UNDECIDED, EQUILIBRIUM, CYCLE, STUCK_FOR_EVER = range(4)
 
 
 class _Loop(eqx.Module):
-    """The loop under way, since the last mark; arrays [lanes], sticks one a belt.
+    """The loop under way, since the mark: arrays [lanes].
 
-    tops: how many there were since the last stick phase; previous, change: the top before, and how
-    far it was from the one before that; word: the events,
-    see `Attractor`; period and transient are set when the attractor is found.
+    x1_min, x1_max: extrema; sticks: time stuck to each belt; word: the events, see
+    `events.word_events`. tops: maxima of x1 since the last stick phase; previous: x1 at the last
+    one, change: how far that was from the one before. kind, period, transient, loop_events (how
+    many in one loop) are set when the attractor is found.
     """
 
     mark: Mark
@@ -45,24 +43,42 @@ class _Loop(eqx.Module):
     loop_events: Array
 
 
+def _extended(osc: Oscillator, loop: _Loop, lanes: Lanes, passage: Passage) -> _Loop:
+    """The loop with what has just happened: extrema of x1, time stuck, events."""
+    sticks = tuple(
+        total + jnp.where(stuck, passage.duration, 0.0)
+        for total, stuck in zip(loop.sticks, passage.mode.stuck, strict=True)
+    )
+    word = loop.word
+    for happened, kind, belt in event_kinds(lanes, passage):
+        longer = append(word, kind, belt, len(osc.belts))
+        word = jnp.where(happened & (belt >= 0), longer, word)
+    x1_min, x1_max = jnp.minimum(loop.x1_min, lanes.x1), jnp.maximum(loop.x1_max, lanes.x1)
+    return replace(loop, x1_min=x1_min, x1_max=x1_max, sticks=sticks, word=word)
+
+
 class Attractor(Observer):
     """Where the run leads; it ends as soon as that is known.
 
     - A cycle: an orbit that sticks repeats the end of a stick phase; from there it is a function of
       the parameters alone, so it does so to the last bits. One that does not stick converges: its
-      top (a maximum of x1, where x2 = 0) has repeated when what is left of the way to the limit, by
-      the ratio of its last two changes, is below `REPEATED` times the amplitude.
+      top (a maximum of x1, where x2 = 0) repeats, see `settling`.
     - An equilibrium: the run begins on one, or the orbit has entered a disc that is attracted by a
-      fixed point, see `modes.disc_margin`. A pseudo-focus is recognised by `modes.is_captured`.
+      fixed point, see `modes.settling_margin`. A pseudo-focus is recognised by `modes.is_captured`.
     - Stuck for ever: on a belt at rest.
 
     The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
     """
 
-    REPEATED: ClassVar[float] = 1e-7
-    #: Motion that is smaller than so many tolerances is the integrator's.
+    #: Distance to the last state at the end of a stick phase, which repeats up to rounding, over
+    #: the amplitude.
+    EXACT: ClassVar[float] = 1e-9
+    #: A top that moved by fewer tolerances than this, over the amplitude, moves by rounding alone.
+    STANDS: ClassVar[float] = 30.0
+    #: Motion that is smaller than so many tolerances comes from the integrator.
     RESOLVED: ClassVar[float] = 1e3
-    #: Until then extrema are left out, unless a stick phase has ended: about two loops.
+    #: Time before which steps do not end at extrema, unless a stick phase has ended: about two
+    #: loops, which are transient in nearly every run.
     SETTLING: ClassVar[float] = 12.0
     #: Tops without a stick phase after which a run is taken to stick no more.
     SMOOTH: ClassVar[int] = 2
@@ -76,7 +92,7 @@ class Attractor(Observer):
         nothing = zero + jnp.nan
         rests = begins_at_rest(osc, lanes.x1, lanes.x2)
         return _Loop(
-            mark=no_mark(lanes),
+            mark=Mark.none(lanes),
             x1_min=lanes.x1,
             x1_max=lanes.x1,
             sticks=tuple(zero for _ in osc.belts),
@@ -92,28 +108,59 @@ class Attractor(Observer):
 
     def watch(self, osc, lanes, passage, one, t1, tol):
         loop: _Loop = lanes.memory
-        sticks = tuple(
-            total + jnp.where(stuck, passage.duration, 0.0)
-            for total, stuck in zip(loop.sticks, passage.mode.stuck, strict=True)
-        )
-        word = loop.word
-        for happened, kind, belt in event_kinds(lanes, passage):
-            longer = append(word, kind, belt, len(osc.belts))
-            word = jnp.where(happened & (belt >= 0), longer, word)
+        seen = _extended(osc, loop, lanes, passage)
         # x1 is extreme where x2 = 0, and a step ends there.
-        x1_min, x1_max = jnp.minimum(loop.x1_min, lanes.x1), jnp.maximum(loop.x1_max, lanes.x1)
-        top = once(passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done, one)
-
-        mark, amplitude = loop.mark, x1_max - x1_min
-        change = lanes.x1 - loop.previous
-        ratio = jnp.abs(change / jnp.where(loop.change == 0, 1.0, loop.change))
-        left = jnp.where(ratio < 1, ratio / jnp.where(ratio < 1, 1 - ratio, 1.0), jnp.inf)
-        moved, close = jnp.abs(lanes.x1 - mark.x1), amplitude * self.REPEATED
-        converged = (moved * left <= close) | (moved < 30 * tol * amplitude)
-        released = once(passage.released & ~lanes.mode.any_stuck & ~lanes.done, one)
+        top = materialise(passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done, one)
+        released = materialise(passage.released & ~lanes.mode.any_stuck & ~lanes.done, one)
         tops = jnp.where(released, 0, loop.tops + jnp.where(top, 1, 0))
         section = released | (top & (tops > self.SMOOTH))
-        repeats = section & returned(mark, lanes, jnp.where(released, 1e-9 * amplitude, close))
+        change = lanes.x1 - loop.previous
+        kind = self._kind(seen, lanes, passage, section, released, change, tol)
+        going_on = (loop.kind == UNDECIDED) & (lanes.run >= 0)
+        kind = materialise(jnp.where(going_on, kind, UNDECIDED), one).astype(loop.kind.dtype)
+        found = kind != UNDECIDED
+        resting = found & (kind != CYCLE)
+        cycle = found & ~resting
+        mark = loop.mark
+        renewed, new = mark.renewed(lanes, section & ~found, one)
+        # An attractor at rest is a point; a new mark begins a new loop.
+        fresh = new | resting
+        memory = _Loop(
+            mark=renewed,
+            x1_min=jnp.where(fresh, lanes.x1, seen.x1_min),
+            x1_max=jnp.where(fresh, lanes.x1, seen.x1_max),
+            sticks=tuple(
+                jnp.where(found & passage.forever & stuck, jnp.inf, jnp.where(fresh, 0.0, total))
+                for total, stuck in zip(seen.sticks, passage.mode.stuck, strict=True)
+            ),
+            word=jnp.where(fresh, 1.0, seen.word),
+            tops=tops,
+            previous=jnp.where(top, lanes.x1, loop.previous),
+            change=jnp.where(top, change, loop.change),
+            kind=jnp.where(found, kind, loop.kind),
+            period=jnp.where(cycle, lanes.t - mark.t, loop.period),
+            transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), loop.transient),
+            loop_events=jnp.where(cycle, lanes.events - mark.events, loop.loop_events),
+        )
+        # Lanes that are decided keep what they found until it is handed in.
+        memory = select(loop.kind == UNDECIDED, memory, loop)
+        return replace(
+            lanes,
+            lower=jnp.where(fresh, lanes.x2, lanes.lower),
+            upper=jnp.where(fresh, lanes.x2, lanes.upper),
+            done=lanes.done | (memory.kind != UNDECIDED),
+            memory=memory,
+        )
+
+    def _kind(self, loop: _Loop, lanes, passage, section, released, change, tol) -> Array:
+        """What the lanes are found to lead to; section: lanes in a state to compare with marks;
+        released: those at the end of a stick phase; change: of x1 since the last top."""
+        amplitude = loop.x1_max - loop.x1_min
+        left = way_left(change, loop.change)
+        moved, close = jnp.abs(lanes.x1 - loop.mark.x1), amplitude * REPEATED
+        converged = (moved * left <= close) | (moved < self.STANDS * tol * amplitude)
+        exact = self.EXACT * amplitude
+        repeats = section & loop.mark.met_by(lanes, jnp.where(released, exact, close))
         repeats = repeats & (released | converged)
 
         kind = jnp.where(repeats, CYCLE, UNDECIDED)
@@ -123,72 +170,26 @@ class Attractor(Observer):
         shrinks = section & (change < 0) & (loop.change < 0)
         kind = jnp.where(small & ~released & (repeats | shrinks), EQUILIBRIUM, kind)
         kind = jnp.where(passage.captured | passage.rests, EQUILIBRIUM, kind)
-        kind = jnp.where(passage.forever, STUCK_FOR_EVER, kind)
-        going_on = (loop.kind == UNDECIDED) & (lanes.run >= 0)
-        kind = (jnp.where(going_on, kind, UNDECIDED) / one).astype(loop.kind.dtype)
-        found = kind != UNDECIDED
-        resting = found & (kind != CYCLE)
-        renewed, new = renew(mark, lanes, section & ~found, one)
-        # An attractor at rest is a point; a new mark begins a new loop.
-        fresh = new | resting
-        memory = _Loop(
-            mark=renewed,
-            x1_min=jnp.where(fresh, lanes.x1, x1_min),
-            x1_max=jnp.where(fresh, lanes.x1, x1_max),
-            sticks=tuple(
-                jnp.where(found & passage.forever & stuck, jnp.inf, jnp.where(fresh, 0.0, total))
-                for total, stuck in zip(sticks, passage.mode.stuck, strict=True)
-            ),
-            word=jnp.where(fresh, 1.0, word),
-            tops=tops,
-            previous=jnp.where(top, lanes.x1, loop.previous),
-            change=jnp.where(top, change, loop.change),
-            kind=jnp.where(found, kind, loop.kind),
-            period=jnp.where(found & ~resting, lanes.t - mark.t, loop.period),
-            transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), loop.transient),
-            loop_events=jnp.where(found & ~resting, lanes.events - mark.events, loop.loop_events),
-        )
-        # Decided lanes may have to wait until their result is taken.
-        memory = select(loop.kind == UNDECIDED, memory, loop)
-        return eqx.tree_at(
-            lambda n: (n.lower, n.upper, n.done, n.memory),
-            lanes,
-            (
-                jnp.where(fresh, lanes.x2, lanes.lower),
-                jnp.where(fresh, lanes.x2, lanes.upper),
-                lanes.done | (memory.kind != UNDECIDED),
-                memory,
-            ),
-        )
+        return jnp.where(passage.forever, STUCK_FOR_EVER, kind)
 
-    def rest(self, osc, lanes, one):
+    def watch_rarely(self, osc, lanes, one):
         loop: _Loop = lanes.memory
-        zero = jnp.zeros_like(lanes.t)
-        x1_rest = mode_acceleration(osc, lanes.mode, zero, zero)
-        radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), SMALLEST_DISC)
-        margin = disc_margin(osc, lanes.mode, x1_rest, radius)
-        margin = jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin) / one
-        found = margin > 0
-        memory = eqx.tree_at(
-            lambda m: (m.kind, m.x1_min, m.x1_max, m.sticks, m.transient),
+        margin, x1_rest = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
+        found = materialise(jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin), one) > 0
+        memory = replace(
             loop,
-            (
-                jnp.where(found, EQUILIBRIUM, loop.kind).astype(loop.kind.dtype),
-                jnp.where(found, x1_rest, loop.x1_min),
-                jnp.where(found, x1_rest, loop.x1_max),
-                tuple(jnp.where(found, 0.0, total) for total in loop.sticks),
-                jnp.where(found, lanes.t, loop.transient),
-            ),
+            kind=jnp.where(found, EQUILIBRIUM, loop.kind).astype(loop.kind.dtype),
+            x1_min=jnp.where(found, x1_rest, loop.x1_min),
+            x1_max=jnp.where(found, x1_rest, loop.x1_max),
+            sticks=tuple(jnp.where(found, 0.0, total) for total in loop.sticks),
+            transient=jnp.where(found, lanes.t, loop.transient),
         )
-        return eqx.tree_at(
-            lambda n: (n.lower, n.upper, n.done, n.memory),
+        return replace(
             lanes,
-            (
-                jnp.where(found, 0.0, lanes.lower),
-                jnp.where(found, 0.0, lanes.upper),
-                lanes.done | found,
-                memory,
-            ),
+            lower=jnp.where(found, 0.0, lanes.lower),
+            upper=jnp.where(found, 0.0, lanes.upper),
+            done=lanes.done | found,
+            memory=memory,
         )
 
     def finish(self, osc, lanes):

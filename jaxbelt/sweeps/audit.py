@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ..model.events import of_one_loop
 from ..model.modes import FOCUS_RADIUS
-from ..results import Status, of_one_loop
+from ..results import Status
 from .attractor import CYCLE, UNDECIDED
 from .events import word_events
 from .lanes import Program

@@ -1,16 +1,18 @@
-"""Events: lanes that stand on a guard of their mode go on, and how that is told.
+"""Events of the lanes: what follows where a step has landed, and what each event is called.
 
-Lanes go on by the rules of `modes`; stick phases are passed in closed form.
+What follows is decided by the rules of `model.modes`; stick phases are passed in closed form. A
+sequence of events is kept as one number, its word.
 """
 
-import equinox as eqx
+from dataclasses import replace
+
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..model.events import Signature, event_between
 from ..model.modes import (
-    TANGENT,
     Mode,
-    first_of,
+    force_rounding,
     guard_passed,
     leave_slip,
     leave_stick,
@@ -21,9 +23,7 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator
 from ..results import EventKind, Status
 from .lanes import Lanes, Passage, Program
-from .step import NO_STEP, first_step
-
-AT_REST = 1e-12
+from .step import NO_STEP, SAFETY, first_step
 
 
 def pass_events(
@@ -33,10 +33,10 @@ def pass_events(
     landed = (lanes.h < 0) & ~lanes.done
     # A lane may also have landed where x2 = 0, which is no guard.
     number = guard_passed(osc, lanes.mode, lanes.x1, lanes.x2)
-    # At rest but for rounding a lane stays, even on a guard.
-    slow = jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < AT_REST * (1 + jnp.abs(lanes.x1))
-    fired = landed & (number >= 0) & ~slow
-    rests = landed & slow & ((number >= 0) | (lanes.h >= -NO_STEP))
+    # At rest a lane stays, even on a guard.
+    at_rest = jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < force_rounding(lanes.x1)
+    fired = landed & (number >= 0) & ~at_rest
+    rests = landed & at_rest & ((number >= 0) | (lanes.h >= -NO_STEP))
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
     captured = fired & after.captured & program.captures
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
@@ -51,24 +51,12 @@ def pass_events(
     mode = select(captured, lanes.mode, mode)
     new_x1 = jnp.where(stuck, jnp.where(ends, x1 + x2 * left, phase.x1), x1)
     t = jnp.where(stuck & ends | rests, t1, lanes.t + duration)
-
-    # Slip onset is tangent: x2' = 0 there, for a law without a jump, but for rounding.
-    a = mode_acceleration(osc, mode, new_x1, x2)
-    a = jnp.where(jnp.abs(a) < TANGENT * (1 + jnp.abs(new_x1)), 0.0, a)
-    moved = landed | stuck
-    h = jnp.where(fired, first_step(rtol), jnp.abs(lanes.h))
-    if program.edges:
-        # In a corner one event follows the other at once: a lane that stands on the next guard,
-        # and goes on through it, has landed there.
-        corner = (fired | released) & ~mode.any_stuck & (guard_passed(osc, mode, new_x1, x2) >= 0)
-        h = jnp.where(corner, -h, h)
+    a, h = _set_off(program, osc, lanes, mode, new_x1, x2, fired, released, rtol)
     forever = stuck & jnp.isinf(phase.duration)
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
-    status = jnp.where(forever, Status.STUCK_FOREVER.value, status)
     passage = Passage(
         landed=landed,
         fired=fired,
-        guard=number,
         before=lanes.mode,
         mode=after.mode,
         t=lanes.t,
@@ -79,60 +67,55 @@ def pass_events(
         stuck=stuck,
         duration=duration,
         released=released,
-        slips=released & phase.slips,
         forever=forever,
     )
-    lanes = eqx.tree_at(
-        lambda n: (n.t, n.x1, n.x2, n.a, n.h, n.pace, n.mode, n.events, n.status, n.done),
+    lanes = replace(
         lanes,
-        (
-            t,
-            new_x1,
-            x2,
-            jnp.where(moved, a, lanes.a),
-            # The field is new after an event, and so is the step size.
-            h,
-            jnp.where(fired, 0.9 / first_step(rtol), lanes.pace),
-            mode,
-            lanes.events + jnp.where(fired, 1, 0) + jnp.where(released, 1, 0),
-            status,
-            lanes.done | captured | (t >= t1),
-        ),
+        t=t,
+        x1=new_x1,
+        x2=x2,
+        a=jnp.where(landed | stuck, a, lanes.a),
+        # The field is new after an event, and so is the step size.
+        h=h,
+        pace=jnp.where(fired, SAFETY / first_step(rtol), lanes.pace),
+        mode=mode,
+        events=lanes.events + jnp.where(fired, 1, 0) + jnp.where(released, 1, 0),
+        status=jnp.where(forever, Status.STUCK_FOREVER.value, status),
+        done=lanes.done | captured | (t >= t1),
     )
     return lanes, passage
+
+
+def _set_off(program, osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> tuple[Array, Array]:
+    """x2' and the step size with which the lanes go on in a mode."""
+    a = mode_acceleration(osc, mode, x1, x2)
+    # Slip onset is tangent: x2' = 0 there up to rounding, for a law without a jump.
+    a = jnp.where(jnp.abs(a) < force_rounding(x1), 0.0, a)
+    h = jnp.where(fired, first_step(rtol), jnp.abs(lanes.h))
+    if program.edges:
+        # In a corner one event follows the other at once: a lane that stands on the next guard,
+        # and goes on through it, has landed there.
+        corner = (fired | released) & ~mode.any_stuck & (guard_passed(osc, mode, x1, x2) >= 0)
+        h = jnp.where(corner, -h, h)
+    return a, h
 
 
 def event_kinds(lanes: Lanes, passage: Passage) -> tuple[tuple[Array, Array, Array], ...]:
     """(happened, kind, belt) of the event that ended a step, and of that which ended a stick phase
     after it."""
-    sticks = jnp.where(passage.mode.any_stuck, EventKind.STICK.value, EventKind.CROSS.value)
-    at_edge = passage.guard >= len(lanes.mode.codes)
-    kind = jnp.where(at_edge, EventKind.EDGE.value, sticks)
-    release = jnp.where(passage.slips, EventKind.SLIP.value, EventKind.EDGE.value)
     return (
-        (passage.fired, kind, _belt(passage.before, passage.mode, at_edge)),
-        (passage.released, release, _belt(passage.mode, lanes.mode, ~passage.slips)),
+        (passage.fired, *event_between(passage.before.codes, passage.mode.codes)),
+        (passage.released, *event_between(passage.mode.codes, lanes.mode.codes)),
     )
 
 
-def _belt(before: Mode, after: Mode, at_edge: Array) -> Array:
-    """The lowest belt whose contact changed, or, at an edge, that came or went."""
-    numbers = [jnp.asarray(i) for i in range(len(before.codes))]
-
-    def first_change(a, b):
-        return first_of([p != q for p, q in zip(a, b, strict=True)], numbers, jnp.asarray(-1))
-
-    came = first_change(before.touching, after.touching)
-    return jnp.where(at_edge, came, first_change(before.codes, after.codes))
-
-
 def append(word: Array, kind: Array, belt: Array, belts: int) -> Array:
-    """A word with one more event; inf if it would no longer be a whole number to the last bit."""
+    """A word with one more event; inf where a float64 would no longer hold it exactly."""
     longer = word * (len(EventKind) * belts + 1) + (1 + (kind - 1) * belts + belt)
     return jnp.where(longer < 2.0**53, longer, jnp.inf)
 
 
-def word_events(word: int, belts: int) -> tuple[tuple[EventKind, int], ...]:
+def word_events(word: int, belts: int) -> Signature:
     """The events, (kind, belt) each, that the word of an attractor's signature stands for.
 
     A word is a number in the base 4 belts + 1: a leading 1, then for each event

@@ -1,7 +1,7 @@
-"""Lanes: the state of the many runs that one kernel advances at once, and who looks at them.
+"""Lanes: the state of the runs that one kernel advances together, and the base of its observers.
 
-An `Observer` says what is wanted of a run. A `Program` is all that is fixed when the kernel is
-compiled for it.
+An `Observer` says what is wanted of a run and when it may end. A `Program` is everything that is
+fixed when the kernel is compiled.
 """
 
 import abc
@@ -19,11 +19,11 @@ from ..model.oscillator import Oscillator
 class Lanes(eqx.Module):
     """The state of all lanes, arrays [lanes].
 
-    run: number of the run, -1 for none; begun: the pass in which it began; t, x1, x2, a: time,
-    state and x2'; h: next step size; negative where the lane has landed on a bound of its mode and
-    waits for what follows; pace: the inverse of the step that would have met the tolerance; mode;
-    events: their number; status; done. lower, upper: extrema of x2 since `memory` was cleared,
-    where the observer tracks them. memory: the observer's own.
+    run: number of the run, -1 for none; begun: the pass of the kernel's loop in which it began; t,
+    x1, x2, a: time, state and x2'; h: next step size, negative where the lane has landed on a bound
+    of its mode and waits for `events.pass_events`; pace: inverse of the largest step that the last
+    error would have allowed; mode; events: how many there were; status; done. lower, upper:
+    extrema of x2 since the observer reset them, where it asks for extrema. memory: the observer's.
     """
 
     run: Array
@@ -44,17 +44,16 @@ class Lanes(eqx.Module):
 
 
 class Passage(eqx.Module):
-    """What happened to the lanes in one look at the events, arrays [lanes].
+    """What one call of `events.pass_events` did to the lanes, arrays [lanes].
 
-    landed: a step ended on a guard or where x2 = 0. fired: it was a guard, its number is `guard`,
-    and `mode` is what followed, at (t, x1, x2). captured: by a pseudo-focus. rests: it is at rest
-    but for rounding. stuck: there was a stick phase, of that duration; released: it ended, by slip
-    onset or at an edge.
+    landed: the last step ended on a guard or where x2 = 0. fired: it was a guard; `before` and
+    `mode` are the modes on both sides of it, at (t, x1, x2). captured: by a pseudo-focus. rests: at
+    rest up to rounding. stuck: a stick phase followed, of that duration; released: it ended before
+    t1, by slip onset or at an edge; forever: it never ends.
     """
 
     landed: Array
     fired: Array
-    guard: Array
     before: Mode
     mode: Mode
     t: Array
@@ -65,7 +64,6 @@ class Passage(eqx.Module):
     stuck: Array
     duration: Array
     released: Array
-    slips: Array
     forever: Array
 
 
@@ -78,11 +76,23 @@ def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
     return jax.tree.map(pick, on_true, on_false)
 
 
+def materialise(value: Array, one: Array) -> Array:
+    """The value, computed once; one: an array of ones, an argument of the kernel.
+
+    XLA on the CPU computes cheap values again in each place that uses them, and so what they depend
+    on. It holds a division to be expensive and keeps its result; dividing by ones that it cannot
+    see through changes no bit.
+    """
+    if value.dtype == bool:
+        return jnp.where(value, 1.0, 0.0) / one > 0
+    return value / one
+
+
 class Observer(eqx.Module):
     """What a run hands in, and when it may end early: subclasses are static settings."""
 
     def extrema(self, lanes: Lanes) -> Array | None:
-        """Where the extrema of a run are wanted, for then steps end at them; None: nowhere."""
+        """The lanes whose extrema of x2 are wanted, so that steps end at them; None: no lanes."""
         return None
 
     @abc.abstractmethod
@@ -93,12 +103,13 @@ class Observer(eqx.Module):
     def watch(
         self, osc: Oscillator, lanes: Lanes, passage: Passage, one: Array, t1: Array, tol: Array
     ) -> Lanes:
-        """The lanes after a look at the events; sets `memory`, and `done` to end a run.
+        """The lanes after `events.pass_events`, with `memory`, and `done` where a run may end.
 
-        one: an array of ones. What is divided by it is computed once, see the module's text."""
+        one: an array of ones, for `materialise`; tol: the relative tolerance of a step.
+        """
 
-    def rest(self, osc: Oscillator, lanes: Lanes, one: Array) -> Lanes:
-        """The same at each refill, for what costs more."""
+    def watch_rarely(self, osc: Oscillator, lanes: Lanes, one: Array) -> Lanes:
+        """The lanes before each refill, every dozen steps or so: for what is costly to find out."""
         return lanes
 
     @abc.abstractmethod
@@ -107,16 +118,15 @@ class Observer(eqx.Module):
 
 
 class Program(eqx.Module):
-    """What is fixed when the kernel is compiled."""
+    """Everything that is fixed when the kernel is compiled.
+
+    structure: of the oscillator's tree; mapped: which of its leaves differ from run to run; edges:
+    whether a contact edge may be met; captures: whether a run ends where a pseudo-focus captures
+    it.
+    """
 
     structure: Any = eqx.field(static=True)
     mapped: tuple[bool, ...] = eqx.field(static=True)
     observer: Observer = eqx.field(static=True)
     edges: bool = eqx.field(static=True)
-    #: Whether a run that a pseudo-focus captures ends there.
     captures: bool = eqx.field(static=True, default=True)
-
-
-def once(flag: Array, one: Array) -> Array:
-    """A flag that XLA computes once, not again in each place where it is used."""
-    return jnp.where(flag, 1.0, 0.0) / one > 0

@@ -26,9 +26,10 @@ from ..numerics.compiling import one_kernel
 from ..results import Status
 from .events import pass_events
 from .lanes import Lanes, Program, choose
-from .step import first_step, take_step, window_of
+from .step import SAFETY, first_step, take_step, window_of
 
-#: Steps between two looks at the events, and events between two refills.
+#: Steps between two looks at the events, and looks between two refills: events and refills cost
+#: about as much as a step, and a lane that waits for them is idle.
 STEPS, ROUNDS = 4, 4
 
 
@@ -45,7 +46,7 @@ def _oscillator(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator
     osc = jax.tree.unflatten(program.structure, leaves)
     if program.edges:
         return osc
-    # Known to be infinite while the kernel is compiled; see `modes.has_edges`.
+    # Infinite as constants of the compiled kernel; see `modes.has_edges`.
     with jax.ensure_compile_time_eval():
         lower, upper = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
     belts = tuple(
@@ -72,7 +73,7 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
         x2=x2,
         a=mode_acceleration(osc, mode, x1, x2) + zero,
         h=zero + first_step(rtol),
-        pace=zero + 0.9 / first_step(rtol),
+        pace=zero + SAFETY / first_step(rtol),
         mode=Mode(tuple(code + zero for code in mode.codes)),
         events=jnp.zeros_like(run),
         status=status.astype(run.dtype),
@@ -85,7 +86,8 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
 
 
 class Stream(eqx.Module):
-    """The kernel between two calls: lanes, the rows of the queue that they work on, and passes."""
+    """The kernel between two calls: lanes, the rows of the queue that they work on, the number of
+    passes that its loop has made, and ones for `lanes.materialise`."""
 
     lanes: Lanes
     rows: tuple[Array, ...]
@@ -95,7 +97,7 @@ class Stream(eqx.Module):
 
 @functools.partial(jax.jit, static_argnums=(0, 2, 3))
 def idle(program: Program, shared, width: int, columns: int) -> Stream:
-    """Lanes with nothing to do."""
+    """A stream whose lanes have nothing to do."""
     rows = tuple(jnp.zeros(width) for _ in range(columns))
     osc = _oscillator(program, shared, rows)
     run = jnp.full(width, -1, dtype=jnp.int32)
@@ -119,9 +121,10 @@ def _columns(values: dict[str, Any]) -> list[Array]:
 
 
 class _Desk(eqx.Module):
-    """What lies ready for the lanes, and what they have handed in: no more than there are lanes.
+    """The stream, and what its lanes have handed in: no more than there are lanes.
 
-    begun: runs taken; filled: rows handed in, of numbers and of columns of results.
+    begun: runs taken from the block that lies ready; filled: how many numbers of runs, and rows of
+    the columns of results, were handed in.
     """
 
     stream: Stream
@@ -137,7 +140,7 @@ def _refill(program: Program, shared, rtol, limit, block, begun, available, desk
     slots = jnp.arange(one.size, dtype=jnp.int32)
     lanes, passes = desk.stream.lanes, desk.stream.passes
     osc = _oscillator(program, shared, desk.stream.rows)
-    lanes = _give_up(observer.rest(osc, lanes, one), passes, limit)
+    lanes = _give_up(observer.watch_rarely(osc, lanes, one), passes, limit)
     finished = lanes.done & (lanes.run >= 0)
     finished = finished & (_rank(finished) < one.size - desk.filled)
     # In order, behind what is there.
@@ -184,31 +187,21 @@ def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> 
     return lax.fori_loop(0, ROUNDS, round_, lanes)
 
 
-def advance(
-    program: Program, shared, t1, rtol, atol, limit, queue, first, count, stream: Stream, drain
-):
-    """Work through the queue; with `drain` until all lanes are idle.
+def _at_work(stream: Stream) -> Array:
+    return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
 
-    queue: columns [runs + lanes], the starts and the parameters that differ; the runs are numbered
-    from `first`, `count` of them are real. Returns the lanes, and, in order of completion, numbers
-    (-1 where there is none) and results [columns, runs + 3 lanes].
 
-    Two loops, because on the CPU only loops on small arrays can be one kernel. The inner loop sees
-    small ones only: as many new runs, and as many results, as there are lanes.
+def _fill(program: Program):
+    """The inner loop: works until the block of runs is taken, the desk is full, or in pass `until`.
+
+    As one piece of machine code, which may close over no array.
     """
-    width = stream.one.size
-    size = queue[0].size + 2 * width
-
-    def at_work(stream):
-        return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
 
     @one_kernel
-    def fill(shared, t1, rtol, atol, limit, block, begun, available, last, desk):
-        """Work until the block of runs is taken or the desk is full."""
-
+    def fill(shared, t1, rtol, atol, limit, block, begun, available, last, until, desk):
         def unfinished(desk):
-            left = (desk.begun < available) | (last & at_work(desk.stream))
-            return left & (desk.filled < width)
+            left = (desk.begun < available) | (last & _at_work(desk.stream))
+            return left & (desk.filled < desk.numbers.size) & (desk.stream.passes - until < 0)
 
         def go_on(desk):
             desk = _refill(program, shared, rtol, limit, block, begun, available, desk)
@@ -218,31 +211,93 @@ def advance(
 
         return lax.while_loop(unfinished, go_on, desk)
 
+    return fill
+
+
+class Call(eqx.Module):
+    """What the kernel is called for: numbers, all but `drain` int32.
+
+    first: number of the first run in the queue; count: how many runs there are; taken: how many of
+    them earlier calls took; passes: how many passes of the loop this call may make; drain: whether
+    to go on until all lanes are idle, and not only until all runs are taken.
+    """
+
+    first: Any
+    count: Any
+    taken: Any
+    passes: Any
+    drain: Any
+
+
+def advance(program: Program, shared, t1, rtol, atol, limit, queue, call: Call, stream: Stream):
+    """Work through the queue, or as far as the call's passes go.
+
+    queue: columns [runs + lanes], the starts and the parameters that differ. Returns the stream,
+    the number of runs taken, whether there is more to do, and, in order of completion, numbers of
+    runs (-1 where there is none) and results [columns, runs + 3 lanes].
+
+    Two loops, because on the CPU only loops on small arrays can be one kernel. The inner loop sees
+    small ones only: as many new runs, and as many results, as there are lanes.
+    """
+    width = stream.one.size
+    size = queue[0].size + 2 * width
+    # Differences of pass numbers stay right where they overflow.
+    until = stream.passes + call.passes
+    fill = _fill(program)
+
     def outer(state):
         stream, taken, written, numbers, results = state
         zero = jnp.zeros_like(taken)
         block = tuple(lax.dynamic_slice(column, (taken,), (width,)) for column in queue)
-        available = jnp.minimum(count - taken, width)
-        last = drain & (taken + available >= count)
+        available = jnp.minimum(call.count - taken, width)
+        last = call.drain & (taken + available >= call.count)
         nothing = [jnp.zeros_like(stream.one) for _ in results]
         desk = _Desk(stream, zero, zero, jnp.full(width, -1, dtype=jnp.int32), nothing)
-        desk = fill(shared, t1, rtol, atol, limit, block, first + taken, available, last, desk)
+        begun = call.first + taken
+        desk = fill(shared, t1, rtol, atol, limit, block, begun, available, last, until, desk)
         numbers = lax.dynamic_update_slice(numbers, desk.numbers, (written,))
         pairs = zip(results, desk.columns, strict=True)
         results = [lax.dynamic_update_slice(whole, part, (written,)) for whole, part in pairs]
         return desk.stream, taken + desk.begun, written + desk.filled, numbers, results
 
+    def more(stream, taken):
+        return (taken < call.count) | (call.drain & _at_work(stream))
+
     def unfinished(state):
         stream, taken, *_ = state
-        return (taken < count) | (drain & at_work(stream))
+        return more(stream, taken) & (stream.passes - until < 0)
 
     n_columns = sum(math.prod(shape) for shape in layout(program, shared).values())
-    none = jnp.zeros((), jnp.int32)
     numbers = jnp.full(size, -1, dtype=jnp.int32)
     results = [jnp.full(size, jnp.nan) for _ in range(n_columns)]
-    start = (stream, none, none, numbers, results)
-    stream, _, _, numbers, results = lax.while_loop(unfinished, outer, start)
-    return stream, numbers, jnp.stack(results)
+    start = (stream, call.taken, jnp.zeros((), jnp.int32), numbers, results)
+    stream, taken, _, numbers, results = lax.while_loop(unfinished, outer, start)
+    return stream, taken, more(stream, taken), numbers, jnp.stack(results)
+
+
+def advance_with_derivatives(program, shared, t1, rtol, atol, limit, queue, call: Call, stream):
+    """`advance`, with derivatives in the directions queue[1:] of the rows queue[0].
+
+    stream: a stream and the derivatives of its floats, [directions, ...]; the results have the same
+    first axis, behind the values themselves.
+    """
+    stream, slopes = stream
+    floats, others = eqx.partition(stream, eqx.is_inexact_array)
+
+    def of_floats(rows, floats):
+        stream_out, taken, more, numbers, results = advance(
+            program, shared, t1, rtol, atol, limit, rows, call, eqx.combine(floats, others)
+        )
+        floats, others_out = eqx.partition(stream_out, eqx.is_inexact_array)
+        return (results, floats), (others_out, taken, more, numbers)
+
+    def column(direction, slope):
+        return jax.jvp(of_floats, (queue[0], floats), (direction, slope), has_aux=True)
+
+    out = jax.vmap(column, out_axes=(None, 0, None))(queue[1:], slopes)
+    (results, floats), (columns, slopes), (others, taken, more, numbers) = out
+    results = jnp.concatenate([results[None], columns])
+    return (eqx.combine(floats, others), slopes), taken, more, numbers, results
 
 
 def _rank(flags: Array) -> Array:

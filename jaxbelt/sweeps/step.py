@@ -28,24 +28,31 @@ from jaxtyping import Array
 
 from ..model.modes import ABOVE, BELOW, ULPS, select
 from ..model.oscillator import Oscillator
-from .lanes import Lanes
+from .lanes import Lanes, materialise
 
-#: First step of a run and after each event, at a tolerance of 1e-8.
-FIRST_STEP = 0.1
+#: First step of a run and after each event, at a tolerance of 1e-8: about what the tolerance allows
+#: where the friction law bends.
+INITIAL_STEP = 0.1
 #: Longest step: a quarter of a loop, so that x2 has at most one extremum in it.
-MAX_STEP = 1.5
-#: Errors over the tolerance below this one are taken for it: they may be rounding.
-LEAST = 1e-5
-#: The way that a Taylor step may bridge to a guard, over the square root of the tolerance.
+LONGEST_STEP = 1.5
+#: Share of the step that the last error would have allowed.
+SAFETY = 0.9
+#: Bounds of error/tolerance. Smaller values may be rounding; larger ones, and NaN, shrink a step by
+#: no more than a factor of 100000^(1/8), 4.2.
+LEAST_ERROR, LARGEST_ERROR = 1e-5, 1e5
+#: Longest way to a guard that a Taylor step bridges, over the square root of the tolerance: the
+#: terms that it leaves out are below the tolerance then.
 LANDING = 0.1
-#: Speed over |x2'| below which a slow passage of an edge begins.
+#: Speed over |x2'| below which an edge is passed slowly: over a way d, the terms that the Taylor
+#: step leaves out grow like (|x2'| d / x2^2)^2.
 SLOW = 0.1
-#: A lane whose step is to be shorter than this one stands on a bound of its mode; if it is also as
-#: slow as AT_REST and leaves through no guard, it is at rest there.
+#: A lane whose next step would be shorter stands on a bound of its mode.
 NO_STEP = 1e-15
+#: A time that no Taylor step bridges, and finite, so that derivatives are.
+NEVER = 1e300
 
-#: Of order eight: twice the stages of order five for a third of the steps at 1e-8, and what a step
-#: costs beside its stages (its path, bounds, choices) is the larger part.
+#: Order eight takes twice the stages of order five and a third of the steps at 1e-8, and most of a
+#: step's cost is not in its stages but in its interpolant, bounds and choices.
 _TABLEAU = diffrax.Dopri8.tableau
 
 
@@ -65,8 +72,11 @@ _A, _AA, _C, _E, _EA = _nystroem()
 
 
 class _Window(eqx.Module):
-    """Where the mode of a lane holds: bounds of x1 and x2; extrema: where they are wanted; active:
-    it slips; and for its field."""
+    """Bounds of the modes, arrays [lanes].
+
+    x1, x2: (lower, upper); x1 is None where there are no edges. extrema: lanes whose extrema are
+    wanted. signs, pulls: constants of the mode's field, one a belt. active: lanes that slip.
+    """
 
     x1: tuple[Array, Array] | None
     x2: tuple[Array, Array]
@@ -77,14 +87,14 @@ class _Window(eqx.Module):
 
 
 def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | None) -> _Window:
-    """The bounds of the current modes. Where x1 has to be monotone x2 is bounded by 0, too."""
+    """The bounds of the current modes. Where x1 has to be monotone, x2 = 0 is a bound, too."""
     mode, inf = lanes.mode, jnp.full_like(lanes.t, jnp.inf)
     low, high = -inf, inf
     for belt, code in zip(osc.belts, mode.codes, strict=True):
         boundary = belt.velocity / osc.omega
         high = jnp.where(code == 1, jnp.minimum(high, boundary), high)
         low = jnp.where(code == -1, jnp.maximum(low, boundary), low)
-    x1, loops = None, jnp.zeros_like(lanes.done) if extrema is None else extrema
+    x1, split = None, jnp.zeros_like(lanes.done) if extrema is None else extrema
     if edges:
         left, right = -inf, inf
         for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
@@ -93,13 +103,13 @@ def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | No
             right = jnp.where(touches, jnp.minimum(right, belt.upper), right)
             right = jnp.where(code == BELOW, jnp.minimum(right, belt.lower), right)
         x1 = left, right
-        # Far from the edges, as measured by the motion, no loop matters. Without this a lane that
-        # comes to rest would loop for ever, with steps as small as rounding.
+        # Far from the edges, as measured by the motion, x1 need not be monotone. Steps that ended
+        # at every x2 = 0 would become as small as rounding where a lane comes to rest.
         reach = 4 * (jnp.abs(lanes.x2) + jnp.abs(lanes.a))
-        loops = loops | (jnp.minimum(lanes.x1 - left, right - lanes.x1) <= reach)
+        split = split | (jnp.minimum(lanes.x1 - left, right - lanes.x1) <= reach)
     if edges or extrema is not None:
-        up = loops & ((lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0)))
-        down = loops & ((lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0)))
+        up = split & ((lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0)))
+        down = split & ((lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0)))
         low = jnp.where(up, jnp.maximum(low, 0.0), low)
         high = jnp.where(down, jnp.minimum(high, 0.0), high)
     signs = mode.signs
@@ -108,8 +118,7 @@ def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | No
 
 
 def _acceleration(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array) -> Array:
-    """`oscillator.acceleration` as a single quotient; one: an array of ones that XLA cannot see
-    through, for laws that are no quotient themselves."""
+    """`oscillator.acceleration` as a single quotient; one: see `lanes.materialise`."""
     numerator, denominator = -x1 - osc.damping * x2, one
     for belt, sign, pull in zip(osc.belts, window.signs, window.pulls, strict=True):
         top, bottom = belt.friction.fraction(sign * (belt.velocity - osc.omega * x2))
@@ -119,6 +128,7 @@ def _acceleration(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: A
 
 
 def _combine(weights: np.ndarray, arrays: list[Array]) -> Array:
+    """The weighted sum of the first arrays, without those of weight 0."""
     terms = [w * array for w, array in zip(weights.tolist(), arrays, strict=False) if w != 0]
     return functools.reduce(jnp.add, terms)
 
@@ -142,8 +152,8 @@ def _attempt(osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol) -> _
         x2_stage = x2 + h * _combine(row, stages)
         stages.append(_acceleration(osc, window, one, x1 + h * drift, x2_stage))
     # The weights of the solution are those of the last stage, which is the next step's first.
-    y1 = (x1 + h * (x2 + h * _combine(_AA[-1], stages))) / one
-    y2 = (x2 + h * _combine(_A[-1], stages)) / one
+    y1 = materialise(x1 + h * (x2 + h * _combine(_AA[-1], stages)), one)
+    y2 = materialise(x2 + h * _combine(_A[-1], stages), one)
     stages.append(_acceleration(osc, window, one, y1, y2))
     scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
     scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
@@ -152,7 +162,7 @@ def _attempt(osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol) -> _
     return _Attempt(h, y1, y2, stages[-1], lax.stop_gradient(error))
 
 
-class _Path(eqx.Module):
+class _Interpolant(eqx.Module):
     """x2 within a step, x2 + k1 theta + ... + k4 theta^4 for theta from 0 to 1, and its extremum.
 
     has_extremum: whether there is one inside, at theta = extremum; x2_extremum: x2 there, or at
@@ -165,7 +175,7 @@ class _Path(eqx.Module):
     x2_extremum: Array
 
 
-def _path(one: Array, lanes: Lanes, new: _Attempt) -> _Path:
+def _interpolate(one: Array, lanes: Lanes, new: _Attempt) -> _Interpolant:
     """Hermite's cubic and the term that makes the integral of x2 the change of x1."""
     h, x2, m0, m1 = new.h, lanes.x2, new.h * lanes.a, new.h * new.a
     rise, mean = new.x2 - x2, 0.5 * (x2 + new.x2) + (m0 - m1) / 12
@@ -178,7 +188,8 @@ def _path(one: Array, lanes: Lanes, new: _Attempt) -> _Path:
     safe = has_extremum & (divisor != 0)
     extremum = lax.stop_gradient(jnp.where(safe, m0, 1.0) / jnp.where(safe, divisor, 1.0))
     x2_extremum = x2 + extremum * (k[0] + extremum * (k[1] + extremum * (k[2] + extremum * k[3])))
-    return _Path(k, has_extremum, extremum, jnp.where(has_extremum, x2_extremum, new.x2) / one)
+    x2_extremum = materialise(jnp.where(has_extremum, x2_extremum, new.x2), one)
+    return _Interpolant(k, has_extremum, extremum, x2_extremum)
 
 
 class _Landing(eqx.Module):
@@ -198,7 +209,9 @@ class _Landing(eqx.Module):
     theta: Array
 
 
-def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rtol) -> _Landing:
+def _landing(
+    window: _Window, one, lanes: Lanes, new: _Attempt, path: _Interpolant, rtol
+) -> _Landing:
     low, high = window.x2
     beyond_extremum = path.has_extremum & ((path.x2_extremum > high) | (path.x2_extremum < low))
     peak = jnp.where(beyond_extremum, path.x2_extremum, new.x2)
@@ -206,52 +219,30 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
     bound = jnp.where(new.a > 0, high, low)
     reached = ~beyond_extremum & (jnp.abs(bound - new.x2) <= reach * jnp.abs(new.a))
     slope = jnp.where(reached, new.a, 1.0)
-    delta = jnp.where(reached, bound - new.x2, 1e300) / slope
-    # The next term, too: it counts where x2' is small, and there x2'' is -x2.
+    delta = jnp.where(reached, bound - new.x2, NEVER) / slope
+    # The next term counts where x2' is small, and there x2'' is -x2.
     delta = jnp.where(reached, delta + 0.5 * bound * delta**2 / slope, delta)
     # A quarter where the bound is x2 = 0: what is left there is the rounding of x2' in a step.
     rounding = ULPS * (0.25 + jnp.abs(peak))
     outside = (peak > high + rounding) | (peak < low - rounding)
     blocked = outside & ~reached
     target = jnp.where(peak > high, high, low)
-    k = lax.stop_gradient(path.k)
-    start, end, poly = lanes.x2, peak, k
+    poly = lax.stop_gradient(path.k)
+    start, end = lanes.x2, peak
     on_edge, edge = jnp.zeros_like(reached), lanes.x1
     if window.x1 is not None:
-        left, right = window.x1
-        edge = jnp.where(new.x2 > 0, right, left)
-        # Slow passages are bridged over less of the way, for there x2' counts more than x2.
-        way, speed = edge - new.x1, jnp.abs(new.x2)
-        near = jnp.abs(way) * jnp.maximum(speed, SLOW * jnp.abs(new.a)) < reach * speed * speed
-        there = jnp.abs(way) <= ULPS * jnp.abs(new.x1)
-        slope = jnp.where(near, new.x2, 1.0)
-        delta1 = jnp.where(near, way, jnp.where(there, 0.0, 1e300)) / slope
-        delta1 = jnp.where(near, delta1 - 0.5 * new.a * delta1**2 / slope, delta1)
-        near = near | there
+        edge, near, delta1 = _way_to_edge(window.x1, new, reach)
         on_edge = near & (delta1 < delta)
         reached, delta = reached | near, jnp.minimum(delta, delta1)
-        # x1 over the step is the integral of x2; x2 keeps its sign, so x1 is monotone.
-        h = new.h
-        integral = (h * lanes.x2, h * k[0] / 2, h * k[1] / 3, h * k[2] / 4, h * k[3] / 5)
-        beyond = ((new.x1 > right) | (new.x1 < left)) & ~near
+        integral, beyond, side = _beyond_edge(window.x1, lanes, new, near, poly)
         use = beyond & ~blocked
         poly = lax.stop_gradient(select(use, integral, (*poly, jnp.zeros_like(peak))))
         start, end = jnp.where(use, lanes.x1, start), jnp.where(use, new.x1, end)
-        target = jnp.where(use, jnp.where(new.x1 > right, right, left), target)
+        target = jnp.where(use, side, target)
         blocked = blocked | beyond
     until = jnp.where(beyond_extremum, path.extremum, 1.0)
     theta = _first_root(poly, start - target, until, end - target)
-    # An extremum that close to a bound is no matter for an interpolant, nor is one that is wanted:
-    # split the step there. The terms that the interpolant leaves out are far smaller than its last
-    # ones, and near the ends of a step it is exact to the second order.
-    doubt = jnp.abs(path.k[3]) + 0.1 * jnp.abs(path.k[2])
-    inside = jnp.minimum(path.extremum, 1 - path.extremum)
-    grazes = (path.x2_extremum > high - doubt) | (path.x2_extremum < low + doubt)
-    grazes = grazes & (inside * new.h > reach)
-    if window.extrema is not None:
-        further = (path.extremum > lanes.upper) | (path.extremum < lanes.lower)
-        grazes = grazes | (window.extrema & further & (inside > 1e-3))
-    grazes = grazes & path.has_extremum & ~beyond_extremum
+    grazes = _grazes(window, lanes, new, path, reach) & ~beyond_extremum
     return _Landing(
         reached=reached,
         delta=delta,
@@ -259,8 +250,52 @@ def _landing(window: _Window, one, lanes: Lanes, new: _Attempt, path: _Path, rto
         x2=bound,
         on_edge=on_edge,
         blocked=blocked | grazes,
-        theta=jnp.where(blocked, theta, path.extremum) / one,
+        theta=materialise(jnp.where(blocked, theta, path.extremum), one),
     )
+
+
+def _way_to_edge(x1: tuple[Array, Array], new: _Attempt, reach) -> tuple[Array, Array, Array]:
+    """The edge ahead, whether a Taylor step bridges the way to it, and the time that it takes."""
+    left, right = x1
+    edge = jnp.where(new.x2 > 0, right, left)
+    # Slow passages are bridged over less of the way, for there x2' counts more than x2.
+    way, speed = edge - new.x1, jnp.abs(new.x2)
+    near = jnp.abs(way) * jnp.maximum(speed, SLOW * jnp.abs(new.a)) < reach * speed * speed
+    there = jnp.abs(way) <= ULPS * jnp.abs(new.x1)
+    slope = jnp.where(near, new.x2, 1.0)
+    delta = jnp.where(near, way, jnp.where(there, 0.0, NEVER)) / slope
+    delta = jnp.where(near, delta - 0.5 * new.a * delta**2 / slope, delta)
+    return edge, near | there, delta
+
+
+def _beyond_edge(x1: tuple[Array, Array], lanes: Lanes, new: _Attempt, near: Array, k):
+    """x1 over the step as a polynomial, whether it ends beyond an edge, and that edge.
+
+    x1 is the integral of x2, which keeps its sign here, so x1 is monotone.
+    """
+    left, right = x1
+    h = new.h
+    integral = (h * lanes.x2, h * k[0] / 2, h * k[1] / 3, h * k[2] / 4, h * k[3] / 5)
+    beyond = ((new.x1 > right) | (new.x1 < left)) & ~near
+    return integral, beyond, jnp.where(new.x1 > right, right, left)
+
+
+def _grazes(window: _Window, lanes: Lanes, new: _Attempt, path: _Interpolant, reach) -> Array:
+    """Whether x2 has an extremum in the step at which the step should be split.
+
+    That is, one so close to a bound that the interpolant cannot tell on which side it is, or one
+    that the observer wants. The terms that the interpolant leaves out are far smaller than its last
+    ones, and near the ends of a step it is exact to the second order.
+    """
+    low, high = window.x2
+    doubt = jnp.abs(path.k[3]) + 0.1 * jnp.abs(path.k[2])
+    inside = jnp.minimum(path.extremum, 1 - path.extremum)
+    grazes = (path.x2_extremum > high - doubt) | (path.x2_extremum < low + doubt)
+    grazes = grazes & (inside * new.h > reach)
+    if window.extrema is not None:
+        further = (path.extremum > lanes.upper) | (path.extremum < lanes.lower)
+        grazes = grazes | (window.extrema & further & (inside > 1e-3))
+    return grazes & path.has_extremum
 
 
 def take_step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol) -> Lanes:
@@ -269,17 +304,17 @@ def take_step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol) ->
     going = window.active & (lanes.h > 0) & (left > 0)
     h = jnp.where(going, jnp.minimum(lanes.h, left), 0.0)
     new = _attempt(osc, window, one, lanes, h, rtol, atol)
-    path = _path(one, lanes, new)
+    path = _interpolate(one, lanes, new)
     at = _landing(window, one, lanes, new, path, rtol)
 
     last = h >= left
     accepted = going & (new.error <= 1)
     lands = accepted & ~at.blocked & at.reached & ~(last & (at.delta > 0))
-    # As a number, divided: what many results depend on is then computed once.
+    # One number, because many results depend on it.
     outcome = jnp.where(accepted, jnp.where(at.blocked, -1.0, 1.0), 0.0)
-    outcome = jnp.where(lands, 2.0, outcome) / one
+    outcome = materialise(jnp.where(lands, 2.0, outcome), one)
     shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
-    delta = jnp.where(lands, at.delta, 0.0) / one
+    delta = materialise(jnp.where(lands, at.delta, 0.0), one)
 
     # The Taylor step to the bound, if there is one.
     x1 = new.x1 + delta * (new.x2 + 0.5 * delta * new.a)
@@ -287,15 +322,7 @@ def take_step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol) ->
     if window.x1 is not None:
         x1 = jnp.where(lands & at.on_edge, at.x1, x1)
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
-    # NaN is a large error, too. The error is of order eight in h.
-    size = jnp.where(new.error < 1e5, jnp.maximum(new.error, LEAST), 1e5)
-    # No power, and no quotient by a root: XLA's are no vector operations.
-    pace = jnp.sqrt(jnp.sqrt(jnp.sqrt(size))) / jnp.where(going, h, 1.0)
-    # A step that was cut short tells little: the pace is at most that.
-    pace = jnp.where(new.error <= LEAST, jnp.minimum(pace, lanes.pace), pace)
-    # What has become slower goes on to do so, on the way to a boundary with its bend of the law.
-    trend = jnp.where(accepted, jnp.maximum(pace, lanes.pace) / lanes.pace, 1.0)
-    proposed = jnp.minimum(0.9 / (pace * trend), MAX_STEP)
+    pace, proposed = _next_size(lanes, new, going, accepted)
     stands = shortened & (at.theta * h < NO_STEP)
     proposed = jnp.where(shortened, at.theta * h, proposed)
     proposed = jnp.where(stands, NO_STEP, proposed)
@@ -318,20 +345,35 @@ def take_step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol) ->
     )
 
 
+def _next_size(lanes: Lanes, new: _Attempt, going, accepted) -> tuple[Array, Array]:
+    """The lanes' pace after a step, and the size of the next one by its error."""
+    # NaN is a large error, too; the error is of order eight in h.
+    error = jnp.where(new.error < LARGEST_ERROR, jnp.maximum(new.error, LEAST_ERROR), LARGEST_ERROR)
+    # The eighth root as roots of roots: XLA's power and its quotient by a root are no vector
+    # operations.
+    pace = jnp.sqrt(jnp.sqrt(jnp.sqrt(error))) / jnp.where(going, new.h, 1.0)
+    # A step with next to no error, cut short at a bound perhaps, says only that more is allowed.
+    pace = jnp.where(new.error <= LEAST_ERROR, jnp.minimum(pace, lanes.pace), pace)
+    # Towards a boundary the law bends more and more: a step that had to shrink will have to again.
+    trend = jnp.where(accepted, jnp.maximum(pace, lanes.pace) / lanes.pace, 1.0)
+    return pace, jnp.minimum(SAFETY / (pace * trend), LONGEST_STEP)
+
+
 def first_step(rtol):
     """First step of a run and after each event."""
-    return FIRST_STEP * (1e8 * rtol) ** 0.125
+    return INITIAL_STEP * (1e8 * rtol) ** 0.125
 
 
 def _first_root(poly, g_start, end, g_end):
     """Root in (0, end] of g_start + poly[0] theta + poly[1] theta^2 ..., by Newton's method."""
     # A lane that moves away from the bound at first comes back to it late in the step. So does one
-    # that has just left it, where g vanishes but for rounding: that root is not the one.
+    # that has just left it: there g vanishes up to rounding, far below 1e-9 of its change, and that
+    # root is not wanted.
     nears = (g_start * poly[0] < 0) & (jnp.abs(g_start) > 1e-9 * jnp.abs(g_end))
     ratio = jnp.abs(g_start) / (jnp.abs(g_start) + jnp.abs(g_end))
     straight = jnp.abs(g_start) / jnp.where(nears, jnp.abs(poly[0]), 1.0)
     theta = jnp.where(nears, jnp.minimum(straight, ratio * end), end)
-    for _ in range(3):
+    for _ in range(3):  # the step is then made again: the root need not be exact
         value, slope = poly[-1], jnp.zeros_like(theta)
         for k in (*reversed(poly[:-1]), g_start):
             value, slope = value * theta + k, slope * theta + value

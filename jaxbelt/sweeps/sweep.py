@@ -10,6 +10,7 @@ import importlib.metadata
 import inspect
 import json
 import math
+import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -30,9 +31,9 @@ from ..checks import (
     require,
     require_usable_jax,
 )
+from ..model.events import signature_name
 from ..model.oscillator import Oscillator, check_scalars
 from ..numerics.compiling import depends
-from ..results import of_one_loop
 from .attractor import KINDS, Attractor
 from .audit import chosen, differing
 from .events import word_events
@@ -82,8 +83,8 @@ TYPES = {
     "n_events": "int32",
     "status": "int8",
 }
-#: Where attractors are looked for until then unless t1 is given.
-LONG_ENOUGH = 3000.0
+#: Default t1 of attractor runs.
+LONG_ENOUGH = 30_000.0
 
 
 def sweep(
@@ -112,16 +113,16 @@ def sweep(
     observe: what is wanted, and the variables of the dataset, over the axes:
 
     - `"final"`: x1_end, x2_end, mode_end(belt) (contact codes as in `Trajectory.modes`), n_events.
-    - `"attractor"`: kind ("equilibrium", "cycle", "stuck", or "undecided" at t1, which is 3000
+    - `"attractor"`: kind ("equilibrium", "cycle", "stuck", or "undecided" at t1, which is 30,000
       unless given), signature (the events of one loop, kind and belt: a number, with its meaning in
       the attributes flag_values and flag_meanings), sticks(belt), period, stick_duration(belt) in
       a loop (inf where stuck for ever), x1_min, x1_max, x2_min, x2_max on the attractor,
       transient: the time at which it was reached, n_events: of a cycle in one loop, else until it
       was known. Runs end as soon as their attractor is known, see `attractor.Attractor`.
     - an object with three methods for scalars: `init(osc, x1, x2)`, the state of a run, any tree of
-      arrays; `update(state, event)`, the state after an `observers.Event` (t, x1, x2, kind, belt);
-      and `finish(state, end)`, a dictionary of results from the state and an `observers.End` (t,
-      x1, x2, status), numbers or vectors. They are traced, so use `jax.numpy`.
+      arrays; `update(state, event)`, the state after an `observers.RunEvent` (t, x1, x2, kind,
+      belt); and `finish(state, end)`, a dictionary of results, numbers or vectors, from the state
+      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`.
 
     and always status, a `Status` code a run: nothing raises because of one run.
 
@@ -133,7 +134,7 @@ def sweep(
     audit_differed say how many, and a warning says so where one differed.
 
     Uses every core (every device, if JAX has others). `ValueError` names the argument that is
-    impossible.
+    impossible. `KeyboardInterrupt` ends the sweep within a second and says what became of its runs.
     """
     require_usable_jax()
     grid = _Grid(make, axes, y0)
@@ -161,7 +162,18 @@ def sweep(
     attributes = _provenance(grid, numbers, observe, derivatives)
     program = grid.program(observer)
     table = _Table(program, grid, derivatives, store, attributes)
-    todo = table.todo()
+    try:
+        _run(program, grid, table, numbers, derivatives, progress)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(table.interrupted()) from None
+    if audit:
+        attributes |= _audited(program, grid, table, audit, numbers)
+    return table.dataset(attributes)
+
+
+def _run(program, grid: "_Grid", table: "_Table", numbers, derivatives, progress) -> None:
+    """Do the runs that the table lacks."""
+    todo, lock = table.todo(), threading.Lock()
 
     def rows_of(first: int, last: int) -> np.ndarray:
         return grid.rows(todo[first:last], derivatives)
@@ -169,13 +181,19 @@ def sweep(
     with _Progress(len(todo), progress) as advance:
 
         def put(done: np.ndarray, results: np.ndarray) -> None:
-            table.put(todo[done], results)
-            advance(len(done))
+            with lock:
+                table.put(todo[done], results)
+                advance(len(done))
 
-        run(program, grid.shared, rows_of, len(todo), put, **numbers, derivatives=len(derivatives))
-    if audit:
-        attributes |= _audited(program, grid, table, audit, numbers)
-    return table.dataset(attributes)
+        run(
+            program,
+            grid.shared,
+            rows_of,
+            len(todo),
+            put,
+            **numbers,
+            derivatives=len(derivatives),
+        )
 
 
 def _audited(program, grid: "_Grid", table: "_Table", share: float, numbers) -> dict[str, int]:
@@ -316,6 +334,7 @@ class _Table:
         runs = math.prod(grid.shape)
         self.arrays: dict[str, np.ndarray] = {}
         folder = None if store is None else _open_store(Path(store), grid, attributes)
+        self.folder = folder
         shapes = dict(self.layout)
         for by in derivatives:
             shapes |= {
@@ -349,6 +368,17 @@ class _Table:
                 for by, derivative in zip(self.derivatives, part[1:], strict=True):
                     self.arrays[f"d_{name}_d_{by}"][runs] = derivative
         self.arrays["status"][runs] = status
+
+    def interrupted(self) -> str:
+        """What becomes of the results of an interrupted sweep."""
+        status = self.arrays["status"]
+        done = f"{np.sum(status >= 0):,} of {status.size:,} runs"
+        if self.folder is None:
+            return (
+                f"interrupted after {done}, which are not kept; with a store "
+                '(store="results.zarr") they are, and the same call goes on from there'
+            )
+        return f"interrupted: {done} are in {self.folder}; the same call goes on from there"
 
     def dataset(self, attributes: dict[str, Any]) -> "xarray.Dataset":
         import xarray  # with pandas, half of what `import jaxbelt` would take
@@ -402,8 +432,7 @@ def _meaning(word: int, belts: int) -> str:
     """A signature as one word; -1 stands for one that is too long to be told."""
     if word < 1:
         return "none" if word == 0 else "long"
-    loop = of_one_loop(word_events(word, belts))
-    return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in loop) or "smooth"
+    return signature_name(word_events(word, belts))
 
 
 def _position(name: str) -> tuple[int, str]:

@@ -1,11 +1,19 @@
-"""Runs in bulk: every core at work on one queue."""
+"""Runs in bulk: all cores at work on one queue, each with a kernel on its own lanes."""
 
+import atexit
 import functools
 import os
+import signal
+import sys
 import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,15 +21,22 @@ from jaxtyping import Array
 
 from ..numerics.compiling import wide
 from .lanes import Program
-from .queue import ROUNDS, STEPS, advance, idle
+from .queue import ROUNDS, STEPS, Call, advance, advance_with_derivatives, idle
 
 #: Steps that a run may take for each 100 units of time before it is given up. On its way to a
 #: pseudo-focus beside a slow belt it may pass ten thousand events in that time.
 MAX_STEPS = 400_000
-#: Runs that the kernel is given at once.
+#: Runs that the kernel is given at once: enough that a call costs nothing beside them, and few
+#: enough that the threads end together.
 CHUNK = 2**14
-#: Lanes. On the CPU few, which stay near the processor, but more than is lost at each refill.
+#: Lanes. On the CPU so few that they stay in the nearest cache, and so many that a refill is cheap
+#: for each; other devices need far more.
 WIDTH = {"cpu": 128}
+#: Seconds in which an interrupt is to be heard; a call of the kernel takes half of that or less.
+PATIENCE = 0.5
+#: Passes of the first call, before it is known how long one takes: about a seventh of a second on
+#: the CPU; where there are more lanes, a pass takes longer.
+FIRST_PASSES = {"cpu": 2000}
 
 
 def _kernel(program: Program, derivatives: int) -> Callable:
@@ -34,25 +49,6 @@ def compiled(program, derivatives):
     """The kernel, compiled when it is first called."""
     function = advance_with_derivatives if derivatives else advance
     return wide(functools.partial(function, program))
-
-
-def advance_with_derivatives(
-    program, shared, t1, rtol, atol, limit, queue, first, count, stream, drain
-):
-    """`advance` to the end, with derivatives in the directions queue[1:] of the rows queue[0]."""
-
-    def of_rows(rows):
-        stream_out, numbers, results = advance(
-            program, shared, t1, rtol, atol, limit, rows, first, count, stream, True
-        )
-        return results, (stream_out, numbers)
-
-    def column(direction):
-        return jax.jvp(of_rows, (queue[0],), (direction,), has_aux=True)
-
-    out = jax.vmap(column, out_axes=(None, 0, None))(queue[1:])
-    results, columns, (stream_out, numbers) = out
-    return stream_out, numbers, jnp.concatenate([results[None], columns])
 
 
 def workers() -> int:
@@ -75,54 +71,174 @@ def run(
     derivatives: int = 0,
     budget: float = 1.0,
 ) -> None:
-    """Do all runs: rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]:
-    the starts and the parameters that vary, and their derivatives in so many directions;
-    put(numbers, results) takes results [1 + derivatives, columns, runs] in any order. budget: the
-    share of `MAX_STEPS` that a run may take.
+    """Do all runs, on all cores.
+
+    rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]: the starts and the
+    parameters that vary, and their derivatives in so many directions. put(numbers, results) takes
+    results [1 + derivatives, columns, runs] in any order, on any thread. budget: the share of
+    `MAX_STEPS` that a run may take.
 
     Every thread feeds chunks to one compiled kernel (which lets go of Python's lock) on its own
-    lanes. Long runs stay in their lanes while the next chunk is worked on.
+    lanes. Long runs stay in their lanes while the next chunk is worked on. An exception, a
+    `KeyboardInterrupt` too, ends all threads within `PATIENCE` and is raised.
     """
-    limit = int(budget * MAX_STEPS * max(1.0, t1 / 100)) // (STEPS * ROUNDS)
-    settings = (t1, rtol, atol, np.int32(limit))
-    kernel = functools.partial(_kernel(program, derivatives), shared, *settings)
-    columns = 2 + sum(program.mapped)
-    threads = workers()
-    # The queue is of one size, for one compiled program; short work is shared out all the same.
-    share = min(CHUNK, -(-runs // threads))
-    width = WIDTH.get(jax.default_backend(), 2**17)
-    chunks = iter([(i, min(i + share, runs)) for i in range(0, runs, share)])
-    lock = threading.Lock()
-
-    def take():
-        with lock:
-            return next(chunks, None)
-
-    def work(device) -> None:
-        with jax.default_device(device):
-            stream, todo = idle(program, shared, width, columns), take()
-            while todo is not None:
-                (first, last), todo = todo, take()
-                rows = np.zeros((1 + derivatives, columns, CHUNK + width))
-                rows[:, :, : last - first] = rows_of(first, last)
-                rows = rows if derivatives else rows[0]
-                span = np.int32(first), np.int32(last - first)
-                stream, numbers, results = kernel(rows, *span, stream, todo is None)
-                numbers = np.asarray(numbers)
-                done = np.flatnonzero(numbers >= 0)
-                results = np.asarray(results).reshape(1 + derivatives, -1, len(numbers))
-                with lock:
-                    put(numbers[done], results[:, :, done])
-
-    devices = jax.local_devices()
     if not runs:
         return
-    # Compiled here, once, and not by each thread; on a device as there, or they would do it again.
-    nothing = np.zeros((1 + derivatives, columns, CHUNK + width))
-    with jax.default_device(devices[0]):
-        lanes = idle(program, shared, width, columns)
-        kernel(nothing if derivatives else nothing[0], np.int32(0), np.int32(0), lanes, False)
-    with ThreadPoolExecutor(threads) as pool:
-        started = [pool.submit(work, devices[i % len(devices)]) for i in range(threads)]
-        for future in started:
-            future.result()
+    limit = int(budget * MAX_STEPS * max(1.0, t1 / 100)) // (STEPS * ROUNDS)
+    columns = 2 + sum(program.mapped)
+    kernel = _kernel(program, derivatives)
+    team = _Team(
+        functools.partial(kernel, shared, t1, rtol, atol, np.int32(limit)),
+        functools.partial(_idle, program, shared, columns, derivatives),
+        rows_of,
+        put,
+        (1 + derivatives, columns) if derivatives else (columns,),
+        _Chunks(runs, workers()),
+    )
+    devices = jax.local_devices()
+    # Compiled once, before the threads that would each do it again, and like all else not on the
+    # thread of the caller, so that an interrupt need not wait for it.
+    _wait([_started(team.compile, devices[0])])
+    threads = [_started(team.work, devices[i % len(devices)]) for i in range(workers())]
+    try:
+        _wait(threads)
+    finally:
+        team.stop.set()
+        wait(threads, timeout=10 * PATIENCE)
+
+
+def _idle(program: Program, shared, columns: int, derivatives: int) -> Any:
+    """The stream that a kernel with so many derivatives starts from."""
+    stream = idle(program, shared, WIDTH.get(jax.default_backend(), 2**17), columns)
+    if not derivatives:
+        return stream
+    floats = eqx.filter(stream, eqx.is_inexact_array)
+    return stream, jax.tree.map(lambda x: jnp.zeros((derivatives, *x.shape), x.dtype), floats)
+
+
+class _Chunks:
+    """The runs in chunks, (first, last) each, for several threads to take.
+
+    Short work is shared out evenly.
+    """
+
+    def __init__(self, runs: int, threads: int):
+        share = min(CHUNK, -(-runs // threads))
+        self.spans = iter([(i, min(i + share, runs)) for i in range(0, runs, share)])
+        self.lock = threading.Lock()
+
+    def take(self) -> tuple[int, int] | None:
+        with self.lock:
+            return next(self.spans, None)
+
+
+@dataclass
+class _Team:
+    """What the threads of one call of `run` share: see there; shape: of the queue but for runs."""
+
+    kernel: Callable
+    idle: Callable[[], Any]
+    rows_of: Callable[[int, int], np.ndarray]
+    put: Callable[[np.ndarray, np.ndarray], None]
+    shape: tuple[int, ...]
+    chunks: _Chunks
+    stop: threading.Event = field(default_factory=threading.Event)
+
+    def compile(self, device) -> None:
+        """Compile the kernel by a call with nothing to do, on a device as `work` calls it."""
+        zero = np.int32(0)
+        with _settings(device):
+            call = Call(zero, zero, zero, zero, np.bool_(False))
+            jax.block_until_ready(self.kernel(self._queue(), call, self.idle()))
+
+    def work(self, device) -> None:
+        """Take chunks until there are no more, or until the team is stopped."""
+        with _settings(device):
+            passes = FIRST_PASSES.get(jax.default_backend(), 100)
+            stream, todo = self.idle(), self.chunks.take()
+            while todo is not None and not self.stop.is_set():
+                (first, last), todo = todo, self.chunks.take()
+                queue = self._queue()
+                queue[..., : last - first] = np.reshape(
+                    self.rows_of(first, last), (*self.shape, -1)
+                )
+                stream, passes = self._chunk(queue, first, last, todo is None, stream, passes)
+
+    def _queue(self) -> np.ndarray:
+        """Room for a chunk: of one size, for one compiled kernel."""
+        width = WIDTH.get(jax.default_backend(), 2**17)
+        return np.zeros((*self.shape, CHUNK + width))
+
+    def _chunk(self, queue, first: int, last: int, drain: bool, stream, passes: int):
+        """Call the kernel until a chunk is taken (with `drain`: done); calls take half of PATIENCE
+        or so. Returns the stream, and how many passes a call may make."""
+        taken, more = np.int32(0), True
+        while more and not self.stop.is_set():
+            began = time.monotonic()
+            span = np.int32(first), np.int32(last - first)
+            call = Call(*span, taken, np.int32(passes), np.bool_(drain))
+            stream, taken, more, numbers, results = self.kernel(queue, call, stream)
+            numbers, more = np.asarray(numbers), bool(more)
+            seconds = time.monotonic() - began
+            if more:  # it made all of its passes
+                passes = int(np.clip(passes * 0.5 * PATIENCE / seconds, 1, 4 * passes))
+            done = np.flatnonzero(numbers >= 0)
+            results = np.asarray(results).reshape(-1, *np.shape(results)[-2:])
+            if done.size:
+                self.put(numbers[done], results[:, :, done])
+        return stream, passes
+
+
+@contextmanager
+def _settings(device) -> Iterator[None]:
+    """JAX's settings on a thread: those that a caller makes by `with` are for his thread only."""
+    with jax.enable_x64(True), jax.default_device(device):
+        yield
+
+
+#: Threads at work. They outlive a call only where an interrupt came while one was compiling, for
+#: nothing ends that.
+_at_work: set[threading.Thread] = set()
+
+
+def _started(function: Callable, *args: Any) -> Future:
+    """A function at work on a thread of its own."""
+    future: Future = Future()
+
+    def call():
+        try:
+            future.set_result(function(*args))
+        except BaseException as error:
+            future.set_exception(error)
+        finally:
+            _at_work.discard(threading.current_thread())
+
+    thread = threading.Thread(target=call, daemon=True)
+    _at_work.add(thread)
+    thread.start()
+    return future
+
+
+@atexit.register
+def _end_of_process() -> None:
+    """Let no thread see the end of the interpreter, where the process would be aborted.
+
+    A process that an interrupt ends is ended at once, as Python does it itself, by the signal.
+    """
+    if _at_work and getattr(sys, "last_type", None) is KeyboardInterrupt:
+        sys.stdout.flush()
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGINT)
+    for thread in tuple(_at_work):
+        thread.join()
+
+
+def _wait(futures: list[Future]) -> None:
+    """Wait until all are done or one has failed, and raise what it raised."""
+    # With a timeout, for some systems do not interrupt a wait without one.
+    while wait(futures, timeout=0.1, return_when=FIRST_EXCEPTION).not_done:
+        for future in futures:
+            if future.done():
+                future.result()
+    for future in futures:
+        future.result()

@@ -54,8 +54,9 @@ def main(arguments=None):
                 disagreements.append(line)
                 if report:
                     print(json.dumps(line), file=report, flush=True)
-            if options.what == "grazing" and not labels:
-                _differentiate(graze, verdicts, disagreements, rng, options)
+            if options.what == "grazing":
+                judge_all = _differentiate_cycles if labels else _differentiate
+                judge_all(graze, verdicts, disagreements, rng, options)
                 graze.clear()
             done += len(batch)
             if options.verbose:
@@ -180,10 +181,38 @@ def _differentiate(graze, verdicts, disagreements, rng, options):
                 case=case.to_json(),
                 code=package.as_code(case),
             )
-            disagreements.append(line)
-            if options.report:
-                with open(options.report, "a", encoding="utf-8") as file:
-                    print(json.dumps(line), file=file)
+            _report(line, disagreements, options)
+
+
+def _differentiate_cycles(graze, verdicts, disagreements, rng, options):
+    """Derivatives of the periods of the cycles that were right."""
+    from . import compare, derivatives, package
+
+    graze = [(case, mine) for case, mine in graze if mine.kind == "cycle"]
+    along = [derivatives.directions(case, rng) for case, _ in graze]
+    told = package.period_derivatives([case for case, _ in graze], along)
+    for (case, mine), direction, answer in zip(graze, along, told):
+        verdict, right = compare.judge_period_derivative(case, answer, mine, direction)
+        verdicts[f"{case.kind}, derivative", verdict] += 1
+        if verdict != "same":
+            line = dict(
+                what="derivative",
+                verdict=verdict,
+                tol=options.tol,
+                told=float(answer),
+                engine=right,
+                direction=direction,
+                case=case.to_json(),
+                code=package.as_code(case),
+            )
+            _report(line, disagreements, options)
+
+
+def _report(line, disagreements, options):
+    disagreements.append(line)
+    if options.report:
+        with open(options.report, "a", encoding="utf-8") as file:
+            print(json.dumps(line), file=file)
 
 
 def _plain(value):

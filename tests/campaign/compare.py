@@ -295,3 +295,32 @@ def judge_label(case, told, _tol):
                 return "corner", mine
         return f"corner: {what}", mine
     return what, mine
+
+
+#: Moves of a number by which the derivative of a period is asked again: a cycle's states are
+#: promised to 1e-10.
+SHIFT = 1e-10
+
+
+def judge_period_derivative(case, told, label, direction):
+    """The verdict on d(period) of a cycle along a direction, and the engine's.
+
+    Near grazing it changes fast: the room is what moving the edge or boundary by `SHIFT` changes.
+    """
+    right = derivatives.of_period(case, label, direction)
+    far = 0.0
+    for by in (SHIFT, -SHIFT):
+        last = case.oscillator.belts[-1]
+        moved = replace(
+            last,
+            lower=last.lower + by,
+            upper=last.upper + by,
+            velocity=last.velocity + (by if last.load == 0 else 0.0),
+        )
+        belts = (*case.oscillator.belts[:-1], moved)
+        near = replace(case, oscillator=replace(case.oscillator, belts=belts))
+        other = engine.attractor(near.oscillator, near.y0)
+        if other.loop == label.loop:
+            far = max(far, abs(derivatives.of_period(near, other, direction) - right))
+    good = abs(told - right) <= STEPS * far + 1e-7 * (1 + abs(right))
+    return ("same" if good else "derivative of the period"), right

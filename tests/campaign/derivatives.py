@@ -127,3 +127,21 @@ def _edge_shift(osc, direction, x1):
         if b.upper == x1:
             return upper
     raise ValueError(f"no edge at {x1}")
+
+
+def of_period(case, label, direction):
+    """d(period) of the engine's cycle along a direction of the parameters.
+
+    The cycle begins at its maximum of x1, (x1, 0). With M and N the derivatives of the state one
+    period later by x1 and along the direction, and f the field there, it stays closed where
+    (M - (1, 0)) dx1 + f dT = -N: two equations in dx1 and dT.
+    """
+    loop = replace(case, y0=label.y, T=label.period)
+    run = engine.simulate(case.oscillator, loop.y0, loop.T)
+    resting = tuple((0.0, 0.0, 0.0, 0.0) for _ in case.oscillator.belts)
+    by_start = derivative(loop, run, ((1.0, 0.0), 0.0, resting))
+    by_direction = derivative(loop, run, ((0.0, 0.0), *direction[1:]))
+    x1, x2 = run.y_end
+    field = np.array([x2, engine.force(case.oscillator, run.mode_end, x1, x2)])
+    matrix = np.column_stack([by_start - np.array([1.0, 0.0]), field])
+    return float(np.linalg.solve(matrix, -by_direction)[1])

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbelt as jb
+from jaxbelt.model.events import of_one_loop
 
 #: The module, whose name in the package is that of its function.
 _SWEEP = sys.modules[jb.sweep.__module__]
@@ -192,7 +193,7 @@ def cycles(cases):
         found = jb.find_cycle(oscillator(case.oscillator), case.y0)
         status = int(found.status)
         kind = {0: "cycle", 1: "stuck", 2: "equilibrium", 6: "equilibrium"}.get(status, "undecided")
-        loop = jb.results.of_one_loop([(int(k), int(b)) for k, b in found.signature])
+        loop = of_one_loop([(int(k), int(b)) for k, b in found.signature])
         out.append(
             Label(
                 kind,
@@ -306,3 +307,21 @@ def derivatives(cases, directions, tol, by):
         table, starts, rows, moves = parts
         out.append(np.asarray(run(table, starts, (rows, moves)))[: len(some)])
     return np.concatenate(out)
+
+
+@functools.cache
+def _pushed_cycle(structure):
+    def period(row, y0):
+        return jb.period(jb.find_cycle(_from_numbers(structure, row), y0))
+
+    return jax.jit(lambda row, y0, d: jax.jvp(lambda row: period(row, y0), (row,), (d,))[1])
+
+
+def period_derivatives(cases, directions):
+    """d(period) of the cycle that each start leads to, along a direction a case."""
+    out = []
+    for case, direction in zip(cases, directions):
+        row = jnp.array(numbers(case))
+        along = jnp.array(tangent(case, direction)[0])
+        out.append(float(_pushed_cycle(case.structure)(row, jnp.array(case.y0), along)))
+    return np.array(out)

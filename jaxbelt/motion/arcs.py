@@ -1,0 +1,243 @@
+"""One arc: from a state to where its mode, or its monotone motion, ends, and how it goes on there.
+
+In a slip arc the orbit runs in the smooth field of its mode until one of these vanishes first:
+
+- a guard of the mode, that is, a boundary r_k = 0 or a contact edge (see `modes`);
+- x2' or x2. Between two such extrema x2 (x1) is monotone, so each boundary (edge) is met once at
+  most: the sign of a guard after a step tells whether it was met, and its sign at the extremum
+  itself whether an orbit that grazes a boundary meets it.
+
+An integrator marches until a step ends outside; that step is then made once more, shorter, so that
+it ends on the first root, see `roots`. A stick arc is known in closed form.
+
+`simulate` and the orbits behind cycles are made of these arcs, and share what follows at their
+ends.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..model.modes import (
+    Mode,
+    boundary_guards,
+    bounds_leftward,
+    bounds_rightward,
+    directions,
+    edge_guards,
+    first_of,
+    leave_slip,
+    leave_stick,
+    mode_acceleration,
+    select,
+    stick_phase,
+)
+from ..model.oscillator import Oscillator
+from ..numerics.roots import first_root
+from .integrators import AbstractIntegrator, State, slip_field
+
+#: Signs of x2' and of x2 on an arc: +1 or -1, as numbers.
+Signs = tuple[Array, Array]
+
+
+class Ends:
+    """Numbers for what ends an arc, for n belts.
+
+    i < n: the boundary of belt i; n <= i < 3n: the edge i - n of `modes.edges`; then the extremum
+    x2' = 0 of x2, the extremum x2 = 0 of x1, and slip onset. For shooting there follow an arc that
+    is not used, and from there on a tangency to the boundary of belt i.
+    """
+
+    def __init__(self, n: int):
+        self.extremum_x2, self.extremum_x1, self.onset, self.unused, self.tangent = range(
+            3 * n, 3 * n + 5
+        )
+
+
+class ArcEnd(eqx.Module):
+    """How an arc ends, and how the orbit goes on.
+
+    duration: of the arc; fired: what ended it, a number of `Ends`, or -1: nothing; y, mode, signs:
+    from there on. captured: by a pseudo-focus; forever: the mass stays stuck; failed: the
+    integrator gave up.
+    """
+
+    duration: Array
+    y: State
+    mode: Mode
+    signs: Signs
+    fired: Array
+    captured: Array
+    forever: Array
+    failed: Array
+
+
+def signs_after(osc: Oscillator, mode: Mode, y: State) -> Signs:
+    """Signs of x2' and x2 just after y; +1 at an equilibrium."""
+    of_x2, of_x1 = directions(osc, mode, *y)
+    signs = jnp.where(of_x2 == 0, 1.0, of_x2), jnp.where(of_x1 == 0, 1.0, of_x1)
+    return lax.stop_gradient(signs)
+
+
+# --- slip arcs ------------------------------------------------------------------------------------
+
+
+def _all_guards(osc: Oscillator, mode: Mode, signs: Signs, y: State) -> Array:
+    """The guards of a slip arc in the order of `Ends`: boundaries, edges, extrema of x2 and x1."""
+    x1, x2 = y
+    a = mode_acceleration(osc, mode, x1, x2)
+    guards = [*boundary_guards(osc, mode, x2), *edge_guards(osc, mode, x1)]
+    return jnp.stack([*guards, signs[0] * a, signs[1] * x2])
+
+
+def _that_count(
+    osc: Oscillator, mode: Mode, signs: Signs, guards: Array, every_extremum: bool
+) -> Array:
+    """The same, larger where they do not count.
+
+    A boundary or edge from which the orbit moves away until its next extremum does not; nor, unless
+    every extremum is to end an arc, does an extremum while what it protects is out of reach of one
+    step.
+    """
+    n = len(osc.belts)
+    boundary, edge, extrema = guards[:n], guards[n : 3 * n], guards[3 * n :]
+    if not every_extremum:
+        reach = jnp.abs(extrema[0]) + jnp.abs(extrema[1])
+        distances = jnp.stack([jnp.min(boundary) / osc.omega, jnp.min(edge)])
+        extrema = jnp.maximum(extrema, distances - reach)
+    nears_boundary = signs[0] * jnp.stack(mode.codes) > 0
+    rightward, leftward = jnp.stack(bounds_rightward(mode)), jnp.stack(bounds_leftward(mode))
+    nears_edge = jnp.where(signs[1] > 0, rightward, leftward)
+    nears = jnp.concatenate([nears_boundary, nears_edge])
+    return jnp.append(jnp.where(nears, guards[: 3 * n], jnp.inf), extrema)
+
+
+class SlipArc(eqx.Module):
+    """End of a slip arc: its duration and state, the guard that fired (-1: none), failure."""
+
+    duration: Array
+    y: State
+    fired: Array
+    failed: Array
+
+
+def slip_arc(
+    osc: Oscillator,
+    mode: Mode,
+    signs: Signs,
+    y: State,
+    integrator: AbstractIntegrator,
+    *,
+    every_extremum: bool,
+) -> SlipArc:
+    """Follow the slip arc from y until a guard fires, or the integrator's time is over.
+
+    signs: see `signs_after`; every_extremum: whether the arc ends at an extremum also where no
+    boundary and no edge is near.
+    """
+
+    def count(osc, mode, signs, guards):
+        return _that_count(osc, mode, signs, guards, every_extremum)
+
+    def left(y):
+        return jnp.min(count(osc, mode, signs, _all_guards(osc, mode, signs, y))) < 0
+
+    last = integrator.march(functools.partial(slip_field, osc, mode), y, left)
+    root, fired = _first_guard(osc, mode, signs, last, integrator, count)
+    # Where not every extremum ends an arc nothing depends on where exactly one does.
+    is_sharp = last.left & (every_extremum | (fired < 3 * len(osc.belts)))
+    length = lax.stop_gradient(last.length)
+
+    def guard_fired(*y):
+        guards = _all_guards(osc, mode, signs, y)
+        return jnp.sum(jnp.where(jnp.arange(guards.size) == fired, guards, 0.0))
+
+    # Two Newton steps, small ones: the digits that are left, and derivatives to second order.
+    def polish(carry, _):
+        h = carry[0]
+        y = integrator.step(functools.partial(slip_field, osc, mode), last.start, h)
+        guard, slope = jax.jvp(guard_fired, y, slip_field(osc, mode, y))
+        regular = jnp.abs(slope) * 1e-3 * length > jnp.abs(lax.stop_gradient(guard))
+        shift = jnp.where(regular, guard / jnp.where(regular, slope, 1.0), 0.0)
+        return (h - jnp.where(is_sharp, shift, 0.0), h, y), None
+
+    h = jnp.where(last.left, root, last.length)
+    (_, h, y), _ = lax.scan(polish, (h, h, last.start), length=3)
+    return SlipArc(last.t + h, y, jnp.where(last.left, fired, -1), ~last.finished)
+
+
+def _first_guard(osc, mode, signs, last, integrator, count) -> tuple[Array, Array]:
+    """When within the last step a guard first vanishes, and which; without derivatives."""
+    osc, mode, signs, last, integrator = lax.stop_gradient((osc, mode, signs, last, integrator))
+    field = functools.partial(slip_field, osc, mode)
+
+    def guards_at(y):
+        def guards(*y):
+            return _all_guards(osc, mode, signs, y)
+
+        values, slopes = jax.jvp(guards, y, field(y))
+        return count(osc, mode, signs, values), slopes
+
+    values, slopes = guards_at(last.end)
+    return first_root(
+        lambda h: guards_at(integrator.step(field, last.start, h)),
+        guards_at(last.start),
+        last.length,
+        (jnp.where(last.left, values, jnp.inf), slopes),
+        extrema=2,
+    )
+
+
+def after_slip(osc: Oscillator, mode: Mode, signs: Signs, arc: SlipArc) -> ArcEnd:
+    """How the orbit goes on at the end of a slip arc; at a pseudo-focus that captures it, at rest.
+
+    Where the arc ends at an extremum, or for want of time, the mode stays.
+    """
+    ends = Ends(len(osc.belts))
+    after = leave_slip(osc, mode, arc.fired, *arc.y)
+    y = after.x1, jnp.where(after.captured, 0.0, after.x2)
+    flipped = (
+        jnp.where(arc.fired == ends.extremum_x2, -signs[0], signs[0]),
+        jnp.where(arc.fired == ends.extremum_x1, -signs[1], signs[1]),
+    )
+    at_event = after.at_boundary | after.at_edge
+    return ArcEnd(
+        duration=arc.duration,
+        y=y,
+        mode=after.mode,
+        signs=select(at_event, signs_after(osc, after.mode, y), flipped),
+        fired=arc.fired,
+        captured=after.captured,
+        forever=jnp.zeros_like(arc.failed),
+        failed=arc.failed,
+    )
+
+
+# --- stick arcs -----------------------------------------------------------------------------------
+
+
+def stick_arc(osc: Oscillator, mode: Mode, y: State, longest: Array) -> ArcEnd:
+    """The stick arc from y to its end, or, where that is finite, for the time `longest`."""
+    x1, x2 = y
+    n = len(osc.belts)
+    phase = stick_phase(osc, mode, x1)
+    is_cut = (phase.duration >= longest) & (longest < jnp.inf)
+    edges = [jnp.asarray(n + i) for i in range(2 * n)]
+    fired = first_of(phase.edge, edges, jnp.asarray(Ends(n).onset))
+    y_end = jnp.where(is_cut, x1 + x2 * jnp.where(is_cut, longest, 0.0), phase.x1), x2
+    after = select(is_cut, mode, leave_stick(osc, mode, phase, x2))
+    never = jnp.zeros_like(is_cut)
+    return ArcEnd(
+        duration=jnp.where(is_cut, longest, phase.duration),
+        y=y_end,
+        mode=after,
+        signs=signs_after(osc, after, y_end),
+        fired=jnp.where(is_cut, -1, fired),
+        captured=never,
+        forever=jnp.isinf(phase.duration),
+        failed=never,
+    )

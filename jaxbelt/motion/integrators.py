@@ -1,0 +1,221 @@
+"""How a slip arc is integrated: step by step through the smooth field of its mode.
+
+An integrator is a class with two methods: `march` goes from a state until it has left the mode, and
+`step` makes one step of a given size, with which `arcs` then finds the place where the mode ends.
+`Adaptive`, on diffrax, controls the error of each step; `simulate` uses it. `Graded` makes steps
+that are short where the friction law bends; orbits that are followed in search of a cycle use it,
+because shooting solves for the cycle afterwards.
+
+A state is a tuple of scalars, (x1, x2), and a field a function of it.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..model.modes import Mode, mode_acceleration
+from ..model.oscillator import Oscillator
+from ..numerics.extrapolation import increments, scheme
+
+State = tuple[Array, Array]
+Field = Callable[[Any], State]
+
+#: Longest and first step of `Adaptive`, as fractions of its span.
+MAX_FRACTION, FIRST_FRACTION = 0.5, 0.2
+#: Steps of `Adaptive` before an arc is given up.
+MAX_ADAPTIVE_STEPS = 100_000
+#: A step of `Graded` times the wanted density of steps: errors of about 1e-11 a loop.
+STRIDE = 0.2
+#: Steps of `Graded` before an arc, a quarter of a loop at most, is given up.
+MAX_GRADED_STEPS = 200
+
+_ORDER_8 = scheme((2, 4, 6, 8))
+
+
+class LastStep(NamedTuple):
+    """The last step of a march: when and where it began, its length, and the state at its end.
+
+    left: whether the orbit is outside of its mode there; finished: whether it is, or its time is
+    over.
+    """
+
+    t: Array
+    start: State
+    length: Array
+    end: State
+    left: Array
+    finished: Array
+
+
+class AbstractIntegrator(eqx.Module):
+    """Integrates the smooth field of a mode; its fields are arrays, or modules of arrays."""
+
+    @abc.abstractmethod
+    def march(self, field: Field, y: State, left: Callable[[State], Array]) -> LastStep:
+        """Go from y until left(y) holds after a step."""
+
+    def step(self, field: Field, y: State, h: Array) -> State:
+        """The state one step of size h after y, as accurate as a step of `march`."""
+        (change,) = increments(field, y, h, _ORDER_8)
+        return y[0] + change[0], y[1] + change[1]
+
+
+def slip_field(osc: Oscillator, mode: Mode, y: State) -> State:
+    """The field (x1', x2') of a slip mode."""
+    x1, x2 = y
+    return x2, mode_acceleration(osc, mode, x1, x2)
+
+
+# --- steps whose error is controlled --------------------------------------------------------------
+
+
+class _Extrapolation(diffrax.AbstractAdaptiveSolver):
+    """The midpoint rule extrapolated to order eight, the error from the extrapolation to six.
+
+    Its state is where its last step began and where it ended, (t, x1, x2) each.
+    """
+
+    scheme: ClassVar = scheme((2, 4, 6, 8), (2, 4, 6))
+    term_structure = diffrax.ODETerm
+    interpolation_cls = diffrax.LocalLinearInterpolation
+
+    def order(self, terms):
+        return 7  # that of the controlled error
+
+    def init(self, terms, t0, t1, y0, args):
+        return (t0, *y0), (t0, *y0)
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        def field(y):
+            return terms.vf(t0, y, args)
+
+        best, lower = increments(field, y0, t1 - t0, self.scheme)
+        y1 = tuple(a + b for a, b in zip(y0, best, strict=True))
+        error = tuple(a - b for a, b in zip(best, lower, strict=True))
+        last = (t0, *y0), (t1, *y1)
+        return y1, error, {"y0": y0, "y1": y1}, last, diffrax.RESULTS.successful
+
+
+class Adaptive(AbstractIntegrator):
+    """Steps whose error is kept below rtol and atol, for the time `span`; scalars."""
+
+    span: Array
+    rtol: Array
+    atol: Array
+
+    def march(self, field, y, left):
+        def outside(t, y, args, **kwargs):
+            # A rejected first step leaves t = 0, where a guard may vanish.
+            return (t > 0) & left(y)
+
+        started, reached, hit = self._integrate(field, y, outside)
+        (t_start, *start), (t_end, *end) = started, reached
+        hit = jnp.asarray(hit)
+        finished = hit | (t_end >= 1)
+        t_start, t_end = self.span * t_start, self.span * t_end
+        last = lax.stop_gradient(t_end - t_start)
+        length = jnp.where(finished & ~hit, self.span - t_start, last)
+        return LastStep(t_start, tuple(start), length, tuple(end), hit, finished)
+
+    def flow(self, field: Field, y: State) -> State:
+        """The state after the time `span`; no events are looked for."""
+        _, (_, x1, x2), _ = self._integrate(field, y, None)
+        return x1, x2
+
+    def _integrate(self, field, y, outside):
+        """The last step's beginning and end, (t, x1, x2) each, t as a fraction of the span, and
+        whether it ended outside.
+
+        In units of the span the times are plain numbers: where they are not, diffrax checks them
+        with a callback, and that has no place in one kernel. Nor have the writes into arrays that
+        saving a result is in a batch; so the result is the solver's state.
+        """
+
+        def scaled(t, y, args):
+            return tuple(self.span * slope for slope in field(y))
+
+        def norm(y):
+            # A lane that has nothing to do, and may be NaN, must not keep a batch waiting.
+            return jnp.where(self.span > 0, jnp.maximum(*(jnp.abs(part) for part in y)), 0.0)
+
+        # Where no event is looked for, a step may be as long as its error allows.
+        first, longest = (1.0, 1.0) if outside is None else (FIRST_FRACTION, MAX_FRACTION)
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(scaled),
+            _Extrapolation(),
+            t0=0.0,
+            t1=1.0,
+            dt0=first,
+            y0=y,
+            saveat=diffrax.SaveAt(solver_state=True),
+            stepsize_controller=diffrax.PIDController(
+                rtol=self.rtol, atol=self.atol, dtmax=longest, norm=norm
+            ),
+            event=None if outside is None else diffrax.Event(outside),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=MAX_ADAPTIVE_STEPS,
+            throw=False,
+        )
+        last: Any = solution.solver_state
+        return *last, solution.event_mask
+
+
+# --- steps that are short where the friction law bends --------------------------------------------
+
+
+def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """How many steps per unit of time an orbit wants: more where the friction law bends.
+
+    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0.
+    """
+    a = mode_acceleration(osc, mode, x1, x2)
+    bend = jnp.zeros(())
+    for belt, code in zip(osc.belts, mode.codes, strict=True):
+        speed = jnp.maximum(jnp.sign(code) * (belt.velocity - osc.omega * x2), 0.0)
+
+        def slope(r, belt=belt):
+            return jax.jvp(belt.friction.mu, (r,), (jnp.ones_like(r),))[1]
+
+        curvature = jax.jvp(slope, (speed,), (jnp.ones_like(speed),))[1]
+        slips = jnp.abs(code) == 1
+        bend = bend + jnp.where(slips, jnp.sqrt(jnp.abs(belt.load * curvature)), 0.0)
+    near_extremum = jnp.sqrt(bend * jnp.abs(osc.omega * x2))  # where x2' = 0, x2'' = -x2
+    return 1 + 0.4 * bend * jnp.abs(osc.omega * a) + near_extremum
+
+
+class Graded(AbstractIntegrator):
+    """Steps of STRIDE over the `density` that the slip mode wants."""
+
+    osc: Oscillator
+    mode: Mode
+
+    def march(self, field, y, left):
+        # A stuck lane of a batch has no slip arc to follow; it must not keep the others waiting.
+        active = ~self.mode.any_stuck
+
+        def unfinished(state):
+            _, _, _, y, steps = state
+            finite = jnp.isfinite(y[0]) & jnp.isfinite(y[1])
+            going = (steps < MAX_GRADED_STEPS) & active & finite
+            return ((steps == 0) | ~left(y)) & going
+
+        def advance(state):
+            t, _, h, y, steps = state
+            h_new = STRIDE / density(self.osc, self.mode, *y)
+            return t + h, y, h_new, self.step(field, y, h_new), steps + 1
+
+        zero = jnp.zeros(())
+        start = zero, y, zero, y, jnp.asarray(0)
+        t, y_start, h, y_end, _ = lax.while_loop(unfinished, advance, start)
+        outside = active & left(y_end)
+        return LastStep(t, y_start, h, y_end, outside, outside)

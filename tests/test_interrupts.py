@@ -1,0 +1,77 @@
+"""Ctrl-C: every sweep is back at the prompt soon, and says what became of its runs."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+#: A sweep that would take hours: many short runs, or a few long ones, each longer than a call of
+#: the kernel is to take. Before it, one of the same program that compiles it.
+SWEEP = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np
+import jaxbelt as jb
+
+def sweep(n, t1):
+    nus = {"nu0": np.linspace(-0.6, 0.55, n), "nu1": np.linspace(-0.5, 0.55, n)}
+    return jb.sweep(jb.presets.class_b, nus, t1=t1, observe=observe, progress=False)
+
+class Last:  # sees every event, so that no loop of a run is skipped
+    def init(self, osc, x1, x2):
+        return x1
+    def update(self, state, event):
+        return event.t
+    def finish(self, state, end):
+        return {"last": state}
+
+observe = Last() if sys.argv[1] == "long" else "final"
+if sys.argv[1] != "compiling":
+    sweep(2, 1.0)
+print("ready", flush=True)
+sweep(20, 1e6) if sys.argv[1] == "long" else sweep(3000, 300.0)
+"""
+#: Seconds from the interrupt to the end of the process.
+SOON = 2.0
+
+
+def interrupted(command: list[str], delay: float, ready: bool) -> tuple[float, int, str]:
+    """Seconds until the process ended, its exit code, and what it wrote last."""
+    # Without a cache of compiled programs, so that there is something to compile.
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(command, **pipes)
+    if ready:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    time.sleep(delay)
+    began = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    return time.monotonic() - began, process.returncode, errors
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("when, delay", [("many", 3.0), ("long", 3.0), ("compiling", 3.0)])
+def test_an_interrupt_ends_a_sweep_and_says_what_became_of_it(when, delay):
+    seconds, code, errors = interrupted([sys.executable, "-c", SWEEP, when], delay, ready=True)
+    assert code == -signal.SIGINT, errors
+    last = errors.strip().splitlines()[-1]
+    assert (
+        last.startswith("KeyboardInterrupt: interrupted after ") and 'store="results.zarr"' in last
+    )
+    assert seconds < SOON
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_an_interrupt_ends_the_command(tmp_path):
+    axes = ["nu0=-0.6:0.55:3000", "nu1=-0.5:0.5:3000"]
+    out = ["--out", str(tmp_path / "plane.nc")]
+    command = [sys.executable, "-c", "from jaxbelt.cli import app; app()", "sweep", *axes, *out]
+    seconds, code, errors = interrupted(command, 10.0, ready=False)
+    assert code == 130 and "interrupted after " in errors and "Traceback" not in errors
+    assert seconds < SOON
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,232 @@
+"""The transitions between modes: one table, and every engine held to it.
+
+A mode is a contact code a belt: +1 or -1 the mass slips with that sign of r = nu - omega x2, 0 it
+sticks, -2 it is below the belt's contact interval, +2 above. Each row is a start, the mode that it
+is in, the first event, (kind, belt), and the mode after that. All belts follow Coulomb's law with
+static coefficient 1 and kinetic coefficient 1/2, and there is no damping, so
+
+    x2' = -x1 + sum of s/2 load,    and a belt holds a needed force of size up to its load.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import EventKind, Oscillator, Status
+from jaxbelt.cycles.orbits import follow
+from jaxbelt.model.events import event_between
+from jaxbelt.numerics.compiling import jit
+
+CROSS, EDGE, SLIP, STICK = EventKind.CROSS, EventKind.EDGE, EventKind.SLIP, EventKind.STICK
+BELOW, ABOVE = -2, 2
+
+
+def belt(nu: float, load: float = 1.0, lower: float = -np.inf, upper: float = np.inf) -> jb.Belt:
+    return jb.Belt(nu, jb.Coulomb(static=1.0, kinetic=0.5), load, lower, upper)
+
+
+class Row(NamedTuple):
+    """A start y = (x1, x2), its mode, the first event, (kind, belt), and the mode afterwards."""
+
+    name: str
+    belts: tuple[jb.Belt, ...]
+    y: tuple[float, float]
+    mode: tuple[int, ...]
+    event: tuple[EventKind, int]
+    after: tuple[int, ...]
+
+    @property
+    def osc(self) -> Oscillator:
+        return Oscillator(0.0, self.belts)
+
+
+ONE, BACK, STILL = (belt(0.5),), (belt(-0.5),), (belt(0.0),)
+OPPOSED = (belt(0.5), belt(-0.5))
+EQUAL = (belt(0.5), belt(0.5))
+
+# fmt: off
+TABLE = [
+    # A boundary r = 0 is reached. Needed is -x1 plus the friction of the other belts.
+    Row("held: it sticks",               ONE,     (-0.3, 0.4), (1,),    (STICK, 0), (0,)),
+    Row("held, from above",              ONE,     (0.3, 0.7),  (-1,),   (STICK, 0), (0,)),
+    Row("not held: it crosses",          ONE,     (-2.0, 0.4), (1,),    (CROSS, 0), (-1,)),
+    Row("not held, from above",          ONE,     (2.0, 0.7),  (-1,),   (CROSS, 0), (1,)),
+    Row("the other belt helps to hold",  OPPOSED, (-1.3, 0.4), (1, -1), (STICK, 0), (0, -1)),
+    Row("the other belt pulls it over",  OPPOSED, (0.7, 0.6),  (-1, -1),(CROSS, 0), (1, -1)),
+    Row("the lower one of two",          OPPOSED, (0.4, -0.4), (1, -1), (STICK, 1), (1, 0)),
+    Row("belt at rest, held",            STILL,   (0.3, 0.2),  (-1,),   (STICK, 0), (0,)),
+    Row("belt at rest, not held",        STILL,   (-2.0, -.1), (1,),    (CROSS, 0), (-1,)),
+    Row("belt without load",     (belt(0.5, 0.0),), (-.3, .45), (1,),   (CROSS, 0), (-1,)),
+    Row("equal speeds: loads add up",    EQUAL,   (-1.7, 0.4), (1, 1),  (STICK, 0), (0, 0)),
+    Row("equal speeds, not held",        EQUAL,   (-3.0, 0.4), (1, 1),  (CROSS, 0), (-1, -1)),
+
+    # Slip onset: the new sign is that of the belt's velocity.
+    Row("onset, belt to the right",      ONE,     (0.9, 0.5),  (0,),    (SLIP, 0),  (1,)),
+    Row("onset, belt to the left",       BACK,    (-.9, -.5),  (0,),    (SLIP, 0),  (-1,)),
+    Row("onset beside another belt",     OPPOSED, (0.4, 0.5),  (0, -1), (SLIP, 0),  (1, -1)),
+    Row("onset from two belts",          EQUAL,   (1.9, 0.5),  (0, 0),  (SLIP, 0),  (1, 1)),
+
+    # A contact edge is met in slip: it is passed, and belts that stay keep their sign.
+    Row("a belt arrives, from the left", (belt(0.5), belt(-0.2, lower=0.0)),
+        (-0.1, 0.3), (1, BELOW), (EDGE, 1), (1, -1)),
+    Row("a belt arrives, from the right", (belt(0.5), belt(-0.2, upper=0.0)),
+        (0.1, -0.4), (1, ABOVE), (EDGE, 1), (1, 1)),
+    Row("a belt is left, to the left",   (belt(0.5), belt(-0.2, lower=0.0)),
+        (0.05, -0.4), (1, 1), (EDGE, 1), (1, BELOW)),
+    Row("a belt is left, to the right",  (belt(0.5), belt(-0.2, 0.5, upper=0.0)),
+        (-0.1, 0.3), (1, -1), (EDGE, 1), (1, ABOVE)),
+    Row("one belt after another",        (belt(0.5, upper=0.0), belt(-0.2, lower=0.0)),
+        (-0.1, 0.3), (1, BELOW), (EDGE, 0), (ABOVE, -1)),
+    Row("no belt is left",               (belt(0.5, upper=0.0),),
+        (-0.1, 0.3), (1,), (EDGE, 0), (ABOVE,)),
+
+    # A contact edge is met while the mass sticks.
+    Row("a belt arrives: still held",    (belt(0.5), belt(-0.2, lower=0.0)),
+        (-0.1, 0.5), (0, BELOW), (EDGE, 1), (0, -1)),
+    Row("a belt arrives: torn off",      (belt(0.5), belt(-0.2, 3.0, lower=0.0)),
+        (-0.1, 0.5), (0, BELOW), (EDGE, 1), (1, -1)),
+    Row("one of that speed arrives",     (belt(0.5), belt(0.5, lower=0.0)),
+        (-0.1, 0.5), (0, BELOW), (EDGE, 1), (0, 0)),
+    Row("another is left: still held",   (belt(0.5), belt(-0.2, upper=0.0)),
+        (-0.1, 0.5), (0, -1), (EDGE, 1), (0, ABOVE)),
+    Row("another is left: torn off",     (belt(0.5), belt(0.9, 3.0, upper=1.4)),
+        (1.3, 0.5), (0, 1), (EDGE, 1), (1, ABOVE)),
+    Row("its own is left: slip",         (belt(0.5, upper=0.0), belt(-0.2)),
+        (-0.1, 0.5), (0, -1), (EDGE, 0), (ABOVE, -1)),
+    Row("its own is left: the other holds it", (belt(0.5, upper=0.0), belt(0.5)),
+        (-0.1, 0.5), (0, 0), (EDGE, 0), (ABOVE, 0)),
+    Row("onset on the edge itself",      (belt(0.5, upper=1.0),),
+        (0.9, 0.5), (0,), (EDGE, 0), (ABOVE,)),
+
+    # Starts on a boundary or an edge: the mode is that in which the orbit goes on.
+    Row("on a boundary, pulled down",    ONE,     (1.2, 0.5),  (1,),    (STICK, 0), (0,)),
+    Row("on a boundary, pulled up",      ONE,     (-1.2, 0.5), (-1,),   (STICK, 0), (0,)),
+    Row("on an edge, to the right",      (belt(0.5), belt(-0.2, lower=0.0)),
+        (0.0, 0.3), (1, -1), (STICK, 1), (1, 0)),
+    Row("on an edge, to the left",       (belt(0.5), belt(-0.2, lower=0.0)),
+        (0.0, -0.4), (1, BELOW), (EDGE, 1), (1, -1)),
+    Row("at rest on an edge, pushed right", (belt(0.5), belt(0.5, lower=0.0)),
+        (0.0, 0.0), (1, 1), (STICK, 0), (0, 0)),
+    Row("at rest on an edge, pushed left", (belt(-0.3), belt(-0.3, lower=0.0)),
+        (0.0, 0.0), (-1, BELOW), (STICK, 0), (0, BELOW)),
+    Row("at rest in a slip mode",        ONE,     (-0.4, 0.0), (1,),    (STICK, 0), (0,)),
+]
+
+
+class Rest(NamedTuple):
+    """A start at which the motion ends at once: its mode, and the status of a run."""
+
+    name: str
+    belts: tuple[jb.Belt, ...]
+    y: tuple[float, float]
+    mode: tuple[int, ...]
+    status: Status
+
+    @property
+    def osc(self) -> Oscillator:
+        return Oscillator(0.0, self.belts)
+
+
+RESTS = [
+    Rest("fixed point of a slip mode",   ONE,   (0.5, 0.0), (1,), Status.EQUILIBRIUM),
+    Rest("stuck to a belt at rest",      STILL, (0.9, 0.0), (0,), Status.STUCK_FOREVER),
+    Rest("pushed back by both sides of an edge", (belt(0.5, upper=0.0), belt(-0.5, lower=0.0)),
+         (0.0, 0.0), (1, BELOW), Status.PSEUDO_FOCUS),
+]
+# fmt: on
+
+
+class Seen(NamedTuple):
+    """What an engine does: the mode at the start, the first event, the mode after it."""
+
+    mode: tuple[int, ...]
+    event: tuple[EventKind, int]
+    after: tuple[int, ...]
+
+
+LONG, AT_ONCE = 8.0, 1e-6  # more than a period; less than any arc of the table
+
+
+def ints(codes) -> tuple[int, ...]:
+    return tuple(int(code) for code in codes)
+
+
+def by_simulate(osc: Oscillator, y) -> Seen:
+    run = jb.simulate(osc, y, LONG)
+    events, arcs = run.events, run.arcs
+    after = next(mode for mode in np.asarray(arcs.mode) if np.any(mode != arcs.mode[0]))
+    return Seen(
+        ints(arcs.mode[0]), (EventKind(int(events.kind[0])), int(events.belt[0])), ints(after)
+    )
+
+
+@jit
+def orbit_of(osc: Oscillator, y):
+    return follow(osc, y, 16)
+
+
+def by_orbit(osc: Oscillator, y) -> Seen:
+    """As `find_cycle` follows it."""
+    orbit = orbit_of(osc, jnp.array(y))
+    codes = np.vstack([np.asarray(orbit.codes)[: int(orbit.count)], orbit.code])
+    row = np.flatnonzero(np.any(np.diff(codes, axis=0) != 0, axis=1))[0]
+    kind, number = event_between([*codes[row]], [*codes[row + 1]])
+    return Seen(ints(codes[0]), (EventKind(int(kind)), int(number)), ints(codes[row + 1]))
+
+
+class FirstEvent:
+    """A reducer: time, kind and belt of the first event of a run."""
+
+    def init(self, osc, x1, x2):
+        return jnp.array([jnp.inf, 0.0, -1.0])
+
+    def update(self, state, event):
+        new = jnp.stack([event.t, event.kind.astype(float), event.belt.astype(float)])
+        return jnp.where(state[1] == 0, new, state)
+
+    def finish(self, state, end):
+        return {"first": state}
+
+
+FIRST = FirstEvent()
+
+
+def by_sweep(osc: Oscillator, y) -> Seen:
+    def mode_at(t1):
+        found = jb.sweep(lambda: osc, {"x1": [y[0]], "x2": [y[1]]}, t1=t1, observe="final")
+        return ints(np.asarray(found.mode_end)[0, 0])
+
+    run = jb.sweep(lambda: osc, {"x1": [y[0]], "x2": [y[1]]}, t1=LONG, observe=FIRST)
+    t, kind, number = np.asarray(run["first"])[0, 0]
+    return Seen(mode_at(AT_ONCE), (EventKind(int(kind)), int(number)), mode_at(t + AT_ONCE))
+
+
+ENGINES = {"simulate": by_simulate, "orbits": by_orbit, "sweep": by_sweep}
+
+
+@pytest.mark.parametrize("engine", ENGINES.values(), ids=ENGINES)
+@pytest.mark.parametrize("row", TABLE, ids=[row.name for row in TABLE])
+def test_transition(row: Row, engine: Callable):
+    assert engine(row.osc, row.y) == Seen(row.mode, row.event, row.after)
+
+
+@pytest.mark.parametrize("rest", RESTS, ids=[rest.name for rest in RESTS])
+def test_rest(rest: Rest):
+    """An end that is no event. An equilibrium is no end for a run of `simulate`: it stays."""
+    run = jb.simulate(rest.osc, rest.y, LONG)
+    ends = rest.status != Status.EQUILIBRIUM
+    assert run.status == (rest.status if ends else Status.OK) and run.events.t.size == 0
+    np.testing.assert_allclose(run.ys, np.broadcast_to(rest.y, run.ys.shape), atol=1e-15)
+    assert ints(run.arcs.mode[0]) == rest.mode
+
+    assert jb.find_cycle(rest.osc, rest.y).status == rest.status
+
+    axes = {"x1": [rest.y[0]], "x2": [rest.y[1]]}
+    found = jb.sweep(lambda: rest.osc, axes, t1=LONG, observe="attractor").squeeze()
+    kind = "stuck" if rest.status == Status.STUCK_FOREVER else "equilibrium"
+    assert found.kind == kind and found.n_events == 0
+    assert (found.x1_min, found.x1_max) == (rest.y[0], rest.y[0])
