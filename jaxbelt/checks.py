@@ -78,7 +78,7 @@ def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Ar
     ):
         raise ValueError(
             f"{field} must be float64, got {dtype}"
-            + (f"; {TURN_ON_FLOAT64} loops float64 on" if dtype == jnp.float32 else "")
+            + (f"; {TURN_ON_FLOAT64} turns float64 on" if dtype == jnp.float32 else "")
         )
     array = value if isinstance(value, jax.Array) else np.asarray(value)
     array = array.astype(np.float64)

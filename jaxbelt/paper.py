@@ -46,7 +46,7 @@ from .results import EventKind, Status
 #: Every portrait runs over this time (dimensionless), sampled at so many times.
 TIME_SPAN, SAMPLES = 60.0, 2401
 #: Room for the arcs of every run here: one program serves all.
-BUDGET = 512
+SEGMENTS = 512
 #: Transients that do not join a cycle are drawn until this time.
 TRANSIENT = 25.0
 
@@ -105,7 +105,7 @@ def critical_values() -> tuple[CriticalValue, ...]:
         rows = [published for published in PUBLISHED if published.system == system]
         osc = _with_two_belts(paper_oscillator(system, rows[0].printed))
         wanted = {row: CONDITIONS[system, row.point] for row in rows}
-        index = jnp.asarray(np.array(leaf_index(osc, _velocity)))
+        index = jnp.asarray(np.array(leaf_index(osc, _nu0)))
         for row in rows:
             point = wanted[row].found_from(osc, index, row.printed + AWAY)
             if point is None or point.condition != wanted[row]:
@@ -121,7 +121,7 @@ def critical_values() -> tuple[CriticalValue, ...]:
     return tuple(values[row] for row in PUBLISHED)
 
 
-def _velocity(osc: Oscillator) -> Any:
+def _nu0(osc: Oscillator) -> Any:
     return osc.belts[0].velocity
 
 
@@ -211,7 +211,7 @@ def simulate_panels(panels: Sequence[Panel]) -> list[list[Trajectory]]:
 
 def _orbit(osc: Oscillator, start: tuple[float, float]) -> Trajectory:
     times = np.linspace(0.0, TIME_SPAN, SAMPLES)
-    run = simulate(osc, start, TIME_SPAN, ts=times, rtol=1e-7, atol=1e-7, max_segments=BUDGET)
+    run = simulate(osc, start, TIME_SPAN, ts=times, rtol=1e-7, atol=1e-7, max_segments=SEGMENTS)
     return jax.tree.map(np.asarray, run)
 
 
@@ -372,7 +372,7 @@ def formulation_errors(
     """
     osc, y0, span = class_b(-0.2, PUBLISHED_NU1), (2.0, 0.0), 15.0
     ts = np.linspace(0.0, span, SAMPLES)
-    exact = simulate(osc, y0, span, ts=ts, max_segments=BUDGET).ys
+    exact = simulate(osc, y0, span, ts=ts, max_segments=SEGMENTS).ys
 
     def error(value):
         run = simulate(osc, y0, span, ts=ts, formulation=formulation, **{width: value})
@@ -419,7 +419,7 @@ def draw_formulations(studies: Sequence[Study]) -> Figure:
 
 def diagram_a() -> BifurcationDiagram:
     """Of Fig. 3: equilibria and cycles of the oscillator with one belt, over its velocity."""
-    diagram = bifurcation_diagram(_with_two_belts(class_a(0.2)), _velocity, (0.0, 0.4))
+    diagram = bifurcation_diagram(_with_two_belts(class_a(0.2)), _nu0, (0.0, 0.4))
     # One belt only: the paper gives these regions no letter.
     regions = tuple((first, last, name[:1]) for first, last, name in diagram.regions)
     return replace(diagram, regions=regions)
@@ -427,7 +427,7 @@ def diagram_a() -> BifurcationDiagram:
 
 def diagram_b() -> BifurcationDiagram:
     """Of Fig. 7: the same with two belts, along nu1 = 0.35."""
-    return bifurcation_diagram(class_b(0.3, PUBLISHED_NU1), _velocity, (-0.7, 0.7))
+    return bifurcation_diagram(class_b(0.3, PUBLISHED_NU1), _nu0, (-0.7, 0.7))
 
 
 def map_b() -> RegionMap:

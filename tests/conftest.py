@@ -1,6 +1,9 @@
 """What every test runs under: float64, JAX's strict promotion rules, checked annotations."""
 
+import gc
 import os
+import random
+import time
 
 import pytest
 
@@ -12,6 +15,40 @@ import jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+# A trace makes many objects that stay: to look for garbage among them as often as Python does takes
+# a seventh of the time of tests that trace.
+gc.set_threshold(200_000, 20, 100)
+
+START = time.monotonic()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--minutes N`: what has not begun by then is skipped, and another part of it every time."""
+    parser.addoption("--minutes", type=float, help="skip what has not begun after so many minutes")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """The order of a run that may be cut short: what is checked nowhere else, `slow(first=True)`,
+    then the other files, another one first in every run; the same for all its workers."""
+    if config.getoption("minutes") is None:
+        return
+    files = sorted({item.path for item in items})
+    random.Random(getattr(config, "workerinput", {}).get("testrunuid")).shuffle(files)
+
+    def order(item):
+        slow = item.get_closest_marker("slow")
+        return not (slow and slow.kwargs.get("first")), files.index(item.path)
+
+    items.sort(key=order)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skips what comes too late."""
+    minutes = item.config.getoption("minutes")
+    if minutes is not None and time.monotonic() - START > 60 * minutes:
+        pytest.skip(f"not begun after {minutes:g} minutes")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -118,7 +118,7 @@ def test_two_cycles_with_one_sequence_of_events_are_two():
 
 def test_two_segments_are_two_attractors():
     """A belt at rest touches on both sides of a stretch without it."""
-    law = jb.Coulomb(0.3, 0.2)
+    law = jb.Conti(0.3, 0.2, 10.0)  # the law of the test above, for one program
     belts = (jb.Belt(0.0, law, upper=-0.1), jb.Belt(0.0, law, lower=0.1))
     osc = jb.Oscillator(0.5, belts)
     found = jb.basins(osc, x1=np.linspace(-0.3, 0.3, 7), x2=np.array([-0.1, 0.1]))

@@ -200,12 +200,18 @@ def test_help_teaches(command):
 
 
 @pytest.fixture(scope="module")
+def values():
+    return reproduce.critical_values()
+
+
+@pytest.fixture(scope="module")
 def reproduced(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reproduction") / "results"
     return folder, runner.invoke(app, ["reproduce", "--out", str(folder)])
 
 
-def test_reproduce_writes_the_table_and_every_figure(reproduced):
+@pytest.mark.slow(first=True)
+def test_reproduce_writes_the_table_and_every_figure(reproduced, values):
     folder, result = reproduced
     assert result.exit_code == 0, result.output
     names = {f"{name}.png" for name in reproduce.FIGURES}
@@ -213,11 +219,12 @@ def test_reproduce_writes_the_table_and_every_figure(reproduced):
     assert {path.name for path in folder.iterdir()} == names | {"critical_values.json"}
     for name in names:
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
+    written = json.loads((folder / "critical_values.json").read_text(encoding="utf-8"))
+    assert written == reproduce.as_json(values)
 
 
-def test_critical_values_json(reproduced):
-    folder, _ = reproduced
-    rows = json.loads((folder / "critical_values.json").read_text(encoding="utf-8"))
+def test_critical_values_json(values):
+    rows = json.loads(json.dumps(reproduce.as_json(values)))
     keys = ["class", "point", "kind", "printed", "computed", "residual", "iterations"]
     assert [list(row) for row in rows] == [keys] * 9
     assert [(r["class"], r["point"], r["kind"], r["printed"]) for r in rows] == [
@@ -237,6 +244,7 @@ def test_critical_values_json(reproduced):
         assert row["computed"] == pytest.approx(row["printed"], abs=1e-3)
 
 
+@pytest.mark.slow(first=True)
 def test_reproduce_says_what_the_paper_misprints_and_lacks(reproduced):
     _, result = reproduced
     text = " ".join(result.output.split())
@@ -255,9 +263,8 @@ def test_reproduce_tells_in_one_sentence_where_it_cannot_write(tmp_path):
     assert result.stderr.count("\n") == 1
 
 
-def test_portraits_show_what_the_paper_says_of_the_regions():
+def test_portraits_show_what_the_paper_says_of_the_regions(values):
     """Which panels have a steady cycle, and on which belts it sticks."""
-    values = reproduce.critical_values()
     panels = {name: figure.panels(values) for name, figure in reproduce.PORTRAITS.items()}
     orbits = iter(
         reproduce.simulate_panels([panel for group in panels.values() for panel in group])

@@ -7,10 +7,20 @@ import matplotlib.pyplot as plt
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+#: Quick to compile.
+QUICK = ("02_sweeps",)
 
 
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive:UserWarning")
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(
+            path, marks=[] if path.stem in QUICK else pytest.mark.slow(first=True), id=path.stem
+        )
+        for path in NOTEBOOKS
+    ],
+)
 def test_notebook_runs(path):
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     namespace = {}

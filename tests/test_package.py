@@ -95,6 +95,19 @@ def test_modules_are_imported_by_statements_only(module: str):
     assert used.isdisjoint(HIDDEN_WAYS)
 
 
+@pytest.mark.parametrize("module", [name for name in LADDER if name != "numerics.compiling"])
+def test_what_others_do_not_promise_is_used_in_one_place(module: str):
+    """Behind the switch JAXBELT_PLAIN."""
+    inside = ("jax._src", "jax.extend", "jax.experimental", "jax.custom_batching")
+    inside = (*inside, "equinox.internal", "eqx.internal")
+    assert not [name for name in imported_names(module) if name.startswith(inside)]
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Attribute):
+            assert not ast.unparse(node).startswith(inside)
+        if isinstance(node, ast.keyword):
+            assert node.arg not in ("compiler_options", "inline")
+
+
 @pytest.mark.parametrize(
     "module", [module for module in LADDER if not module.startswith("plotting.")]
 )
@@ -139,6 +152,7 @@ def test_readme_reproduces_the_paper_in_one_line():
     assert readme_command("reproduce").endswith("&& .venv/bin/jaxbelt reproduce")
 
 
+@pytest.mark.slow(first=True)
 def test_examples_of_the_readme_run():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     examples = re.findall(r"^```python\n(.+?)^```$", readme, re.MULTILINE | re.DOTALL)
@@ -147,20 +161,22 @@ def test_examples_of_the_readme_run():
     plt.close("all")
 
 
-def test_ci_runs_the_test_command_of_the_readme():
-    """The lines of .ci/run that read the command find it, its exit code counts, and pytest is
+@pytest.mark.parametrize("mark", ["tests", "slow tests"])
+def test_ci_runs_the_test_commands_of_the_readme(mark):
+    """The line of .ci/run that reads a command finds it, its exit code counts, and pytest is
     started nowhere else."""
     ci = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-    (extraction,) = re.findall(r"^command=.*$", ci, re.MULTILINE)
+    (extraction,) = re.findall(r"^ *command=.*$", ci, re.MULTILINE)
+    assert 'for mark in tests "slow tests"; do' in ci
     run = subprocess.run(
-        ["bash", "-c", f'{extraction}\nprintf %s "$command"'],
+        ["bash", "-c", f'mark={mark!r}\n{extraction}\nprintf %s "$command"'],
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=True,
         timeout=60,
     )
-    assert run.stdout == readme_command("tests")
+    assert run.stdout == readme_command(mark)
     assert ci.count("$command") == 3  # looked at, shown, run
     assert 'bash -euo pipefail -c "$command") || tested=$?' in ci
     assert ci.rstrip().endswith("exit $((tested || linted))")

@@ -10,7 +10,7 @@ from matplotlib.colors import to_hex
 
 import jaxbelt as jb
 from jaxbelt import paper as reproduce
-from jaxbelt.plotting.phase import _field, draw_overview, stick_phases
+from jaxbelt.plotting.phase import _vector_field, draw_overview, stick_phases
 from jaxbelt.plotting.style import BELT_COLOURS, journal_style, save
 
 
@@ -193,7 +193,7 @@ def test_vector_field_jumps_at_the_boundary_and_slides_on_it(kind):
     ax = jb.plot_vector_field(osc, kind=kind, xlim=(-2.0, 2.0), ylim=(-1.0, 1.0))
     assert ax.collections
     x2 = jnp.array([0.3 - 1e-9, 0.3, 0.3 + 1e-9])
-    x1_dot, x2_dot = _field(osc, jnp.zeros(3), x2)
+    x1_dot, x2_dot = _vector_field(osc, jnp.zeros(3), x2)
     np.testing.assert_array_equal(x1_dot, x2)
     # -zeta nu0 + mus, stuck, -zeta nu0 - mus
     np.testing.assert_allclose(x2_dot, [0.85, 0.0, -1.15], atol=1e-7)
@@ -243,7 +243,7 @@ def test_no_steady_cycle_where_the_mass_comes_to_rest():
 def test_class_a_is_the_limit_of_two_belts():
     osc = jb.presets.class_a(0.23)
     x1, x2 = np.random.default_rng(0).uniform(-3, 3, (2, 50))
-    alone, beside = (_field(o, x1, x2) for o in (osc, reproduce._with_two_belts(osc)))
+    alone, beside = (_vector_field(o, x1, x2) for o in (osc, reproduce._with_two_belts(osc)))
     np.testing.assert_array_equal(alone, beside)
 
 

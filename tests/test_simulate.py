@@ -156,17 +156,23 @@ LATE = 42.0
 N_EVENTS = 12
 
 
-def outcome(p, late=LATE):
-    """Final state, event times, event states of a two-belt run with every parameter traced."""
+def outcome(p):
+    """Final state, event times, event states of a two-belt run with every parameter traced.
+
+    And beside them what has no derivatives: the kinds of the events, and the last mode.
+    """
     law = jb.Conti(static=1.0, residual=p[3], steepness=p[4])
     osc = jb.Oscillator(p[2], (jb.Belt(p[0], law), jb.Belt(p[1], law)))
-    run = jb.simulate(osc, p[5:], late, ts=jnp.array([late]), max_segments=256)
-    return run.ys[0], run.events.t[:N_EVENTS], run.events.y[:N_EVENTS], run.events.kind[:N_EVENTS]
+    run = jb.simulate(osc, p[5:], LATE, ts=jnp.array([LATE]), max_segments=256)
+    events = jax.tree.map(lambda column: column[:N_EVENTS], run.events)
+    numbers = run.ys[0], events.t, events.y
+    return numbers, (numbers, events.kind, run.modes[0])
 
 
 @functools.cache
 def forward_derivatives():
-    return jax.jit(jax.jacfwd(lambda p: outcome(p)[:3]))(PARAMETERS)
+    """The derivatives, and what `outcome` gives beside them, by one program."""
+    return jax.jit(jax.jacfwd(outcome, has_aux=True))(PARAMETERS)
 
 
 def test_derivatives_agree_with_richardson_differences_of_the_oracle():
@@ -177,7 +183,7 @@ def test_derivatives_agree_with_richardson_differences_of_the_oracle():
         assert len(run.events) >= N_EVENTS
         return np.concatenate([run.at(LATE), [e.t for e in run.events[:N_EVENTS]]])
 
-    final, times, _ = forward_derivatives()
+    (final, times, _), _ = forward_derivatives()
     computed = np.concatenate([final, times])
     base = np.asarray(PARAMETERS)
     for i in range(len(base)):
@@ -194,14 +200,13 @@ def test_derivatives_agree_with_richardson_differences_of_the_oracle():
 
 
 def test_reverse_mode_equals_forward_mode():
-    reverse = jax.jit(jax.jacrev(lambda p: outcome(p)[:3]))(PARAMETERS)
-    for a, b in zip(reverse, forward_derivatives(), strict=True):
+    reverse, _ = jax.jit(jax.jacrev(outcome, has_aux=True))(PARAMETERS)
+    for a, b in zip(reverse, forward_derivatives()[0], strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
 
 
 def test_a_stick_phase_forgets_the_start():
-    final, times, states = forward_derivatives()
-    kind = jax.jit(outcome)(PARAMETERS)[3]
+    (final, times, states), ((end, *_), kind, mode) = forward_derivatives()
     first = int(np.argmax(kind == EventKind.SLIP))
     assert kind[first] == EventKind.SLIP
     by_start = slice(5, 7)
@@ -211,10 +216,7 @@ def test_a_stick_phase_forgets_the_start():
     intervals = np.diff(np.asarray(times[first:, by_start]), axis=0)
     np.testing.assert_allclose(intervals, 0, atol=1e-12)
     # The clock is not forgotten: the final state moves along the orbit, by minus the time shift.
-    run = outcome(PARAMETERS)
-    osc = jb.presets.class_b(-0.3, 0.35)
-    x1, x2 = run[0]
-    mode = jb.simulate(osc, PARAMETERS[5:], LATE, ts=jnp.array([LATE]), max_segments=256).modes[0]
+    x1, x2 = end
     push = sum(
         float(s) * oracle.conti(1.0, 0.6, 10.0)[0](abs(nu - float(x2)))
         for s, nu in zip(mode, (-0.3, 0.35), strict=True)
@@ -299,7 +301,7 @@ def test_the_smooth_formulation_has_derivatives():
         run = jb.simulate(osc, (2.0, 0.0), 5.0, ts=ts, formulation="smooth", eps=0.05)
         return run.ys[-1]
 
-    forward, reverse = jax.jacfwd(end)(-0.2), jax.jacrev(end)(-0.2)
+    forward, reverse = jax.jit(lambda nu: (jax.jacfwd(end)(nu), jax.jacrev(end)(nu)))(-0.2)
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
     difference, _ = oracle.richardson(lambda nu: np.asarray(end(nu)), -0.2, 1e-3)
     np.testing.assert_allclose(forward, difference, rtol=1e-6)
@@ -615,10 +617,10 @@ def test_float32_is_refused_with_the_remedy():
 
 def test_times_that_do_not_increase_under_a_trace():
     """Outside they are refused; inside nobody can know, and the samples are right all the same."""
-    ts = np.random.default_rng(0).uniform(0.0, 40.0, 100)
+    ts = np.random.default_rng(0).uniform(0.0, SPAN, SAMPLES.size)
 
     def states(ts):
-        return jb.simulate(jb.presets.class_b(0.45, 0.35), (3.0, 0.0), 40.0, ts=ts).ys
+        return simulate(jb.presets.class_b(0.45, 0.35), (3.0, 0.0), SPAN, ts=ts).ys
 
     order = np.argsort(ts)
     np.testing.assert_allclose(jax.jit(states)(ts)[order], states(ts[order]), rtol=0, atol=1e-9)

@@ -38,7 +38,7 @@ from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
 from ..results import Status, describe
 from .record import WINDOW, Record, record_of
-from .selection import ITERATIONS, LONGEST, Selection, select
+from .selection import ITERATIONS, LONGEST_STEP, Selection, selection_of
 
 #: Each stage joins so many neighbouring windows.
 JOIN = 3
@@ -117,8 +117,8 @@ def _search(starts, selection: Selection, osc: Oscillator, record: Record, eps, 
 
 def _candidates(selection, u, osc, record: Record, starts: int):
     """The ends of the search, best first, each with its window starts; near ones count once."""
-    # The velocity over which tanh loops. Steps of the scheme are stable up to 2.8 over the slope of
-    # the friction there; two belts of one velocity double it.
+    # The velocity over which tanh changes its sign. Steps of the scheme are stable up to 2.8 over
+    # the slope of the friction there; two belts of one velocity double it.
     eps = 0.1 * float(record.scale[1])
     slope = max(float(b.load * b.friction.static * osc.omega) for b in osc.belts) / eps
     steps = 16 * int(np.ceil(float(jnp.max(record.times)) * max(20.0, slope / 1.3) / 16))
@@ -224,7 +224,7 @@ def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float) -> _
         if not np.isfinite(point.chi2) or damping > 1e5:
             break
         du, dstarts = _damped_step(point.blocks, damping)
-        shorter = min(1.0, LONGEST / max(np.max(np.abs(du)), 1e-300))
+        shorter = min(1.0, LONGEST_STEP / max(np.max(np.abs(du)), 1e-300))
         moved = point.starts.copy()
         moved[fresh] += np.clip(shorter * dstarts, -0.5, 0.5)
         trial = at(point.u + shorter * du, moved, point.evaluations + 1)
@@ -336,7 +336,7 @@ def fit(
     check_oscillator(oscillator, "oscillator")
     times, values, sigmas = _checked_record(ts, x1, x2, noise)
     require(isinstance(starts, int) and starts > 0, "starts", "a positive integer", starts)
-    selection, u = select(oscillator, where, bounds)
+    selection, u = selection_of(oscillator, where, bounds)
     tell = report or (lambda text: None)
 
     record = record_of(times, values, sigmas)

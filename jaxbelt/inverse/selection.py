@@ -12,8 +12,8 @@ from ..checks import require
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_groups, names_of
 
-#: Steps of one damped Gauss-Newton iteration, and how far one may move a parameter.
-ITERATIONS, LONGEST = 40, 0.4
+#: Most steps of a damped Newton iteration, and the longest, in units of `Selection.values`' u.
+ITERATIONS, LONGEST_STEP = 40, 0.4
 
 
 class Selection(eqx.Module):
@@ -53,7 +53,7 @@ class Selection(eqx.Module):
         return jax.tree.unflatten(structure, leaves)
 
 
-def select(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, np.ndarray]:
+def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, np.ndarray]:
     """What `where` selects, a leaf or a tuple of leaves kept equal for each parameter; and u."""
     groups, leaves = leaf_groups(osc, where), jax.tree.leaves(osc)
     if bounds is None:

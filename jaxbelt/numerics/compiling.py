@@ -179,7 +179,7 @@ def one_kernel(function: Callable) -> Callable:
     for a few numbers that takes longer than the operations do. In a batch, in derivatives, and
     where something in it is not possible in one piece, the function is as it was.
     """
-    piece = _piece(function)
+    piece = _as_piece(function)
 
     @functools.wraps(function)
     def call(*args):
@@ -189,7 +189,7 @@ def one_kernel(function: Callable) -> Callable:
     return call
 
 
-def _piece(function: Callable) -> Callable:
+def _as_piece(function: Callable) -> Callable:
     @jax.custom_jvp
     def in_one_piece(*args):
         if _is_part.get():
@@ -259,10 +259,10 @@ def _try_piece() -> bool:
         return lax.while_loop(lambda state: state[0] > 1, lambda s: (s[0] / 2, s[1] + 1), (x, 0))
 
     def derivatives(x):
-        return jax.jvp(lambda x: jax.vmap(_piece(halve), (0, None))(x, x), (x,), (x,))
+        return jax.jvp(lambda x: jax.vmap(_as_piece(halve), (0, None))(x, x), (x,), (x,))
 
     jax.eval_shape(derivatives, np.ones(2))
-    x, n = jax.jit(_piece(halve))(40.0, np.ones(2))
+    x, n = jax.jit(_as_piece(halve))(40.0, np.ones(2))
     return (float(x), int(n)) == (0.625, 6)
 
 

@@ -57,7 +57,7 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
     """
     if ax is None:
         ax = tuple(new_figure().subplots(2, sharex=True))
-    t, ys = _path(trajectory)
+    t, ys = _path_of(trajectory)
     upper, lower = ax
     for axes, component, name in ((upper, 0, "displacement $x_1$"), (lower, 1, "velocity $x_2$")):
         axes.plot(t, ys[:, component], color="black", linewidth=0.9)
@@ -113,7 +113,7 @@ def _belt_shading(belt: int) -> dict[str, Any]:
     return {"facecolor": pale, "edgecolor": (*colour[:3], 0.45), "linewidth": 0.0, "hatch": hatch}
 
 
-def _path(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+def _path_of(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Times and states of a trajectory, its events among the samples so that corners are sharp."""
     t = np.concatenate([trajectory.ts, trajectory.events.t])
     ys = np.concatenate([trajectory.ys, trajectory.events.y])
@@ -144,7 +144,7 @@ def plot_phase_portrait(
     if isinstance(trajectories, Trajectory):
         trajectories = (trajectories,)
     ax = new_axes() if ax is None else ax
-    paths = [_path(trajectory)[1] for trajectory in trajectories]
+    paths = [_path_of(trajectory)[1] for trajectory in trajectories]
     loops = [np.asarray(cycle.sample(400)) for cycle in cycles]
     equilibria = find_equilibria(osc) if equilibria is None else equilibria
     window = _window(osc, [*paths, *loops], equilibria, xlim, ylim)
@@ -355,7 +355,7 @@ def plot_vector_field(
     ax.set(xlim=(left, right), ylim=(bottom, top))
     columns, rows = (201, 201) if kind == "streamlines" else (21, 17)
     x1, x2 = np.meshgrid(np.linspace(left, right, columns), np.linspace(bottom, top, rows))
-    v1, v2 = _field(osc, jnp.asarray(x1), jnp.asarray(x2))
+    v1, v2 = _vector_field(osc, jnp.asarray(x1), jnp.asarray(x2))
     if kind == "streamlines":
         ax.streamplot(
             x1, x2, np.asarray(v1), np.asarray(v2),
@@ -376,7 +376,7 @@ def plot_vector_field(
 
 
 @jit
-def _field(osc, x1, x2):
+def _vector_field(osc, x1, x2):
     mode = mode_of_state(osc, x1, x2)
     return x2, jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
 

@@ -1,0 +1,31 @@
+"""JAXBELT_PLAIN=1: all works the same without what JAX, XLA and Equinox do not promise."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+#: One of everything that leans on it: motion, cycles, sweeps, parameters, processes.
+PART = (
+    "test_compiling.py::test_jit_works_inside_of_every_trace",
+    "test_compiling.py::test_a_batch_gives_what_a_loop_gives",
+    "test_simulate.py::test_error_falls_with_the_tolerance",
+    "test_cycles.py::test_sticking_cycle_is_that_of_the_oracle",
+    "test_coincidences.py::test_audits_find_nothing",
+    "test_parameters.py::test_an_argument_that_is_one_parameter",
+    "test_processes.py",
+)
+
+
+def test_a_part_of_the_tests_passes_plainly():
+    tests = Path(__file__).parent
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")}
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-n0", *(str(tests / part) for part in PART)],
+        cwd=tests.parent,
+        env={**inherited, "JAXBELT_PLAIN": "1"},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert run.returncode == 0, run.stdout
