@@ -14,7 +14,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     presets         the published systems
     motion/         smoothing simulate
     cycles/         cycle attractors functionals
-    sweeps/         lanes step events marks observers attractor queue threads audit sweep basins
+    sweeps/         lanes step events marks observers attractor queue threads audit
+    sweeps/         grid datasets question store progress sweep basins
     bifurcations/   refine switch_folds scan curves diagrams
     inverse/        inverse
     plotting/       plotting
@@ -70,7 +71,9 @@ from .model.oscillator import Belt, Oscillator
 from .motion.simulate import Arcs, Events, Trajectory, simulate
 from .results import EventKind, Status, describe
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
-from .sweeps.sweep import sweep
+from .sweeps.datasets import decoded
+from .sweeps.store import Verified, verify
+from .sweeps.sweep import Explanation, explain, sweep
 
 if TYPE_CHECKING:
     from .plotting.plotting import (
@@ -104,6 +107,7 @@ __all__ = [
     "EquilibriumKind",
     "EventKind",
     "Events",
+    "Explanation",
     "Fit",
     "FoldOfCycles",
     "GrazingEdge",
@@ -119,17 +123,20 @@ __all__ = [
     "Stribeck",
     "SuddenSliding",
     "Trajectory",
+    "Verified",
     "amplitude",
     "basin_stability",
     "basins",
     "bifurcation_curve",
     "bifurcation_diagram",
+    "decoded",
     "describe",
     "design",
     "distance_to",
     "energy_dissipated",
     "energy_fed",
     "equilibria",
+    "explain",
     "find_cycle",
     "fit",
     "gap",
@@ -151,6 +158,7 @@ __all__ = [
     "stick_fraction",
     "sweep",
     "unstable_cycle",
+    "verify",
 ]
 
 

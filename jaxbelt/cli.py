@@ -563,8 +563,15 @@ def sweep(
         float, typer.Option(help="Relative and absolute tolerance of the integrator.")
     ] = 1e-8,
     out: Annotated[
-        Path, typer.Option(help="Where to write: NetCDF if it ends in .nc, Zarr if in .zarr.")
+        Path,
+        typer.Option(
+            help="Where to write: NetCDF if it ends in .nc; if in .zarr, a store, from which the "
+            "same command goes on where it was interrupted."
+        ),
     ] = Path("sweep.nc"),
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only tell how much it is and how long it will take.")
+    ] = False,
 ) -> None:
     """Run one of the paper's classes from every point of a grid; write the data and a picture.
 
@@ -597,15 +604,19 @@ def sweep(
         make = functools.partial(getattr(jb.presets, f"class_{system}"), **fixed)
         if t1 is None and observe != "attractor":
             t1 = 100.0
-        dataset = jb.sweep(
-            make, values, y0=start, t1=t1, rtol=tolerance, atol=tolerance, observe=observe
+        asked: dict[str, Any] = dict(
+            y0=start, t1=t1, rtol=tolerance, atol=tolerance, observe=observe
         )
-        out.parent.mkdir(parents=True, exist_ok=True)
-        if out.suffix == ".nc":
+        if dry_run:
+            console.print(repr(jb.explain(make, values, **asked)), highlight=False, soft_wrap=True)
+            return
+        if out.suffix == ".zarr":
+            dataset = jb.sweep(make, values, **asked, store=out)
+        else:
+            _check_place(out)
+            dataset = jb.sweep(make, values, **asked)
             # Version 3 of the format, which needs no library but SciPy.
             dataset.to_netcdf(out, engine="scipy")
-        else:
-            dataset.to_zarr(out, mode="w")
         written = [out]
         if sum(len(axis) > 1 for axis in values.values()) in (1, 2):
             written.append(out.with_suffix(".png"))
@@ -616,6 +627,36 @@ def sweep(
                 plotting.save(figure, written[1])
     for line in (repr(dataset), f"Written: {', '.join(map(str, written))}"):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _check_place(out: Path) -> None:
+    """Raise unless a file can be written there; before the computing, not after."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.is_dir():
+        raise IsADirectoryError(f"out must be a file, got the folder {out}")
+    if not os.access(out if out.exists() else out.parent, os.W_OK):
+        raise PermissionError(f"out must be a place that can be written to, got {out}")
+
+
+@app.command()
+def verify(
+    store: Annotated[Path, typer.Argument(help="A store that sweep wrote, such as plane.zarr.")],
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Mark bad blocks, so that the sweep does them again.")
+    ] = False,
+) -> None:
+    """Compute the checksums of a store again and tell which of its blocks are right.
+
+    Exit code 1 if there are bad ones and they are not repaired. After a repair the command or the
+    call that made the store does the marked blocks again.
+
+    Example: **jaxbelt verify plane.zarr --repair**
+    """
+    with _plain_errors():
+        found = jb.verify(store, repair)
+    _console().print(repr(found), highlight=False, soft_wrap=True)
+    if found.bad and not repair:
+        raise typer.Exit(1)
 
 
 def parse_axis(text: str) -> tuple[str, np.ndarray]:
@@ -689,14 +730,15 @@ def basins(
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
         osc = _oscillator(system, arguments, belt, damping, omega)
         grid = [np.linspace(*span, points) for span in (x1, x2)]
+        written = [out.with_name(out.name + end) for end in (".png", ".csv")]
+        for path in written:
+            _check_place(path)
         with console.status("following the starts (the first seconds are compilation)"):
             found = jb.basins(osc, x1=grid[0], x2=grid[1], progress=False)
             lines = [repr(found)]
             if starts:
                 key = jax.random.key(seed)
                 lines.append(repr(jb.basin_stability(osc, box=(x1, x2), n=starts, key=key)))
-        out.parent.mkdir(parents=True, exist_ok=True)
-        written = [out.with_name(out.name + end) for end in (".png", ".csv")]
         with plotting.journal_style():
             plotting.save(plotting.draw_basins(found), written[0])
         with written[1].open("w", newline="", encoding="utf-8") as file:

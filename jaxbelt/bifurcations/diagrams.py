@@ -34,6 +34,7 @@ from ..model.oscillator import Oscillator
 from ..model.parameters import set_alone
 from ..numerics.compiling import jit
 from ..results import Status
+from ..sweeps.datasets import decoded
 from ..sweeps.sweep import sweep
 from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere, place_at
 from .refine import (
@@ -338,7 +339,7 @@ def _cell_names(make, names, values, axes, starts) -> np.ndarray:
     seen = np.zeros((*shape, len(runs)), dtype=int)  # 0 no cycle, else 1 + the belts stuck to
     decided = np.ones(shape, dtype=bool)
     for i, run in enumerate(runs):
-        kind = run.kind.transpose(*names).values
+        kind = decoded(run[["kind"]]).kind.transpose(*names).values
         sticks = run.sticks.transpose(*names, "belt").values
         seen[..., i] = np.where(kind == "cycle", 1 + sticks @ 2 ** np.arange(n), 0)
         decided &= kind != "undecided"

@@ -44,6 +44,7 @@ from ..model.oscillator import Oscillator
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
 from ..sweeps.basins import Basins
+from ..sweeps.datasets import decoded
 
 #: One colour a belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
 BELT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
@@ -989,13 +990,14 @@ def _math_name(name: str) -> str:
 
 def _attractors(dataset: xr.Dataset) -> xr.DataArray:
     """What each run leads to, in words."""
-    words = dataset.kind.astype(object)
+    kind = decoded(dataset[["kind"]]).kind
+    words = kind.astype(object)
     for belts in itertools.product((False, True), repeat=dataset.sizes["belt"]):
         stuck = [str(i) for i, sticks in enumerate(belts) if sticks]
         where = (
             f"cycle, sticks to belt {' and '.join(stuck)}" if stuck else "cycle without sticking"
         )
-        same = (dataset.sticks == np.array(belts)).all("belt") & (dataset.kind == "cycle")
+        same = (dataset.sticks == np.array(belts)).all("belt") & (kind == "cycle")
         words = words.where(~same, where)
     return words.squeeze(drop=True)
 

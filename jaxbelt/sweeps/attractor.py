@@ -1,5 +1,6 @@
 """The observer of attractors: where each run leads, found as early as it is certain."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -15,14 +16,23 @@ from ..model.modes import (
     select,
 )
 from ..model.oscillator import Oscillator
-from ..results import Status
-from .events import append, event_kinds
-from .lanes import Lanes, Observer, Passage, materialise
+from ..results import Status, of_one_loop
+from .events import append, event_kinds, word_events
+from .lanes import Lanes, Observer, Passage, Variable, materialise
 from .marks import Mark
 
 #: What a run leads to, in the order of their codes.
 KINDS = ("undecided", "equilibrium", "cycle", "stuck")
 UNDECIDED, EQUILIBRIUM, CYCLE, STUCK_FOR_EVER = range(4)
+
+
+def signature(word: int, belts: int) -> str:
+    """The name of a cycle's signature: from where its sequence of events is smallest, so that it
+    does not depend on where the loop began; "none" at rest, "long" if no word holds it."""
+    if word < 1:
+        return "none" if word == 0 else "long"
+    loop = of_one_loop(word_events(word, belts))
+    return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in loop) or "smooth"
 
 
 class _Loop(eqx.Module):
@@ -76,6 +86,19 @@ class Attractor(Observer):
     The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
     """
 
+    variables: ClassVar[Mapping[str, Variable]] = {
+        "kind": Variable("what the run leads to", "int8", meanings=dict(enumerate(KINDS))),
+        "signature": Variable("events of one loop of the cycle", "int64", name_of=signature),
+        "sticks": Variable("whether the attractor sticks to the belt", "bool", per_belt=True),
+        "period": Variable("period of the cycle"),
+        "stick_duration": Variable("time stuck to the belt in one loop", per_belt=True),
+        "x1_min": Variable("smallest displacement on the attractor"),
+        "x1_max": Variable("largest displacement on the attractor"),
+        "x2_min": Variable("smallest velocity on the attractor"),
+        "x2_max": Variable("largest velocity on the attractor"),
+        "transient": Variable("time at which the attractor was reached"),
+        "n_events": Variable("number of events (of a cycle: in one loop)", "int32"),
+    }
     #: Distance to the limit, over the amplitude, below which a smooth cycle is accepted.
     REPEATED: ClassVar[float] = 1e-7
     #: The same at the end of a stick phase, which repeats up to rounding.

@@ -21,9 +21,11 @@ from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator, check_oscillator
 from .attractor import KINDS, Attractor
+from .datasets import decoded, flags
 from .lanes import Program
-from .queue import layout
-from .sweep import LONG_ENOUGH, sweep
+from .question import LONG_ENOUGH
+from .queue import column_of, layout
+from .sweep import sweep
 from .threads import run
 
 if TYPE_CHECKING:
@@ -113,7 +115,8 @@ def basins(
     dataset["label"] = (
         ("x1", "x2"),
         labels,
-        {"long_name": "number of the attractor", "attractors": list(attractors)},
+        {"long_name": "number of the attractor", "units": "1"}
+        | flags({-1: "undecided", **dict(enumerate(attractors))}, "int32"),
     )
     return Basins(oscillator, dataset, attractors, cycles, unstable_cycle(oscillator))
 
@@ -122,7 +125,7 @@ def _labels(
     osc: Oscillator, dataset: "xarray.Dataset"
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[Cycle, ...]]:
     """Numbers of the attractors, the most frequent first, names, and those that are cycles."""
-    kinds = np.asarray(dataset["kind"])
+    kinds = np.asarray(decoded(dataset[["kind"]])["kind"])
     sticks = np.asarray(dataset["sticks"]).astype(bool)
     low, high = np.asarray(dataset["x1_min"]), np.asarray(dataset["x1_max"])
     rest, held = _rest_reached(osc, 0.5 * (low + high))
@@ -148,7 +151,7 @@ def _labels(
         else:
             before.runs[same] = True
     found.sort(key=lambda one: -int(np.sum(one.runs)))
-    labels = np.full(kinds.shape, -1)
+    labels = np.full(kinds.shape, -1, "int32")
     for i, one in enumerate(found):
         labels[one.runs] = i
     cycles = tuple(one.cycle for one in found if one.cycle is not None)
@@ -229,9 +232,7 @@ def _kinds(osc: Oscillator, starts: np.ndarray, t1, rtol, atol) -> np.ndarray:
     leaves, structure = jax.tree.flatten(osc)
     edges = bool(np.any([np.isfinite([belt.lower, belt.upper]) for belt in osc.belts]))
     program = Program(structure, (False,) * len(leaves), Attractor(), edges)
-    shapes = layout(program, leaves)
-    names = list(shapes)
-    column = sum(int(np.prod(shapes[name])) for name in names[: names.index("kind")])
+    column = column_of(layout(program, leaves), "kind")
     kinds = np.zeros(starts.shape[1], int)
 
     def put(runs: np.ndarray, results: np.ndarray) -> None:

@@ -331,6 +331,12 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
+def column_of(layout: dict[str, tuple[int, ...]], name: str) -> int:
+    """The number of a result's first column."""
+    names = list(layout)
+    return sum(math.prod(layout[before]) for before in names[: names.index(name)])
+
+
 def by_name(layout: dict[str, tuple[int, ...]], columns: np.ndarray) -> dict[str, np.ndarray]:
     """Columns [..., columns, runs] as results by name, [..., runs] and the shape of each."""
     results, first = {}, 0
