@@ -613,7 +613,7 @@ def sweep(
         if out.suffix == ".zarr":
             dataset = jb.sweep(make, values, **asked, store=out)
         else:
-            _check_place(out)
+            _check_out(out)
             dataset = jb.sweep(make, values, **asked)
             # Version 3 of the format, which needs no library but SciPy.
             dataset.to_netcdf(out, engine="scipy")
@@ -629,7 +629,7 @@ def sweep(
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def _check_place(out: Path) -> None:
+def _check_out(out: Path) -> None:
     """Raise unless a file can be written there; before the computing, not after."""
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.is_dir():
@@ -732,7 +732,7 @@ def basins(
         grid = [np.linspace(*span, points) for span in (x1, x2)]
         written = [out.with_name(out.name + end) for end in (".png", ".csv")]
         for path in written:
-            _check_place(path)
+            _check_out(path)
         with console.status("following the starts (the first seconds are compilation)"):
             found = jb.basins(osc, x1=grid[0], x2=grid[1], progress=False)
             lines = [repr(found)]

@@ -34,7 +34,7 @@ def child(store: Path, cache: Path, begins, observe: str) -> None:
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    stores.BLOCK = BLOCK
+    stores.BLOCK_RUNS = BLOCK
     one = {name: values[:1] for name, values in AXES.items()}
     jb.sweep(jb.presets.class_b, one, t1=100.0, observe=observe, progress=False)
     begins.set()

@@ -22,7 +22,7 @@ OPTIONS = dict(observe="attractor", progress=False)
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
-    monkeypatch.setattr(stores, "BLOCK", 4)
+    monkeypatch.setattr(stores, "BLOCK_RUNS", 4)
 
 
 @pytest.fixture(scope="module")

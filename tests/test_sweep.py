@@ -179,7 +179,7 @@ def test_every_dataset_can_be_drawn_and_written(tmp_path, dataset):
 
 
 def test_a_sweep_is_explained_without_doing_it(monkeypatch):
-    monkeypatch.setattr(store, "BLOCK", 4)
+    monkeypatch.setattr(store, "BLOCK_RUNS", 4)
     found = jb.explain(jb.presets.class_b, AXES, t1=SPAN)
     assert (found.runs, found.blocks) == (8, 2) and found.seconds > 0
     swept = final(AXES)
@@ -187,6 +187,16 @@ def test_a_sweep_is_explained_without_doing_it(monkeypatch):
     assert "8 runs in 2 blocks" in repr(found)
     with pytest.raises(ValueError, match="t1 must be given"):
         jb.explain(jb.presets.class_b, AXES)
+
+
+def test_progress_is_shown_where_it_is_wanted(capsys):
+    final(AXES, progress=True)
+    shown = " ".join(capsys.readouterr().err.split())
+    assert "sweep" in shown and "8 of 8 runs" in shown
+    final({**AXES, "nu1": [np.nan]}, progress=True)
+    assert "4 not_finite" in " ".join(capsys.readouterr().err.split())
+    final(AXES)
+    assert capsys.readouterr().err == ""  # this is no terminal
 
 
 def test_a_reducer_sees_every_event(dataset):

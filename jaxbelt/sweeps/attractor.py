@@ -35,7 +35,7 @@ def signature(word: int, belts: int) -> str:
     return "-".join(f"{kind.name.lower()}{belt}" for kind, belt in loop) or "smooth"
 
 
-class _Loop(eqx.Module):
+class _LoopSoFar(eqx.Module):
     """The loop under way, since the mark: arrays [lanes].
 
     x1_min, x1_max: extrema; sticks: time stuck to each belt; word: the events, see
@@ -58,7 +58,7 @@ class _Loop(eqx.Module):
     loop_events: Array
 
 
-def _extended(osc: Oscillator, loop: _Loop, lanes: Lanes, passage: Passage) -> _Loop:
+def _extended(osc: Oscillator, loop: _LoopSoFar, lanes: Lanes, passage: Passage) -> _LoopSoFar:
     """The loop with what has just happened: extrema of x1, time stuck, events."""
     sticks = tuple(
         total + jnp.where(stuck, passage.duration, 0.0)
@@ -121,7 +121,7 @@ class Attractor(Observer):
         count = jnp.zeros_like(lanes.events)
         nothing = zero + jnp.nan
         rests = begins_at_rest(osc, lanes.x1, lanes.x2)
-        return _Loop(
+        return _LoopSoFar(
             mark=Mark.none(lanes),
             x1_min=lanes.x1,
             x1_max=lanes.x1,
@@ -137,7 +137,7 @@ class Attractor(Observer):
         )
 
     def watch(self, osc, lanes, passage, one, t1, tol):
-        loop: _Loop = lanes.memory
+        loop: _LoopSoFar = lanes.memory
         seen = _extended(osc, loop, lanes, passage)
         # x1 is extreme where x2 = 0, and a step ends there.
         top = materialise(passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done, one)
@@ -155,7 +155,7 @@ class Attractor(Observer):
         renewed, new = mark.renewed(lanes, section & ~found, one)
         # An attractor at rest is a point; a new mark begins a new loop.
         fresh = new | resting
-        memory = _Loop(
+        memory = _LoopSoFar(
             mark=renewed,
             x1_min=jnp.where(fresh, lanes.x1, seen.x1_min),
             x1_max=jnp.where(fresh, lanes.x1, seen.x1_max),
@@ -182,7 +182,7 @@ class Attractor(Observer):
             memory=memory,
         )
 
-    def _kind(self, loop: _Loop, lanes, passage, section, released, change, tol) -> Array:
+    def _kind(self, loop: _LoopSoFar, lanes, passage, section, released, change, tol) -> Array:
         """What the lanes are found to lead to; section: lanes in a state to compare with marks;
         released: those at the end of a stick phase; change: of x1 since the last top."""
         amplitude = loop.x1_max - loop.x1_min
@@ -204,7 +204,7 @@ class Attractor(Observer):
         return jnp.where(passage.forever, STUCK_FOR_EVER, kind)
 
     def watch_rarely(self, osc, lanes, one):
-        loop: _Loop = lanes.memory
+        loop: _LoopSoFar = lanes.memory
         zero = jnp.zeros_like(lanes.t)
         x1_rest = mode_acceleration(osc, lanes.mode, zero, zero)
         radius = jnp.maximum(jnp.hypot(lanes.x1 - x1_rest, lanes.x2), SMALLEST_DISC)
@@ -227,7 +227,7 @@ class Attractor(Observer):
         )
 
     def finish(self, osc, lanes):
-        loop: _Loop = lanes.memory
+        loop: _LoopSoFar = lanes.memory
         undecided = (loop.kind == UNDECIDED) & (lanes.status == Status.OK.value)
         status = jnp.where(undecided, Status.NOT_SETTLED.value, lanes.status)
         word = jnp.where(jnp.isinf(loop.word), -1.0, loop.word)

@@ -130,7 +130,7 @@ def _labels(
     low, high = np.asarray(dataset["x1_min"]), np.asarray(dataset["x1_max"])
     rest, held = _rest_reached(osc, 0.5 * (low + high))
     runs = Runs.of(dataset, ("x1", "x2"))
-    found: list[_Attractor] = []
+    found: list[_Found] = []
     left = kinds != "undecided"
     while np.any(left):
         first = tuple(int(i) for i in np.unravel_index(np.argmax(left), left.shape))
@@ -147,7 +147,7 @@ def _labels(
             same &= np.all(sticks == stuck, axis=-1) & (place == place[first])
         left &= ~same
         if before is None:
-            found.append(_Attractor(_name(kind, stuck, rest[first]), same, cycle))
+            found.append(_Found(_words_for(kind, stuck, rest[first]), same, cycle))
         else:
             before.runs[same] = True
     found.sort(key=lambda one: -int(np.sum(one.runs)))
@@ -158,7 +158,7 @@ def _labels(
     return labels, tuple(one.name for one in found), cycles
 
 
-class _Attractor(NamedTuple):
+class _Found(NamedTuple):
     """Its name, which runs lead to it, and, of a cycle, what shooting finds from one of them."""
 
     name: str
@@ -190,7 +190,7 @@ def _rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return rest, segment
 
 
-def _name(kind: str, sticks: np.ndarray, x1: float) -> str:
+def _words_for(kind: str, sticks: np.ndarray, x1: float) -> str:
     belts = " and ".join(f"belt {i}" for i in np.flatnonzero(sticks))
     if kind == "equilibrium":
         return f"rest at {x1:.3f}"

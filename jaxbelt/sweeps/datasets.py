@@ -34,7 +34,7 @@ STATUS = Variable(
     meanings={status.value: status.name.lower() for status in Status},
 )
 #: Status of runs that are yet to be done.
-TO_DO = -1
+NOT_RUN = -1
 
 
 def decoded(dataset: "xarray.Dataset") -> "xarray.Dataset":
@@ -103,7 +103,7 @@ class Table:
     def empty(self, name: str) -> Any:
         """What stands for results that are yet to come."""
         dtype = np.dtype(self.variable(name).dtype)
-        return dtype.type(TO_DO if name == "status" else 0)
+        return dtype.type(NOT_RUN if name == "status" else 0)
 
     def parts(self, results: np.ndarray) -> dict[str, np.ndarray]:
         """The variables of runs, [runs, ...], from results [1 + derivatives, columns, runs]."""
@@ -159,21 +159,21 @@ class Table:
 
 
 #: Categories that come first where they are numbered.
-FIRST = ("none", "smooth")
+FIRST_NAMES = ("none", "smooth")
 #: The type of categories that are numbered.
 NUMBERED = "int16"
 
 
 def numbered(names: Mapping[int, str]) -> tuple[dict[int, int], dict[str, Any]]:
     """Numbers of categories whose codes have these names, and the attributes that name them."""
-    ordered = sorted(set(names.values()), key=_place)
+    ordered = sorted(set(names.values()), key=_rank_of)
     number = {name: i for i, name in enumerate(ordered)}
     numbers = {code: number[name] for code, name in names.items()}
     return numbers, flags(dict(enumerate(ordered)), NUMBERED)
 
 
-def _place(name: str) -> tuple[Any, ...]:
-    return *(name != first for first in FIRST), name
+def _rank_of(name: str) -> tuple[Any, ...]:
+    return *(name != first for first in FIRST_NAMES), name
 
 
 def renumber(codes: np.ndarray, numbers: dict[int, int]) -> np.ndarray:
@@ -206,7 +206,7 @@ class Memory:
 
     def done(self) -> int:
         """How many runs are done."""
-        return int(np.sum(self.arrays["status"] != TO_DO))
+        return int(np.sum(self.arrays["status"] != NOT_RUN))
 
     def interrupted(self) -> str:
         """What becomes of the results of an interrupted sweep."""

@@ -72,7 +72,7 @@ class Question:
         packages = ("jaxbelt", "jax", "jaxlib", "diffrax", "equinox", "numpy", "xarray")
         return {
             "title": "sweep of a belt-driven dry-friction oscillator",
-            "make": _name(grid.make),
+            "make": _name_of_function(grid.make),
             "oscillator": f"{_plain(repr(grid.example))}, where the axes do not say otherwise",
             "start": ", ".join(start) or "along the axes",
             **self.numbers,
@@ -135,7 +135,7 @@ def _observer(observe: Any) -> Observer:
     return Reduce(observe)
 
 
-def _name(make: Callable) -> str:
+def _name_of_function(make: Callable) -> str:
     return getattr(make, "__qualname__", None) or _plain(repr(make))
 
 
@@ -160,11 +160,11 @@ def _source(kind: type) -> str:
             found.append(inspect.getsource(one))
         except (OSError, TypeError):
             functions = sorted(inspect.getmembers(one, inspect.isfunction))
-            found += [f"{name} {_compiled(function.__code__)}" for name, function in functions]
+            found += [f"{name} {_bytecode(function.__code__)}" for name, function in functions]
     return _hash("\n".join(found).encode())
 
 
-def _compiled(code: CodeType) -> str:
+def _bytecode(code: CodeType) -> str:
     """What a compiled function does, without where it came from."""
-    constants = [_compiled(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
+    constants = [_bytecode(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
     return f"{code.co_code.hex()} {code.co_names} {constants}"

@@ -41,15 +41,15 @@ if TYPE_CHECKING:
 SCHEMA = 1
 #: Runs in a block: enough that writing them takes little beside doing them, and few enough that not
 #: much is lost with one.
-BLOCK = 2**17
+BLOCK_RUNS = 2**17
 #: The columns of the ledger, and the states of a block.
-STATE, CHECKSUM, ATTEMPTS, SECONDS = range(4)
+STATE, CHECKSUM, TIMES_DONE, SECONDS = range(4)
 TO_DO, DONE = 0, 1
 
 
 def blocks_of(grid: Grid) -> Blocks:
     """The blocks of a grid in a store."""
-    return Blocks(grid.shape, BLOCK)
+    return Blocks(grid.shape, BLOCK_RUNS)
 
 
 @dataclass
@@ -70,7 +70,7 @@ class Store:
         if _is_finished(path):
             yield cls(path, question)
             return
-        _check_place(path)
+        _check_folder(path)
         with _locked(path):
             if not (path / "zarr.json").exists():
                 _create(path, question)
@@ -82,7 +82,7 @@ class Store:
         self.blocks = blocks_of(question.grid)
         _check_question(path, self.root, _identity(question, self.blocks))
         self.ledger = self.root["ledger"]
-        self.rows = _rows(path, self.ledger)
+        self.rows = _ledger_rows(path, self.ledger)
         self.finished = bool(self.ledger.attrs["finished"])
         self.to_do = np.flatnonzero(self.rows[:, STATE] != DONE).tolist()
         self.arrays = {name: _array(self.root, name) for name in self.ledger.attrs["variables"]}
@@ -111,7 +111,7 @@ class Store:
         for name, array in self.arrays.items():
             parts[name] = parts[name].reshape(*extent, *parts[name].shape[1:])
             array[place] = parts[name]
-        attempts = self.rows[block, ATTEMPTS] + 1
+        attempts = self.rows[block, TIMES_DONE] + 1
         seconds, self.began = time.monotonic() - self.began, time.monotonic()
         row = np.array([DONE, _checksum(parts[name] for name in self.arrays), attempts, seconds])
         self.ledger["blocks"][block] = row
@@ -155,7 +155,7 @@ class Store:
             for block in range(len(self.blocks)):
                 place = self.blocks.slices(block)
                 shown[place] = renumber(np.asarray(self.arrays[name][place]), numbers)
-            shown.attrs.update(_plain(named))
+            shown.attrs.update(_as_json(named))
             self.ledger.attrs[f"{name}_numbers"] = {str(k): v for k, v in numbers.items()}
         _consolidate(self.path)
         self.ledger.attrs["finished"] = self.finished = True
@@ -216,7 +216,7 @@ def _is_finished(path: Path) -> bool:
     return (path / "zarr.json").exists() and bool(_open(path, "r")["ledger"].attrs["finished"])
 
 
-def _check_place(path: Path) -> None:
+def _check_folder(path: Path) -> None:
     """Raise unless a store can be written there."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -278,7 +278,7 @@ def _create(path: Path, question: Question) -> None:
         group.create_array(name, dtype=dtype, fill_value=fill, **options)
 
     for name in table.shapes:
-        told = {"dimension_names": table.dims(name), "attributes": _plain(table.attributes(name))}
+        told = {"dimension_names": table.dims(name), "attributes": _as_json(table.attributes(name))}
         dtype, fill = table.variable(name).dtype, table.empty(name)
         if name in numbered:
             allocate(ledger, f"{name}_codes", dtype, fill)
@@ -293,7 +293,7 @@ def _create(path: Path, question: Question) -> None:
             "variables": list(table.shapes),
             "numbered": numbered,
             "shape": grid.shape,
-            "block": BLOCK,
+            "block": BLOCK_RUNS,
             "finished": False,
         }
     )
@@ -301,7 +301,7 @@ def _create(path: Path, question: Question) -> None:
     os.replace(new, path)
 
 
-def _rows(path: Path, ledger: Any) -> np.ndarray:
+def _ledger_rows(path: Path, ledger: Any) -> np.ndarray:
     """The ledger's rows of all blocks."""
     try:
         return np.array(ledger["blocks"][:])
@@ -329,7 +329,7 @@ def _check_question(path: Path, root: Any, here: dict[str, str]) -> None:
             )
 
 
-def _plain(attributes: dict[str, Any]) -> dict[str, Any]:
+def _as_json(attributes: dict[str, Any]) -> dict[str, Any]:
     """Attributes as JSON has them."""
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in attributes.items()}
 

@@ -96,19 +96,19 @@ def sweep(
     )
     if store is None:
         results = Memory(question.table)
-        _run(question, results, progress)
+        _do_runs(question, results, progress)
         told = _audited(question, results, audit) if audit else {}
         return results.dataset(question.attributes() | told)
     with Store.opened(Path(store), question) as results:
         if results.to_do:
-            _run(question, results, progress)
+            _do_runs(question, results, progress)
         results.finish()
         if results.root.attrs.get("audited", 0) < len(chosen(question.grid.runs, audit)):
             results.tell(_audited(question, results, audit))
     return results.dataset()
 
 
-def _run(question: Question, results: Memory | Store, progress: bool | None) -> None:
+def _do_runs(question: Question, results: Memory | Store, progress: bool | None) -> None:
     """Do the runs that the results lack."""
     blocks, to_do = results.blocks, results.to_do
     ends = np.cumsum([blocks.size(block) for block in to_do])
