@@ -14,14 +14,15 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     presets         the published systems
     motion/         integrators arcs smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
-    sweeps/         lanes step events marks observers attractor queue threads audit sweep basins
+    sweeps/         lanes step events marks observers attractor queue threads audit
+    sweeps/         grid datasets question store progress sweep basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   refine path scan curves diagrams switch_folds
     inverse/        selection record fit design
     plotting/       style phase diagrams sweeps model draw
     paper           the paper's table and figures
     __init__        the public names
-    commands/       options reproduce simulate diagram map sweep basins
+    commands/       options reproduce simulate diagram map sweep basins verify
     cli             the command line
 """
 
@@ -64,7 +65,9 @@ from .model.oscillator import Belt, Oscillator
 from .motion.simulate import Arcs, Events, Trajectory, simulate
 from .results import EventKind, Status, describe, draw_with
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
-from .sweeps.sweep import sweep
+from .sweeps.datasets import decoded
+from .sweeps.store import Verified, verify
+from .sweeps.sweep import Explanation, explain, sweep
 
 if TYPE_CHECKING:
     from .plotting.model import plot_friction_law
@@ -94,6 +97,7 @@ __all__ = [
     "EquilibriumKind",
     "EventKind",
     "Events",
+    "Explanation",
     "Fit",
     "FoldOfCycles",
     "GrazingEdge",
@@ -109,17 +113,20 @@ __all__ = [
     "Stribeck",
     "SuddenSliding",
     "Trajectory",
+    "Verified",
     "amplitude",
     "basin_stability",
     "basins",
     "bifurcation_curve",
     "bifurcation_diagram",
+    "decoded",
     "describe",
     "design",
     "distance_to",
     "energy_dissipated",
     "energy_fed",
     "equilibria",
+    "explain",
     "find_cycle",
     "fit",
     "gap",
@@ -141,6 +148,7 @@ __all__ = [
     "stick_fraction",
     "sweep",
     "unstable_cycle",
+    "verify",
 ]
 
 

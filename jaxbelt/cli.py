@@ -9,6 +9,7 @@ from .commands.map import region_map
 from .commands.reproduce import reproduce
 from .commands.simulate import simulate
 from .commands.sweep import sweep
+from .commands.verify import verify
 
 app = typer.Typer(
     name="jaxbelt",
@@ -36,5 +37,6 @@ for name, command in (
     ("map", region_map),
     ("sweep", sweep),
     ("basins", basins),
+    ("verify", verify),
 ):
     app.command(name)(command)

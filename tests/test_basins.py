@@ -97,7 +97,7 @@ def test_labels_tell_attractors_of_one_kind_apart():
     """Cycles by where they are; the most frequent first; undecided is -1."""
     dataset = jb.sweep(lambda: belt_drive(1.4), {"x1": [0.0] * 5, "x2": [2.0]}, observe="attractor")
     dataset = dataset.load()
-    dataset["kind"][:, 0] = ["equilibrium", "undecided", "cycle", "cycle", "cycle"]
+    dataset["kind"][:, 0] = [1, 0, 2, 2, 2]  # equilibrium, undecided, cycle ...
     dataset["x1_max"][:, 0] += [0.0, 0.0, 0.0, 1e-9, 0.0]
     labels, names, cycles = _labels(belt_drive(1.4), dataset)
     assert labels[:, 0].tolist() == [1, -1, 0, 0, 0]
@@ -122,8 +122,9 @@ def test_two_segments_are_two_attractors():
     belts = (jb.Belt(0.0, law, upper=-0.1), jb.Belt(0.0, law, lower=0.1))
     osc = jb.Oscillator(0.5, belts)
     found = jb.basins(osc, x1=np.linspace(-0.3, 0.3, 7), x2=np.array([-0.1, 0.1]))
-    x1 = np.asarray(found.dataset.x1_min)[np.asarray(found.dataset.kind) == "stuck"]
-    labels = np.asarray(found.label)[np.asarray(found.dataset.kind) == "stuck"]
+    stuck = np.asarray(jb.decoded(found.dataset).kind) == "stuck"
+    x1 = np.asarray(found.dataset.x1_min)[stuck]
+    labels = np.asarray(found.label)[stuck]
     assert len(set(labels[x1 < 0]) & set(labels[x1 > 0])) == 0
 
 

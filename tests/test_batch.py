@@ -9,8 +9,9 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
+from jaxbelt.sweeps.attractor import signature
+from jaxbelt.sweeps.datasets import numbered, renumber
 from jaxbelt.sweeps.events import append, word_events
-from jaxbelt.sweeps.sweep import _signatures
 
 SPAN = 40.0
 #: Both integrate with this tolerance.
@@ -104,7 +105,7 @@ def test_degenerate_velocities():
         end = np.array([dataset.x1_end[i], dataset.x2_end[i]])
         np.testing.assert_allclose(end, run.at(SPAN), atol=1e-8)
     assert (dataset.status == Status.STUCK_FOREVER).values.tolist() == [False, *[True] * 3, False]
-    kinds = sweep_of("b", cases, observe="attractor").kind
+    kinds = jb.decoded(sweep_of("b", cases, observe="attractor")).kind
     assert kinds.values.tolist() == ["cycle", "stuck", "stuck", "stuck", "cycle"]
 
 
@@ -169,15 +170,17 @@ def test_attractors_equal_the_cycles_of_the_oracle():
     points = np.array([[0.45, 0.35], [0.1, 0.35], [-0.2, 0.35], [-0.5, 0.35], [0.05, -0.4]]).T
     dataset = sweep_of("b", points, observe="attractor", rtol=TIGHT, atol=TIGHT)
     for i, (nu0, nu1) in enumerate(points.T.tolist()):
-        here, expected = dataset.isel(run=i), oracle_cycles.sticking_cycle(oracle.class_b(nu0, nu1))
+        here, expected = (
+            jb.decoded(dataset.isel(run=i)),
+            oracle_cycles.sticking_cycle(oracle.class_b(nu0, nu1)),
+        )
         assert here.kind == "cycle"
         for name in ("period", "x1_min", "x1_max", "x2_min", "x2_max"):
             # Ends of steps, and the extrema of x2 in between, from a polynomial of degree four.
             np.testing.assert_allclose(here[name], getattr(expected, name), atol=3e-8)
         np.testing.assert_allclose(here.stick_duration, expected.stick_durations, atol=1e-8)
         assert np.array_equal(here.sticks, np.array(expected.stick_durations) > 0)
-        meaning = dataset.signature.flag_meanings.split()[int(here.signature)]
-        assert meaning == signature_word(expected.signature)
+        assert here.signature == signature_word(expected.signature)
 
 
 def signature_word(events):
@@ -189,9 +192,9 @@ def signature_word(events):
 
 def test_signatures_that_are_not_of_one_turn():
     """At rest there is none; one that no number holds is told to be long."""
-    values, flags = _signatures(np.array([[0, -1], [1, 1]]), belts=2)
+    numbers, flags = numbered({code: signature(code, 2) for code in (-1, 0, 1)})
     assert flags["flag_meanings"].split() == ["none", "smooth", "long"]
-    assert values.tolist() == [[0, 2], [1, 1]]
+    assert renumber(np.array([[0, -1], [1, 1]]), numbers).tolist() == [[0, 2], [1, 1]]
     assert np.array_equal(flags["flag_values"], [0, 1, 2])
     word = jnp.ones(())
     for _ in range(16):
@@ -225,7 +228,7 @@ def test_early_labels_equal_those_of_long_runs(kind):
     """The small version of a comparison on 20,000 points with T = 3000."""
     table = lanes(kind, 200, seed=1)
     table = table[:, np.min(np.abs(table[:2]), axis=0) > 0.01]  # periods short against the span
-    early = sweep_of(kind, table, observe="attractor")
+    early = jb.decoded(sweep_of(kind, table, observe="attractor"))
     late = sweep_of(kind, table, observe=Late(), t1=Late.span)
     rests = (late.late_events == 0) & (np.abs(late.x2) < 1e-7)
     rests |= late.status == Status.PSEUDO_FOCUS
@@ -251,7 +254,8 @@ def test_a_cycle_that_crosses_without_sticking():
     mu = oracle.coulomb(0.1, 0.1)
     there = oracle.Oscillator(-0.05, (oracle.Belt(1.0, *mu), oracle.Belt(-1.0, *mu)))
     run = oracle.simulate(there, (1.5, 0.0), 600.0)
-    assert dataset.kind == "cycle" and not dataset.sticks.any() and dataset.n_events == 4
+    assert jb.decoded(dataset).kind == "cycle"
+    assert not dataset.sticks.any() and dataset.n_events == 4
     assert dataset.signature.flag_meanings == "cross0-cross0-cross1-cross1"
     # It has converged to 1e-7 of the amplitude when it is accepted.
     np.testing.assert_allclose(dataset.period, run.events[-1].t - run.events[-5].t, rtol=1e-6)

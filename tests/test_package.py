@@ -121,7 +121,7 @@ def test_importing_jaxbelt_is_light_and_leaves_the_settings_of_jax_alone():
 import sys, jax
 before = jax.config.values.copy()
 import jaxbelt
-heavy = {"matplotlib", "optax", "pandas", "scipy.ndimage", "scipy.optimize", "xarray"}
+heavy = {"matplotlib", "optax", "pandas", "scipy.ndimage", "scipy.optimize", "xarray", "zarr"}
 print(sorted(heavy & sys.modules.keys()), jax.config.values == before)
 """
     run = subprocess.run(

@@ -339,7 +339,7 @@ def test_a_belt_without_load_holds_nothing():
     found = run(osc, np.array([float(rest.x1), 0.0]))
     assert found.status == Status.OK
     dataset = swept([osc], "attractor")
-    assert np.all(dataset.kind == "equilibrium") and not np.any(dataset.sticks)
+    assert np.all(jb.decoded(dataset).kind == "equilibrium") and not np.any(dataset.sticks)
 
 
 def test_an_orbit_comes_to_a_focus_beside_a_belt_without_load():
@@ -541,7 +541,7 @@ def test_an_image_has_the_same_attractors(image_of, seed):
     close = dict(rtol=10 * SWEPT, atol=10 * SWEPT)
     np.testing.assert_allclose(durations, whole.stick_duration, **close)
     np.testing.assert_allclose(found.period, whole.period, **close)
-    decided = whole.kind.values != "undecided"  # of others the last stretch is told
+    decided = jb.decoded(whole).kind.values != "undecided"  # of others the last stretch is told
     for name in ("x1", "x2"):
         ends = [f"{name}_min", f"{name}_max"]
         for end, other in zip(ends, ends[:: int(image.sign)], strict=True):

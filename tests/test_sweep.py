@@ -1,9 +1,12 @@
 """`sweep`: the dataset, derivatives, reducers, stores, and what it says about bad input."""
 
 import functools
+from dataclasses import replace
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import oracle_cycles
@@ -14,6 +17,8 @@ from typer.testing import CliRunner
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.cli import app
+from jaxbelt.sweeps import store
+from jaxbelt.sweeps.lanes import Observer, Variable
 from jaxbelt.sweeps.threads import CHUNK
 
 NU0, NU1 = np.linspace(-0.6, 0.55, 4), np.array([0.35, -0.2])
@@ -128,6 +133,72 @@ class Sticks:
         return {"sticks_to_1": state[0], "last": state[1], "end": jnp.stack([end.x1, end.x2])}
 
 
+class Extent(Observer):
+    """An observable of one class: the largest |x1| at the events of a run."""
+
+    variables: ClassVar = {"extent": Variable("largest |x1| at an event")}
+
+    def start(self, osc, lanes):
+        return jnp.abs(lanes.x1)
+
+    def watch(self, osc, lanes, passage, one, t1, tol):
+        return replace(lanes, memory=jnp.maximum(lanes.memory, jnp.abs(lanes.x1)))
+
+    def finish(self, osc, lanes):
+        return {"extent": lanes.memory, "status": lanes.status}
+
+
+def test_an_observable_is_one_class():
+    found = final(AXES, observe=Extent())
+    assert found.extent.attrs["long_name"] == "largest |x1| at an event"
+    assert np.all(found.extent >= 3.0 - 1e-12) and list(found) == ["extent", "status"]
+
+
+def test_every_dataset_can_be_drawn_and_written(tmp_path, dataset):
+    attractors = jb.sweep(jb.presets.class_b, AXES, observe="attractor")
+    basins = jb.basins(jb.presets.class_b(0.45, 0.35), x1=[0.0, 2.0, 3.0], x2=[-1.0, 1.0]).dataset
+    for one, variable in ((dataset, "status"), (attractors, "kind"), (basins, "label")):
+        one[variable].plot()
+        one.to_netcdf(tmp_path / "one.nc", engine="scipy")
+        one.to_zarr(tmp_path / "one.zarr", mode="w", consolidated=False)
+        for read in (
+            xr.open_dataset(tmp_path / "one.nc", engine="scipy"),
+            xr.open_zarr(tmp_path / "one.zarr", consolidated=False),
+        ):
+            assert read.load().equals(one)
+            assert jb.decoded(read).equals(jb.decoded(one))
+    plt.close("all")
+    words = jb.decoded(attractors)
+    assert set(words.kind.values.ravel()) <= {"undecided", "equilibrium", "cycle", "stuck"}
+    assert np.array_equal(words.kind == "cycle", attractors.kind == 2)
+    assert set(jb.decoded(basins).label.values.ravel()) == {
+        "rest_at_1.424",
+        "cycle_that_sticks_to_belt_1",
+    }
+    assert jb.decoded(dataset).mode_end.values.ravel()[0].startswith("slips")
+
+
+def test_a_sweep_is_explained_without_doing_it(monkeypatch):
+    monkeypatch.setattr(store, "BLOCK_RUNS", 4)
+    found = jb.explain(jb.presets.class_b, AXES, t1=SPAN)
+    assert (found.runs, found.blocks) == (8, 2) and found.seconds > 0
+    swept = final(AXES)
+    assert found.bytes == swept.nbytes - swept.belt.nbytes
+    assert "8 runs in 2 blocks" in repr(found)
+    with pytest.raises(ValueError, match="t1 must be given"):
+        jb.explain(jb.presets.class_b, AXES)
+
+
+def test_progress_is_shown_where_it_is_wanted(capsys):
+    final(AXES, progress=True)
+    shown = " ".join(capsys.readouterr().err.split())
+    assert "sweep" in shown and "8 of 8 runs" in shown
+    final({**AXES, "nu1": [np.nan]}, progress=True)
+    assert "4 not_finite" in " ".join(capsys.readouterr().err.split())
+    final(AXES)
+    assert capsys.readouterr().err == ""  # this is no terminal
+
+
 def test_a_reducer_sees_every_event(dataset):
     reduced = final(AXES, observe=Sticks())
     for i, nu0 in enumerate(NU0.tolist()):
@@ -138,20 +209,6 @@ def test_a_reducer_sees_every_event(dataset):
         np.testing.assert_allclose(reduced["last"][i, 0], run.events[-1].t, atol=1e-5)
     # Not skipping loops changes nothing but the sum of the rounding of the clock.
     np.testing.assert_allclose(reduced.end[..., 0], dataset.x1_end, atol=1e-9)
-
-
-def test_an_interrupted_sweep_goes_on_from_its_store(tmp_path, dataset):
-    store = tmp_path / "store"
-    first = final(AXES, store=store)
-    assert first.equals(dataset)
-    status = np.load(store / "status.npy", mmap_mode="r+")
-    status[3:] = -1  # as an interruption leaves it
-    np.load(store / "x1_end.npy", mmap_mode="r+")[:3] = 7.0
-    again = final(AXES, store=store)
-    assert again.x1_end.values.ravel()[:3].tolist() == [7.0] * 3
-    assert np.array_equal(again.x1_end.values.ravel()[3:], dataset.x1_end.values.ravel()[3:])
-    with pytest.raises(ValueError, match=r"store must be .* this very sweep"):
-        final(AXES, store=store, rtol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +243,20 @@ def test_the_command_writes_data_and_a_picture(tmp_path):
     assert done.exit_code == 0, done.output
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     written = xr.open_dataset(out, engine="scipy")
-    assert written.kind.dims == ("nu0", "nu1") and set(written.kind.values.ravel()) == {"cycle"}
+    assert written.kind.dims == ("nu0", "nu1") and np.all(jb.decoded(written).kind == "cycle")
+    done = runner.invoke(app, ["sweep", *axes, "--dry-run", "--out", str(tmp_path / "no" / "a.nc")])
+    assert done.exit_code == 0 and "4 runs in 1 blocks" in done.output
+    assert not (tmp_path / "no").exists()
+    kept = tmp_path / "plane.zarr"
+    done = runner.invoke(app, ["sweep", *axes, "--out", str(kept)])
+    assert done.exit_code == 0 and xr.open_zarr(kept).kind.equals(written.kind)
+    done = runner.invoke(app, ["verify", str(kept)])
+    assert done.exit_code == 0 and "1 blocks right, 0 to do, 0 bad; finished" in done.output
+    next((kept / "period" / "c").rglob("0")).write_bytes(b"nothing")
+    done = runner.invoke(app, ["verify", str(kept)])
+    assert done.exit_code == 1 and "1 bad (0)" in done.output
+    done = runner.invoke(app, ["sweep", *axes, "--out", str(tmp_path)])
+    assert done.exit_code == 2 and "out must end in .nc or .zarr" in done.output
     done = runner.invoke(app, ["sweep", "nu0=0.1:0.2", "--out", str(out)])
     assert (
         done.exit_code == 2 and "NAME=FROM:TO:COUNT or NAME=VALUE, got 'nu0=0.1:0.2'" in done.output

@@ -34,6 +34,7 @@ from ..model.oscillator import Oscillator
 from ..model.parameters import set_alone
 from ..numerics.compiling import jit
 from ..results import Status, draw
+from ..sweeps.datasets import decoded
 from ..sweeps.sweep import sweep
 from .conditions import BifurcationPoint
 from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere
@@ -330,7 +331,7 @@ def _cell_names(make, names, values, axes, starts) -> np.ndarray:
     seen = np.zeros((*shape, len(runs)), dtype=int)  # 0 no cycle, else 1 + the belts stuck to
     decided = np.ones(shape, dtype=bool)
     for i, run in enumerate(runs):
-        kind = run.kind.transpose(*names).values
+        kind = decoded(run[["kind"]]).kind.transpose(*names).values
         sticks = run.sticks.transpose(*names, "belt").values
         seen[..., i] = np.where(kind == "cycle", 1 + sticks @ 2 ** np.arange(n), 0)
         decided &= kind != "undecided"

@@ -20,6 +20,7 @@ from .options import (
     Sigma,
     Sigma0,
     Sigma1,
+    check_out,
     make_console,
     oscillator,
     plain_errors,
@@ -80,14 +81,15 @@ def basins(
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
         osc = oscillator(system, arguments, belt, damping, omega)
         grid = [np.linspace(*span, points) for span in (x1, x2)]
+        written = [out.with_name(out.name + end) for end in (".png", ".csv")]
+        for path in written:
+            check_out(path)
         with console.status("following the starts (the first seconds are compilation)"):
             found = jb.basins(osc, x1=grid[0], x2=grid[1], progress=False)
             lines = [repr(found)]
             if starts:
                 key = jax.random.key(seed)
                 lines.append(repr(jb.basin_stability(osc, box=(x1, x2), n=starts, key=key)))
-        out.parent.mkdir(parents=True, exist_ok=True)
-        written = [out.with_name(out.name + end) for end in (".png", ".csv")]
         with journal_style():
             save(draw_basins(found), written[0])
         with written[1].open("w", newline="", encoding="utf-8") as file:

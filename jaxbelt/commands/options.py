@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -40,6 +41,15 @@ def plain_errors() -> Iterator[None]:
     except (ValueError, OSError) as error:
         typer.secho(f"Error: {error}", err=True, fg=typer.colors.RED)
         raise typer.Exit(2) from None
+
+
+def check_out(out: Path) -> None:
+    """Raise unless a file can be written there; before the computing, not after."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.is_dir():
+        raise IsADirectoryError(f"out must be a file, got the folder {out}")
+    if not os.access(out if out.exists() else out.parent, os.W_OK):
+        raise PermissionError(f"out must be a place that can be written to, got {out}")
 
 
 def make_console() -> Console:

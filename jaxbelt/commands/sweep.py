@@ -2,14 +2,14 @@
 
 import functools
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 import jaxbelt as jb
 
-from .options import CLASSES, Class, make_console, plain_errors
+from .options import CLASSES, Class, check_out, make_console, plain_errors
 
 
 def sweep(
@@ -33,14 +33,21 @@ def sweep(
         typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0."),
     ] = (3.0, 0.0),
     t1: Annotated[
-        float | None, typer.Option(help="End of each run [3000 for attractors, 100]")
+        float | None, typer.Option(help="End of each run [30000 for attractors, 100]")
     ] = None,
     tolerance: Annotated[
         float, typer.Option(help="Relative and absolute tolerance of the integrator.")
     ] = 1e-8,
     out: Annotated[
-        Path, typer.Option(help="Where to write: NetCDF if it ends in .nc, Zarr if in .zarr.")
+        Path,
+        typer.Option(
+            help="Where to write: NetCDF if it ends in .nc; if in .zarr, a store, from which the "
+            "same command goes on where it was interrupted."
+        ),
     ] = Path("sweep.nc"),
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only tell how much it is and how long it will take.")
+    ] = False,
 ) -> None:
     """Run one of the paper's classes from every point of a grid; write the data and a picture.
 
@@ -74,15 +81,19 @@ def sweep(
         make = functools.partial(getattr(jb.presets, f"class_{system}"), **fixed)
         if t1 is None and observe != "attractor":
             t1 = 100.0
-        dataset = jb.sweep(
-            make, values, y0=start, t1=t1, rtol=tolerance, atol=tolerance, observe=observe
+        asked: dict[str, Any] = dict(
+            y0=start, t1=t1, rtol=tolerance, atol=tolerance, observe=observe
         )
-        out.parent.mkdir(parents=True, exist_ok=True)
-        if out.suffix == ".nc":
+        if dry_run:
+            console.print(repr(jb.explain(make, values, **asked)), highlight=False, soft_wrap=True)
+            return
+        if out.suffix == ".zarr":
+            dataset = jb.sweep(make, values, **asked, store=out)
+        else:
+            check_out(out)
+            dataset = jb.sweep(make, values, **asked)
             # Version 3 of the format, which needs no library but SciPy.
             dataset.to_netcdf(out, engine="scipy")
-        else:
-            dataset.to_zarr(out, mode="w")
         written = [out]
         if sum(len(axis) > 1 for axis in values.values()) in (1, 2):
             written.append(out.with_suffix(".png"))

@@ -12,6 +12,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from ..checks import require
 from ..sweeps.basins import Basins
+from ..sweeps.datasets import decoded
 from .phase import plot_phase_portrait
 from .style import draw_key, figure_of, journal_figure, new_axes
 
@@ -66,13 +67,14 @@ def _math_name(name: str) -> str:
 
 def _attractors(dataset: xr.Dataset) -> xr.DataArray:
     """What each run leads to, in words."""
-    words = dataset.kind.astype(object)
+    kind = decoded(dataset[["kind"]]).kind
+    words = kind.astype(object)
     for belts in itertools.product((False, True), repeat=dataset.sizes["belt"]):
         stuck = [str(i) for i, sticks in enumerate(belts) if sticks]
         where = (
             f"cycle, sticks to belt {' and '.join(stuck)}" if stuck else "cycle without sticking"
         )
-        same = (dataset.sticks == np.array(belts)).all("belt") & (dataset.kind == "cycle")
+        same = (dataset.sticks == np.array(belts)).all("belt") & (kind == "cycle")
         words = words.where(~same, where)
     return words.squeeze(drop=True)
 

@@ -1,5 +1,6 @@
 """The observer of attractors: where each run leads, found as early as it is certain."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -8,11 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..cycles.settling import REPEATED, way_left
+from ..model.events import signature_name
 from ..model.modes import begins_at_rest, select, settling_margin
 from ..model.oscillator import Oscillator
 from ..results import Status
-from .events import append, event_kinds
-from .lanes import Lanes, Observer, Passage, materialise
+from .events import append, event_kinds, word_events
+from .lanes import Lanes, Observer, Passage, Variable, materialise
 from .marks import Mark
 
 #: What a run leads to, in the order of their codes.
@@ -20,7 +22,14 @@ KINDS = ("undecided", "equilibrium", "cycle", "stuck")
 UNDECIDED, EQUILIBRIUM, CYCLE, STUCK_FOR_EVER = range(4)
 
 
-class _Loop(eqx.Module):
+def signature(word: int, belts: int) -> str:
+    """The name of a cycle's signature; "none" at rest, "long" if no word holds it."""
+    if word < 1:
+        return "none" if word == 0 else "long"
+    return signature_name(word_events(word, belts))
+
+
+class _LoopSoFar(eqx.Module):
     """The loop under way, since the mark: arrays [lanes].
 
     x1_min, x1_max: extrema; sticks: time stuck to each belt; word: the events, see
@@ -43,7 +52,7 @@ class _Loop(eqx.Module):
     loop_events: Array
 
 
-def _extended(osc: Oscillator, loop: _Loop, lanes: Lanes, passage: Passage) -> _Loop:
+def _extended(osc: Oscillator, loop: _LoopSoFar, lanes: Lanes, passage: Passage) -> _LoopSoFar:
     """The loop with what has just happened: extrema of x1, time stuck, events."""
     sticks = tuple(
         total + jnp.where(stuck, passage.duration, 0.0)
@@ -70,6 +79,19 @@ class Attractor(Observer):
     The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
     """
 
+    variables: ClassVar[Mapping[str, Variable]] = {
+        "kind": Variable("what the run leads to", "int8", meanings=dict(enumerate(KINDS))),
+        "signature": Variable("events of one loop of the cycle", "int64", name_of=signature),
+        "sticks": Variable("whether the attractor sticks to the belt", "bool", per_belt=True),
+        "period": Variable("period of the cycle"),
+        "stick_duration": Variable("time stuck to the belt in one loop", per_belt=True),
+        "x1_min": Variable("smallest displacement on the attractor"),
+        "x1_max": Variable("largest displacement on the attractor"),
+        "x2_min": Variable("smallest velocity on the attractor"),
+        "x2_max": Variable("largest velocity on the attractor"),
+        "transient": Variable("time at which the attractor was reached"),
+        "n_events": Variable("number of events (of a cycle: in one loop)", "int32"),
+    }
     #: Distance to the last state at the end of a stick phase, which repeats up to rounding, over
     #: the amplitude.
     EXACT: ClassVar[float] = 1e-9
@@ -91,7 +113,7 @@ class Attractor(Observer):
         count = jnp.zeros_like(lanes.events)
         nothing = zero + jnp.nan
         rests = begins_at_rest(osc, lanes.x1, lanes.x2)
-        return _Loop(
+        return _LoopSoFar(
             mark=Mark.none(lanes),
             x1_min=lanes.x1,
             x1_max=lanes.x1,
@@ -107,7 +129,7 @@ class Attractor(Observer):
         )
 
     def watch(self, osc, lanes, passage, one, t1, tol):
-        loop: _Loop = lanes.memory
+        loop: _LoopSoFar = lanes.memory
         seen = _extended(osc, loop, lanes, passage)
         # x1 is extreme where x2 = 0, and a step ends there.
         top = materialise(passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done, one)
@@ -125,7 +147,7 @@ class Attractor(Observer):
         renewed, new = mark.renewed(lanes, section & ~found, one)
         # An attractor at rest is a point; a new mark begins a new loop.
         fresh = new | resting
-        memory = _Loop(
+        memory = _LoopSoFar(
             mark=renewed,
             x1_min=jnp.where(fresh, lanes.x1, seen.x1_min),
             x1_max=jnp.where(fresh, lanes.x1, seen.x1_max),
@@ -152,7 +174,7 @@ class Attractor(Observer):
             memory=memory,
         )
 
-    def _kind(self, loop: _Loop, lanes, passage, section, released, change, tol) -> Array:
+    def _kind(self, loop: _LoopSoFar, lanes, passage, section, released, change, tol) -> Array:
         """What the lanes are found to lead to; section: lanes in a state to compare with marks;
         released: those at the end of a stick phase; change: of x1 since the last top."""
         amplitude = loop.x1_max - loop.x1_min
@@ -173,7 +195,7 @@ class Attractor(Observer):
         return jnp.where(passage.forever, STUCK_FOR_EVER, kind)
 
     def watch_rarely(self, osc, lanes, one):
-        loop: _Loop = lanes.memory
+        loop: _LoopSoFar = lanes.memory
         margin, x1_rest = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
         found = materialise(jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin), one) > 0
         memory = replace(
@@ -193,7 +215,7 @@ class Attractor(Observer):
         )
 
     def finish(self, osc, lanes):
-        loop: _Loop = lanes.memory
+        loop: _LoopSoFar = lanes.memory
         undecided = (loop.kind == UNDECIDED) & (lanes.status == Status.OK.value)
         status = jnp.where(undecided, Status.NOT_SETTLED.value, lanes.status)
         word = jnp.where(jnp.isinf(loop.word), -1.0, loop.word)

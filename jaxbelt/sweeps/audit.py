@@ -24,9 +24,9 @@ from .queue import by_name, layout
 from .threads import CHUNK, run
 
 #: States and extrema may differ by so many times the tolerance of a step: errors add up over a run.
-CLOSE = 1e4
+AUDIT_CLOSE = 1e4
 #: Share of the usual budget of steps on the long way, where no pseudo-focus ends a run.
-BUDGET = 0.025
+LONG_WAY_BUDGET = 0.025
 
 Results = dict[str, np.ndarray]
 
@@ -78,14 +78,14 @@ def _results(program, shared, rows: np.ndarray, numbers: dict[str, Any]) -> Resu
         runs,
         put,
         **numbers,
-        budget=BUDGET,
+        budget=LONG_WAY_BUDGET,
     )
     return by_name(shapes, columns)
 
 
 def _close(a: np.ndarray, b: np.ndarray, numbers: dict[str, float]) -> np.ndarray:
     largest = np.maximum(np.abs(a), np.abs(b))
-    return np.abs(a - b) <= CLOSE * (numbers["atol"] + numbers["rtol"] * largest)
+    return np.abs(a - b) <= AUDIT_CLOSE * (numbers["atol"] + numbers["rtol"] * largest)
 
 
 def _same_ends(known: Results, final: Results, numbers: dict[str, float]) -> np.ndarray:

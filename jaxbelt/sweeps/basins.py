@@ -21,9 +21,11 @@ from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator, check_oscillator
 from .attractor import KINDS, Attractor
+from .datasets import decoded, flags
 from .lanes import Program
-from .queue import layout
-from .sweep import LONG_ENOUGH, sweep
+from .question import LONG_ENOUGH
+from .queue import column_of, layout
+from .sweep import sweep
 from .threads import run
 
 if TYPE_CHECKING:
@@ -113,7 +115,8 @@ def basins(
     dataset["label"] = (
         ("x1", "x2"),
         labels,
-        {"long_name": "number of the attractor", "attractors": list(attractors)},
+        {"long_name": "number of the attractor", "units": "1"}
+        | flags({-1: "undecided", **dict(enumerate(attractors))}, "int32"),
     )
     return Basins(oscillator, dataset, attractors, cycles, unstable_cycle(oscillator))
 
@@ -122,12 +125,12 @@ def _labels(
     osc: Oscillator, dataset: "xarray.Dataset"
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[Cycle, ...]]:
     """Numbers of the attractors, the most frequent first, names, and those that are cycles."""
-    kinds = np.asarray(dataset["kind"])
+    kinds = np.asarray(decoded(dataset[["kind"]])["kind"])
     sticks = np.asarray(dataset["sticks"]).astype(bool)
     low, high = np.asarray(dataset["x1_min"]), np.asarray(dataset["x1_max"])
     rest, held = _rest_reached(osc, 0.5 * (low + high))
     runs = Runs.of(dataset, ("x1", "x2"))
-    found: list[_Attractor] = []
+    found: list[_Found] = []
     left = kinds != "undecided"
     while np.any(left):
         first = tuple(int(i) for i in np.unravel_index(np.argmax(left), left.shape))
@@ -144,18 +147,18 @@ def _labels(
             same &= np.all(sticks == stuck, axis=-1) & (place == place[first])
         left &= ~same
         if before is None:
-            found.append(_Attractor(_name(kind, stuck, rest[first]), same, cycle))
+            found.append(_Found(_words_for(kind, stuck, rest[first]), same, cycle))
         else:
             before.runs[same] = True
     found.sort(key=lambda one: -int(np.sum(one.runs)))
-    labels = np.full(kinds.shape, -1)
+    labels = np.full(kinds.shape, -1, "int32")
     for i, one in enumerate(found):
         labels[one.runs] = i
     cycles = tuple(one.cycle for one in found if one.cycle is not None)
     return labels, tuple(one.name for one in found), cycles
 
 
-class _Attractor(NamedTuple):
+class _Found(NamedTuple):
     """Its name, which runs lead to it, and, of a cycle, what shooting finds from one of them."""
 
     name: str
@@ -187,7 +190,7 @@ def _rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return rest, segment
 
 
-def _name(kind: str, sticks: np.ndarray, x1: float) -> str:
+def _words_for(kind: str, sticks: np.ndarray, x1: float) -> str:
     belts = " and ".join(f"belt {i}" for i in np.flatnonzero(sticks))
     if kind == "equilibrium":
         return f"rest at {x1:.3f}"
@@ -229,9 +232,7 @@ def _kinds(osc: Oscillator, starts: np.ndarray, t1, rtol, atol) -> np.ndarray:
     leaves, structure = jax.tree.flatten(osc)
     edges = bool(np.any([np.isfinite([belt.lower, belt.upper]) for belt in osc.belts]))
     program = Program(structure, (False,) * len(leaves), Attractor(), edges)
-    shapes = layout(program, leaves)
-    names = list(shapes)
-    column = sum(int(np.prod(shapes[name])) for name in names[: names.index("kind")])
+    column = column_of(layout(program, leaves), "kind")
     kinds = np.zeros(starts.shape[1], int)
 
     def put(runs: np.ndarray, results: np.ndarray) -> None:

@@ -23,7 +23,7 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator
 from ..results import EventKind, Status
 from .lanes import Lanes, Passage, Program
-from .step import NO_STEP, SAFETY, first_step
+from .step import NO_STEP, STEP_SAFETY, first_step
 
 
 def pass_events(
@@ -77,7 +77,7 @@ def pass_events(
         a=jnp.where(landed | stuck, a, lanes.a),
         # The field is new after an event, and so is the step size.
         h=h,
-        pace=jnp.where(fired, SAFETY / first_step(rtol), lanes.pace),
+        pace=jnp.where(fired, STEP_SAFETY / first_step(rtol), lanes.pace),
         mode=mode,
         events=lanes.events + jnp.where(fired, 1, 0) + jnp.where(released, 1, 0),
         status=jnp.where(forever, Status.STUCK_FOREVER.value, status),

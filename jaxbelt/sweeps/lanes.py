@@ -5,7 +5,9 @@ fixed when the kernel is compiled.
 """
 
 import abc
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -88,8 +90,28 @@ def materialise(value: Array, one: Array) -> Array:
     return value / one
 
 
+@dataclass(frozen=True)
+class Variable:
+    """What is known of a result.
+
+    per_belt: whether it has a number a belt. Of a category, an integer: meanings, what the values
+    stand for; or name_of(code, belts), if they are codes that are numbered when all runs are known.
+    """
+
+    long_name: str
+    dtype: str = "float64"
+    per_belt: bool = False
+    meanings: Mapping[int, str] | None = None
+    name_of: Callable[[int, int], str] | None = None
+
+
 class Observer(eqx.Module):
-    """What a run hands in, and when it may end early: subclasses are static settings."""
+    """What a run hands in, and when it may end early: subclasses are static settings.
+
+    variables: what is known of the results, by name, in the order in which datasets show them.
+    """
+
+    variables: ClassVar[Mapping[str, Variable]] = {}
 
     def extrema(self, lanes: Lanes) -> Array | None:
         """The lanes whose extrema of x2 are wanted, so that steps end at them; None: no lanes."""

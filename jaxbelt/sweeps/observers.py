@@ -1,7 +1,8 @@
 """Observers of whole runs: the state at t1, and what a user's reducer makes of the events."""
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,8 +11,17 @@ from jax import lax
 from jaxtyping import Array
 
 from .events import event_kinds
-from .lanes import Observer, choose
+from .lanes import Observer, Variable, choose
 from .marks import Mark
+
+#: What contact codes stand for.
+CONTACTS = {
+    -2: "below the belt's interval",
+    -1: "slips with nu < omega x2",
+    0: "stuck",
+    1: "slips with nu > omega x2",
+    2: "above the belt's interval",
+}
 
 
 class Final(Observer):
@@ -22,6 +32,14 @@ class Final(Observer):
     (unless `skip` is false).
     """
 
+    variables: ClassVar[Mapping[str, Variable]] = {
+        "x1_end": Variable("displacement at t1"),
+        "x2_end": Variable("velocity at t1"),
+        "mode_end": Variable(
+            "contact at t1, as in Trajectory.modes", "int8", per_belt=True, meanings=CONTACTS
+        ),
+        "n_events": Variable("number of events", "int32"),
+    }
     skip: bool = eqx.field(static=True, default=True)
 
     def start(self, osc, lanes):

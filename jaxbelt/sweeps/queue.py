@@ -26,14 +26,14 @@ from ..numerics.compiling import one_kernel
 from ..results import Status
 from .events import pass_events
 from .lanes import Lanes, Program, choose
-from .step import SAFETY, first_step, take_step, window_of
+from .step import STEP_SAFETY, first_step, take_step, window_of
 
 #: Steps between two looks at the events, and looks between two refills: events and refills cost
 #: about as much as a step, and a lane that waits for them is idle.
-STEPS, ROUNDS = 4, 4
+STEPS_PER_ROUND, ROUNDS_PER_PASS = 4, 4
 
 
-def _oscillator(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator:
+def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator:
     """The oscillators of the lanes: leaves that differ from run to run are arrays [lanes]."""
     leaves, column = [], 2
     others = iter(shared)
@@ -73,7 +73,7 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
         x2=x2,
         a=mode_acceleration(osc, mode, x1, x2) + zero,
         h=zero + first_step(rtol),
-        pace=zero + SAFETY / first_step(rtol),
+        pace=zero + STEP_SAFETY / first_step(rtol),
         mode=Mode(tuple(code + zero for code in mode.codes)),
         events=jnp.zeros_like(run),
         status=status.astype(run.dtype),
@@ -99,7 +99,7 @@ class Stream(eqx.Module):
 def idle(program: Program, shared, width: int, columns: int) -> Stream:
     """A stream whose lanes have nothing to do."""
     rows = tuple(jnp.zeros(width) for _ in range(columns))
-    osc = _oscillator(program, shared, rows)
+    osc = _oscillators(program, shared, rows)
     run = jnp.full(width, -1, dtype=jnp.int32)
     lanes = _begin(program, osc, run, rows[0], rows[1], jnp.zeros((), jnp.int32), jnp.ones(()))
     lanes = eqx.tree_at(lambda n: n.done, lanes, jnp.ones(width, dtype=bool))
@@ -139,7 +139,7 @@ def _refill(program: Program, shared, rtol, limit, block, begun, available, desk
     observer, one = program.observer, desk.stream.one
     slots = jnp.arange(one.size, dtype=jnp.int32)
     lanes, passes = desk.stream.lanes, desk.stream.passes
-    osc = _oscillator(program, shared, desk.stream.rows)
+    osc = _oscillators(program, shared, desk.stream.rows)
     lanes = _give_up(observer.watch_rarely(osc, lanes, one), passes, limit)
     finished = lanes.done & (lanes.run >= 0)
     finished = finished & (_rank(finished) < one.size - desk.filled)
@@ -158,7 +158,7 @@ def _refill(program: Program, shared, rtol, limit, block, begun, available, desk
     place = jnp.where(takes, place, 0)
     pairs = zip(block, desk.stream.rows, strict=True)
     rows = tuple(jnp.where(takes, column[place], row) for column, row in pairs)
-    osc = _oscillator(program, shared, rows)
+    osc = _oscillators(program, shared, rows)
     fresh = _begin(program, osc, begun + place, rows[0], rows[1], passes, rtol)
     lanes = choose(takes, fresh, replace(lanes, run=jnp.where(free, -1, lanes.run)))
     return _Desk(
@@ -171,8 +171,8 @@ def _refill(program: Program, shared, rtol, limit, block, begun, available, desk
 
 
 def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> Lanes:
-    """ROUNDS times: past the events, and some steps."""
-    osc, observer = _oscillator(program, shared, rows), program.observer
+    """ROUNDS_PER_PASS times: past the events, and some steps."""
+    osc, observer = _oscillators(program, shared, rows), program.observer
 
     def round_(_, lanes):
         lanes, passage = pass_events(program, osc, lanes, t1, rtol)
@@ -182,9 +182,9 @@ def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> 
         def step(_, lanes):
             return take_step(osc, window, one, lanes, t1, rtol, atol)
 
-        return lax.fori_loop(0, STEPS, step, lanes)
+        return lax.fori_loop(0, STEPS_PER_ROUND, step, lanes)
 
-    return lax.fori_loop(0, ROUNDS, round_, lanes)
+    return lax.fori_loop(0, ROUNDS_PER_PASS, round_, lanes)
 
 
 def _at_work(stream: Stream) -> Array:
@@ -319,7 +319,7 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
 
     def finish():
         stream = idle(program, shared, 1, 2 + sum(program.mapped))
-        osc = _oscillator(program, shared, stream.rows)
+        osc = _oscillators(program, shared, stream.rows)
         return program.observer.finish(osc, stream.lanes)
 
     values = jax.eval_shape(finish)
@@ -329,6 +329,12 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
         is_tuple = isinstance(value, tuple)
         shapes[name] = (len(value),) if is_tuple else value.shape[1:]
     return shapes
+
+
+def column_of(layout: dict[str, tuple[int, ...]], name: str) -> int:
+    """The number of a result's first column."""
+    names = list(layout)
+    return sum(math.prod(layout[before]) for before in names[: names.index(name)])
 
 
 def by_name(layout: dict[str, tuple[int, ...]], columns: np.ndarray) -> dict[str, np.ndarray]:

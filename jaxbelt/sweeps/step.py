@@ -36,7 +36,7 @@ INITIAL_STEP = 0.1
 #: Longest step: a quarter of a loop, so that x2 has at most one extremum in it.
 LONGEST_STEP = 1.5
 #: Share of the step that the last error would have allowed.
-SAFETY = 0.9
+STEP_SAFETY = 0.9
 #: Bounds of error/tolerance. Smaller values may be rounding; larger ones, and NaN, shrink a step by
 #: no more than a factor of 100000^(1/8), 4.2.
 LEAST_ERROR, LARGEST_ERROR = 1e-5, 1e5
@@ -117,7 +117,7 @@ def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | No
     return _Window(x1, (low, high), extrema, signs, pulls, ~lanes.done & ~mode.any_stuck)
 
 
-def _acceleration(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array) -> Array:
+def _quotient(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array) -> Array:
     """`oscillator.acceleration` as a single quotient; one: see `lanes.materialise`."""
     numerator, denominator = -x1 - osc.damping * x2, one
     for belt, sign, pull in zip(osc.belts, window.signs, window.pulls, strict=True):
@@ -150,11 +150,11 @@ def _attempt(osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol) -> _
     for row, row1, c in zip(_A[1:-1], _AA[1:-1], _C[1:-1].tolist(), strict=True):
         drift = c * x2 + h * _combine(row1, stages) if np.any(row1) else c * x2
         x2_stage = x2 + h * _combine(row, stages)
-        stages.append(_acceleration(osc, window, one, x1 + h * drift, x2_stage))
+        stages.append(_quotient(osc, window, one, x1 + h * drift, x2_stage))
     # The weights of the solution are those of the last stage, which is the next step's first.
     y1 = materialise(x1 + h * (x2 + h * _combine(_AA[-1], stages)), one)
     y2 = materialise(x2 + h * _combine(_A[-1], stages), one)
-    stages.append(_acceleration(osc, window, one, y1, y2))
+    stages.append(_quotient(osc, window, one, y1, y2))
     scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
     scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
     error1, error2 = jnp.abs(h * h * _combine(_EA, stages)), jnp.abs(h * _combine(_E, stages))
@@ -241,7 +241,7 @@ def _landing(
         target = jnp.where(use, side, target)
         blocked = blocked | beyond
     until = jnp.where(beyond_extremum, path.extremum, 1.0)
-    theta = _first_root(poly, start - target, until, end - target)
+    theta = _root_in_step(poly, start - target, until, end - target)
     grazes = _grazes(window, lanes, new, path, reach) & ~beyond_extremum
     return _Landing(
         reached=reached,
@@ -356,7 +356,7 @@ def _next_size(lanes: Lanes, new: _Attempt, going, accepted) -> tuple[Array, Arr
     pace = jnp.where(new.error <= LEAST_ERROR, jnp.minimum(pace, lanes.pace), pace)
     # Towards a boundary the law bends more and more: a step that had to shrink will have to again.
     trend = jnp.where(accepted, jnp.maximum(pace, lanes.pace) / lanes.pace, 1.0)
-    return pace, jnp.minimum(SAFETY / (pace * trend), LONGEST_STEP)
+    return pace, jnp.minimum(STEP_SAFETY / (pace * trend), LONGEST_STEP)
 
 
 def first_step(rtol):
@@ -364,7 +364,7 @@ def first_step(rtol):
     return INITIAL_STEP * (1e8 * rtol) ** 0.125
 
 
-def _first_root(poly, g_start, end, g_end):
+def _root_in_step(poly, g_start, end, g_end):
     """Root in (0, end] of g_start + poly[0] theta + poly[1] theta^2 ..., by Newton's method."""
     # A lane that moves away from the bound at first comes back to it late in the step. So does one
     # that has just left it: there g vanishes up to rounding, far below 1e-9 of its change, and that

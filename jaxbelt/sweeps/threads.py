@@ -21,11 +21,11 @@ from jaxtyping import Array
 
 from ..numerics.compiling import wide
 from .lanes import Program
-from .queue import ROUNDS, STEPS, Call, advance, advance_with_derivatives, idle
+from .queue import ROUNDS_PER_PASS, STEPS_PER_ROUND, Call, advance, advance_with_derivatives, idle
 
 #: Steps that a run may take for each 100 units of time before it is given up. On its way to a
 #: pseudo-focus beside a slow belt it may pass ten thousand events in that time.
-MAX_STEPS = 400_000
+STEP_BUDGET = 400_000
 #: Runs that the kernel is given at once: enough that a call costs nothing beside them, and few
 #: enough that the threads end together.
 CHUNK = 2**14
@@ -76,7 +76,7 @@ def run(
     rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]: the starts and the
     parameters that vary, and their derivatives in so many directions. put(numbers, results) takes
     results [1 + derivatives, columns, runs] in any order, on any thread. budget: the share of
-    `MAX_STEPS` that a run may take.
+    `STEP_BUDGET` that a run may take.
 
     Every thread feeds chunks to one compiled kernel (which lets go of Python's lock) on its own
     lanes. Long runs stay in their lanes while the next chunk is worked on. An exception, a
@@ -84,12 +84,12 @@ def run(
     """
     if not runs:
         return
-    limit = int(budget * MAX_STEPS * max(1.0, t1 / 100)) // (STEPS * ROUNDS)
+    limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
     columns = 2 + sum(program.mapped)
     kernel = _kernel(program, derivatives)
     team = _Team(
         functools.partial(kernel, shared, t1, rtol, atol, np.int32(limit)),
-        functools.partial(_idle, program, shared, columns, derivatives),
+        functools.partial(_first_stream, program, shared, columns, derivatives),
         rows_of,
         put,
         (1 + derivatives, columns) if derivatives else (columns,),
@@ -107,7 +107,7 @@ def run(
         wait(threads, timeout=10 * PATIENCE)
 
 
-def _idle(program: Program, shared, columns: int, derivatives: int) -> Any:
+def _first_stream(program: Program, shared, columns: int, derivatives: int) -> Any:
     """The stream that a kernel with so many derivatives starts from."""
     stream = idle(program, shared, WIDTH.get(jax.default_backend(), 2**17), columns)
     if not derivatives:
@@ -198,7 +198,7 @@ def _settings(device) -> Iterator[None]:
 
 #: Threads at work. They outlive a call only where an interrupt came while one was compiling, for
 #: nothing ends that.
-_at_work: set[threading.Thread] = set()
+_alive: set[threading.Thread] = set()
 
 
 def _started(function: Callable, *args: Any) -> Future:
@@ -211,10 +211,10 @@ def _started(function: Callable, *args: Any) -> Future:
         except BaseException as error:
             future.set_exception(error)
         finally:
-            _at_work.discard(threading.current_thread())
+            _alive.discard(threading.current_thread())
 
     thread = threading.Thread(target=call, daemon=True)
-    _at_work.add(thread)
+    _alive.add(thread)
     thread.start()
     return future
 
@@ -225,11 +225,11 @@ def _end_of_process() -> None:
 
     A process that an interrupt ends is ended at once, as Python does it itself, by the signal.
     """
-    if _at_work and getattr(sys, "last_type", None) is KeyboardInterrupt:
+    if _alive and getattr(sys, "last_type", None) is KeyboardInterrupt:
         sys.stdout.flush()
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         signal.raise_signal(signal.SIGINT)
-    for thread in tuple(_at_work):
+    for thread in tuple(_alive):
         thread.join()
 
 

@@ -5,7 +5,6 @@ the oscillator and of the start varies from lane to lane.
 """
 
 import functools
-import sys
 from dataclasses import dataclass
 from unittest import mock
 
@@ -15,9 +14,9 @@ import numpy as np
 
 import jaxbelt as jb
 from jaxbelt.model.events import of_one_loop
+from jaxbelt.sweeps import question
 
 #: The module, whose name in the package is that of its function.
-_SWEEP = sys.modules[jb.sweep.__module__]
 _LAWS = {"conti": jb.Conti, "coulomb": jb.Coulomb, "stribeck": jb.Stribeck}
 _SIZES = {"conti": 4, "coulomb": 2, "stribeck": 3}
 _KINDS = ("equilibrium", "cycle", "stuck")
@@ -114,7 +113,7 @@ def swept(cases, observe, directions=None, **options):
         rows, moves = (np.array(part) for part in zip(*pairs))
         tables.append(np.column_stack([moves, _leaves(structure, rows)]))
 
-    class Cases(_SWEEP._Grid):
+    class Cases(question.Grid):
         def rows(self, runs, derivatives=()):
             varying = [True, True, *self.mapped]
             return np.stack([t[runs][:, varying].T for t in tables[: 1 + len(derivatives)]])
@@ -123,7 +122,7 @@ def swept(cases, observe, directions=None, **options):
         # Every number depends on the axis, so that every one varies.
         return _from_numbers(structure, [value + 0 * case for value in table[0]])
 
-    with mock.patch.object(_SWEEP, "_Grid", Cases):
+    with mock.patch.object(question, "Grid", Cases):
         axes = {"case": np.arange(len(cases), dtype=float)}
         return jb.sweep(make, axes, observe=observe, progress=False, **options)
 
@@ -164,11 +163,7 @@ class Label:
 
 def labels(cases, tol, **options):
     """Attractors by the sweep."""
-    found = swept(cases, "attractor", rtol=tol, atol=tol, **options)
-    flags = found.signature.attrs
-    meanings = dict(
-        zip(np.atleast_1d(flags["flag_values"]).tolist(), flags["flag_meanings"].split())
-    )
+    found = jb.decoded(swept(cases, "attractor", rtol=tol, atol=tol, **options))
     out = []
     for i in range(len(cases)):
         row = found.isel(case=i)
@@ -176,7 +171,7 @@ def labels(cases, tol, **options):
             Label(
                 str(row.kind.values),
                 float(row.period),
-                _loop(meanings[int(row.signature)]),
+                _loop(str(row.signature.values)),
                 (float(row.x1_min), float(row.x1_max)),
                 (float(row.x2_min), float(row.x2_max)),
                 tuple(row.stick_duration.values.tolist()),

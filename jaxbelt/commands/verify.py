@@ -1,0 +1,30 @@
+"""`jaxbelt verify`: whether a store is right."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import jaxbelt as jb
+
+from .options import make_console, plain_errors
+
+
+def verify(
+    store: Annotated[Path, typer.Argument(help="A store that sweep wrote, such as plane.zarr.")],
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Mark bad blocks, so that the sweep does them again.")
+    ] = False,
+) -> None:
+    """Compute the checksums of a store again and tell which of its blocks are right.
+
+    Exit code 1 if there are bad ones and they are not repaired. After a repair the command or the
+    call that made the store does the marked blocks again.
+
+    Example: **jaxbelt verify plane.zarr --repair**
+    """
+    with plain_errors():
+        found = jb.verify(store, repair)
+    make_console().print(repr(found), highlight=False, soft_wrap=True)
+    if found.bad and not repair:
+        raise typer.Exit(1)

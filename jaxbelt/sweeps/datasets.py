@@ -1,0 +1,232 @@
+"""Datasets of sweeps: variables with names, units and meanings, and the results in memory.
+
+A category is an integer; the attributes `flag_values` and `flag_meanings` of the CF conventions say
+what it stands for, and `decoded` puts the words in its place.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..results import Status
+from .grid import Blocks, Grid
+from .lanes import Program, Variable
+from .queue import by_name, layout
+
+if TYPE_CHECKING:
+    import xarray
+
+#: What axes are called in words; other arguments of `make` go by their own name.
+AXIS_NAMES = {
+    "nu0": "velocity of belt 0",
+    "nu1": "velocity of belt 1",
+    "sigma": "edge between the contact intervals",
+    "sigma0": "lower edge of belt 1's contact interval",
+    "sigma1": "upper edge of belt 0's contact interval",
+    "x1": "displacement at the start",
+    "x2": "velocity at the start",
+    "belt": "belt",
+}
+STATUS = Variable(
+    "how the run ended, a jaxbelt.Status",
+    "int8",
+    meanings={status.value: status.name.lower() for status in Status},
+)
+#: Status of runs that are yet to be done.
+NOT_RUN = -1
+
+
+def decoded(dataset: "xarray.Dataset") -> "xarray.Dataset":
+    """The dataset with words for the integers of its categories.
+
+    dataset: of `sweep`, or `Basins.dataset`, also as read from a file. Every variable with the
+    attributes `flag_values` and `flag_meanings` becomes one of strings, so that
+    `decoded(dataset).kind == "cycle"` is what it says; what has no meaning becomes "".
+    """
+    return dataset.assign(
+        {
+            name: variable.copy(data=words_of(variable.values, variable.attrs)).drop_attrs()
+            for name, variable in dataset.items()
+            if "flag_meanings" in variable.attrs
+        }
+    )
+
+
+def words_of(values: np.ndarray, attributes: dict[str, Any]) -> np.ndarray:
+    """The words that the values of a category stand for."""
+    numbers = np.atleast_1d(attributes["flag_values"])
+    words = np.array(["", *attributes["flag_meanings"].split()])
+    order = np.argsort(numbers)
+    place = order[np.searchsorted(numbers, values, sorter=order).clip(max=len(order) - 1)]
+    return words[np.where(numbers[place] == values, place + 1, 0)]
+
+
+def flags(meanings: Mapping[int, str], dtype: str) -> dict[str, Any]:
+    """CF's attributes of a category."""
+    return {
+        "flag_values": np.array(list(meanings), dtype),
+        "flag_meanings": " ".join(name.replace(" ", "_") for name in meanings.values()),
+    }
+
+
+class Table:
+    """The variables of a sweep: their order, shapes, types and attributes.
+
+    layout: the kernel's results, the shape of each by name; shapes: the same of all variables,
+    derivatives among them.
+    """
+
+    def __init__(self, program: Program, grid: Grid, derivatives: tuple[str, ...]):
+        self.grid, self.derivatives = grid, derivatives
+        self.layout = layout(program, grid.shared)
+        self.described = {**program.observer.variables, "status": STATUS}
+        names = [name for name in self.described if name in self.layout]
+        names += [name for name in self.layout if name not in names]
+        self.shapes = {name: self.layout[name] for name in names}
+        for by in derivatives:
+            for name in names:
+                if np.issubdtype(self.variable(name).dtype, np.floating):
+                    self.shapes[f"d_{name}_d_{by}"] = self.layout[name]
+
+    def variable(self, name: str) -> Variable:
+        """What is known of a variable."""
+        if name in self.described:
+            return self.described[name]
+        for by in self.derivatives:
+            of = name.removeprefix("d_").removesuffix(f"_d_{by}")
+            if name == f"d_{of}_d_{by}":
+                known = self.described.get(of, Variable(of))
+                return Variable(f"derivative of {of} by {by}", per_belt=known.per_belt)
+        return Variable(name)
+
+    def empty(self, name: str) -> Any:
+        """What stands for results that are yet to come."""
+        dtype = np.dtype(self.variable(name).dtype)
+        return dtype.type(NOT_RUN if name == "status" else 0)
+
+    def parts(self, results: np.ndarray) -> dict[str, np.ndarray]:
+        """The variables of runs, [runs, ...], from results [1 + derivatives, columns, runs]."""
+        values = by_name(self.layout, results)
+        found = {}
+        for name in self.shapes:
+            if name in values:
+                part, dtype = values[name][0], np.dtype(self.variable(name).dtype)
+                # Codes of runs that are not finite are not numbers: 0.
+                exact = not np.issubdtype(dtype, np.floating)
+                found[name] = (np.nan_to_num(part) if exact else part).astype(dtype)
+        for i, by in enumerate(self.derivatives):
+            found |= {
+                f"d_{name}_d_{by}": values[name][i + 1]
+                for name in values
+                if f"d_{name}_d_{by}" in self.shapes
+            }
+        return found
+
+    def dims(self, name: str) -> tuple[str, ...]:
+        """The dimensions of a variable."""
+        extra = [f"{name}_{i}" for i in range(len(self.shapes[name]))]
+        if self.variable(name).per_belt:
+            extra = ["belt"]
+        return (*self.grid.axes, *extra)
+
+    def attributes(self, name: str) -> dict[str, Any]:
+        """The attributes of a variable, but for the flags of categories that are numbered."""
+        variable = self.variable(name)
+        told = {"long_name": variable.long_name, "units": "1"}
+        return told | (flags(variable.meanings, variable.dtype) if variable.meanings else {})
+
+    def coordinates(self) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
+        """The coordinates of the dataset."""
+        axes = dict(self.grid.axes)
+        if any("belt" in self.dims(name) for name in self.shapes):
+            axes["belt"] = np.arange(len(self.grid.example.belts))
+        return {
+            name: (name, values, {"long_name": AXIS_NAMES.get(name, name), "units": "1"})
+            for name, values in axes.items()
+        }
+
+    def numbered(self) -> list[str]:
+        """The variables whose categories are numbered when all runs are known."""
+        return [name for name in self.shapes if self.variable(name).name_of is not None]
+
+    def numbering(self, name: str, codes: Iterable[int]) -> tuple[dict[int, int], dict[str, Any]]:
+        """The numbers of the categories with these codes, and the attributes that name them."""
+        name_of = self.variable(name).name_of
+        assert name_of is not None
+        belts = len(self.grid.example.belts)
+        return numbered({code: name_of(code, belts) for code in codes})
+
+
+#: Categories that come first where they are numbered.
+FIRST_NAMES = ("none", "smooth")
+#: The type of categories that are numbered.
+NUMBERED = "int16"
+
+
+def numbered(names: Mapping[int, str]) -> tuple[dict[int, int], dict[str, Any]]:
+    """Numbers of categories whose codes have these names, and the attributes that name them."""
+    ordered = sorted(set(names.values()), key=_rank_of)
+    number = {name: i for i, name in enumerate(ordered)}
+    numbers = {code: number[name] for code, name in names.items()}
+    return numbers, flags(dict(enumerate(ordered)), NUMBERED)
+
+
+def _rank_of(name: str) -> tuple[Any, ...]:
+    return *(name != first for first in FIRST_NAMES), name
+
+
+def renumber(codes: np.ndarray, numbers: dict[int, int]) -> np.ndarray:
+    """The numbers of categories for their codes."""
+    different, place = np.unique(codes, return_inverse=True)
+    return np.array([numbers[int(code)] for code in different], NUMBERED)[place].reshape(
+        codes.shape
+    )
+
+
+class Memory:
+    """The results of a sweep in memory: what `Store` keeps in a file."""
+
+    def __init__(self, table: Table):
+        self.table, self.runs = table, table.grid.runs
+        self.blocks, self.to_do = Blocks(table.grid.shape, self.runs), [0]
+        self.arrays = {
+            name: np.full((self.runs, *shape), table.empty(name), table.variable(name).dtype)
+            for name, shape in table.shapes.items()
+        }
+
+    def put(self, block: int, positions: np.ndarray, results: np.ndarray) -> None:
+        """Take results of runs."""
+        for name, part in self.table.parts(results).items():
+            self.arrays[name][positions] = part
+
+    def of_runs(self, runs: np.ndarray) -> dict[str, np.ndarray]:
+        """The kernel's results for some runs."""
+        return {name: self.arrays[name][runs] for name in self.table.layout}
+
+    def done(self) -> int:
+        """How many runs are done."""
+        return int(np.sum(self.arrays["status"] != NOT_RUN))
+
+    def interrupted(self) -> str:
+        """What becomes of the results of an interrupted sweep."""
+        return (
+            f"interrupted after {self.done():,} of {self.runs:,} runs, which are not kept; with a "
+            'store (store="results.zarr", on the command line --out results.zarr) they are, and '
+            "the same call goes on from there"
+        )
+
+    def dataset(self, attributes: dict[str, Any]) -> "xarray.Dataset":
+        """The results, labelled."""
+        import xarray  # with pandas, half of what `import jaxbelt` would take
+
+        table, variables = self.table, {}
+        numbered = table.numbered()
+        for name in table.shapes:
+            values, told = self.arrays[name], table.attributes(name)
+            if name in numbered:
+                numbers, named = table.numbering(name, np.unique(values).tolist())
+                values, told = renumber(values, numbers), told | named
+            values = values.reshape(*table.grid.shape, *values.shape[1:])
+            variables[name] = (table.dims(name), values, told)
+        return xarray.Dataset(variables, table.coordinates(), attributes)

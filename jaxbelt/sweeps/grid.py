@@ -1,0 +1,161 @@
+"""The grid of a sweep: its points, the oscillators there, and the blocks in which it is done."""
+
+import functools
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..checks import as_array, check_finite, is_concrete, require
+from ..model.oscillator import Oscillator, check_scalars
+from .lanes import Observer, Program
+from .threads import CHUNK
+
+
+class Grid:
+    """The points of a sweep and the oscillators there."""
+
+    def __init__(self, make: Callable[..., Oscillator], axes: Mapping[str, Any], y0: Any):
+        require(callable(make), "make", "a function that returns an Oscillator", repr(make))
+        require(
+            isinstance(axes, Mapping) and len(axes) > 0,
+            "axes",
+            "a dictionary of values",
+            repr(axes),
+        )
+        self.make = make
+        self.axes = {
+            name: np.asarray(as_array(v, f"axis {name}", (None,))) for name, v in axes.items()
+        }
+        for name, values in self.axes.items():
+            require(name != "belt", "axes", "without the name belt, a dimension of results", name)
+            require(values.size > 0, f"axis {name}", "at least one value", "none")
+        start = as_array(y0, "y0", (2,))
+        check_finite(start, "y0")
+        self.y0 = dict(zip(("x1", "x2"), np.asarray(start).tolist(), strict=True))
+        self.shape = tuple(values.size for values in self.axes.values())
+        self.runs = math.prod(self.shape)
+        self.names = [name for name in self.axes if name not in self.y0]
+        self._accepted_by(make)
+        # An oscillator of the sweep, for the structure and for what does not vary. Whatever is
+        # impossible in it is told here; runs that are not finite are told by their status.
+        finite = {name: self.axes[name][np.isfinite(self.axes[name])] for name in self.names}
+        first = {name: float(v[0]) if v.size else 0.0 for name, v in finite.items()}
+        self.example = make(**first)
+        require(
+            isinstance(self.example, Oscillator),
+            "make",
+            "a function that returns an Oscillator",
+            f"one that returns {type(self.example).__name__}",
+        )
+        check_scalars(self.example)
+        leaves, self.structure = jax.tree.flatten(self.example)
+        self.mapped = self._varying()
+        self.shared = [leaf for leaf, mapped in zip(leaves, self.mapped, strict=True) if not mapped]
+
+    def _accepted_by(self, make):
+        try:
+            parameters = inspect.signature(make).parameters
+        except (TypeError, ValueError):
+            return
+        if any(p.kind == p.VAR_KEYWORD for p in parameters.values()):
+            return
+        for name in self.names:
+            require(
+                name in parameters,
+                "axes",
+                f"arguments of make ({', '.join(parameters)}), x1 or x2",
+                repr(name),
+            )
+
+    def _varying(self) -> tuple[bool, ...]:
+        """For each leaf of the oscillator whether it depends on an axis."""
+        found = []
+
+        def probe(values):
+            # What does not depend on the mapped values is computed on the spot.
+            found.extend(not is_concrete(leaf) for leaf in jax.tree.leaves(self.make(**values)))
+            return 0
+
+        jax.vmap(probe, axis_size=2, out_axes=None)({name: np.zeros(2) for name in self.names})
+        return tuple(found)
+
+    def program(self, observer: Observer) -> Program:
+        leaves = jax.tree.unflatten(self.structure, self.mapped)
+        edges = any(
+            varies or np.isfinite(value)
+            for belt, which in zip(self.example.belts, leaves.belts, strict=True)
+            for varies, value in ((which.lower, belt.lower), (which.upper, belt.upper))
+        )
+        return Program(self.structure, self.mapped, observer, bool(edges))
+
+    def rows(self, runs: np.ndarray, derivatives: tuple[str, ...] = ()) -> np.ndarray:
+        """Starts and varying parameters of some runs, [1 + derivatives, columns, runs]."""
+        # Of one size, for one compiled program.
+        padded = np.concatenate([runs, np.zeros(CHUNK - len(runs), runs.dtype)])
+        places = np.unravel_index(padded, self.shape)
+        values = {
+            name: axis[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)
+        }
+        start = tuple(self.y0.items())
+        table = _rows(self.make, tuple(self.names), self.mapped, start, derivatives, values)
+        return np.asarray(table)[:, :, : len(runs)]
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4))
+def _rows(make, names, mapped, start, derivatives, values):
+    def row(values):
+        leaves = jax.tree.leaves(make(**{name: values[name] for name in names}))
+        varying = [leaf for leaf, varies in zip(leaves, mapped, strict=True) if varies]
+        return jnp.stack([*(jnp.asarray(values.get(x, default)) for x, default in start), *varying])
+
+    rows = jax.vmap(row, out_axes=1)
+    tables = [rows(values)]
+    for name in derivatives:
+        direction = {n: jnp.full_like(v, float(n == name)) for n, v in values.items()}
+        tables.append(jax.jvp(rows, (values,), (direction,))[1])
+    return jnp.stack(tables)
+
+
+class Blocks:
+    """A grid cut into boxes of about `size` runs, each a chunk of every variable of a store.
+
+    The last axes are whole in a box as long as there is room for them; what is cut is cut evenly.
+    """
+
+    def __init__(self, shape: tuple[int, ...], size: int):
+        self.shape, box, room = shape, [], size
+        for n in reversed(shape):
+            box.insert(0, math.ceil(n / math.ceil(n / max(room, 1))))
+            room //= box[0] if box[0] == n else room + 1
+        self.box = tuple(box)
+        self.counts = tuple(math.ceil(n / k) for n, k in zip(shape, box, strict=True))
+
+    def __len__(self) -> int:
+        return math.prod(self.counts)
+
+    def slices(self, block: int) -> tuple[slice, ...]:
+        """Where a block is in the grid."""
+        place = np.unravel_index(block, self.counts)
+        starts = [int(i) * k for i, k in zip(place, self.box, strict=True)]
+        ends = map(min, map(sum, zip(starts, self.box, strict=True)), self.shape)
+        return tuple(map(slice, starts, ends))
+
+    def extent(self, block: int) -> tuple[int, ...]:
+        """The shape of a block: that of the box, or less at the ends of the axes."""
+        return tuple(part.stop - part.start for part in self.slices(block))
+
+    def size(self, block: int) -> int:
+        """How many runs a block has."""
+        return math.prod(self.extent(block))
+
+    def runs(self, block: int, positions: np.ndarray) -> np.ndarray:
+        """Numbers in the grid of the runs at some positions in a block."""
+        inside = np.unravel_index(positions, self.extent(block))
+        parts = zip(inside, self.slices(block), strict=True)
+        places = tuple(i + part.start for i, part in parts)
+        return np.asarray(np.ravel_multi_index(places, self.shape))

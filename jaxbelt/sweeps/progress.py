@@ -1,0 +1,70 @@
+"""Progress of a sweep: one line on the terminal."""
+
+import threading
+import time
+from collections import Counter
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from ..results import Status
+
+
+class SweepProgress:
+    """A bar on the terminal, for what takes longer than a moment.
+
+    It says "compiling" until the first runs are done, then how many there are, how many in a
+    second, and how many ended otherwise than with the status OK. Runs of an earlier call count as
+    done, but not for the time that is left.
+    """
+
+    #: Seconds before a bar is shown that nobody asked for.
+    PATIENCE = 3.0
+
+    def __init__(self, total: int, done: int, wanted: bool | None):
+        console = Console(stderr=True)
+        self.shown = (console.is_terminal or console.is_jupyter) if wanted is None else wanted
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:,.0f} of {task.total:,.0f} runs{task.fields[told]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        self.bar = Progress(*columns, console=console)
+        self.task = self.bar.add_task("compiling", total=total, completed=done, told="")
+        self.patience = threading.Timer(0.0 if wanted else self.PATIENCE, self._show)
+        self.patience.daemon = True
+        self.lock, self.ended = threading.Lock(), False
+        self.statuses: Counter[int] = Counter()
+        self.began: float | None = None
+
+    def __enter__(self) -> "SweepProgress":
+        if self.shown:
+            self.patience.start()
+        return self
+
+    def _show(self) -> None:
+        with self.lock:
+            if not self.ended:
+                self.bar.start()
+
+    def advance(self, statuses: np.ndarray) -> None:
+        """More runs are done, with these statuses."""
+        now = time.monotonic()
+        with self.lock:
+            # The first results may come long after the first runs began: they give no rate.
+            known = 0 if self.began is None else self.statuses.total() + len(statuses)
+            self.began = self.began or now
+            self.statuses.update(statuses.astype(int).tolist())
+            others = {Status(k).name.lower(): n for k, n in self.statuses.items() if k != Status.OK}
+        told = f", {known / (now - self.began):,.0f} runs/s" if known and now > self.began else ""
+        told += "".join(f", {count:,} {name}" for name, count in sorted(others.items()))
+        self.bar.update(self.task, advance=len(statuses), description="sweep", told=told)
+
+    def __exit__(self, *_) -> None:
+        self.patience.cancel()
+        with self.lock:
+            self.ended = True
+            self.bar.stop()

@@ -1,0 +1,170 @@
+"""What a sweep is asked: its arguments, checked once, and what makes two sweeps the same."""
+
+import functools
+import hashlib
+import importlib.metadata
+import inspect
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import CodeType
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..checks import as_array, check_positive, require, require_usable_jax
+from .attractor import Attractor
+from .datasets import Table
+from .grid import Grid
+from .lanes import Observer, Program
+from .observers import Final, Reduce
+from .threads import CHUNK
+
+#: Default t1 of attractor runs: some 500 loops, where nearly all have long been decided.
+LONG_ENOUGH = 30_000.0
+#: The observers that have a name.
+NAMED: dict[str, type[Observer]] = {"final": Final, "attractor": Attractor}
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """A sweep: where, what, and how exactly. numbers: t1, rtol and atol."""
+
+    grid: Grid
+    observe: Any
+    numbers: dict[str, float]
+    derivatives: tuple[str, ...]
+
+    @classmethod
+    def of(cls, make, axes, y0, t1, rtol, atol, observe, derivatives) -> "Question":
+        """The arguments of `sweep`, checked."""
+        require_usable_jax()
+        grid = Grid(make, axes, y0)
+        _observer(observe)
+        if t1 is None:
+            require(observe == "attractor", "t1", "given", "None")
+            t1 = LONG_ENOUGH
+        numbers: dict[str, Any] = {"t1": t1, "rtol": rtol, "atol": atol}
+        for name, value in numbers.items():
+            numbers[name] = float(as_array(value, name))
+            check_positive(numbers[name], name)
+        wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
+        for name in wanted:
+            known = ", ".join(grid.axes)
+            require(name in grid.axes, "derivatives", f"names of axes, {known}", repr(name))
+        return cls(grid, observe, numbers, tuple(wanted))
+
+    @functools.cached_property
+    def program(self) -> Program:
+        """What the kernel is compiled for."""
+        return self.grid.program(_observer(self.observe))
+
+    @functools.cached_property
+    def table(self) -> Table:
+        """The variables of the results."""
+        return Table(self.program, self.grid, self.derivatives)
+
+    def attributes(self) -> dict[str, Any]:
+        """What the numbers of a dataset came from."""
+        grid, observe = self.grid, self.observe
+        start = [f"{axis} = {value}" for axis, value in grid.y0.items() if axis not in grid.axes]
+        packages = ("jaxbelt", "jax", "jaxlib", "diffrax", "equinox", "numpy", "xarray")
+        return {
+            "title": "sweep of a belt-driven dry-friction oscillator",
+            "make": _name_of_function(grid.make),
+            "oscillator": f"{_plain(repr(grid.example))}, where the axes do not say otherwise",
+            "start": ", ".join(start) or "along the axes",
+            **self.numbers,
+            "observe": observe if isinstance(observe, str) else type(observe).__name__,
+            "derivatives": ", ".join(self.derivatives) or "none",
+            "versions": ", ".join(f"{p} {importlib.metadata.version(p)}" for p in packages),
+            "units": "all quantities are dimensionless; time is tau = omega t",
+        }
+
+    def call(self) -> str:
+        """How to ask it again."""
+        shown = self.attributes()
+        settings = ", ".join(f"{name}={value!r}" for name, value in self.numbers.items())
+        start = tuple(self.grid.y0.values())
+        return (
+            f"jaxbelt.sweep({shown['make']}, {{axes: the coordinates}}, y0={start}, {settings}, "
+            f"observe={shown['observe']!r}, derivatives={self.derivatives!r}, store=...)"
+        )
+
+    def identity(self) -> dict[str, str]:
+        """What makes two sweeps the same, by the names of the arguments.
+
+        `make` counts by what it gives, at up to `CHUNK` points of the grid: its numbers to eleven
+        digits, which do not depend on the machine, and the friction laws of its oscillator by
+        their types, numbers and, if they are not this package's, source.
+        """
+        grid = self.grid
+        sample = np.unique(np.linspace(0, grid.runs - 1, CHUNK).astype(int))
+        rows = grid.rows(sample)
+        leaves, _ = jax.tree_util.tree_flatten_with_path(grid.example)
+        parameters = [f"{jax.tree_util.keystr(path)}={float(leaf)!r}" for path, leaf in leaves]
+        told = {f"axis {name}": _hash(axis.tobytes()) for name, axis in grid.axes.items()}
+        told["axes"] = ", ".join(f"{name} ({axis.size})" for name, axis in grid.axes.items())
+        told["y0"] = repr(tuple(grid.y0.values()))
+        told["oscillator"] = ", ".join(parameters)
+        told["make"] = _hash(" ".join(f"{x:.10e}" for x in rows.ravel().tolist()).encode())
+        for i, belt in enumerate(grid.example.belts):
+            law = type(belt.friction)
+            shown = _plain(repr(belt.friction))
+            told[f"the law of belt {i}"] = f"{shown} of {law.__qualname__}, {_source(law)}"
+        told |= {name: repr(value) for name, value in self.numbers.items()}
+        told["observe"] = repr(self.observe)
+        if not isinstance(self.observe, str):
+            kind = type(self.observe)
+            settings = {k: _plain(repr(v)) for k, v in sorted(vars(self.observe).items())}
+            told["observe"] = f"{kind.__qualname__} {_source(kind)} {settings}"
+        told["derivatives"] = repr(self.derivatives)
+        return told
+
+
+def _observer(observe: Any) -> Observer:
+    if isinstance(observe, Observer):
+        return observe
+    if isinstance(observe, str):
+        require(observe in NAMED, "observe", '"final", "attractor" or a reducer', repr(observe))
+        return NAMED[observe]()
+    methods = ("init", "update", "finish")
+    fits = all(callable(getattr(observe, name, None)) for name in methods)
+    require(fits, "observe", '"final", "attractor" or an object with init, update, finish', observe)
+    return Reduce(observe)
+
+
+def _name_of_function(make: Callable) -> str:
+    return getattr(make, "__qualname__", None) or _plain(repr(make))
+
+
+def _plain(text: str) -> str:
+    """A repr without addresses in memory."""
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def _source(kind: type) -> str:
+    """A class by its text, or, where there is none, by its compiled functions."""
+    if kind.__module__.partition(".")[0] == __name__.partition(".")[0]:
+        return "jaxbelt"
+    found = []
+    for one in kind.__mro__:
+        if one.__module__.partition(".")[0] in ("builtins", "abc", "equinox", "jaxbelt"):
+            continue
+        try:
+            found.append(inspect.getsource(one))
+        except (OSError, TypeError):
+            functions = sorted(inspect.getmembers(one, inspect.isfunction))
+            found += [f"{name} {_bytecode(function.__code__)}" for name, function in functions]
+    return _hash("\n".join(found).encode())
+
+
+def _bytecode(code: CodeType) -> str:
+    """What a compiled function does, without where it came from."""
+    constants = [_bytecode(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
+    return f"{code.co_code.hex()} {code.co_names} {constants}"

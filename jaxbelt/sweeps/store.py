@@ -1,0 +1,417 @@
+"""Stores: the results of a sweep in a Zarr group that grows block by block and survives its writer.
+
+A store is a folder that `xarray.open_zarr` opens: variables over the axes, with units and long
+names. One block of runs is one chunk of every variable, so no two writers meet in a chunk, and what
+a block holds does not depend on when or where it was done. Beside the variables the group `ledger`
+holds
+
+- `blocks`, a row a block: its state (0 to do, 1 done), a checksum of its data, how often and in how
+  many seconds it was done. The row is written after the data, in a write of its own, so that no
+  block is called done that is not, whenever the writer dies;
+- the codes of categories that are numbered when all runs are done, see `lanes.Variable.name_of`.
+
+The attributes of the group say what was asked; a sweep that asks anything else is refused.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import threading
+import time
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..checks import require
+from .datasets import NUMBERED, renumber
+from .grid import Blocks, Grid
+from .question import Question
+
+if TYPE_CHECKING:
+    import xarray
+
+#: Version of the layout described above.
+SCHEMA = 1
+#: Runs in a block: enough that writing them takes little beside doing them, and few enough that not
+#: much is lost with one.
+BLOCK_RUNS = 2**17
+#: The columns of the ledger, and the states of a block.
+STATE, CHECKSUM, TIMES_DONE, SECONDS = range(4)
+TO_DO, DONE = 0, 1
+
+
+def blocks_of(grid: Grid) -> Blocks:
+    """The blocks of a grid in a store."""
+    return Blocks(grid.shape, BLOCK_RUNS)
+
+
+@dataclass
+class _Waiting:
+    """A block of which some runs are done: its variables, and how many runs are left."""
+
+    parts: dict[str, np.ndarray]
+    left: int
+
+
+class Store:
+    """The results of a sweep in a store that is open for writing, or finished."""
+
+    @classmethod
+    @contextmanager
+    def opened(cls, path: Path, question: Question) -> "Iterator[Store]":
+        """The store of a sweep, made where there is none, and locked unless it is finished."""
+        if _is_finished(path):
+            yield cls(path, question)
+            return
+        _check_folder(path)
+        with _locked(path):
+            if not (path / "zarr.json").exists():
+                _create(path, question)
+            yield cls(path, question)
+
+    def __init__(self, path: Path, question: Question):
+        self.path, self.question, self.table = path, question, question.table
+        self.root = _open(path)
+        self.blocks = blocks_of(question.grid)
+        _check_question(path, self.root, _identity(question, self.blocks))
+        self.ledger = self.root["ledger"]
+        self.rows = _ledger_rows(path, self.ledger)
+        self.finished = bool(self.ledger.attrs["finished"])
+        self.to_do = np.flatnonzero(self.rows[:, STATE] != DONE).tolist()
+        self.arrays = {name: _array(self.root, name) for name in self.ledger.attrs["variables"]}
+        self.waiting: dict[int, _Waiting] = {}
+        self.lock = threading.Lock()
+        self.began = time.monotonic()
+
+    def put(self, block: int, positions: np.ndarray, results: np.ndarray) -> None:
+        """Take results of runs; those of a block are written when they are complete."""
+        parts, size = self.table.parts(results), self.blocks.size(block)
+        with self.lock:
+            if block not in self.waiting:
+                empty = {name: np.empty((size, *p.shape[1:]), p.dtype) for name, p in parts.items()}
+                self.waiting[block] = _Waiting(empty, size)
+            waiting = self.waiting[block]
+            for name, part in parts.items():
+                waiting.parts[name][positions] = part
+            waiting.left -= len(positions)
+            if waiting.left:
+                return
+            del self.waiting[block]
+        self._write(block, waiting.parts)
+
+    def _write(self, block: int, parts: dict[str, np.ndarray]) -> None:
+        place, extent = self.blocks.slices(block), self.blocks.extent(block)
+        for name, array in self.arrays.items():
+            parts[name] = parts[name].reshape(*extent, *parts[name].shape[1:])
+            array[place] = parts[name]
+        attempts = self.rows[block, TIMES_DONE] + 1
+        seconds, self.began = time.monotonic() - self.began, time.monotonic()
+        row = np.array([DONE, _checksum(parts[name] for name in self.arrays), attempts, seconds])
+        self.ledger["blocks"][block] = row
+        self.rows[block] = row
+
+    def done(self) -> int:
+        """How many runs are in the store."""
+        done = np.flatnonzero(self.rows[:, STATE] == DONE)
+        return sum(self.blocks.size(block) for block in done.tolist())
+
+    def interrupted(self) -> str:
+        """What becomes of the results of an interrupted sweep."""
+        done = f"{self.done():,} of {self.question.grid.runs:,} runs"
+        return f"interrupted: {done} are in {self.path}; the same call goes on from there"
+
+    def of_runs(self, runs: np.ndarray) -> dict[str, np.ndarray]:
+        """The kernel's results for some runs."""
+        places = np.unravel_index(runs, self.question.grid.shape)
+        box = [np.asarray(i) // k for i, k in zip(places, self.blocks.box, strict=True)]
+        blocks = np.ravel_multi_index(box, self.blocks.counts)
+        found = {}
+        for name in self.table.layout:
+            array = self.arrays[name]
+            found[name] = np.empty((len(runs), *array.shape[len(places) :]), array.dtype)
+            for block in np.unique(blocks).tolist():
+                here, part = blocks == block, self.blocks.slices(block)
+                inside = tuple(i[here] - s.start for i, s in zip(places, part, strict=True))
+                found[name][here] = np.asarray(array[part])[inside]
+        return found
+
+    def finish(self) -> None:
+        """Number the categories whose codes are all known, and call the store finished."""
+        if self.finished:
+            return
+        for name in self.table.numbered():
+            codes: set[int] = set()
+            for block in range(len(self.blocks)):
+                codes |= set(np.unique(self.arrays[name][self.blocks.slices(block)]).tolist())
+            numbers, named = self.table.numbering(name, sorted(codes))
+            shown = _array(self.root, name, numbered=True)
+            for block in range(len(self.blocks)):
+                place = self.blocks.slices(block)
+                shown[place] = renumber(np.asarray(self.arrays[name][place]), numbers)
+            shown.attrs.update(_as_json(named))
+            self.ledger.attrs[f"{name}_numbers"] = {str(k): v for k, v in numbers.items()}
+        _consolidate(self.path)
+        self.ledger.attrs["finished"] = self.finished = True
+
+    def tell(self, attributes: dict[str, Any]) -> None:
+        """Add attributes to the dataset."""
+        self.root.attrs.update(attributes)
+        _consolidate(self.path)
+
+    def dataset(self) -> "xarray.Dataset":
+        """The dataset in the store, which is read where it is used."""
+        import xarray
+
+        return xarray.open_zarr(self.path, chunks=None)
+
+
+# --- opening and creating -------------------------------------------------------------------------
+
+
+def _open(path: Path, mode: Any = "r+") -> Any:
+    """The group of a store, checked for its schema."""
+    import zarr
+
+    expected = "a folder that is empty or holds the store of a sweep"
+    try:
+        root = zarr.open_group(path, mode=mode, use_consolidated=False)
+        schema = root.attrs["jaxbelt_schema"]
+    except Exception as error:
+        raise ValueError(f"store must be {expected}, got {path}: {error}") from None
+    require(
+        schema == SCHEMA,
+        "store",
+        f"of schema {SCHEMA}, which this version of jaxbelt reads and writes",
+        f"schema {schema} in {path}; xarray.open_zarr opens it, and its sweep needs a new store",
+    )
+    return root
+
+
+def _consolidate(path: Path) -> None:
+    """Copy all metadata to one place, where xarray looks for them first."""
+    import zarr
+
+    with warnings.catch_warnings():
+        # That this is not yet in the specification; others then read the metadata one by one.
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(path)
+
+
+def _array(root: Any, name: str, numbered: bool = False) -> Any:
+    """The array of a variable; of one that is numbered, that of its codes or its numbers."""
+    codes = f"{name}_codes"
+    array = root["ledger"][codes] if codes in root["ledger"] and not numbered else root[name]
+    # A chunk that is all NaN, say, has to be there to be known as done.
+    return array.with_config({"write_empty_chunks": True})
+
+
+def _is_finished(path: Path) -> bool:
+    return (path / "zarr.json").exists() and bool(_open(path, "r")["ledger"].attrs["finished"])
+
+
+def _check_folder(path: Path) -> None:
+    """Raise unless a store can be written there."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and not (path / "zarr.json").exists():
+            fits = path.is_dir() and not any(path.iterdir())
+            require(fits, "store", "an empty folder or the store of this very sweep", f"{path}")
+    except OSError as error:
+        message = f"store cannot be written: {error.strerror}"
+        raise OSError(error.errno, message, str(path)) from None
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise PermissionError(13, "store cannot be written", str(path))
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Keep other sweeps off the store, on this machine and on others that see its folder."""
+    import filelock
+
+    lock = filelock.FileLock(path.with_name(f".{path.name}.lock"), timeout=0)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        raise BlockingIOError(
+            f"store {path} is being written by another sweep; wait for it, or use another store"
+        ) from None
+    try:
+        for left in path.rglob("*.partial"):  # of a writer that died
+            left.unlink()
+        yield
+    finally:
+        lock.release()
+
+
+def _create(path: Path, question: Question) -> None:
+    """An empty store, which appears in its place when it is complete."""
+    import xarray
+    import zarr
+
+    table, grid = question.table, question.grid
+    blocks = blocks_of(grid)
+    identity = _identity(question, blocks)
+    attributes = question.attributes() | {
+        "jaxbelt_schema": SCHEMA,
+        "jaxbelt_question": json.dumps(identity),
+        "jaxbelt_hash": hashlib.sha256(json.dumps(identity).encode()).hexdigest(),
+        "jaxbelt_call": question.call(),
+    }
+    new = path.with_name(f".{path.name}.new")
+    shutil.rmtree(new, ignore_errors=True)
+    empty = xarray.Dataset(coords=table.coordinates(), attrs=attributes)
+    empty.to_zarr(new, mode="w", zarr_format=3, consolidated=False)
+    root = zarr.open_group(new, mode="r+", use_consolidated=False)
+    ledger = root.create_group("ledger")
+    numbered = table.numbered()
+
+    def allocate(group: Any, name: str, dtype: str, fill: Any, **options: Any) -> None:
+        extra = table.shapes[name.removesuffix("_codes")]
+        options |= {"shape": (*grid.shape, *extra), "chunks": (*blocks.box, *extra)}
+        group.create_array(name, dtype=dtype, fill_value=fill, **options)
+
+    for name in table.shapes:
+        told = {"dimension_names": table.dims(name), "attributes": _as_json(table.attributes(name))}
+        dtype, fill = table.variable(name).dtype, table.empty(name)
+        if name in numbered:
+            allocate(ledger, f"{name}_codes", dtype, fill)
+            dtype, fill = NUMBERED, -1
+        fill = np.nan if np.issubdtype(np.dtype(dtype), np.floating) else fill
+        allocate(root, name, dtype, fill, **told)
+    # A chunk a row, for two threads may write theirs at once.
+    shape = (len(blocks), 4)
+    ledger.create_array("blocks", shape=shape, chunks=(1, 4), dtype="float64", fill_value=0)
+    ledger.attrs.update(
+        {
+            "variables": list(table.shapes),
+            "numbered": numbered,
+            "shape": grid.shape,
+            "block": BLOCK_RUNS,
+            "finished": False,
+        }
+    )
+    _consolidate(new)
+    os.replace(new, path)
+
+
+def _ledger_rows(path: Path, ledger: Any) -> np.ndarray:
+    """The ledger's rows of all blocks."""
+    try:
+        return np.array(ledger["blocks"][:])
+    except Exception as error:  # whatever a codec makes of bytes that are not its own
+        raise ValueError(
+            f"store must have a ledger that can be read, got a harmed one in {path} ({error}); "
+            f"`jaxbelt verify {path} --repair` finds what is left of it"
+        ) from None
+
+
+def _identity(question: Question, blocks: Blocks) -> dict[str, str]:
+    return question.identity() | {"the size of a block": repr(blocks.box)}
+
+
+def _check_question(path: Path, root: Any, here: dict[str, str]) -> None:
+    """Raise unless the store is of this very sweep, and name what differs."""
+    there = json.loads(root.attrs["jaxbelt_question"])
+    for name in dict.fromkeys([*there, *here]):
+        if here.get(name) != there.get(name):
+            short = max(len(str(part.get(name))) for part in (here, there)) < 80
+            told = f": {there.get(name)} there, {here.get(name)} here" if short else ""
+            raise ValueError(
+                f"store must be an empty folder or the store of this very sweep, got that of "
+                f"another one in {path}, which differs in {name}{told}"
+            )
+
+
+def _as_json(attributes: dict[str, Any]) -> dict[str, Any]:
+    """Attributes as JSON has them."""
+    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in attributes.items()}
+
+
+def _checksum(parts: Any) -> float:
+    """CRC-32 of the bytes of a block's variables, one after another."""
+    total = 0
+    for part in parts:
+        total = zlib.crc32(np.asarray(part).tobytes(), total)
+    return float(total)
+
+
+# --- verifying ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What `verify` found: numbers of blocks that are done and right, to do, and bad.
+
+    finished: whether all blocks are right and the categories numbered.
+    """
+
+    done: tuple[int, ...]
+    to_do: tuple[int, ...]
+    bad: tuple[int, ...]
+    finished: bool
+
+    def __repr__(self) -> str:
+        bad = f" ({', '.join(map(str, self.bad[:10]))}{', ...' * (len(self.bad) > 10)})"
+        return (
+            f"Verified({len(self.done)} blocks right, {len(self.to_do)} to do, {len(self.bad)} bad"
+            f"{bad if self.bad else ''}; {'finished' if self.finished else 'not finished'})"
+        )
+
+
+def verify(path: str | Path, repair: bool = False) -> Verified:
+    """Whether the data in a store are what was written: checksums of all blocks, computed again.
+
+    path: of a store that `sweep` wrote. repair: mark bad blocks as to do, so that the call that
+    made the store does them again. `ValueError` if there is no store that this version knows,
+    `OSError` if a sweep is writing it and `repair` is wanted.
+    """
+    path = Path(path)
+    root = _open(path, "r")
+    if not repair:
+        return _verified(root)
+    with _locked(path):
+        root = _open(path)
+        found = _verified(root)
+        for block in found.bad:
+            root["ledger"]["blocks"][block] = np.zeros(4)
+        if not found.finished:
+            root["ledger"].attrs["finished"] = False
+    return found
+
+
+def _verified(root: Any) -> Verified:
+    ledger = root["ledger"]
+    blocks = Blocks(tuple(ledger.attrs["shape"]), ledger.attrs["block"])
+    arrays = [_array(root, name) for name in ledger.attrs["variables"]]
+    states: dict[str, list[int]] = {"done": [], "to do": [], "bad": []}
+    finished = bool(ledger.attrs["finished"])
+    for block in range(len(blocks)):
+        state = _state(root, ledger, arrays, block, blocks.slices(block), finished)
+        states[state].append(block)
+    done, to_do, bad = map(tuple, states.values())
+    return Verified(done, to_do, bad, finished and len(done) == len(blocks))
+
+
+def _state(root, ledger, arrays, block: int, place: tuple[slice, ...], finished: bool) -> str:
+    """Of a block: done, to do or bad."""
+    try:
+        row = np.asarray(ledger["blocks"][block])
+        if row[STATE] == TO_DO and not finished:
+            return "to do"
+        parts = [np.asarray(array[place]) for array in arrays]
+        right = row[STATE] == DONE and _checksum(parts) == row[CHECKSUM]
+        for name in ledger.attrs["numbered"] if finished else ():
+            numbers = {int(k): v for k, v in ledger.attrs[f"{name}_numbers"].items()}
+            codes = np.asarray(_array(root, name)[place])
+            shown = np.asarray(_array(root, name, numbered=True)[place])
+            right = right and np.array_equal(renumber(codes, numbers), shown)
+        return "done" if right else "bad"
+    except Exception:  # whatever a codec makes of bytes that are not its own
+        return "bad"

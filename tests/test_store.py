@@ -1,0 +1,313 @@
+"""Stores: what is resumed, what is refused, and that kills, full disks and lies do no harm."""
+
+import errno
+import json
+import sys
+
+import jax.numpy as jnp
+import kills
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+
+import jaxbelt as jb
+from jaxbelt.sweeps import store as stores
+from jaxbelt.sweeps.grid import Blocks
+from jaxbelt.sweeps.store import CHECKSUM
+
+AXES = {"nu0": np.linspace(-0.6, 0.55, 5), "nu1": np.array([0.35, -0.2, 0.1])}
+OPTIONS = dict(observe="attractor", progress=False)
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch):
+    monkeypatch.setattr(stores, "BLOCK_RUNS", 4)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return jb.sweep(jb.presets.class_b, AXES, **OPTIONS)
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A finished store of five blocks."""
+    path = tmp_path / "results.zarr"
+    assert jb.sweep(jb.presets.class_b, AXES, store=path, **OPTIONS).nu0.size == 5
+    return path
+
+
+def again(path, **options):
+    return jb.sweep(jb.presets.class_b, AXES, **(OPTIONS | options), store=path)
+
+
+def ledger(path):
+    return zarr.open_group(path, mode="r+", use_consolidated=False)["ledger"]
+
+
+def chunk(path, name, block):
+    """The file of a block of a variable; a block is a row of the grid here."""
+    return path / name / "c" / str(block) / "0"
+
+
+def undone(path, *blocks):
+    """Make the store as if these blocks had never been done."""
+    for block in blocks:
+        ledger(path)["blocks"][block] = np.zeros(4)
+    ledger(path).attrs["finished"] = False
+
+
+@pytest.mark.parametrize(
+    "shape, size, box",
+    [
+        ((5, 3), 4, (1, 3)),
+        ((5, 3), 6, (2, 3)),
+        ((5, 3), 2, (1, 2)),
+        ((5, 3), 100, (5, 3)),
+        ((10,), 4, (4,)),
+        ((10,), 6, (5,)),
+        ((4, 3, 2), 5, (1, 2, 2)),
+        ((7,), 1, (1,)),
+    ],
+)
+def test_blocks_are_boxes_that_hold_every_run_once(shape, size, box):
+    blocks = Blocks(shape, size)
+    assert blocks.box == box and np.prod(box) <= size
+    runs = [blocks.runs(b, np.arange(blocks.size(b))) for b in range(len(blocks))]
+    assert sorted(np.concatenate(runs).tolist()) == list(range(int(np.prod(shape))))
+    grid = np.arange(np.prod(shape)).reshape(shape)
+    for b, part in enumerate(runs):
+        assert np.array_equal(grid[blocks.slices(b)].ravel(), part)
+
+
+def test_a_store_is_what_the_sweep_gives(path, whole):
+    plain = xr.open_zarr(path)
+    assert plain.load().equals(whole)
+    for name, variable in whole.variables.items():
+        assert plain[name].dtype == variable.dtype and plain[name].dims == variable.dims
+        assert plain[name].attrs.keys() == variable.attrs.keys()
+    assert jb.decoded(plain).equals(jb.decoded(whole))
+    told = plain.attrs
+    assert (
+        told["jaxbelt_schema"] == stores.SCHEMA and "jaxbelt.sweep(class_b" in told["jaxbelt_call"]
+    )
+    assert " at 0x" not in json.dumps({k: str(v) for k, v in told.items()})
+    assert jb.verify(path) == stores.Verified((0, 1, 2, 3, 4), (), (), True)
+
+
+@pytest.mark.parametrize("observe", ["final", "attractor"])
+def test_derivatives_and_vectors_are_kept(tmp_path, observe):
+    options = dict(t1=20.0, observe=observe, derivatives=("nu0",), progress=False)
+    expected = jb.sweep(jb.presets.class_b, AXES, **options)
+    found = jb.sweep(jb.presets.class_b, AXES, **options, store=tmp_path / "a.zarr")
+    assert found.equals(expected) and jb.verify(tmp_path / "a.zarr").finished
+
+
+def test_a_finished_store_is_returned_at_once(path, whole, monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("nothing is to be run")
+
+    monkeypatch.setattr("jaxbelt.sweeps.sweep.run", never)
+    assert again(path).equals(whole)
+
+
+def test_only_what_is_not_done_is_done(path, whole):
+    undone(path, 1, 3)
+    mark = zarr.open_group(path, mode="r+", use_consolidated=False)["x1_min"]
+    mark[:] = 7.0
+    found = again(path)
+    assert np.all(found.x1_min[[0, 2, 4]] == 7.0)
+    assert np.array_equal(found.x1_min[[1, 3]], whole.x1_min[[1, 3]])
+    assert ledger(path)["blocks"][:, 2].tolist() == [1, 1, 1, 1, 1]
+    assert jb.verify(path).bad == (0, 2, 4)
+    assert jb.verify(path, repair=True).bad == (0, 2, 4)
+    assert jb.verify(path).to_do == (0, 2, 4) and not jb.verify(path).finished
+    assert again(path).equals(whole) and jb.verify(path).finished
+
+
+def test_an_audit_of_a_store(path):
+    found = again(path, audit=1.0)
+    assert (found.attrs["audited"], found.attrs["audit_differed"]) == (15, 0)
+    assert xr.open_zarr(path).attrs["audited"] == 15
+
+
+class Constant(jb.AbstractFriction):
+    """A law of a user's own."""
+
+    static: jnp.ndarray
+
+    def mu(self, speed):
+        return self.static + 0 * speed
+
+
+class Count:
+    """How many events there were, in units of a number."""
+
+    def __init__(self, unit):
+        self.unit = unit
+
+    def init(self, osc, x1, x2):
+        return jnp.zeros(())
+
+    def update(self, state, event):
+        return state + 1
+
+    def finish(self, state, end):
+        return {"count": state / self.unit}
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(rtol=1e-7), r"which differs in rtol: 1e-08 there, 1e-07 here"),
+        (dict(t1=10.0), r"which differs in t1: 3000.0 there, 10.0 here"),
+        (dict(y0=(2.0, 0.0)), r"which differs in y0: \(3.0, 0.0\) there, \(2.0, 0.0\) here"),
+        (dict(observe="final", t1=3000.0), r"which differs in observe: 'attractor' there, 'final'"),
+        (dict(axes={**AXES, "nu1": AXES["nu1"] + 1e-9}), r"which differs in axis nu1"),
+        (dict(axes={**AXES, "x1": [1.0]}), r"which differs in axes"),
+        (dict(make=lambda nu0, nu1: jb.presets.class_b(nu0, nu1 * 2)), r"which differs in "),
+        (dict(derivatives="nu0"), r"which differs in derivatives"),
+    ],
+)
+def test_a_store_of_another_sweep_is_refused_by_what_differs(path, change, message):
+    asked = dict(make=jb.presets.class_b, axes=AXES, **OPTIONS) | change
+    with pytest.raises(ValueError, match="store must be .* " + message):
+        jb.sweep(asked.pop("make"), asked.pop("axes"), **asked, store=path)
+    assert jb.verify(path).finished
+
+
+def test_a_law_and_a_reducer_count_by_type_numbers_and_source(tmp_path):
+    def make(nu, law=Constant, mu=0.5):
+        return jb.Oscillator(0.1, (jb.Belt(nu, law(jnp.asarray(mu))),))
+
+    def sweep(make=make, unit=1.0, kind=Count):
+        axes = {"nu": [0.1, 0.2]}
+        return jb.sweep(make, axes, t1=5.0, observe=kind(unit), store=tmp_path / "a.zarr")
+
+    class Other(Constant):
+        def mu(self, speed):
+            return self.static - 0.1 * speed
+
+    class Twice(Count):
+        def update(self, state, event):
+            return state + 2
+
+    sweep()
+    for change, word in (
+        (dict(make=lambda nu: make(nu, law=Other)), "the law of belt 0"),
+        (dict(make=lambda nu: make(nu, mu=0.6)), "oscillator"),
+        (dict(unit=2.0), "observe"),
+        (dict(kind=Twice), "observe"),
+    ):
+        with pytest.raises(ValueError, match=f"which differs in {word}"):
+            sweep(**change)
+    assert sweep(make=lambda nu: make(nu)).equals(sweep())
+
+
+def test_places_that_cannot_hold_a_store_are_told_before_the_computing(tmp_path, monkeypatch):
+    monkeypatch.delattr("jaxbelt.sweeps.sweep.run")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    for name in ("full", "file"):
+        with pytest.raises(ValueError, match="store must be an empty folder or the store of this"):
+            again(tmp_path / name)
+    with pytest.raises(OSError, match="store cannot be written"):
+        again(tmp_path / "file" / "a.zarr")
+    assert (tmp_path / "full" / "thesis.tex").read_text() == "mine"
+
+
+# --- what can go wrong ----------------------------------------------------------------------------
+
+
+def test_what_was_harmed_is_found_and_repaired(path, whole):
+    flipped, cut = chunk(path, "x1_max", 1), chunk(path, "period", 2)
+    data = bytearray(flipped.read_bytes())
+    data[len(data) // 2] ^= 1
+    flipped.write_bytes(data)
+    cut.write_bytes(cut.read_bytes()[:-3])
+    chunk(path, "status", 3).unlink()
+    row = ledger(path)["blocks"][4]
+    row[CHECKSUM] += 1
+    ledger(path)["blocks"][4] = row
+    assert jb.verify(path, repair=True).bad == (1, 2, 3, 4)
+    assert again(path).equals(whole) and jb.verify(path).finished
+
+
+def test_a_ledger_that_lies_is_found_out(path, whole):
+    undone(path, 0)
+    rows = ledger(path)["blocks"]
+    rows[0] = [1, 12345, 1, 0.5]  # done, it says
+    chunk(path, "kind", 1).unlink()
+    assert jb.verify(path).bad == (0, 1)
+    (path / "ledger" / "blocks" / "c" / "2" / "0").write_bytes(b"?")
+    with pytest.raises(ValueError, match="jaxbelt verify"):
+        again(path)
+    assert jb.verify(path, repair=True).bad == (0, 1, 2)
+    assert again(path).equals(whole)
+    (path / "signature" / "c" / "3" / "0").unlink()
+    assert jb.verify(path).bad == (3,)
+
+
+def test_stores_of_other_schemas_and_wrecks_are_refused(path):
+    root = zarr.open_group(path, mode="r+", use_consolidated=False)
+    root.attrs["jaxbelt_schema"] = 0
+    for call in (again, jb.verify):
+        with pytest.raises(ValueError, match=r"store must be of schema 1, .* got schema 0"):
+            call(path)
+    (path / "zarr.json").write_text("{")
+    for call in (again, jb.verify):
+        with pytest.raises(ValueError, match="store must be a folder that is empty or holds"):
+            call(path)
+
+
+def test_of_two_sweeps_at_once_the_second_is_refused(path, whole):
+    undone(path, 2)
+    with stores._locked(path):
+        for call in (again, lambda path: jb.verify(path, repair=True)):
+            with pytest.raises(BlockingIOError, match="is being written by another sweep"):
+                call(path)
+    assert again(path).equals(whole)
+
+
+def test_a_full_disk_harms_nothing(tmp_path, whole, monkeypatch):
+    local = sys.modules["zarr.storage._local"]
+    path, written, put = tmp_path / "a.zarr", [], local._put
+
+    def full(target, *args, **options):
+        if "/c/" in target.as_posix():
+            if len(written) >= 30:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            written.append(target)
+        return put(target, *args, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(local, "_put", full)
+        with pytest.raises(OSError, match=r"No space left on device; interrupted: .* of 15 runs"):
+            again(path)
+    found = jb.verify(path)
+    assert not found.bad and 0 < len(found.to_do) < 5
+    assert again(path).equals(whole)
+
+
+def test_an_interrupt_keeps_what_is_done(tmp_path, whole, monkeypatch):
+    path, put = tmp_path / "a.zarr", stores.Store.put
+
+    def interrupted(self, *args):
+        put(self, *args)
+        if self.done() >= 6:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stores.Store, "put", interrupted)
+        with pytest.raises(KeyboardInterrupt, match=r"\d+ of 15 runs are in .*a.zarr; the"):
+            again(path)
+    assert len(jb.verify(path).done) >= 2
+    assert again(path).equals(whole)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes of POSIX")
+def test_kills_at_random_moments_do_no_harm(tmp_path):
+    told = kills.campaign(tmp_path, "final", kills=20, seed=1)
+    assert told["blocks seen done"] > 0
