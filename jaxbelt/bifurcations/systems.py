@@ -26,7 +26,7 @@ from ..cycles.shooting import Chain, Loop, jacobian, meshed, residual, residual_
 from ..model.oscillator import Oscillator
 from ..model.parameters import vary
 from ..motion.arcs import Ends
-from ..numerics.newton import newton
+from ..numerics.newton import Equations, newton, solve
 from ..results import Status
 
 #: Unknowns of a cycle count this much in the length of a step along a curve, beside the two
@@ -261,32 +261,24 @@ def contact_tests(name: str, nearest: Array, watched: Array) -> Tests:
 # --- Newton's method ------------------------------------------------------------------------------
 
 
-@eqx.filter_custom_jvp
+class _InParameter(Equations):
+    """The equations of a system in its own unknowns and one parameter."""
+
+    system: CycleSystem
+
+    def residual(self, given, z):
+        (osc, index), (own, p) = given, z
+        return self.system.residual(vary(osc, index, p), own)
+
+    def linearized(self, given, z):
+        osc, index = given
+        return self.system.linearized(functools.partial(vary, osc, index), *z)
+
+
 def solve_system(osc, index, system, z0, p0):
     """Unknowns, the parameter, the steps of Newton's method and the matrix of the last one."""
-
-    def linearized(unknowns):
-        return system.linearized(functools.partial(vary, osc, index), *unknowns)
-
-    solved = newton(linearized, (z0, p0))
+    solved = solve(_InParameter(system), (osc, index), (z0, p0))
     return (*solved.z, solved.lengths, solved.matrix)
-
-
-@solve_system.def_jvp
-def _(primals, tangents):
-    osc, index, system, z0, p0 = primals
-    z, p, steps, matrix = solve_system(osc, index, system, z0, p0)
-    moved, fixed = eqx.partition(
-        osc, jax.tree.map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
-    )
-    _, shift = jax.jvp(
-        lambda moved: system.residual(vary(eqx.combine(moved, fixed), index, p), z),
-        (moved,),
-        (tangents[0],),
-    )
-    _, slopes = system.linearized(functools.partial(vary, osc, index), z, p)
-    change = jnp.linalg.solve(slopes, -shift)
-    return (z, p, steps, matrix), (change[:-1].reshape(z.shape), change[-1:], None, None)
 
 
 def accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):

@@ -27,6 +27,8 @@ STEPS = 30
 DISTURBED = 6
 #: Statuses of runs that came to an end.
 ORDINARY = (engine.OK, engine.STUCK_FOREVER, engine.PSEUDO_FOCUS)
+#: The sweep's status of a run that takes too many steps.
+GAVE_UP = 4
 GOOD = ("same", "tolerance", "corner")
 
 
@@ -97,6 +99,8 @@ def difference(case, told, mine, tol):
     if told.status != mine.status and focus in (told.status, mine.status):
         # Both may be right: one tells sooner than the other that a run converges.
         return _focus_difference(case, told, mine)
+    if told.status == GAVE_UP and mine.status == engine.BUDGET:
+        return None  # too many events for both, and both say so
     if told.status != mine.status:
         return f"status {told.status}, not {mine.status}"
     if mine.status == engine.NOT_FINITE:
