@@ -59,7 +59,7 @@ def words_of(values: np.ndarray, attributes: dict[str, Any]) -> np.ndarray:
     words = np.array(["", *attributes["flag_meanings"].split()])
     order = np.argsort(numbers)
     place = order[np.searchsorted(numbers, values, sorter=order).clip(max=len(order) - 1)]
-    return words[np.where(numbers[place] == values, place + 1, 0)]
+    return np.asarray(words[np.where(numbers[place] == values, place + 1, 0)])
 
 
 def flags(meanings: Mapping[int, str], dtype: str) -> dict[str, Any]:

@@ -155,6 +155,8 @@ class Blocks:
 
     def runs(self, block: int, positions: np.ndarray) -> np.ndarray:
         """Numbers in the grid of the runs at some positions in a block."""
+        if len(self) == 1:
+            return positions
         inside = np.unravel_index(positions, self.extent(block))
         parts = zip(inside, self.slices(block), strict=True)
         places = tuple(i + part.start for i, part in parts)

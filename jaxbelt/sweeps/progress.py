@@ -57,7 +57,8 @@ class SweepProgress:
             # The first results may come long after the first runs began: they give no rate.
             known = 0 if self.began is None else self.statuses.total() + len(statuses)
             self.began = self.began or now
-            self.statuses.update(statuses.astype(int).tolist())
+            values, counts = np.unique(statuses.astype(int), return_counts=True)
+            self.statuses.update(dict(zip(values.tolist(), counts.tolist(), strict=True)))
             others = {Status(k).name.lower(): n for k, n in self.statuses.items() if k != Status.OK}
         told = f", {known / (now - self.began):,.0f} runs/s" if known and now > self.began else ""
         told += "".join(f", {count:,} {name}" for name, count in sorted(others.items()))
@@ -67,4 +68,5 @@ class SweepProgress:
         self.patience.cancel()
         with self.lock:
             self.ended = True
-            self.bar.stop()
+            if self.bar.live.is_started:
+                self.bar.stop()

@@ -117,6 +117,9 @@ def _do_runs(question: Question, results: Memory | Store, progress: bool | None)
 
     def parts(numbers: np.ndarray):
         """Block by block: which of the numbers are in it, and their positions there."""
+        if len(to_do) == 1:
+            yield to_do[0], slice(None), numbers
+            return
         places = np.searchsorted(ends, numbers, side="right")
         for i in np.unique(places):
             here = places == i

@@ -35,7 +35,7 @@ WIDTH = {"cpu": 128}
 #: Seconds in which an interrupt is to be heard; a call of the kernel takes half of that or less.
 PATIENCE = 0.5
 #: Passes of the first call, before it is known how long one takes: about a seventh of a second on
-#: the CPU; where there are more lanes, a pass takes longer.
+#: the CPU; with derivatives, or where there are more lanes, a pass takes longer.
 FIRST_PASSES = {"cpu": 2000}
 
 
@@ -94,6 +94,7 @@ def run(
         put,
         (1 + derivatives, columns) if derivatives else (columns,),
         _Chunks(runs, workers()),
+        FIRST_PASSES.get(jax.default_backend(), 100) // (1 + derivatives),
     )
     devices = jax.local_devices()
     # Compiled once, before the threads that would each do it again, and like all else not on the
@@ -142,6 +143,7 @@ class _Team:
     put: Callable[[np.ndarray, np.ndarray], None]
     shape: tuple[int, ...]
     chunks: _Chunks
+    first_passes: int
     stop: threading.Event = field(default_factory=threading.Event)
 
     def compile(self, device) -> None:
@@ -154,7 +156,7 @@ class _Team:
     def work(self, device) -> None:
         """Take chunks until there are no more, or until the team is stopped."""
         with _settings(device):
-            passes = FIRST_PASSES.get(jax.default_backend(), 100)
+            passes = self.first_passes
             stream, todo = self.idle(), self.chunks.take()
             while todo is not None and not self.stop.is_set():
                 (first, last), todo = todo, self.chunks.take()

@@ -163,15 +163,16 @@ class Label:
 
 def labels(cases, tol, **options):
     """Attractors by the sweep."""
-    found = jb.decoded(swept(cases, "attractor", rtol=tol, atol=tol, **options))
+    found = swept(cases, "attractor", rtol=tol, atol=tol, **options)
+    words = jb.decoded(found)
     out = []
     for i in range(len(cases)):
         row = found.isel(case=i)
         out.append(
             Label(
-                str(row.kind.values),
+                str(words.kind.values[i]),
                 float(row.period),
-                _loop(str(row.signature.values)),
+                _loop(str(words.signature.values[i])),
                 (float(row.x1_min), float(row.x1_max)),
                 (float(row.x2_min), float(row.x2_max)),
                 tuple(row.stick_duration.values.tolist()),
