@@ -3,8 +3,11 @@
 - `lanes`: the state of the runs that the kernel advances together, a lane each, and `Observer`,
   the base of what can be asked of them;
 - `step`: one Runge-Kutta step of all lanes; `events`: what follows where a step lands on a guard;
+  `marks`: states that later ones are compared with, to find what repeats;
 - `observers`, `attractor`: what can be asked: final states, a user's reducer, attractors;
 - `queue`: the compiled loop that fills lanes from a queue of runs; `threads`: a loop on each core;
+- `grid`, `question`: the points of a sweep, and everything that makes two sweeps the same;
+- `datasets`, `store`: the results, in memory and in a Zarr group; `progress`: a bar;
 - `sweep`: named axes in, a labelled dataset out; `audit`: runs again, without shortcuts;
 - `basins`: the same for starts of one oscillator.
 

@@ -24,7 +24,9 @@ class SweepProgress:
 
     def __init__(self, total: int, done: int, wanted: bool | None):
         console = Console(stderr=True)
-        self.shown = (console.is_terminal or console.is_jupyter) if wanted is None else wanted
+        self.bar: Progress | None = None
+        if not ((console.is_terminal or console.is_jupyter) if wanted is None else wanted):
+            return
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
@@ -41,17 +43,19 @@ class SweepProgress:
         self.began: float | None = None
 
     def __enter__(self) -> "SweepProgress":
-        if self.shown:
+        if self.bar is not None:
             self.patience.start()
         return self
 
     def _show(self) -> None:
         with self.lock:
-            if not self.ended:
+            if self.bar is not None and not self.ended:
                 self.bar.start()
 
     def advance(self, statuses: np.ndarray) -> None:
         """More runs are done, with these statuses."""
+        if self.bar is None:
+            return
         now = time.monotonic()
         with self.lock:
             # The first results may come long after the first runs began: they give no rate.
@@ -65,6 +69,8 @@ class SweepProgress:
         self.bar.update(self.task, advance=len(statuses), description="sweep", told=told)
 
     def __exit__(self, *_) -> None:
+        if self.bar is None:
+            return
         self.patience.cancel()
         with self.lock:
             self.ended = True
