@@ -228,5 +228,5 @@ def test_rest(rest: Rest):
     axes = {"x1": [rest.y[0]], "x2": [rest.y[1]]}
     found = jb.sweep(lambda: rest.osc, axes, t1=LONG, observe="attractor").squeeze()
     kind = "stuck" if rest.status == Status.STUCK_FOREVER else "equilibrium"
-    assert found.kind == kind and found.n_events == 0
+    assert jb.decoded(found).kind == kind and found.n_events == 0
     assert (found.x1_min, found.x1_max) == (rest.y[0], rest.y[0])

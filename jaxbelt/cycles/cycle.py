@@ -41,8 +41,6 @@ from .shooting import (
 
 #: The same where those leave a larger error than EXACT, as halved steps tell it.
 FINE_STEPS, EXACT = 32, 1e-11
-#: In transformations nothing is known that could tell whether the usual steps are enough.
-TRACED_STEPS = 12
 
 
 class Cycle(eqx.Module):
@@ -225,10 +223,8 @@ def _if_it_fits(status: Array, count: Array, size: int) -> Array:
 
 def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
     """The cycle that a loop nearly is; where it is known, with as many steps as it takes."""
-    if not is_concrete((osc, loop)):
-        return polish(osc, loop, status, steps=TRACED_STEPS)
     cycle = polish(osc, loop, status)
-    if int(status) == Status.OK:
+    if is_concrete(cycle) and int(status) == Status.OK:
         inexact = int(cycle.status) == Status.NO_CONVERGENCE or integration_error(cycle) > EXACT
         cycle = polish(osc, loop, status, steps=FINE_STEPS) if inexact else cycle
     return cycle

@@ -293,7 +293,7 @@ def _grazes(window: _Window, lanes: Lanes, new: _Attempt, path: _Interpolant, re
     grazes = (path.x2_extremum > high - doubt) | (path.x2_extremum < low + doubt)
     grazes = grazes & (inside * new.h > reach)
     if window.extrema is not None:
-        further = (path.extremum > lanes.upper) | (path.extremum < lanes.lower)
+        further = (path.x2_extremum > lanes.upper) | (path.x2_extremum < lanes.lower)
         grazes = grazes | (window.extrema & further & (inside > 1e-3))
     return grazes & path.has_extremum
 

@@ -312,6 +312,8 @@ def judge_period_derivative(case, told, label, direction):
     Near grazing it changes fast: the room is what moving the edge or boundary by `SHIFT` changes.
     """
     right = derivatives.of_period(case, label, direction)
+    if np.isnan(told):
+        return "no derivative, and a status that says so", right
     far = 0.0
     for by in (SHIFT, -SHIFT):
         last = case.oscillator.belts[-1]
