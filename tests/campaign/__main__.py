@@ -1,6 +1,7 @@
 """Campaigns: `python -m tests.campaign final|simulate|attractors|grazing|paths`, see `--help`."""
 
 import argparse
+import functools
 import json
 import os
 import sys
@@ -30,6 +31,10 @@ def main(arguments=None):
             told = _ask(package, batch, options)
             labels = options.what == "attractors" or options.by == "find_cycle"
             judge = compare.judge_label if labels else compare.judge
+            if labels and options.by != "find_cycle":
+                judge = functools.partial(
+                    judge, again=lambda case, tol: package.labels([case], tol)[0]
+                )
 
             def one(pair, judge=judge):
                 return judge(*pair, options.tol)

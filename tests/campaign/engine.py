@@ -936,7 +936,7 @@ def attractor(osc, y0, *, chunk=100.0, t_max=200_000.0, same=1e-9, at_rest=1e-6,
         if found:
             cycle = _cycle(osc, run, *found)
             if max(np.ptp(cycle.x1), np.ptp(cycle.x2)) > at_rest:
-                return replace(cycle, margin=margin)
+                return replace(cycle, margin=min(margin, run.margin))
         if run.status == BUDGET:
             patience -= 1
             if patience == 0:
