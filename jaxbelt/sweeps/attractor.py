@@ -180,9 +180,9 @@ class Attractor(Observer):
         amplitude = loop.x1_max - loop.x1_min
         left = way_left(change, loop.change)
         moved, close = jnp.abs(lanes.x1 - loop.mark.x1), amplitude * REPEATED
-        # Small moves of one sign after the other may be those of a slow spiral.
-        wavers = change * loop.change <= 0
-        converged = (moved * left <= close) | wavers & (moved < self.STANDS * tol * amplitude)
+        stands = moved < self.STANDS * tol * amplitude
+        # The moves of a slow spiral around a pseudo-focus shrink like the square of its size.
+        converged = (moved * left <= close) | stands & (amplitude > jnp.sqrt(tol))
         exact = self.EXACT * amplitude
         repeats = section & loop.mark.met_by(lanes, jnp.where(released, exact, close))
         repeats = repeats & (released | converged)
