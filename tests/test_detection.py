@@ -199,7 +199,7 @@ def test_two_cycles_with_one_sequence_of_events():
     assert [point.condition for point in points] == [jb.GrazingEdge(1), jb.Hopf(), jb.Hopf()]
     path.look([-0.06341])
     loops = [one.loop for one in path.cycles[-0.06341]]
-    assert len({loop_events(loop) for loop in turns}) == 1
+    assert len({loop_events(loop) for loop in loops}) == 1
     assert sorted(np.sum(loop.durations) for loop in loops) == pytest.approx(
         [9.9148027860, 10.9019400715], abs=1e-7
     )
