@@ -163,7 +163,10 @@ class Count:
         (dict(rtol=1e-7), r"which differs in rtol: 1e-08 there, 1e-07 here"),
         (dict(t1=10.0), r"which differs in t1: 30000.0 there, 10.0 here"),
         (dict(y0=(2.0, 0.0)), r"which differs in y0: \(3.0, 0.0\) there, \(2.0, 0.0\) here"),
-        (dict(observe="final", t1=30_000.0), r"which differs in observe: 'attractor' there, 'final'"),
+        (
+            dict(observe="final", t1=30_000.0),
+            r"which differs in observe: 'attractor' there, 'final'",
+        ),
         (dict(axes={**AXES, "nu1": AXES["nu1"] + 1e-9}), r"which differs in axis nu1"),
         (dict(axes={**AXES, "x1": [1.0]}), r"which differs in axes"),
         (dict(make=lambda nu0, nu1: jb.presets.class_b(nu0, nu1 * 2)), r"which differs in "),
