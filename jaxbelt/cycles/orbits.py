@@ -78,7 +78,7 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     stuck_since = jnp.any((rows > before) & jnp.any(orbit.codes == 0, axis=-1))
     shrinks = amplitude < orbit.tops[before] - orbit.low_before
     resting = is_top & shrinks & (amplitude < AT_REST) & ~stuck_since
-    resting = resting | settles(osc, end.mode, *end.y)
+    resting = (resting | settles(osc, end.mode, *end.y)) & ~end.forever
 
     status = jnp.where(end.forever, Status.STUCK_FOREVER.value, Status.OK.value)
     status = jnp.where(end.captured, Status.PSEUDO_FOCUS.value, status)

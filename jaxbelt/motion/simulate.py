@@ -194,7 +194,9 @@ def _segment(osc: Oscillator, state: _RunState, t1, rtol, atol) -> tuple[_RunSta
     status = jnp.where(end.failed, Status.TOO_MANY_STEPS, status)
     status = jnp.where(finite, status, Status.NOT_FINITE)
     done = done | (t >= t1) | (status != Status.OK)
-    return _RunState(t, end.y, end.mode, end.signs, status, done), record
+    # At a pseudo-focus the mass is in no mode; it is told in the one that it came by.
+    mode = select(end.captured, state.mode, end.mode)
+    return _RunState(t, end.y, mode, end.signs, status, done), record
 
 
 def _arcs_of_run(
