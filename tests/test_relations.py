@@ -537,8 +537,10 @@ def test_an_image_ends_there_too(image_of, seed):
 @two_belts_by_day
 def test_an_image_has_the_same_attractors(image_of, seed):
     whole, found, image = sweeps_of(image_of, "attractor", seed)
-    for name in ("kind", "status"):
-        np.testing.assert_array_equal(found[name], whole[name])
+    np.testing.assert_array_equal(found.kind, whole.kind)
+    # Rest exactly on an edge is that of the side where it is reached, or that of the edge.
+    moves = jb.decoded(whole).kind.values != "equilibrium"
+    np.testing.assert_array_equal(found.status.values[moves], whole.status.values[moves])
     sticks = found.sticks.values[..., image.columns]
     np.testing.assert_array_equal(sticks, whole.sticks)
     durations = found.stick_duration.values[..., image.columns]

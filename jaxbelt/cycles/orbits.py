@@ -10,7 +10,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import at_focus, begins_at_rest, mode_of, mode_of_state, settles
+from ..model.modes import (
+    at_focus,
+    begins_at_rest,
+    force_rounding,
+    mode_of,
+    mode_of_state,
+    settles,
+)
 from ..model.oscillator import Oscillator
 from ..motion.arcs import ArcEnd, Ends, Signs, after_slip, signs_after, slip_arc, stick_arc
 from ..motion.integrators import Graded
@@ -77,7 +84,9 @@ def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
     # An orbit that sticks is on a cycle, however small: it repeats exactly.
     stuck_since = jnp.any((rows > before) & jnp.any(orbit.codes == 0, axis=-1))
     shrinks = amplitude < orbit.tops[before] - orbit.low_before
-    resting = is_top & shrinks & (amplitude < AT_REST) & ~stuck_since
+    # Two arcs that both end at one top are no loop.
+    loops = amplitude > force_rounding(y_end[0])
+    resting = is_top & loops & shrinks & (amplitude < AT_REST) & ~stuck_since
     resting = (resting | settles(osc, end.mode, *end.y)) & ~end.forever
 
     status = jnp.where(end.forever, Status.STUCK_FOREVER.value, Status.OK.value)
