@@ -173,20 +173,8 @@ def _differentiate(graze, verdicts, disagreements, rng, options):
     along = [derivatives.directions(case, rng) for case in cases]
     told = package.derivatives(cases, along, options.tol, options.by)
     for (case, mine), direction, answer in zip(graze, along, told):
-        verdict, right = compare.judge_derivative(case, answer, mine, direction, options.tol)
-        verdicts[f"{case.kind}, derivative", verdict] += 1
-        if verdict != "same":
-            line = dict(
-                what="derivative",
-                verdict=verdict,
-                tol=options.tol,
-                told=answer.tolist(),
-                engine=right.tolist(),
-                direction=direction,
-                case=case.to_json(),
-                code=package.as_code(case),
-            )
-            _report(line, disagreements, options)
+        judged = compare.judge_derivative(case, answer, mine, direction, options.tol)
+        _count_derivative(case, direction, answer, judged, verdicts, disagreements, options)
 
 
 def _differentiate_cycles(graze, verdicts, disagreements, rng, options):
@@ -197,20 +185,28 @@ def _differentiate_cycles(graze, verdicts, disagreements, rng, options):
     along = [derivatives.directions(case, rng) for case, _ in graze]
     told = package.period_derivatives([case for case, _ in graze], along)
     for (case, mine), direction, answer in zip(graze, along, told):
-        verdict, right = compare.judge_period_derivative(case, answer, mine, direction)
-        verdicts[f"{case.kind}, derivative", verdict] += 1
-        if verdict != "same":
-            line = dict(
-                what="derivative",
-                verdict=verdict,
-                tol=options.tol,
-                told=float(answer),
-                engine=right,
-                direction=direction,
-                case=case.to_json(),
-                code=package.as_code(case),
-            )
-            _report(line, disagreements, options)
+        judged = compare.judge_period_derivative(case, answer, mine, direction)
+        _count_derivative(case, direction, answer, judged, verdicts, disagreements, options)
+
+
+def _count_derivative(case, direction, told, judged, verdicts, disagreements, options):
+    """Count a verdict on a derivative, and report it where it is not right."""
+    from . import package
+
+    verdict, right = judged
+    verdicts[f"{case.kind}, derivative", verdict] += 1
+    if verdict != "same":
+        line = dict(
+            what="derivative",
+            verdict=verdict,
+            tol=options.tol,
+            told=np.asarray(told).tolist(),
+            engine=np.asarray(right).tolist(),
+            direction=direction,
+            case=case.to_json(),
+            code=package.as_code(case),
+        )
+        _report(line, disagreements, options)
 
 
 def _report(line, disagreements, options):
