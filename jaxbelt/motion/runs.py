@@ -1,0 +1,182 @@
+"""A run: the chain of arcs from its start to t1, or to where it ends before.
+
+In a slip arc the orbit runs in the smooth field of its mode until a guard of the mode vanishes; a
+stick arc is known in closed form. The chain is a `lax.scan` of segments, an arc each, so that it
+works under `jit`, `vmap`, and derivatives forward and reverse.
+
+Slip arcs are those of `arcs`, integrated by diffrax. The arcs end at extrema where a boundary or an
+edge is within reach, and else after the time MAX_ARC. So no root hides within a step: between two
+zeros of x2' lies a zero of x2, since x2'' = -x2 there, and two extrema of x2 in one step would take
+half a loop around a focus within it, which `MAX_ARC` and `MAX_FRACTION` exclude.
+"""
+
+import functools
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..model.events import event_between
+from ..model.modes import Mode, at_focus, mode_of_state, select
+from ..model.oscillator import Oscillator
+from ..numerics.compiling import any_lane, one_kernel
+from ..numerics.derivatives import forward_jacobian
+from ..results import Status
+from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
+from .integrators import Adaptive, State
+
+#: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
+#: because near-grazing events amplify them.
+SAFETY = 0.03
+#: Longest slip arc, well below half a loop; longer ones are cut.
+MAX_ARC = 1.0
+#: Segments are run in blocks of so many; the budget is rounded up to whole blocks.
+BLOCK = 32
+
+
+@forward_jacobian
+@one_kernel
+def _adaptive_slip_arc(osc, mode, signs, y, integrator) -> SlipArc:
+    return slip_arc(osc, mode, signs, y, integrator, every_extremum=False)
+
+
+class RunState(eqx.Module):
+    """Where a run is: time, state, mode, the signs of x2' and x2, and how it stands."""
+
+    t: Array
+    y: State
+    mode: Mode
+    signs: Signs
+    status: Array
+    done: Array
+
+
+def _slip_segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[ArcEnd, Array]:
+    """A slip arc; and whether the run ends at its end."""
+    left = t1 - state.t
+    span = jnp.minimum(left, MAX_ARC)
+    integrator = Adaptive(span, SAFETY * rtol, SAFETY * atol)
+    arc = _adaptive_slip_arc(osc, state.mode, state.signs, state.y, integrator)
+    end = after_slip(osc, state.mode, state.signs, arc)
+    return end, end.captured | (end.fired < 0) & (left <= MAX_ARC)
+
+
+def _stick_segment(osc: Oscillator, state: RunState, t1) -> tuple[ArcEnd, Array]:
+    end = stick_arc(osc, state.mode, state.y, t1 - state.t)
+    return end, end.fired < 0
+
+
+class ArcRecord(eqx.Module):
+    """What a segment leaves behind: its arc and the event at its end."""
+
+    t: Array
+    y: Array
+    mode: Array
+    duration: Array
+    kind: Array
+    belt: Array
+    event_t: Array
+    event_y: Array
+
+
+def stacked_codes(mode: Mode) -> Array:
+    """The contact codes of a mode, [belts]."""
+    return jnp.stack([jnp.asarray(code, dtype=jnp.int8) for code in mode.codes])
+
+
+def _segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[RunState, ArcRecord]:
+    stuck = state.mode.any_stuck
+    # Under vmap both branches run; lanes that are stuck or done then have no slip arc to follow.
+    slip_until = jnp.where(stuck | state.done, state.t, t1)
+    end, done = lax.cond(
+        stuck,
+        lambda: _stick_segment(osc, state, t1),
+        lambda: _slip_segment(osc, state, slip_until, rtol, atol),
+    )
+    kind, belt = event_between(state.mode.codes, end.mode.codes)
+    # At t1 itself, where no event is before: the sum of the arcs may be short of it by rounding.
+    t = jnp.where(done & (kind == 0), t1, state.t + end.duration)
+    record = ArcRecord(
+        t=state.t,
+        y=jnp.stack(state.y),
+        mode=stacked_codes(state.mode),
+        duration=end.duration,
+        kind=kind,
+        belt=belt,
+        event_t=t,
+        event_y=jnp.stack(end.y),
+    )
+    finite = jnp.isfinite(t) & jnp.isfinite(end.y[0]) & jnp.isfinite(end.y[1])
+    status = jnp.where(end.captured, Status.PSEUDO_FOCUS, Status.OK)
+    status = jnp.where(end.forever, Status.STUCK_FOREVER, status)
+    status = jnp.where(end.failed, Status.TOO_MANY_STEPS, status)
+    status = jnp.where(finite, status, Status.NOT_FINITE)
+    done = done | (t >= t1) | (status != Status.OK)
+    # At a pseudo-focus the mass is in no mode; it is told in the one that it came by.
+    mode = select(end.captured, state.mode, end.mode)
+    return RunState(t, end.y, mode, end.signs, status, done), record
+
+
+def arcs_of_run(
+    osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int
+) -> tuple[RunState, ArcRecord]:
+    """The chain of arcs from y0: the final state and the stacked records, NaN where unused."""
+    y = (y0[0], y0[1])
+    mode = mode_of_state(osc, *y)
+    finite = jnp.all(jnp.isfinite(y0))
+    for leaf in jax.tree.leaves(osc):
+        finite = finite & jnp.all(~jnp.isnan(leaf))
+    status = jnp.where(at_focus(osc, *y), Status.PSEUDO_FOCUS.value, Status.OK.value)
+    status = jnp.where(finite, status, Status.NOT_FINITE.value)
+    start = RunState(t0, y, mode, signs_after(osc, mode, y), status, status != Status.OK)
+
+    def segment(given, state):
+        osc, t1, rtol, atol = given
+        blank = _unused(len(osc.belts))
+
+        def advance():
+            new, record = _segment(osc, state, t1, rtol, atol)
+            keep = functools.partial(jnp.where, state.done)
+            return jax.tree.map(keep, state, new), jax.tree.map(keep, blank, record)
+
+        # A true branch under vmap too: once every lane is done nothing more is computed.
+        return lax.cond(any_lane(~state.done), advance, lambda: (state, blank))
+
+    # In blocks, because stepping over what is left of the budget is not free.
+    length = min(BLOCK, max_segments)
+    blank = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (length, *leaf.shape)), _unused(len(osc.belts))
+    )
+
+    @one_kernel
+    def segments(given, state):
+        return lax.scan(lambda state, _: segment(given, state), state, length=length)
+
+    def block(state, _):
+        return lax.cond(
+            any_lane(~state.done),
+            lambda: segments((osc, t1, rtol, atol), state),
+            lambda: (state, blank),
+        )
+
+    final, records = lax.scan(block, start, length=-(-max_segments // length))
+    records = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), records)
+    # A run that begins at a pseudo-focus has one arc, of duration zero.
+    blank, zero = _unused(len(osc.belts)), jnp.zeros(())
+    rest = replace(blank, t=t0, y=jnp.stack(y), mode=stacked_codes(mode), duration=zero)
+    at_rest = start.status == Status.PSEUDO_FOCUS
+    records = jax.tree.map(
+        lambda leaf, first: leaf.at[0].set(jnp.where(at_rest, first, leaf[0])), records, rest
+    )
+    unfinished = jnp.where(final.done, final.status, Status.TOO_MANY_SEGMENTS.value)
+    return eqx.tree_at(lambda s: s.status, final, unfinished), records
+
+
+def _unused(belts: int) -> ArcRecord:
+    """The record of a segment that is not needed."""
+    nan, pair, none = jnp.full((), jnp.nan), jnp.full(2, jnp.nan), jnp.zeros((), int)
+    mode = jnp.zeros(belts, jnp.int8)
+    return ArcRecord(nan, pair, mode, nan, none, none, event_t=nan, event_y=pair)
