@@ -12,7 +12,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     numerics/       derivatives extrapolation newton continuation roots
     model/          friction oscillator parameters modes events equilibria
     presets         the published systems
-    motion/         integrators arcs runs sampling smoothing simulate
+    motion/         integrators arcs sensitivities runs sampling smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
     sweeps/         lanes step events marks observers attractor queue threads audit
     sweeps/         grid datasets question store progress sweep basins

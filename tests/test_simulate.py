@@ -149,6 +149,17 @@ def test_error_falls_with_the_tolerance():
     assert errors[-1] < 1e-9
 
 
+def test_rest_up_to_rounding_on_the_boundary_of_an_idle_belt_at_rest():
+    """The motion shrinks to a focus at (0.6111, 0), and each half loop ends on that boundary."""
+    law = jb.Conti(1.0, 0.5, 10.0)
+    osc = jb.Oscillator(
+        2.0, (jb.Belt(0.0, law, load=0.0, upper=0.8), jb.Belt(0.35, law, lower=0.45))
+    )
+    run = jb.simulate(osc, (0.8, 0.35), 50.0)
+    assert run.status == Status.OK and run.events.t.size < 20
+    assert run.ys[-1, 0] == pytest.approx(11 / 18, abs=1e-11) and abs(run.ys[-1, 1]) < 1e-11
+
+
 # --- differentiable -------------------------------------------------------------------------------
 
 PARAMETERS = jnp.array([-0.3, 0.35, 0.5, 0.6, 10.0, 2.5, 0.1])  # nu0 nu1 zeta p1 p3 x1 x2
@@ -203,6 +214,66 @@ def test_reverse_mode_equals_forward_mode():
     reverse, _ = jax.jit(jax.jacrev(outcome, has_aux=True))(PARAMETERS)
     for a, b in zip(reverse, forward_derivatives()[0], strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
+
+
+def test_second_derivatives_agree_with_differences_of_the_oracle():
+    def final(z):
+        run = jb.simulate(jb.presets.class_b(z[0], 0.35), z[1:], 9.0, ts=jnp.array([6.0, 9.0]))
+        return run.ys.reshape(-1)
+
+    def reference(z):
+        run = oracle.simulate(oracle.class_b(z[0], 0.35), (z[1], z[2]), 9.0)
+        return np.concatenate([run.at(6.0), run.at(9.0)])
+
+    z = np.array([-0.3, 2.5, 0.1])
+    assert len(oracle.simulate(oracle.class_b(z[0], 0.35), z[1:].tolist(), 9.0).events) >= 3
+    computed = np.asarray(jax.jit(jax.hessian(final))(jnp.asarray(z)))
+    np.testing.assert_allclose(computed, computed.swapaxes(1, 2), rtol=1e-9, atol=1e-11)
+
+    def second(i, j, h):
+        a, b = h * np.eye(3)[i], h * np.eye(3)[j]
+        parts = reference(z + a + b) - reference(z + a - b)
+        return (parts - reference(z - a + b) + reference(z - a - b)) / (4 * h * h)
+
+    for i, j in ((0, 0), (0, 1), (1, 1), (2, 0)):
+        value = (4 * second(i, j, 2e-3) - second(i, j, 4e-3)) / 3
+        scale = 1e-2 + np.abs(value)
+        np.testing.assert_array_less(np.abs(computed[:, i, j] - value) / scale, 1e-5)
+
+
+COMPOSITIONS = {
+    "vmap grad": lambda loss: jax.vmap(jax.grad(loss)),
+    "jit vmap grad": lambda loss: jax.jit(jax.vmap(jax.grad(loss))),
+    "grad vmap": lambda loss: jax.grad(lambda rows: jnp.sum(jax.vmap(loss)(rows))),
+    "jit grad vmap": lambda loss: jax.jit(jax.grad(lambda rows: jnp.sum(jax.vmap(loss)(rows)))),
+    "grad map": lambda loss: jax.grad(lambda rows: jnp.sum(jax.lax.map(loss, rows))),
+    "map grad": lambda loss: functools.partial(jax.lax.map, jax.grad(loss)),
+    "vmap grad checkpoint": lambda loss: jax.vmap(jax.grad(jax.checkpoint(loss))),
+    "vmap jacfwd": lambda loss: jax.vmap(jax.jacfwd(loss)),
+    "vmap jacrev jit": lambda loss: jax.vmap(jax.jacrev(jax.jit(loss))),
+    "jit jvp vmap": lambda loss: jax.jit(
+        lambda rows: jnp.stack(
+            [
+                jax.jvp(jax.vmap(loss), (rows,), (jnp.zeros_like(rows).at[:, i].set(1.0),))[1]
+                for i in range(2)
+            ],
+            axis=1,
+        )
+    ),
+}
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("name", COMPOSITIONS)
+def test_transformations_compose_in_any_order(name):
+    def loss(row):
+        run = jb.simulate(jb.presets.class_b(row[0], 0.35), (row[1], 0.1), 6.0, ts=SAMPLES[:3])
+        times = jnp.where(run.events.kind > 0, run.events.t, 0.0)
+        return jnp.sum(run.ys**2) + jnp.sum(times)
+
+    rows = jnp.array([[-0.3, 2.5], [-0.2, 2.0], [0.4, -1.0]])
+    alone = jnp.stack([jax.jit(jax.jacfwd(loss))(row) for row in rows])
+    np.testing.assert_allclose(COMPOSITIONS[name](loss)(rows), alone, rtol=1e-10, atol=1e-11)
 
 
 def test_a_stick_phase_forgets_the_start():

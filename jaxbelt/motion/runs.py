@@ -20,13 +20,13 @@ from jax import lax
 from jaxtyping import Array
 
 from ..model.events import event_between
-from ..model.modes import Mode, at_focus, mode_of_state, select
+from ..model.modes import Mode, at_focus, is_at_rest, mode_of_state, select
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import any_lane, one_kernel
-from ..numerics.derivatives import forward_jacobian
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
 from .integrators import Adaptive, State
+from .sensitivities import Arc, in_one_row, sensitivities, split
 
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
 #: because near-grazing events amplify them.
@@ -37,7 +37,6 @@ MAX_ARC = 1.0
 BLOCK = 32
 
 
-@forward_jacobian
 @one_kernel
 def _adaptive_slip_arc(osc, mode, signs, y, integrator) -> SlipArc:
     return slip_arc(osc, mode, signs, y, integrator, every_extremum=False)
@@ -60,7 +59,12 @@ def _slip_segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[Arc
     span = jnp.minimum(left, MAX_ARC)
     integrator = Adaptive(span, SAFETY * rtol, SAFETY * atol)
     arc = _adaptive_slip_arc(osc, state.mode, state.signs, state.y, integrator)
-    end = after_slip(osc, state.mode, state.signs, arc)
+    # At rest up to rounding the mass stays, even on a guard.
+    rests = (arc.fired >= 0) & is_at_rest(osc, state.mode, *arc.y)
+    stays = replace(
+        arc, duration=jnp.maximum(arc.duration, span), fired=jnp.full_like(arc.fired, -1)
+    )
+    end = after_slip(osc, state.mode, state.signs, select(rests, stays, arc))
     return end, end.captured | (end.fired < 0) & (left <= MAX_ARC)
 
 
@@ -70,7 +74,10 @@ def _stick_segment(osc: Oscillator, state: RunState, t1) -> tuple[ArcEnd, Array]
 
 
 class ArcRecord(eqx.Module):
-    """What a segment leaves behind: its arc and the event at its end."""
+    """What a segment leaves behind: its arc, the event at its end, and what ended it.
+
+    fired, in_time, captured: as in `sensitivities.Arc`.
+    """
 
     t: Array
     y: Array
@@ -80,6 +87,9 @@ class ArcRecord(eqx.Module):
     belt: Array
     event_t: Array
     event_y: Array
+    fired: Array
+    in_time: Array
+    captured: Array
 
 
 def stacked_codes(mode: Mode) -> Array:
@@ -108,6 +118,9 @@ def _segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[RunState
         belt=belt,
         event_t=t,
         event_y=jnp.stack(end.y),
+        fired=end.fired,
+        in_time=done & ~end.captured,
+        captured=end.captured,
     )
     finite = jnp.isfinite(t) & jnp.isfinite(end.y[0]) & jnp.isfinite(end.y[1])
     status = jnp.where(end.captured, Status.PSEUDO_FOCUS, Status.OK)
@@ -120,6 +133,7 @@ def _segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[RunState
     return RunState(t, end.y, mode, end.signs, status, done), record
 
 
+@eqx.filter_custom_jvp
 def arcs_of_run(
     osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int
 ) -> tuple[RunState, ArcRecord]:
@@ -175,8 +189,64 @@ def arcs_of_run(
     return eqx.tree_at(lambda s: s.status, final, unfinished), records
 
 
+@arcs_of_run.def_jvp
+def _(primals, tangents):
+    osc, y0, t0, t1, *_ = primals
+    final, records = arcs_of_run(*primals)
+    varied, rest = split(osc, tangents[0])
+    used = ~jnp.isnan(records.event_t)
+    arcs = Arc(
+        entry=(records.y[:, 0], records.y[:, 1]),
+        end=(records.event_y[:, 0], records.event_y[:, 1]),
+        codes=records.mode,
+        duration=records.duration,
+        fired=records.fired,
+        in_time=records.in_time,
+        captured=records.captured,
+        used=used,
+    )
+    entries, ends = sensitivities(varied, rest, arcs, t1 - records.t)
+    start = [
+        jnp.zeros_like(value) if slope is None else slope
+        for value, slope in zip((y0, t0, t1), tangents[1:4], strict=True)
+    ]
+    inputs = in_one_row(*start, tangents[0])
+    entries, ends = entries.along(inputs), ends.along(inputs)
+    nothing = jax.tree.map(lambda _: None, (final, records))
+    last = jax.tree.map(lambda leaf: leaf[-1], ends)
+
+    def rows(leaf):
+        known = ~jnp.isnan(records.t)
+        return jnp.where(known.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0.0)
+
+    def states(one):
+        return jnp.stack([one.x1, one.x2], axis=1)
+
+    def places(run):
+        final, records = run
+        events = records.event_t, records.event_y
+        return final.t, final.y, records.t, records.y, records.duration, *events
+
+    moved = [entries.t, states(entries), ends.t - entries.t, ends.t, states(ends)]
+    moved = last.t, (last.x1, last.x2), *map(rows, moved)
+    moved = eqx.tree_at(places, nothing, moved, is_leaf=lambda leaf: leaf is None)
+    return (final, records), moved
+
+
 def _unused(belts: int) -> ArcRecord:
     """The record of a segment that is not needed."""
     nan, pair, none = jnp.full((), jnp.nan), jnp.full(2, jnp.nan), jnp.zeros((), int)
     mode = jnp.zeros(belts, jnp.int8)
-    return ArcRecord(nan, pair, mode, nan, none, none, event_t=nan, event_y=pair)
+    return ArcRecord(
+        t=nan,
+        y=pair,
+        mode=mode,
+        duration=nan,
+        kind=none,
+        belt=none,
+        event_t=nan,
+        event_y=pair,
+        fired=none - 1,
+        in_time=none > 0,
+        captured=none > 0,
+    )

@@ -9,16 +9,15 @@ from jax import lax
 from ..model.modes import Mode, select, stick_velocity
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import one_kernel
-from ..numerics.derivatives import forward_jacobian
 from ..results import Status
 from .integrators import Adaptive, slip_field
 from .runs import ArcRecord, RunState, stacked_codes
+from .sensitivities import with_derivatives
 
 #: Lanes in which samples are computed.
 SAMPLED = 32
 
 
-@forward_jacobian
 @one_kernel
 def _slip_flow(osc, mode, y, integrator):
     """The state after the integrator's span in the slip field of the mode."""
@@ -39,6 +38,16 @@ def states_at(osc: Oscillator, final: RunState, records: ArcRecord, ts, rtol, at
     beyond = ts > final.t
     since = jnp.where(beyond, 0.0, ts - arcs.t)
     stuck = jnp.any(arcs.mode == 0, axis=1)
+    ys = _flown(*lax.stop_gradient((osc, rtol, atol, numbers, arcs, beyond, since, stuck)))
+    ys = with_derivatives(osc, arcs.y, since, arcs.mode, ys)
+    afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
+    ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)
+    modes = jnp.where(beyond[:, None], stacked_codes(final.mode), arcs.mode)
+    return jnp.where(beyond[:, None], afterwards, ys)[:wanted], modes[:wanted]
+
+
+def _flown(osc: Oscillator, rtol, atol, numbers, arcs: ArcRecord, beyond, since, stuck):
+    """The states at a time `since` the entries of arcs, [samples, 2]; numbers: of the arcs."""
 
     def at(osc, rtol, atol, arc, since, stuck, goes_on, before, y):
         mode = Mode(tuple(arc.mode[j].astype(float) for j in range(len(osc.belts))))
@@ -51,7 +60,7 @@ def states_at(osc: Oscillator, final: RunState, records: ArcRecord, ts, rtol, at
 
     # As many pieces of the times as lanes. Each lane goes from one of its samples to the next, or
     # from where the next one's arc begins; so, too, where under a trace the times do not increase.
-    first = jnp.arange(ts.size) % max(ts.size // SAMPLED, 1) == 0
+    first = jnp.arange(since.size) % max(since.size // SAMPLED, 1) == 0
     before = jnp.roll(since, 1)
     goes_on = (numbers == jnp.roll(numbers, 1)) & (before <= since) & ~beyond & ~first
     rows = jax.tree.map(
@@ -65,8 +74,4 @@ def states_at(osc: Oscillator, final: RunState, records: ArcRecord, ts, rtol, at
         return y, y
 
     _, ys = lax.scan(advance, jnp.zeros((SAMPLED, 2)), rows)
-    ys = jnp.swapaxes(ys, 0, 1).reshape(-1, 2)
-    afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
-    ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)
-    modes = jnp.where(beyond[:, None], stacked_codes(final.mode), arcs.mode)
-    return jnp.where(beyond[:, None], afterwards, ys)[:wanted], modes[:wanted]
+    return jnp.swapaxes(ys, 0, 1).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Campaigns: `python -m tests.campaign final|simulate|attractors|grazing|paths`, see `--help`."""
+"""Campaigns: `python -m tests.campaign final|simulate|derivatives|attractors|grazing|paths`."""
 
 import argparse
 import functools
@@ -24,7 +24,7 @@ def main(arguments=None):
         return paths.run(options.seed, options.paths)
     rng = np.random.default_rng(options.seed)
     began = time.monotonic()
-    verdicts, disagreements, graze, done = Counter(), [], [], 0
+    verdicts, disagreements, right, done = Counter(), [], [], 0
     report = open(options.report, "a", encoding="utf-8") if options.report else None
     with ThreadPoolExecutor(options.threads) as pool:
         for batch in _batches(cases, rng, options):
@@ -41,8 +41,8 @@ def main(arguments=None):
 
             for case, answer, (verdict, mine) in zip(batch, told, pool.map(one, zip(batch, told))):
                 verdicts[case.kind, verdict] += 1
-                if verdict == "same" and case.distance is not None:
-                    graze.append((case, mine))
+                if verdict == "same" and options.what in ("grazing", "derivatives"):
+                    right.append((case, mine))
                 if verdict in ("same", "tolerance") or (
                     verdict == "corner" and not options.corners
                 ):
@@ -59,10 +59,10 @@ def main(arguments=None):
                 disagreements.append(line)
                 if report:
                     print(json.dumps(line), file=report, flush=True)
-            if options.what == "grazing":
+            if right:
                 judge_all = _differentiate_cycles if labels else _differentiate
-                judge_all(graze, verdicts, disagreements, rng, options)
-                graze.clear()
+                judge_all(right, verdicts, disagreements, rng, options)
+                right.clear()
             done += len(batch)
             if options.verbose:
                 bad = sum(n for (_, v), n in verdicts.items() if v not in compare.GOOD)
@@ -88,7 +88,9 @@ def main(arguments=None):
 
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=__doc__)
-    parser.add_argument("what", choices=("final", "simulate", "attractors", "grazing", "paths"))
+    parser.add_argument(
+        "what", choices=("final", "simulate", "derivatives", "attractors", "grazing", "paths")
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=int, default=2000)
     parser.add_argument("--paths", type=int, default=20)
@@ -123,7 +125,7 @@ class _Defaults:
     def parse_args(self, arguments):
         options = self.parser.parse_args(arguments)
         if options.tol is None:
-            options.tol = 1e-10 if options.what in ("simulate", "grazing") else 1e-8
+            options.tol = 1e-10 if options.what in ("simulate", "derivatives", "grazing") else 1e-8
         return options
 
 
@@ -165,26 +167,26 @@ def _ask(package, batch, options):
     return package.simulated(batch, options.tol)
 
 
-def _differentiate(graze, verdicts, disagreements, rng, options):
+def _differentiate(runs, verdicts, disagreements, rng, options):
     """Derivatives of the runs that were right, each along a direction of its own."""
     from . import compare, derivatives, package
 
-    cases = [case for case, _ in graze]
+    cases = [case for case, _ in runs]
     along = [derivatives.directions(case, rng) for case in cases]
     told = package.derivatives(cases, along, options.tol, options.by)
-    for (case, mine), direction, answer in zip(graze, along, told):
+    for (case, mine), direction, answer in zip(runs, along, told):
         judged = compare.judge_derivative(case, answer, mine, direction, options.tol)
         _count_derivative(case, direction, answer, judged, verdicts, disagreements, options)
 
 
-def _differentiate_cycles(graze, verdicts, disagreements, rng, options):
+def _differentiate_cycles(runs, verdicts, disagreements, rng, options):
     """Derivatives of the periods of the cycles that were right."""
     from . import compare, derivatives, package
 
-    graze = [(case, mine) for case, mine in graze if mine.kind == "cycle"]
-    along = [derivatives.directions(case, rng) for case, _ in graze]
-    told = package.period_derivatives([case for case, _ in graze], along)
-    for (case, mine), direction, answer in zip(graze, along, told):
+    runs = [(case, mine) for case, mine in runs if mine.kind == "cycle"]
+    along = [derivatives.directions(case, rng) for case, _ in runs]
+    told = package.period_derivatives([case for case, _ in runs], along)
+    for (case, mine), direction, answer in zip(runs, along, told):
         judged = compare.judge_period_derivative(case, answer, mine, direction)
         _count_derivative(case, direction, answer, judged, verdicts, disagreements, options)
 

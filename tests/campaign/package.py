@@ -240,8 +240,23 @@ def _trajectories(structure, T, tol, max_segments):
     return jax.jit(jax.vmap(one))
 
 
-def simulated(cases, tol, max_segments=None):
-    """Trajectories by `simulate`, vmapped over cases of one structure and one T."""
+#: Arcs that runs are given which used up what `simulate` gives them by itself.
+MANY_SEGMENTS = 32768
+
+
+def simulated(cases, tol):
+    """Trajectories by `simulate`; where its budget was too small, with a larger one, as it says."""
+    found = _simulated(cases, tol, None)
+    short = [i for i, one in enumerate(found) if one.status == jb.Status.TOO_MANY_SEGMENTS]
+    for i, one in zip(short, _simulated([cases[i] for i in short], tol, MANY_SEGMENTS)):
+        found[i] = one
+    return found
+
+
+def _simulated(cases, tol, max_segments):
+    """Vmapped over cases of one structure and one T."""
+    if not cases:
+        return []
     run = _trajectories(cases[0].structure, cases[0].T, tol, max_segments)
     out = []
     for first in range(0, len(cases), CHUNK):
