@@ -15,7 +15,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     motion/         integrators arcs smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
     sweeps/         lanes step events marks observers attractor queue threads audit
-    sweeps/         grid datasets question store progress sweep basins
+    sweeps/         grid datasets question locks store progress work clusters sweep basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   refine path scan curves diagrams switch_folds
     inverse/        selection record fit design

@@ -7,7 +7,8 @@
 - `observers`, `attractor`: what can be asked: final states, a user's reducer, attractors;
 - `queue`: the compiled loop that fills lanes from a queue of runs; `threads`: a loop on each core;
 - `grid`, `question`: the points of a sweep, and everything that makes two sweeps the same;
-- `datasets`, `store`: the results, in memory and in a Zarr group; `progress`: a bar;
+- `datasets`, `store`: the results, in memory and in a Zarr group; `locks`: who may write it;
+- `work`: runs of blocks, here; `clusters`: blocks as tasks of a Dask cluster; `progress`: a bar;
 - `sweep`: named axes in, a labelled dataset out; `audit`: runs again, without shortcuts;
 - `basins`: the same for starts of one oscillator.
 

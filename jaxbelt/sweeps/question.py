@@ -55,6 +55,12 @@ class Question:
             require(name in grid.axes, "derivatives", f"names of axes, {known}", repr(name))
         return cls(grid, observe, numbers, tuple(wanted))
 
+    def arguments(self) -> tuple[Any, ...]:
+        """The arguments of `of`: what another process needs to ask the same."""
+        grid, numbers = self.grid, self.numbers.values()
+        start = tuple(grid.y0.values())
+        return grid.make, grid.axes, start, *numbers, self.observe, self.derivatives
+
     @functools.cached_property
     def program(self) -> Program:
         """What the kernel is compiled for."""

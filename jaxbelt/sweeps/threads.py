@@ -70,8 +70,9 @@ def run(
     atol: float,
     derivatives: int = 0,
     budget: float = 1.0,
+    threads: int | None = None,
 ) -> None:
-    """Do all runs, on all cores.
+    """Do all runs, on so many threads or, with None, on all cores.
 
     rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]: the starts and the
     parameters that vary, and their derivatives in so many directions. put(numbers, results) takes
@@ -85,6 +86,7 @@ def run(
     if not runs:
         return
     limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
+    threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
     kernel = _kernel(program, derivatives)
     team = _Team(
@@ -93,19 +95,19 @@ def run(
         rows_of,
         put,
         (1 + derivatives, columns) if derivatives else (columns,),
-        _Chunks(runs, workers()),
+        _Chunks(runs, threads),
         FIRST_PASSES.get(jax.default_backend(), 100) // (1 + derivatives),
     )
     devices = jax.local_devices()
     # Compiled once, before the threads that would each do it again, and like all else not on the
     # thread of the caller, so that an interrupt need not wait for it.
     _wait([_started(team.compile, devices[0])])
-    threads = [_started(team.work, devices[i % len(devices)]) for i in range(workers())]
+    at_work = [_started(team.work, devices[i % len(devices)]) for i in range(threads)]
     try:
-        _wait(threads)
+        _wait(at_work)
     finally:
         team.stop.set()
-        wait(threads, timeout=10 * PATIENCE)
+        wait(at_work, timeout=10 * PATIENCE)
 
 
 def _first_stream(program: Program, shared, columns: int, derivatives: int) -> Any:
