@@ -101,7 +101,7 @@ def sweep(
         '0 but for observe="final" and "attractor"',
         audit,
     )
-    _check_where(store, executor, blocks, audit)
+    _check_where(question, store, executor, blocks, audit)
     if store is None:
         results = Memory(question.table)
         _do_runs(question, results, progress)
@@ -143,7 +143,7 @@ def _do_runs(
             raise OSError(error.errno, f"{told}; {results.interrupted()}") from error
 
 
-def _check_where(store: Any, executor: Any, blocks: Any, audit: float) -> None:
+def _check_where(question: Question, store, executor, blocks, audit: float) -> None:
     """Raise unless blocks can be done there."""
     for name, value in (("executor", executor), ("blocks", blocks)):
         wanted = f"given, where {name} is: blocks are written there one by one"
@@ -153,8 +153,9 @@ def _check_where(store: Any, executor: Any, blocks: Any, audit: float) -> None:
     if blocks is not None:
         fits = isinstance(blocks, Sequence) and len(blocks) == 2
         fits = fits and all(isinstance(b, int) for b in blocks) and 0 <= blocks[0] < blocks[1]
-        expected = "the first block and the one behind the last, two integers 0 <= first < last"
-        require(fits, "blocks", expected, repr(blocks))
+        require(fits, "blocks", "two integers (first, last), 0 <= first < last", repr(blocks))
+        count = len(blocks_of(question.grid))
+        require(blocks[0] < count, "blocks", f"among the {count:,} of this sweep", blocks)
         require(audit == 0, "audit", "0 where blocks is given", audit)
 
 
