@@ -13,7 +13,7 @@ import pickle
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +94,7 @@ def do_block(packed: bytes, place: str, block: int) -> dict[str, Any]:
     """
     stopped = _stopped()
 
-    def go_on(_: Mapping[int, int]) -> None:
+    def watch() -> None:
         if stopped():
             raise RuntimeError("the sweep was interrupted")
 
@@ -105,7 +105,7 @@ def do_block(packed: bytes, place: str, block: int) -> dict[str, Any]:
         if not store.is_done(block):
             store.began = time.monotonic()
             threads = 1 if jax.default_backend() == "cpu" else None
-            do_runs(question, store, [block], go_on, threads)
+            do_runs(question, store, [block], lambda _: None, threads=threads, watch=watch)
         return {"block": block, "statuses": counts(store.statuses(block))}
 
 

@@ -33,7 +33,7 @@ class Question:
 
     grid: Grid
     observe: Any
-    numbers: dict[str, float]
+    numbers: dict[str, Any]
     derivatives: tuple[str, ...]
 
     @classmethod

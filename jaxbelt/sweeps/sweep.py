@@ -233,7 +233,6 @@ def explain(
             lambda *_: None,
             **question.numbers,
             derivatives=len(question.derivatives),
-            threads=None,
         )
         return time.monotonic() - began
 

@@ -71,6 +71,7 @@ def run(
     derivatives: int = 0,
     budget: float = 1.0,
     threads: int | None = None,
+    watch: Callable[[], None] = lambda: None,
 ) -> None:
     """Do all runs, on so many threads or, with None, on all cores.
 
@@ -81,7 +82,8 @@ def run(
 
     Every thread feeds chunks to one compiled kernel (which lets go of Python's lock) on its own
     lanes. Long runs stay in their lanes while the next chunk is worked on. An exception, a
-    `KeyboardInterrupt` too, ends all threads within `PATIENCE` and is raised.
+    `KeyboardInterrupt` too, or what `watch` raises, which is called every tenth of a second, ends
+    all threads within `PATIENCE` and is raised.
     """
     if not runs:
         return
@@ -101,10 +103,10 @@ def run(
     devices = jax.local_devices()
     # Compiled once, before the threads that would each do it again, and like all else not on the
     # thread of the caller, so that an interrupt need not wait for it.
-    _wait([_started(team.compile, devices[0])])
+    _wait([_started(team.compile, devices[0])], watch)
     at_work = [_started(team.work, devices[i % len(devices)]) for i in range(threads)]
     try:
-        _wait(at_work)
+        _wait(at_work, watch)
     finally:
         team.stop.set()
         wait(at_work, timeout=10 * PATIENCE)
@@ -237,10 +239,11 @@ def _end_of_process() -> None:
         thread.join()
 
 
-def _wait(futures: list[Future]) -> None:
+def _wait(futures: list[Future], watch: Callable[[], None]) -> None:
     """Wait until all are done or one has failed, and raise what it raised."""
     # With a timeout, for some systems do not interrupt a wait without one.
     while wait(futures, timeout=0.1, return_when=FIRST_EXCEPTION).not_done:
+        watch()
         for future in futures:
             if future.done():
                 future.result()

@@ -1,6 +1,7 @@
 """The work of a sweep: runs of blocks through the kernel, into memory or a store."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +20,9 @@ def do_runs(
     results: Memory | Store,
     to_do: Sequence[int],
     tell: Tell,
-    threads: int | None = None,
+    **options: Any,
 ) -> None:
-    """Do the runs of some blocks, on so many threads or, with None, on all cores."""
+    """Do the runs of some blocks; options: `threads` and `watch` of `threads.run`."""
     blocks = results.blocks
     ends = np.cumsum([blocks.size(block) for block in to_do])
     starts = np.append(0, ends[:-1])
@@ -55,7 +56,7 @@ def do_runs(
         put,
         **question.numbers,
         derivatives=len(question.derivatives),
-        threads=threads,
+        **options,
     )
 
 
