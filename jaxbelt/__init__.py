@@ -14,7 +14,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     presets         the published systems
     motion/         integrators arcs smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
-    sweeps/         lanes step events marks observers attractor queue threads audit
+    sweeps/         lanes step events marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   refine path scan curves diagrams switch_folds
@@ -66,6 +66,7 @@ from .motion.simulate import Arcs, Events, Trajectory, simulate
 from .results import EventKind, Status, describe, draw_with
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.datasets import decoded
+from .sweeps.moments import AtEvents, AtExtrema, AtSection, AtTimes
 from .sweeps.store import Verified, verify
 from .sweeps.sweep import Explanation, explain, sweep
 
@@ -79,6 +80,10 @@ __version__ = importlib.metadata.version("jaxbelt")
 __all__ = [
     "AbstractFriction",
     "Arcs",
+    "AtEvents",
+    "AtExtrema",
+    "AtSection",
+    "AtTimes",
     "BasinStability",
     "Basins",
     "Belt",

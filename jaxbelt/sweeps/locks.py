@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 #: More blocks than there are: the end of what is locked by who wants the whole store.
 ALL_BLOCKS = 2**63
 #: Seconds that may pass before the door opens: a store may be created behind it.
@@ -30,6 +28,8 @@ def locked(
 
     prepare is called behind the door, when the blocks are locked.
     """
+    from filelock import FileLock
+
     folder = path.with_name(f".{path.name}.locks")
     folder.mkdir(exist_ok=True)
     mine = FileLock(folder / f"{first}-{last}", timeout=0)
@@ -54,6 +54,8 @@ def locked(
 
 def _refuse_if_held(path: Path, other: Path) -> None:
     """Raise if somebody holds that lock; what a process left that died is removed."""
+    from filelock import FileLock, Timeout
+
     lock = FileLock(other, timeout=0)
     try:
         lock.acquire()

@@ -14,10 +14,12 @@ import jax
 import numpy as np
 
 from ..checks import as_array, check_positive, require, require_usable_jax
+from .along import Along
 from .attractor import Attractor
 from .datasets import Table
 from .grid import Grid
 from .lanes import Observer, Program
+from .moments import AtEvents, checked
 from .observers import Final, Reduce
 from .threads import CHUNK
 
@@ -138,6 +140,9 @@ def _observer(observe: Any) -> Observer:
     methods = ("init", "update", "finish")
     fits = all(callable(getattr(observe, name, None)) for name in methods)
     require(fits, "observe", '"final", "attractor" or an object with init, update, finish', observe)
+    if hasattr(observe, "at") or hasattr(observe, "rates"):
+        checked(getattr(observe, "at", (AtEvents(),)))
+        return Along(observe)
     return Reduce(observe)
 
 

@@ -17,6 +17,7 @@ from jaxtyping import ArrayLike
 
 from ..checks import as_array, require
 from ..model.oscillator import Oscillator
+from .along import Along
 from .audit import chosen, differing
 from .clusters import check_executor, do_on_cluster
 from .datasets import Memory
@@ -96,7 +97,7 @@ def sweep(
     audit = float(as_array(audit, "audit"))
     require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
     require(
-        audit == 0 or not isinstance(question.program.observer, Reduce),
+        audit == 0 or not isinstance(question.program.observer, Reduce | Along),
         "audit",
         '0 but for observe="final" and "attractor"',
         audit,
