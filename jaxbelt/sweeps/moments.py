@@ -6,8 +6,10 @@ where x2' = 0.
 """
 
 import hashlib
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import CodeType, FunctionType
 from typing import Any
 
 import jax
@@ -57,9 +59,12 @@ class AtSection:
 
     def __repr__(self) -> str:
         """The same for the same function, in any process: stores compare it."""
-        code = getattr(self.function, "__code__", None)
-        told = f"{code.co_code.hex()} {code.co_consts} {code.co_names}" if code else self.function
-        digest = hashlib.sha256(str(told).encode()).hexdigest()[:16]
+        told = repr(self.function)
+        if isinstance(self.function, FunctionType):
+            held = [cell.cell_contents for cell in self.function.__closure__ or ()]
+            told = f"{bytecode(self.function.__code__)} {self.function.__defaults__} {held}"
+        told = re.sub(r" at 0x[0-9a-fA-F]+", "", told)
+        digest = hashlib.sha256(told.encode()).hexdigest()[:16]
         return f"AtSection({digest}, {self.direction})"
 
 
@@ -75,6 +80,12 @@ class AtTimes:
         fits = np.all(np.diff(times) > 0) and times[0] >= 0 and np.isfinite(times[-1])
         require(fits, "times", "finite, >= 0 and increasing", times)
         object.__setattr__(self, "times", tuple(times.tolist()))
+
+
+def bytecode(code: CodeType) -> str:
+    """What a compiled function does, without where it came from."""
+    constants = [bytecode(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
+    return f"{code.co_code.hex()} {code.co_names} {constants}"
 
 
 KINDS = (AtEvents, AtExtrema, AtSection, AtTimes)

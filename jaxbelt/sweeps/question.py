@@ -7,7 +7,6 @@ import inspect
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import CodeType
 from typing import Any
 
 import jax
@@ -19,7 +18,7 @@ from .attractor import Attractor
 from .datasets import Table
 from .grid import Grid
 from .lanes import Observer, Program
-from .moments import AtEvents, checked
+from .moments import AtEvents, bytecode, checked
 from .observers import Final, Reduce
 from .threads import CHUNK
 
@@ -171,11 +170,5 @@ def _source(kind: type) -> str:
             found.append(inspect.getsource(one))
         except (OSError, TypeError):
             functions = sorted(inspect.getmembers(one, inspect.isfunction))
-            found += [f"{name} {_bytecode(function.__code__)}" for name, function in functions]
+            found += [f"{name} {bytecode(function.__code__)}" for name, function in functions]
     return _hash("\n".join(found).encode())
-
-
-def _bytecode(code: CodeType) -> str:
-    """What a compiled function does, without where it came from."""
-    constants = [_bytecode(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
-    return f"{code.co_code.hex()} {code.co_names} {constants}"

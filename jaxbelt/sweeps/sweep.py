@@ -69,8 +69,10 @@ def sweep(
     - an object with three methods for scalars: `init(osc, x1, x2)`, the state of a run, any tree of
       arrays; `update(state, event)`, the state after an `observers.RunEvent` (t, x1, x2, kind,
       belt); and `finish(state, end)`, a dictionary of results, numbers or vectors, from the state
-      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`.
-
+      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`. It may see
+      more than events: with `at`, a tuple of the moments `AtEvents()`, `AtExtrema("x1")`,
+      `AtSection(function)` and `AtTimes(times)`, it is asked there; with `rates(osc, motion)`, a
+      tree of numbers, their integrals are in event.integrals and end.integrals, see `along.Motion`;
     - a `lanes.Observer`, the base of the first two.
 
     and always status, a `Status` code a run: nothing raises because of one run. Categories, such as
