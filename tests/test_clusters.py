@@ -73,7 +73,7 @@ def test_workers_take_functions_and_classes_of_ones_own(client, tmp_path):
             return {"count": state}
 
     def make(nu0):
-        return jb.presets.class_b(nu0, 0.2)
+        return jb.presets.class_a(nu0 + 0.1)
 
     def swept(**options):
         return jb.sweep(make, {"nu0": AXES["nu0"]}, **OPTIONS, observe=Count(), **options)
@@ -102,17 +102,22 @@ def test_a_block_is_done_once_however_often_it_is_asked_for(tmp_path, whole, mon
 
 def test_killed_workers_cost_their_blocks_and_nothing_else(client, tmp_path, monkeypatch):
     monkeypatch.setattr(stores, "BLOCK_RUNS", kills.BLOCK)
-    told = kills.worker_campaign(client, tmp_path, kills=3, seed=1)
+    told = kills.worker_campaign(client, tmp_path, kills=3, seed=1, t1=1500.0)
     assert told["killed"] == 3
 
 
 def test_an_interrupt_leaves_the_workers_free(client, tmp_path):
     """A block that would take minutes: its worker hears of the interrupt, too."""
     axes = {"nu0": AXES["nu0"][:4], "nu1": [0.35]}
+    # So long that the number of steps that a run may take is more than the kernel can count.
     options = dict(t1=1e7, observe=kills.Sum(), store=tmp_path / "a.zarr", progress=False)
-    threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT)).start()
-    with pytest.raises(KeyboardInterrupt, match="0 of 4 runs are in"):
-        jb.sweep(MAKE, axes, **options, executor=client)
+    timer = threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    try:
+        with pytest.raises(KeyboardInterrupt, match="0 of 4 runs are in"):
+            jb.sweep(MAKE, axes, **options, executor=client)
+    finally:
+        timer.cancel()
     began = time.monotonic()
     while any(client.processing().values()):
         assert time.monotonic() - began < 5.0

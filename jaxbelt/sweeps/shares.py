@@ -48,7 +48,7 @@ def attractors(dataset: "xarray.Dataset") -> "xarray.Dataset":
     first = np.argmax(labels[..., None] == numbers, axis=-2)
     ranks = np.argsort(-fractions, axis=-1, kind="stable")
     fractions, first = (np.take_along_axis(part, ranks, axis=-1) for part in (fractions, first))
-    kept = {name: dataset.coords[name] for name in others}
+    coordinates: dict[str, Any] = {name: dataset.coords[name] for name in others}
     told = {"long_name": "fraction of the starts that lead there", "units": "1"}
     variables: dict[str, Any] = {"fraction": ((*others, "attractor"), fractions, told)}
     for name, one in dataset.items():
@@ -62,8 +62,9 @@ def attractors(dataset: "xarray.Dataset") -> "xarray.Dataset":
         missing = (fractions == 0).reshape(index.shape)
         values = np.where(missing, _nothing(values.dtype), values)
         variables[str(name)] = ((*others, "attractor", *extra), values, one.attrs)
-    axis = ("attractor", numbers, {"long_name": "number of the attractor", "units": "1"})
-    return dataset.drop_dims(order).assign_coords(attractor=axis, **kept).assign(variables)
+    named = {"long_name": "number of the attractor", "units": "1"}
+    coordinates["attractor"] = ("attractor", numbers, named)
+    return dataset.drop_dims(order).assign_coords(coordinates).assign(variables)
 
 
 def _nothing(dtype: np.dtype) -> np.ndarray:

@@ -88,6 +88,7 @@ def run(
     if not runs:
         return
     limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
+    limit = min(limit, np.iinfo(np.int32).max)
     threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
     kernel = _kernel(program, derivatives)
