@@ -166,13 +166,13 @@ class Along(Observer):
             for state in ((lanes.t, lanes.x1, lanes.x2), (t, x1, x2))
         ]
         totals = jax.tree.map(lambda i, *r: i + 0.5 * delta * sum(r), lanes.integrals, *ends)
-        none = jnp.zeros_like(lanes.events)
+        none = jnp.zeros(t.shape, int)
         return self._update(seen, (t, x1, x2, none, none - 1), number, totals, wanted)
 
     def _update(self, seen: _Seen, place: Any, number: int, totals, wanted) -> _Seen:
         """The state after an update where it is wanted; place: t, x1, x2, kind and belt."""
         t, x1, x2, kind, belt = place
-        event = RunEvent(t, x1, x2, kind, belt, jnp.full_like(belt, number), totals)
+        event = RunEvent(t, x1, x2, kind, belt, jnp.full(t.shape, number), totals)
         state = jax.vmap(self.reducer.update)(seen.state, event)
         return replace(seen, state=choose(wanted, state, seen.state))
 

@@ -50,7 +50,7 @@ class AtSection:
     differentiable. direction: 1 where the value rises, -1 where it falls, 0 for both.
     """
 
-    function: Callable[[Oscillator, Array, Array], Array]
+    function: Any
     direction: int = 0
 
     def __post_init__(self):
