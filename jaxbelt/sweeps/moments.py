@@ -121,9 +121,9 @@ def _velocity(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 
 
 def _acceleration(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
-    """x2', and 0 at slip onset, where it is 0 but for rounding."""
+    """x2', and 0 where it is 0 but for rounding, as at slip onset; its derivative stays."""
     a = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
-    return jnp.where(jnp.abs(a) < force_rounding(x1), 0.0 * a, a)
+    return jnp.where(jnp.abs(a) < force_rounding(x1), a - lax.stop_gradient(a), a)
 
 
 def value_and_rate(
