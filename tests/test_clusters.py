@@ -131,7 +131,6 @@ def test_an_interrupt_leaves_the_workers_free(client, tmp_path):
         (dict(executor=3), "store must be given, where executor is"),
         (dict(store="a.zarr", executor=3), "executor must be a dask.distributed.Client"),
         (dict(store="a.zarr", blocks=(2, 2)), r"blocks must be two integers .* got \(2, 2\)"),
-        (dict(store="a.zarr", blocks="0:2"), r"blocks must be two integers"),
         (dict(store="a.zarr", blocks=(5, 9)), r"blocks must be among the 5 of this sweep, got \(5"),
         (dict(store="a.zarr", blocks=(0, 9), audit=0.1), "audit must be 0 where blocks is given"),
     ],
