@@ -245,3 +245,5 @@ def test_impossible_moments_are_named(make, message):
     reducer.at = "x1"
     with pytest.raises(ValueError, match=r"observe\.at must be a tuple of AtEvents, AtExtrema"):
         swept(FAST, reducer)
+    with pytest.raises(ValueError, match="derivatives must be none, where observe has `at` or"):
+        jb.sweep(*FAST, t1=5.0, observe=Largest(0.0), derivatives="nu0")

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import kills
 import numpy as np
@@ -122,6 +123,15 @@ def test_an_interrupt_leaves_the_workers_free(client, tmp_path):
     while any(client.processing().values()):
         assert time.monotonic() - began < 5.0
         time.sleep(0.05)
+
+
+def test_blocks_go_to_workers_with_a_gpu_where_there_are_such():
+    def resources(*workers):
+        told = {"workers": {str(i): {"resources": one} for i, one in enumerate(workers)}}
+        return clusters._resources(SimpleNamespace(scheduler_info=lambda n_workers: told))
+
+    assert resources({}, {"memory": 3}) is None and resources() is None
+    assert resources({}, {"GPU": 1}) == {"GPU": 1}
 
 
 @pytest.mark.parametrize(

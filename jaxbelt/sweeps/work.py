@@ -62,5 +62,5 @@ def do_runs(
 
 def counts(statuses: np.ndarray) -> dict[int, int]:
     """How many runs ended with each status."""
-    values, numbers = np.unique(statuses.astype(int), return_counts=True)
-    return dict(zip(values.tolist(), numbers.tolist(), strict=True))
+    numbers = np.bincount(statuses.ravel().astype(int))
+    return {int(i): int(numbers[i]) for i in np.flatnonzero(numbers)}
