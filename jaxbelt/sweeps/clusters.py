@@ -83,7 +83,7 @@ def do_on_cluster(client: Any, question: Question, store: Store, tell: Tell) -> 
 def _resources(client: Any) -> dict[str, float] | None:
     """What a block needs. All blocks run on one kind of device, for another rounds otherwise."""
     workers = client.scheduler_info(n_workers=-1)["workers"].values()
-    return {GPU: 1} if any(worker["resources"].get(GPU, 0) for worker in workers) else None
+    return {GPU: 1.0} if any(worker["resources"].get(GPU, 0) for worker in workers) else None
 
 
 def do_block(packed: bytes, place: str, block: int) -> dict[str, Any]:
