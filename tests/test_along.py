@@ -100,6 +100,7 @@ Largest, Energy, Points, Samples = (PAGE[n] for n in ("Largest", "Energy", "Poin
 height = PAGE["height"]
 
 
+@pytest.mark.slow(first=True)
 @each
 def test_extrema_are_those_of_the_oracle(name):
     found = swept(CASES[name], Largest(10.0))
@@ -138,6 +139,7 @@ def test_points_of_a_section_are_those_of_the_oracle(name):
         np.testing.assert_allclose(found.above[i, 0], above, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow(first=True)
 @each
 def test_states_at_fixed_times_are_those_of_the_oracle(name):
     found = swept(CASES[name], Samples())
@@ -188,6 +190,7 @@ def test_extrema_of_the_velocity_last_through_stick_phases(name):
         np.testing.assert_allclose(found.way[i, 0], run.y_end[0] - Y0[0], **CLOSE)
 
 
+@pytest.mark.slow(first=True)
 def test_a_smooth_motion_gives_results_too():
     points, found = swept(FAST, Points()), swept(FAST, Energy())
     for i, nu0 in enumerate(FAST[1]["nu0"]):
