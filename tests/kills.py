@@ -135,7 +135,10 @@ def worker_campaign(client, folder: Path, kills: int, seed: int, t1=4000.0) -> d
             sweeping = pool.submit(swept, Sum(), store, t1, executor=client)
             while not sweeping.done() and told["killed"] < kills:
                 time.sleep(rng.uniform(0, LONGEST_OF_WORKERS))
-                alive = [nanny.pid for nanny in client.cluster.workers.values() if nanny.pid]
+                # At work: Dask gives up a worker that dies before it has registered.
+                busy = {address for address, keys in client.processing().items() if keys}
+                nannies = client.cluster.workers.values()
+                alive = [one.pid for one in nannies if one.pid and one.worker_address in busy]
                 if alive and not sweeping.done():
                     os.kill(rng.choice(alive), signal.SIGKILL)
                     told["killed"] += 1
