@@ -14,8 +14,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     presets         the published systems
     motion/         integrators arcs sensitivities runs sampling smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
-    sweeps/         lanes step events marks observers attractor queue threads audit
-    sweeps/         grid datasets question store progress sweep basins
+    sweeps/         lanes step events marks observers moments along attractor queue threads audit
+    sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   refine path scan curves diagrams switch_folds
     inverse/        selection record fit design
@@ -66,6 +66,8 @@ from .motion.simulate import Arcs, Events, Trajectory, simulate
 from .results import EventKind, Status, describe, draw_with
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.datasets import decoded
+from .sweeps.moments import AtEvents, AtExtrema, AtSection, AtTimes
+from .sweeps.shares import attractors
 from .sweeps.store import Verified, verify
 from .sweeps.sweep import Explanation, explain, sweep
 
@@ -79,6 +81,10 @@ __version__ = importlib.metadata.version("jaxbelt")
 __all__ = [
     "AbstractFriction",
     "Arcs",
+    "AtEvents",
+    "AtExtrema",
+    "AtSection",
+    "AtTimes",
     "BasinStability",
     "Basins",
     "Belt",
@@ -115,6 +121,7 @@ __all__ = [
     "Trajectory",
     "Verified",
     "amplitude",
+    "attractors",
     "basin_stability",
     "basins",
     "bifurcation_curve",

@@ -6,7 +6,10 @@ import subprocess
 import sys
 import time
 
+import kills
 import pytest
+
+from jaxbelt.sweeps import store
 
 #: A sweep that would take hours: many short runs, or a few long ones, each longer than a call of
 #: the kernel is to take. Before it, one of the same program that compiles it.
@@ -75,3 +78,11 @@ def test_an_interrupt_ends_the_command(tmp_path):
     assert code == 130 and "interrupted after " in errors and "Traceback" not in errors
     assert seconds < SOON
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_interrupts_of_a_session_lose_nothing(tmp_path, monkeypatch):
+    """At random moments, of the compilation too; the same store goes on."""
+    monkeypatch.setattr(store, "BLOCK_RUNS", kills.BLOCK)
+    told = kills.interrupt_campaign(tmp_path, interrupts=3, seed=2, t1=2000.0)
+    assert told["interrupted"] == 3 and told["longest"] < SOON

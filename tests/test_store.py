@@ -14,6 +14,7 @@ import zarr
 import jaxbelt as jb
 from jaxbelt.sweeps import store as stores
 from jaxbelt.sweeps.grid import Blocks
+from jaxbelt.sweeps.locks import locked
 from jaxbelt.sweeps.store import CHECKSUM
 
 AXES = {"nu0": np.linspace(-0.6, 0.55, 5), "nu1": np.array([0.35, -0.2, 0.1])}
@@ -108,7 +109,7 @@ def test_a_finished_store_is_returned_at_once(path, whole, monkeypatch):
     def never(*_, **__):
         raise AssertionError("nothing is to be run")
 
-    monkeypatch.setattr("jaxbelt.sweeps.sweep.run", never)
+    monkeypatch.setattr("jaxbelt.sweeps.work.run", never)
     assert again(path).equals(whole)
 
 
@@ -209,7 +210,7 @@ def test_a_law_and_a_reducer_count_by_type_numbers_and_source(tmp_path):
 
 
 def test_places_that_cannot_hold_a_store_are_told_before_the_computing(tmp_path, monkeypatch):
-    monkeypatch.delattr("jaxbelt.sweeps.sweep.run")
+    monkeypatch.delattr("jaxbelt.sweeps.work.run")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     (tmp_path / "file").write_text("mine")
@@ -267,7 +268,7 @@ def test_stores_of_other_schemas_and_wrecks_are_refused(path):
 
 def test_of_two_sweeps_at_once_the_second_is_refused(path, whole):
     undone(path, 2)
-    with stores._locked(path):
+    with locked(path):
         for call in (again, lambda path: jb.verify(path, repair=True)):
             with pytest.raises(BlockingIOError, match="is being written by another sweep"):
                 call(path)

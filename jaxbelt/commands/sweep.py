@@ -45,6 +45,14 @@ def sweep(
             "same command goes on where it was interrupted."
         ),
     ] = Path("sweep.nc"),
+    blocks: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FROM:TO",
+            help="Do only these blocks of a store, 0:64 for the first 64; other processes may do "
+            "others at the same time. --dry-run tells how many there are.",
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only tell how much it is and how long it will take.")
     ] = False,
@@ -62,16 +70,18 @@ def sweep(
     - jaxbelt sweep nu0=-0.7:0.7:512 nu1=-0.7:0.7:512 --out plane.nc
 
     - jaxbelt sweep x1=-2:2:200 x2=-2:2:200 --observe final --t1 50 --out starts.zarr
-    """
-    from ..plotting.style import journal_figure, journal_style, save
-    from ..plotting.sweeps import plot_sweep
 
+    - jaxbelt sweep nu0=-0.7:0.7:8192 nu1=-0.7:0.7:8192 --out plane.zarr --blocks 0:64
+    """
     console = make_console()
     with plain_errors():
         if system not in CLASSES:
             raise ValueError(f"class must be a, b, c or d, got {system}")
         if out.suffix not in (".nc", ".zarr"):
             raise ValueError(f"out must end in .nc or .zarr, got {out}")
+        part = None if blocks is None else parse_blocks(blocks)
+        if part and out.suffix != ".zarr":
+            raise ValueError(f"out must end in .zarr where blocks are given, got {out}")
         values = dict(map(parse_axis, axes))
         for name in values:
             if name not in (*CLASSES[system], "x1", "x2"):
@@ -88,22 +98,37 @@ def sweep(
             console.print(repr(jb.explain(make, values, **asked)), highlight=False, soft_wrap=True)
             return
         if out.suffix == ".zarr":
-            dataset = jb.sweep(make, values, **asked, store=out)
+            dataset = jb.sweep(make, values, **asked, store=out, blocks=part)
         else:
             check_out(out)
             dataset = jb.sweep(make, values, **asked)
             # Version 3 of the format, which needs no library but SciPy.
             dataset.to_netcdf(out, engine="scipy")
         written = [out]
-        if sum(len(axis) > 1 for axis in values.values()) in (1, 2):
+        if part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2):
             written.append(out.with_suffix(".png"))
             shown = variable or ("kind" if observe == "attractor" else "x1_end")
-            with journal_style():
-                figure = journal_figure(4.6, 4.4)
-                plot_sweep(dataset, shown, figure.subplots())
-                save(figure, written[1])
+            _draw(dataset, shown, written[1])
     for line in (repr(dataset), f"Written: {', '.join(map(str, written))}"):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _draw(dataset: Any, variable: str, out: Path) -> None:
+    from ..plotting.style import journal_figure, journal_style, save
+    from ..plotting.sweeps import plot_sweep
+
+    with journal_style():
+        figure = journal_figure(4.6, 4.4)
+        plot_sweep(dataset, variable, figure.subplots())
+        save(figure, out)
+
+
+def parse_blocks(text: str) -> tuple[int, int]:
+    """The first block and the one behind the last that a text such as `0:64` names."""
+    first, colon, last = text.partition(":")
+    if not (colon and first.isdecimal() and last.isdecimal() and int(first) < int(last)):
+        raise ValueError(f"blocks must be FROM:TO, two integers with FROM < TO, got {text!r}")
+    return int(first), int(last)
 
 
 def parse_axis(text: str) -> tuple[str, np.ndarray]:

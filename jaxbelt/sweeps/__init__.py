@@ -5,10 +5,13 @@
 - `step`: one Runge-Kutta step of all lanes; `events`: what follows where a step lands on a guard;
   `marks`: states that later ones are compared with, to find what repeats;
 - `observers`, `attractor`: what can be asked: final states, a user's reducer, attractors;
+- `moments`, `along`: reducers that see what is between the events, too;
 - `queue`: the compiled loop that fills lanes from a queue of runs; `threads`: a loop on each core;
 - `grid`, `question`: the points of a sweep, and everything that makes two sweeps the same;
-- `datasets`, `store`: the results, in memory and in a Zarr group; `progress`: a bar;
+- `datasets`, `store`: the results, in memory and in a Zarr group; `locks`: who may write it;
+- `work`: runs of blocks, here; `clusters`: blocks as tasks of a Dask cluster; `progress`: a bar;
 - `sweep`: named axes in, a labelled dataset out; `audit`: runs again, without shortcuts;
+- `shares`: the attractors that several starts lead to, and how many lead to each;
 - `basins`: the same for starts of one oscillator.
 
 A new observable is a subclass of `lanes.Observer` in a file of its own; `sweep` takes it as it is.

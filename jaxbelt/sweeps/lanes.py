@@ -26,6 +26,7 @@ class Lanes(eqx.Module):
     of its mode and waits for `events.pass_events`; pace: inverse of the largest step that the last
     error would have allowed; mode; events: how many there were; status; done. lower, upper:
     extrema of x2 since the observer reset them, where it asks for extrema. memory: the observer's.
+    integrals: of the rates that it gives to the steps, see `Observer.follow`, from 0 to t.
     """
 
     run: Array
@@ -43,6 +44,7 @@ class Lanes(eqx.Module):
     lower: Array
     upper: Array
     memory: Any
+    integrals: Any = None
 
 
 class Passage(eqx.Module):
@@ -120,6 +122,16 @@ class Observer(eqx.Module):
     @abc.abstractmethod
     def start(self, osc: Oscillator, lanes: Lanes) -> Any:
         """The memory of runs that begin, a tree of arrays [lanes]."""
+
+    def integrals(self, osc: Oscillator, lanes: Lanes) -> Any:
+        """The integrals of runs that begin, a tree of zeros [lanes]; None: no integrals."""
+        return None
+
+    def follow(
+        self, take_step: Callable, osc, window, one: Array, lanes: Lanes, t1, rtol, atol
+    ) -> Lanes:
+        """The lanes after `step.take_step`: for who looks at what is between the events."""
+        return take_step(osc, window, one, lanes, t1, rtol, atol)
 
     @abc.abstractmethod
     def watch(

@@ -71,22 +71,29 @@ class Final(Observer):
 
 
 class RunEvent(eqx.Module):
-    """An event of a run, as a reducer sees it: scalars t, x1, x2, kind (`EventKind`) and belt."""
+    """A moment of a run, as a reducer sees it: scalars t, x1, x2, kind (`EventKind`) and belt.
+
+    Of a reducer with `at` or `rates` also moment, the number in `at`, and integrals, those of the
+    rates from 0 to t; at moments that are no events kind is 0 and belt -1.
+    """
 
     t: Array
     x1: Array
     x2: Array
     kind: Array
     belt: Array
+    moment: Any = None
+    integrals: Any = None
 
 
 class RunEnd(eqx.Module):
-    """The end of a run, as a reducer sees it: scalars t, x1, x2 and status."""
+    """The end of a run, as a reducer sees it: scalars t, x1, x2 and status; integrals likewise."""
 
     t: Array
     x1: Array
     x2: Array
     status: Array
+    integrals: Any = None
 
 
 class Reduce(Observer):

@@ -3,8 +3,8 @@
 import threading
 import time
 from collections import Counter
+from collections.abc import Mapping
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -52,21 +52,20 @@ class SweepProgress:
             if self.bar is not None and not self.ended:
                 self.bar.start()
 
-    def advance(self, statuses: np.ndarray) -> None:
-        """More runs are done, with these statuses."""
+    def advance(self, counts: Mapping[int, int]) -> None:
+        """More runs are done, so many with each status."""
         if self.bar is None:
             return
-        now = time.monotonic()
+        now, more = time.monotonic(), sum(counts.values())
         with self.lock:
             # The first results may come long after the first runs began: they give no rate.
-            known = 0 if self.began is None else self.statuses.total() + len(statuses)
+            known = 0 if self.began is None else self.statuses.total() + more
             self.began = self.began or now
-            values, counts = np.unique(statuses.astype(int), return_counts=True)
-            self.statuses.update(dict(zip(values.tolist(), counts.tolist(), strict=True)))
+            self.statuses.update(counts)
             others = {Status(k).name.lower(): n for k, n in self.statuses.items() if k != Status.OK}
         told = f", {known / (now - self.began):,.0f} runs/s" if known and now > self.began else ""
         told += "".join(f", {count:,} {name}" for name, count in sorted(others.items()))
-        self.bar.update(self.task, advance=len(statuses), description="sweep", told=told)
+        self.bar.update(self.task, advance=more, description="sweep", told=told)
 
     def __exit__(self, *_) -> None:
         if self.bar is None:

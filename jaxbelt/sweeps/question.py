@@ -7,17 +7,18 @@ import inspect
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import CodeType
 from typing import Any
 
 import jax
 import numpy as np
 
 from ..checks import as_array, check_positive, require, require_usable_jax
+from .along import Along
 from .attractor import Attractor
 from .datasets import Table
 from .grid import Grid
 from .lanes import Observer, Program
+from .moments import AtEvents, bytecode, checked
 from .observers import Final, Reduce
 from .threads import CHUNK
 
@@ -33,7 +34,7 @@ class Question:
 
     grid: Grid
     observe: Any
-    numbers: dict[str, float]
+    numbers: dict[str, Any]
     derivatives: tuple[str, ...]
 
     @classmethod
@@ -53,7 +54,16 @@ class Question:
         for name in wanted:
             known = ", ".join(grid.axes)
             require(name in grid.axes, "derivatives", f"names of axes, {known}", repr(name))
+        plain = not isinstance(_observer(observe), Along)
+        expected = "none, where observe has `at` or `rates`"
+        require(plain or not wanted, "derivatives", expected, wanted)
         return cls(grid, observe, numbers, tuple(wanted))
+
+    def arguments(self) -> tuple[Any, ...]:
+        """The arguments of `of`: what another process needs to ask the same."""
+        grid, numbers = self.grid, self.numbers.values()
+        start = tuple(grid.y0.values())
+        return grid.make, grid.axes, start, *numbers, self.observe, self.derivatives
 
     @functools.cached_property
     def program(self) -> Program:
@@ -132,6 +142,9 @@ def _observer(observe: Any) -> Observer:
     methods = ("init", "update", "finish")
     fits = all(callable(getattr(observe, name, None)) for name in methods)
     require(fits, "observe", '"final", "attractor" or an object with init, update, finish', observe)
+    if hasattr(observe, "at") or hasattr(observe, "rates"):
+        checked(getattr(observe, "at", (AtEvents(),)))
+        return Along(observe)
     return Reduce(observe)
 
 
@@ -160,11 +173,5 @@ def _source(kind: type) -> str:
             found.append(inspect.getsource(one))
         except (OSError, TypeError):
             functions = sorted(inspect.getmembers(one, inspect.isfunction))
-            found += [f"{name} {_bytecode(function.__code__)}" for name, function in functions]
+            found += [f"{name} {bytecode(function.__code__)}" for name, function in functions]
     return _hash("\n".join(found).encode())
-
-
-def _bytecode(code: CodeType) -> str:
-    """What a compiled function does, without where it came from."""
-    constants = [_bytecode(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
-    return f"{code.co_code.hex()} {code.co_names} {constants}"

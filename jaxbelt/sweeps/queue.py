@@ -82,7 +82,8 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
         upper=x2,
         memory=None,
     )
-    return replace(lanes, memory=program.observer.start(osc, lanes))
+    memory, integrals = program.observer.start(osc, lanes), program.observer.integrals(osc, lanes)
+    return replace(lanes, memory=memory, integrals=integrals)
 
 
 class Stream(eqx.Module):
@@ -180,7 +181,7 @@ def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> 
         window = window_of(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
 
         def step(_, lanes):
-            return take_step(osc, window, one, lanes, t1, rtol, atol)
+            return observer.follow(take_step, osc, window, one, lanes, t1, rtol, atol)
 
         return lax.fori_loop(0, STEPS_PER_ROUND, step, lanes)
 

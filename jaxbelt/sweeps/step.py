@@ -17,10 +17,13 @@ Taylor step gives event times and states their exact ones, and so does the last 
 """
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -28,7 +31,7 @@ from jaxtyping import Array
 
 from ..model.modes import ABOVE, BELOW, ULPS, select
 from ..model.oscillator import Oscillator
-from .lanes import Lanes, materialise
+from .lanes import Lanes, choose, materialise
 
 #: First step of a run and after each event, at a tolerance of 1e-8: about what the tolerance allows
 #: where the friction law bends.
@@ -127,30 +130,34 @@ def _quotient(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array
     return numerator / denominator
 
 
-def _combine(weights: np.ndarray, arrays: list[Array]) -> Array:
+def _combine(weights: np.ndarray, arrays: Sequence[Array]) -> Array:
     """The weighted sum of the first arrays, without those of weight 0."""
     terms = [w * array for w, array in zip(weights.tolist(), arrays, strict=False) if w != 0]
     return functools.reduce(jnp.add, terms)
 
 
 class _Attempt(eqx.Module):
-    """A step of size h, not yet accepted: state and x2' at its end, and its error over the
-    tolerance."""
+    """A step of size h, not yet accepted: state and x2' at its end, its error over the tolerance,
+    and the integrals that the observer asks for."""
 
     h: Array
     x1: Array
     x2: Array
     a: Array
     error: Array
+    integrals: Any
 
 
-def _attempt(osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol) -> _Attempt:
-    """One Runge-Kutta step of all lanes."""
+def _attempt(osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol, rates) -> _Attempt:
+    """One Runge-Kutta step of all lanes; rates: see `take_step`."""
     x1, x2, stages = lanes.x1, lanes.x2, [lanes.a]
+    slopes = [rates(osc, lanes.mode, lanes.t, x1, x2)] if rates else []
     for row, row1, c in zip(_A[1:-1], _AA[1:-1], _C[1:-1].tolist(), strict=True):
         drift = c * x2 + h * _combine(row1, stages) if np.any(row1) else c * x2
         x2_stage = x2 + h * _combine(row, stages)
         stages.append(_quotient(osc, window, one, x1 + h * drift, x2_stage))
+        if rates:
+            slopes.append(rates(osc, lanes.mode, lanes.t + c * h, x1 + h * drift, x2_stage))
     # The weights of the solution are those of the last stage, which is the next step's first.
     y1 = materialise(x1 + h * (x2 + h * _combine(_AA[-1], stages)), one)
     y2 = materialise(x2 + h * _combine(_A[-1], stages), one)
@@ -159,7 +166,8 @@ def _attempt(osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol) -> _
     scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
     error1, error2 = jnp.abs(h * h * _combine(_EA, stages)), jnp.abs(h * _combine(_E, stages))
     error = jnp.maximum(error1 * scale2, error2 * scale1) / (scale1 * scale2)
-    return _Attempt(h, y1, y2, stages[-1], lax.stop_gradient(error))
+    integrals = jax.tree.map(lambda i, *s: i + h * _combine(_A[-1], s), lanes.integrals, *slopes)
+    return _Attempt(h, y1, y2, stages[-1], lax.stop_gradient(error), integrals)
 
 
 class _Interpolant(eqx.Module):
@@ -298,12 +306,17 @@ def _grazes(window: _Window, lanes: Lanes, new: _Attempt, path: _Interpolant, re
     return grazes & path.has_extremum
 
 
-def take_step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol) -> Lanes:
-    """One step of the lanes that slip: kept, shortened to end on a bound, or rejected."""
+def take_step(
+    osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol, rates: Callable | None = None
+) -> Lanes:
+    """One step of the lanes that slip: kept, shortened to end on a bound, or rejected.
+
+    rates(osc, mode, t, x1, x2), a tree of arrays [lanes], is integrated with the motion.
+    """
     left = t1 - lanes.t
     going = window.active & (lanes.h > 0) & (left > 0)
     h = jnp.where(going, jnp.minimum(lanes.h, left), 0.0)
-    new = _attempt(osc, window, one, lanes, h, rtol, atol)
+    new = _attempt(osc, window, one, lanes, h, rtol, atol, rates)
     path = _interpolate(one, lanes, new)
     at = _landing(window, one, lanes, new, path, rtol)
 
@@ -342,7 +355,17 @@ def take_step(osc, window: _Window, one: Array, lanes: Lanes, t1, rtol, atol) ->
         pace=lax.stop_gradient(jnp.where(accepted, pace, lanes.pace)),
         lower=lower,
         upper=upper,
+        integrals=_integrated(rates, osc, lanes, new, delta, x1, x2, kept) if rates else None,
     )
+
+
+def _integrated(rates, osc, lanes: Lanes, new: _Attempt, delta, x1, x2, kept) -> Any:
+    """The integrals after a step and the Taylor step behind it."""
+    t = lanes.t + new.h
+    ends = [(t, new.x1, new.x2), (t + delta, x1, x2)]
+    slopes = [rates(osc, lanes.mode, *end) for end in ends]
+    totals = jax.tree.map(lambda i, *s: i + 0.5 * delta * sum(s), new.integrals, *slopes)
+    return choose(kept, totals, lanes.integrals)
 
 
 def _next_size(lanes: Lanes, new: _Attempt, going, accepted) -> tuple[Array, Array]:

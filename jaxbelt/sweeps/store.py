@@ -32,6 +32,7 @@ import numpy as np
 from ..checks import require
 from .datasets import NUMBERED, renumber
 from .grid import Blocks, Grid
+from .locks import locked
 from .question import Question
 
 if TYPE_CHECKING:
@@ -65,30 +66,78 @@ class Store:
 
     @classmethod
     @contextmanager
-    def opened(cls, path: Path, question: Question) -> "Iterator[Store]":
-        """The store of a sweep, made where there is none, and locked unless it is finished."""
+    def opened(
+        cls, path: Path, question: Question, part: tuple[int, int] | None = None
+    ) -> "Iterator[Store]":
+        """The store of a sweep, made where there is none, and locked unless it is finished.
+
+        part: the first block that is wanted, and the one behind the last; None: all of them.
+        """
         if _is_finished(path):
-            yield cls(path, question)
+            yield cls(path, question, part)
             return
         _check_folder(path)
-        with _locked(path):
+
+        def prepare():
             if not (path / "zarr.json").exists():
                 _create(path, question)
-            yield cls(path, question)
+            if part is None:
+                _sweep_out(path)
 
-    def __init__(self, path: Path, question: Question):
+        with locked(path, *(part or ()), prepare=prepare):
+            yield cls(path, question, part)
+
+    @classmethod
+    def finish_if_done(cls, path: Path, question: Question) -> "Store":
+        """The store as it stands when a part is done; finished if that was the last one."""
+        store = cls(path, question)
+        if store.to_do or store.finished:
+            return store
+        try:
+            with cls.opened(path, question) as store:
+                store.finish()
+        except BlockingIOError:  # by who does another part again, or finishes it
+            pass
+        return store
+
+    def __init__(
+        self,
+        path: Path,
+        question: Question,
+        part: tuple[int, int] | None = None,
+        known: str | None = None,
+    ):
+        """known: the hash of the question, where another process compared all of it."""
         self.path, self.question, self.table = path, question, question.table
         self.root = _open(path)
-        self.blocks = blocks_of(question.grid)
-        _check_question(path, self.root, _identity(question, self.blocks))
+        self.hash = self.root.attrs["jaxbelt_hash"]
+        if known is None:
+            _check_question(path, self.root, _identity(question, blocks_of(question.grid)))
+        elif known != self.hash:
+            raise ValueError(f"store must be that of this very sweep, got another one in {path}")
         self.ledger = self.root["ledger"]
+        self.blocks = Blocks(question.grid.shape, self.ledger.attrs["block"])
+        self.part = range(len(self.blocks))[slice(*(part or (None,)))]
         self.rows = _ledger_rows(path, self.ledger)
         self.finished = bool(self.ledger.attrs["finished"])
-        self.to_do = np.flatnonzero(self.rows[:, STATE] != DONE).tolist()
+        self.to_do = [block for block in self.part if not self.is_done(block)]
         self.arrays = {name: _array(self.root, name) for name in self.ledger.attrs["variables"]}
         self.waiting: dict[int, _Waiting] = {}
         self.lock = threading.Lock()
         self.began = time.monotonic()
+
+    def is_done(self, block: int) -> bool:
+        """Whether a block is done, as far as is known here."""
+        return bool(self.rows[block, STATE] == DONE)
+
+    def look(self, *blocks: int) -> None:
+        """Read the rows of blocks that other processes may have written."""
+        for block in blocks:
+            self.rows[block] = np.asarray(self.ledger["blocks"][block])
+
+    def statuses(self, block: int) -> np.ndarray:
+        """How the runs of a block ended."""
+        return np.asarray(self.arrays["status"][self.blocks.slices(block)])
 
     def put(self, block: int, positions: np.ndarray, results: np.ndarray) -> None:
         """Take results of runs; those of a block are written when they are complete."""
@@ -117,14 +166,18 @@ class Store:
         self.ledger["blocks"][block] = row
         self.rows[block] = row
 
+    @property
+    def runs(self) -> int:
+        """How many runs the wanted blocks have."""
+        return sum(map(self.blocks.size, self.part))
+
     def done(self) -> int:
-        """How many runs are in the store."""
-        done = np.flatnonzero(self.rows[:, STATE] == DONE)
-        return sum(self.blocks.size(block) for block in done.tolist())
+        """How many of them are in the store."""
+        return sum(self.blocks.size(block) for block in self.part if self.is_done(block))
 
     def interrupted(self) -> str:
         """What becomes of the results of an interrupted sweep."""
-        done = f"{self.done():,} of {self.question.grid.runs:,} runs"
+        done = f"{self.done():,} of {self.runs:,} runs"
         return f"interrupted: {done} are in {self.path}; the same call goes on from there"
 
     def of_runs(self, runs: np.ndarray) -> dict[str, np.ndarray]:
@@ -158,6 +211,7 @@ class Store:
             shown.attrs.update(_as_json(named))
             self.ledger.attrs[f"{name}_numbers"] = {str(k): v for k, v in numbers.items()}
         _consolidate(self.path)
+        _sweep_out(self.path)
         self.ledger.attrs["finished"] = self.finished = True
 
     def tell(self, attributes: dict[str, Any]) -> None:
@@ -230,24 +284,10 @@ def _check_folder(path: Path) -> None:
         raise PermissionError(13, "store cannot be written", str(path))
 
 
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Keep other sweeps off the store, on this machine and on others that see its folder."""
-    import filelock
-
-    lock = filelock.FileLock(path.with_name(f".{path.name}.lock"), timeout=0)
-    try:
-        lock.acquire()
-    except filelock.Timeout:
-        raise BlockingIOError(
-            f"store {path} is being written by another sweep; wait for it, or use another store"
-        ) from None
-    try:
-        for left in path.rglob("*.partial"):  # of a writer that died
-            left.unlink()
-        yield
-    finally:
-        lock.release()
+def _sweep_out(path: Path) -> None:
+    """Remove what writers left that died."""
+    for left in path.rglob("*.partial"):
+        left.unlink(missing_ok=True)
 
 
 def _create(path: Path, question: Question) -> None:
@@ -376,7 +416,7 @@ def verify(path: str | Path, repair: bool = False) -> Verified:
     root = _open(path, "r")
     if not repair:
         return _verified(root)
-    with _locked(path):
+    with locked(path):
         root = _open(path)
         found = _verified(root)
         for block in found.bad:

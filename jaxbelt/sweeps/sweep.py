@@ -17,14 +17,16 @@ from jaxtyping import ArrayLike
 
 from ..checks import as_array, require
 from ..model.oscillator import Oscillator
+from .along import Along
 from .audit import chosen, differing
+from .clusters import check_executor, do_on_cluster
 from .datasets import Memory
 from .observers import Reduce
 from .progress import SweepProgress
 from .question import Question
-from .queue import column_of
 from .store import Store, blocks_of
 from .threads import CHUNK, run
+from .work import do_runs
 
 if TYPE_CHECKING:
     import xarray
@@ -41,6 +43,8 @@ def sweep(
     observe: Any = "final",
     derivatives: Sequence[str] = (),
     store: str | Path | None = None,
+    executor: Any = None,
+    blocks: tuple[int, int] | None = None,
     progress: bool | None = None,
     audit: float = 0.0,
 ) -> "xarray.Dataset":
@@ -65,8 +69,10 @@ def sweep(
     - an object with three methods for scalars: `init(osc, x1, x2)`, the state of a run, any tree of
       arrays; `update(state, event)`, the state after an `observers.RunEvent` (t, x1, x2, kind,
       belt); and `finish(state, end)`, a dictionary of results, numbers or vectors, from the state
-      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`.
-
+      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`. It may see
+      more than events: with `at`, a tuple of the moments `AtEvents()`, `AtExtrema("x1")`,
+      `AtSection(function)` and `AtTimes(times)`, it is asked there; with `rates(osc, motion)`, a
+      tree of numbers, their integrals are in event.integrals and end.integrals, see `along.Motion`;
     - a `lanes.Observer`, the base of the first two.
 
     and always status, a `Status` code a run: nothing raises because of one run. Categories, such as
@@ -75,9 +81,13 @@ def sweep(
     derivatives: names of axes. Adds `d_<variable>_d_<axis>` for every variable that is a float, by
     forward mode. store: a folder for the results as they come in, a Zarr group that
     `xarray.open_zarr` opens; the same call with the same store goes on where one was interrupted,
-    and returns at once what is finished. progress: whether to show a bar; None: on a
-    terminal, when it takes long. audit: share of the runs that are done once more without any
-    shortcut and compared, see `audit` for what is left out; the attributes audited and
+    and returns at once what is finished. executor: a `dask.distributed.Client`, whose workers then
+    do the blocks of the store, in a folder that all of them see; a worker that dies costs the block
+    that it was at. blocks: (first, last), which blocks of the store to do, `last` not among them,
+    for processes that share one store, such as those of a job array; who ends last finishes the
+    store, in which until then runs that are not done have the status -1. progress: whether to show
+    a bar; None: on a terminal, when it takes long. audit: share of the runs that are done once more
+    without any shortcut and compared, see `audit` for what is left out; the attributes audited and
     audit_differed say how many, and a warning says so where one differed.
 
     Uses every core (every device, if JAX has others). `ValueError` names the argument that is
@@ -89,68 +99,67 @@ def sweep(
     audit = float(as_array(audit, "audit"))
     require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
     require(
-        audit == 0 or not isinstance(question.program.observer, Reduce),
+        audit == 0 or not isinstance(question.program.observer, Reduce | Along),
         "audit",
         '0 but for observe="final" and "attractor"',
         audit,
     )
+    _check_where(question, store, executor, blocks, audit)
     if store is None:
         results = Memory(question.table)
         _do_runs(question, results, progress)
         told = _audited(question, results, audit) if audit else {}
         return results.dataset(question.attributes() | told)
-    with Store.opened(Path(store), question) as results:
+    return _kept(question, Path(store), executor, blocks, progress, audit)
+
+
+def _kept(
+    question: Question, path: Path, executor: Any, part: tuple[int, int] | None, progress, audit
+) -> "xarray.Dataset":
+    """The sweep in a store, or as far as that part of its blocks goes."""
+    with Store.opened(path, question, part) as results:
         if results.to_do:
-            _do_runs(question, results, progress)
-        results.finish()
-        if results.root.attrs.get("audited", 0) < len(chosen(question.grid.runs, audit)):
+            _do_runs(question, results, progress, executor)
+        if part is None:
+            results.finish()
+        if audit and results.root.attrs.get("audited", 0) < len(chosen(question.grid.runs, audit)):
             results.tell(_audited(question, results, audit))
+    if part is not None:
+        results = Store.finish_if_done(path, question)
     return results.dataset()
 
 
-def _do_runs(question: Question, results: Memory | Store, progress: bool | None) -> None:
-    """Do the runs that the results lack."""
-    blocks, to_do = results.blocks, results.to_do
-    ends = np.cumsum([blocks.size(block) for block in to_do])
-    starts = np.append(0, ends[:-1])
-    status = column_of(question.table.layout, "status")
-
-    def parts(numbers: np.ndarray):
-        """Block by block: which of the numbers are in it, and their positions there."""
-        if len(to_do) == 1:
-            yield to_do[0], slice(None), numbers
-            return
-        places = np.searchsorted(ends, numbers, side="right")
-        for i in np.unique(places):
-            here = places == i
-            yield to_do[i], here, numbers[here] - starts[i]
-
-    def rows_of(first: int, last: int) -> np.ndarray:
-        numbers = np.arange(first, last)
-        runs = [blocks.runs(block, positions) for block, _, positions in parts(numbers)]
-        return question.grid.rows(np.concatenate(runs), question.derivatives)
-
-    with SweepProgress(question.grid.runs, results.done(), progress) as bar:
-
-        def put(numbers: np.ndarray, columns: np.ndarray) -> None:
-            for block, here, positions in parts(numbers):
-                results.put(block, positions, columns[:, :, here])
-            bar.advance(columns[0, status])
-
+def _do_runs(
+    question: Question, results: Memory | Store, progress: bool | None, executor: Any = None
+) -> None:
+    """Do the runs that the results lack, here or on a cluster."""
+    with SweepProgress(results.runs, results.done(), progress) as bar:
         try:
-            run(
-                question.program,
-                question.grid.shared,
-                rows_of,
-                int(ends[-1]),
-                put,
-                **question.numbers,
-                derivatives=len(question.derivatives),
-            )
+            if executor is not None and isinstance(results, Store):
+                do_on_cluster(executor, question, results, bar.advance)
+            else:
+                do_runs(question, results, results.to_do, bar.advance)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(results.interrupted()) from None
         except OSError as error:  # of a store on a full disk, say
-            raise OSError(error.errno, f"{error.strerror}; {results.interrupted()}") from error
+            told = error.strerror or str(error)
+            raise OSError(error.errno, f"{told}; {results.interrupted()}") from error
+
+
+def _check_where(question: Question, store, executor, blocks, audit: float) -> None:
+    """Raise unless blocks can be done there."""
+    for name, value in (("executor", executor), ("blocks", blocks)):
+        wanted = f"given, where {name} is: blocks are written there one by one"
+        require(value is None or store is not None, "store", wanted, "None")
+    if executor is not None:
+        check_executor(executor)
+    if blocks is not None:
+        fits = isinstance(blocks, Sequence) and len(blocks) == 2
+        fits = fits and all(isinstance(b, int) for b in blocks) and 0 <= blocks[0] < blocks[1]
+        require(fits, "blocks", "two integers (first, last), 0 <= first < last", repr(blocks))
+        count = len(blocks_of(question.grid))
+        require(blocks[0] < count, "blocks", f"among the {count:,} of this sweep", blocks)
+        require(audit == 0, "audit", "0 where blocks is given", audit)
 
 
 def _audited(question: Question, results: Memory | Store, share: float) -> dict[str, int]:

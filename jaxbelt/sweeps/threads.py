@@ -70,8 +70,10 @@ def run(
     atol: float,
     derivatives: int = 0,
     budget: float = 1.0,
+    threads: int | None = None,
+    watch: Callable[[], None] = lambda: None,
 ) -> None:
-    """Do all runs, on all cores.
+    """Do all runs, on so many threads or, with None, on all cores.
 
     rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]: the starts and the
     parameters that vary, and their derivatives in so many directions. put(numbers, results) takes
@@ -80,11 +82,14 @@ def run(
 
     Every thread feeds chunks to one compiled kernel (which lets go of Python's lock) on its own
     lanes. Long runs stay in their lanes while the next chunk is worked on. An exception, a
-    `KeyboardInterrupt` too, ends all threads within `PATIENCE` and is raised.
+    `KeyboardInterrupt` too, or what `watch` raises, which is called every tenth of a second, ends
+    all threads within `PATIENCE` and is raised.
     """
     if not runs:
         return
     limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
+    limit = min(limit, np.iinfo(np.int32).max)
+    threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
     kernel = _kernel(program, derivatives)
     team = _Team(
@@ -93,19 +98,19 @@ def run(
         rows_of,
         put,
         (1 + derivatives, columns) if derivatives else (columns,),
-        _Chunks(runs, workers()),
+        _Chunks(runs, threads),
         FIRST_PASSES.get(jax.default_backend(), 100) // (1 + derivatives),
     )
     devices = jax.local_devices()
     # Compiled once, before the threads that would each do it again, and like all else not on the
     # thread of the caller, so that an interrupt need not wait for it.
-    _wait([_started(team.compile, devices[0])])
-    threads = [_started(team.work, devices[i % len(devices)]) for i in range(workers())]
+    _wait([_started(team.compile, devices[0])], watch)
+    at_work = [_started(team.work, devices[i % len(devices)]) for i in range(threads)]
     try:
-        _wait(threads)
+        _wait(at_work, watch)
     finally:
         team.stop.set()
-        wait(threads, timeout=10 * PATIENCE)
+        wait(at_work, timeout=10 * PATIENCE)
 
 
 def _first_stream(program: Program, shared, columns: int, derivatives: int) -> Any:
@@ -235,10 +240,11 @@ def _end_of_process() -> None:
         thread.join()
 
 
-def _wait(futures: list[Future]) -> None:
+def _wait(futures: list[Future], watch: Callable[[], None]) -> None:
     """Wait until all are done or one has failed, and raise what it raised."""
     # With a timeout, for some systems do not interrupt a wait without one.
     while wait(futures, timeout=0.1, return_when=FIRST_EXCEPTION).not_done:
+        watch()
         for future in futures:
             if future.done():
                 future.result()

@@ -1,4 +1,4 @@
-"""Stores measured: a hundred kills, and what keeping ten million runs costs."""
+"""Stores measured: kills and interrupts, two workers beside one, and what keeping runs costs."""
 
 import resource
 import sys
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxbelt as jb
+from jaxbelt.sweeps import store
 
 sys.path.append(str(Path(__file__).parents[1]))
 
@@ -48,3 +49,44 @@ def test_ten_million_runs(benchmark, tmp_path):
     overhead = kept / swept(SIDE) - 1
     print(f"\npeak {above:.0f} MiB over JAX; the store takes {overhead:.1%} of the processor time")
     assert above < 1024
+
+
+def test_fifteen_killed_workers(benchmark, tmp_path, monkeypatch):
+    import kills
+
+    monkeypatch.setattr(store, "BLOCK_RUNS", kills.BLOCK)
+    with kills.cluster(2, tmp_path / "cache") as client:
+        told = benchmark.pedantic(lambda: kills.worker_campaign(client, tmp_path, 15, seed=0))
+    print(f"\n{told}")
+    assert told["killed"] == 15
+
+
+def test_twenty_interrupts(benchmark, tmp_path, monkeypatch):
+    import kills
+
+    monkeypatch.setattr(store, "BLOCK_RUNS", kills.BLOCK)
+    told = benchmark.pedantic(lambda: kills.interrupt_campaign(tmp_path, 20, seed=0))
+    print(f"\n{told}")
+    assert told["interrupted"] == 20 and told["longest"] < 2.0
+
+
+def test_two_workers_beside_one(benchmark, tmp_path):
+    """How many times as fast two workers do a sweep of four million runs: 16 blocks or so a worker.
+    It takes two cores with nothing else to do."""
+    import kills
+
+    nus = np.linspace(-0.7, 0.7, 2048)
+    seconds = {}
+
+    def swept(client, n, name):
+        options = dict(t1=50.0, store=tmp_path / name, executor=client, progress=False)
+        began = time.monotonic()
+        jb.sweep(jb.presets.class_b, {"nu0": nus[:n], "nu1": nus}, **options)
+        return time.monotonic() - began
+
+    for workers in (1, 2):
+        with kills.cluster(workers, tmp_path / "cache") as client:
+            swept(client, 128 * workers, f"compiled{workers}.zarr")
+            seconds[workers] = min(swept(client, 2048, f"{workers}-{i}.zarr") for i in range(3))
+    benchmark.pedantic(lambda: None)
+    print(f"\none worker {seconds[1]:.1f} s, two {seconds[2]:.1f} s: {seconds[1] / seconds[2]:.2f}")

@@ -1,0 +1,129 @@
+"""Sweeps on many machines: blocks as tasks of a Dask cluster.
+
+A task is one block. It looks into the ledger, does the block if it is not done, writes its chunks
+and then its row of the ledger, and returns a small dictionary. So it may run twice, on any worker:
+when a worker dies, its block is done again elsewhere, to the same bits. The client holds the lock
+of the store and numbers the categories when all blocks are done.
+
+`distributed` is imported here only, and where it is used.
+"""
+
+import functools
+import pickle
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from ..checks import require
+from .question import Question
+from .store import Store
+from .work import Tell, counts, do_runs
+
+#: How often a block is done again whose task raised, on a full disk, say.
+RETRIES = 2
+#: How often a block is submitted again that Dask gave up, because several workers died with it.
+RESUBMISSIONS = 3
+#: The resource of workers by this name; where there are such, blocks go to no others.
+GPU = "GPU"
+
+
+def check_executor(executor: Any) -> None:
+    """Raise unless it is a client that can be waited for."""
+    methods = ("submit", "scheduler_info", "cancel", "asynchronous")
+    fits = all(hasattr(executor, name) for name in methods) and not executor.asynchronous
+    require(fits, "executor", "a dask.distributed.Client (not asynchronous)", repr(executor))
+
+
+def do_on_cluster(client: Any, question: Question, store: Store, tell: Tell) -> None:
+    """Do the blocks that the store lacks on the workers of a cluster.
+
+    tell takes how many more runs ended with each status. Workers may come and go.
+    """
+    import cloudpickle
+    from distributed import KilledWorker, as_completed
+
+    packed = cloudpickle.dumps((question.arguments(), store.hash))
+    place, name, resources = str(store.path.resolve()), uuid.uuid4().hex, _resources(client)
+    submitted: Counter[int] = Counter()
+
+    def submit(block: int) -> Any:
+        submitted[block] += 1
+        key = f"jaxbelt-block-{block}-{name}-{submitted[block]}"
+        options = dict(key=key, retries=RETRIES, resources=resources, pure=False)
+        return client.submit(do_block, packed, place, block, **options)
+
+    futures = {submit(block): block for block in store.to_do}
+    done = as_completed(futures)
+    try:
+        for future in done:
+            block = futures.pop(future)
+            try:
+                told = future.result()
+            except KilledWorker:
+                if submitted[block] > RESUBMISSIONS:
+                    raise
+                again = submit(block)
+                futures[again] = block
+                done.add(again)
+                continue
+            store.look(block)
+            if not store.is_done(block):
+                raise OSError(f"store {store.path} must be in a folder that all workers share")
+            tell(told["statuses"])
+    finally:
+        client.cancel(list(futures))
+        store.look(*store.to_do)
+
+
+def _resources(client: Any) -> dict[str, float] | None:
+    """What a block needs. All blocks run on one kind of device, for another rounds otherwise."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    return {GPU: 1.0} if any(worker["resources"].get(GPU, 0) for worker in workers) else None
+
+
+def do_block(packed: bytes, place: str, block: int) -> dict[str, Any]:
+    """Do a block of a store unless it is done; the task of a worker.
+
+    packed: the arguments of the sweep and the hash of the question, pickled; place: the store's
+    folder. Returns the block and how many of its runs ended with each status.
+    """
+    stopped = _stopped()
+
+    def watch() -> None:
+        if stopped():
+            raise RuntimeError("the sweep was interrupted")
+
+    # For this thread of the worker, whatever else the worker does.
+    with jax.enable_x64(True):
+        question, store = _opened(packed, place)
+        store.look(block)
+        if not store.is_done(block):
+            store.began = time.monotonic()
+            threads = 1 if jax.default_backend() == "cpu" else None
+            do_runs(question, store, [block], lambda _: None, threads=threads, watch=watch)
+        return {"block": block, "statuses": counts(store.statuses(block))}
+
+
+@functools.lru_cache(maxsize=4)
+def _opened(packed: bytes, place: str) -> tuple[Question, Store]:
+    """The question and its store, once a worker: the kernel is compiled for this very question."""
+    arguments, known = pickle.loads(packed)
+    question = Question.of(*arguments)
+    return question, Store(Path(place), question, known=known)
+
+
+def _stopped() -> Callable[[], bool]:
+    """Whether the task that asks is wanted no more."""
+    from distributed import get_worker
+
+    try:
+        worker = get_worker()
+    except ValueError:  # called without Dask
+        return lambda: False
+    key, tasks = worker.get_current_task(), worker.state.tasks
+    return lambda: key not in tasks or tasks[key].state == "cancelled"

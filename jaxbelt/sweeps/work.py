@@ -1,0 +1,66 @@
+"""The work of a sweep: runs of blocks through the kernel, into memory or a store."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .datasets import Memory
+from .question import Question
+from .queue import column_of
+from .store import Store
+from .threads import run
+
+#: Takes how many more runs ended with each status.
+Tell = Callable[[Mapping[int, int]], None]
+
+
+def do_runs(
+    question: Question,
+    results: Memory | Store,
+    to_do: Sequence[int],
+    tell: Tell,
+    **options: Any,
+) -> None:
+    """Do the runs of some blocks; options: `threads` and `watch` of `threads.run`."""
+    blocks = results.blocks
+    ends = np.cumsum([blocks.size(block) for block in to_do])
+    starts = np.append(0, ends[:-1])
+    status = column_of(question.table.layout, "status")
+
+    def parts(numbers: np.ndarray):
+        """Block by block: which of the numbers are in it, and their positions there."""
+        if len(to_do) == 1:
+            yield to_do[0], slice(None), numbers
+            return
+        places = np.searchsorted(ends, numbers, side="right")
+        for i in np.unique(places):
+            here = places == i
+            yield to_do[i], here, numbers[here] - starts[i]
+
+    def rows_of(first: int, last: int) -> np.ndarray:
+        numbers = np.arange(first, last)
+        runs = [blocks.runs(block, positions) for block, _, positions in parts(numbers)]
+        return question.grid.rows(np.concatenate(runs), question.derivatives)
+
+    def put(numbers: np.ndarray, columns: np.ndarray) -> None:
+        for block, here, positions in parts(numbers):
+            results.put(block, positions, columns[:, :, here])
+        tell(counts(columns[0, status]))
+
+    run(
+        question.program,
+        question.grid.shared,
+        rows_of,
+        int(ends[-1]),
+        put,
+        **question.numbers,
+        derivatives=len(question.derivatives),
+        **options,
+    )
+
+
+def counts(statuses: np.ndarray) -> dict[int, int]:
+    """How many runs ended with each status."""
+    numbers = np.bincount(statuses.ravel().astype(int))
+    return {int(i): int(numbers[i]) for i in np.flatnonzero(numbers)}

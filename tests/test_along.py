@@ -1,0 +1,252 @@
+"""Reducers that see the whole motion: extrema, sections, fixed times and integrals."""
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+import jaxbelt as jb
+
+SPAN, Y0 = 40.0, (3.0, 0.0)
+NU0, NU1 = (0.45, 0.1, -0.2), 0.35
+#: Sticks and slips on both belts; with sigma, passes an edge, too.
+CASES = {
+    "class_b": (jb.presets.class_b, {"nu0": np.array(NU0), "nu1": [NU1]}),
+    "class_c": (
+        lambda nu0, nu1: jb.presets.class_c(nu0, nu1, 0.8),
+        {"nu0": np.array(NU0), "nu1": [0.4]},
+    ),
+}
+#: Each takes a compilation a case.
+each = pytest.mark.parametrize("name", ["class_c", pytest.param("class_b", marks=pytest.mark.slow)])
+#: No events: the belts are faster than the mass ever is.
+FAST = (jb.presets.class_b, {"nu0": [4.0, 5.0], "nu1": [6.0]})
+#: A sweep at 1e-11 is compared with an oracle at 1e-13: errors add up over a run.
+CLOSE = dict(rtol=0, atol=1e-8)
+TIGHT = dict(rtol=1e-11, atol=1e-11, t1=SPAN, progress=False)
+
+
+def swept(case, observe):
+    make, axes = case
+    return jb.sweep(make, axes, y0=Y0, observe=observe, **TIGHT)
+
+
+def runs(name):
+    """The oracle's runs of a case."""
+    if name == "class_b":
+        oscillators = [oracle.class_b(nu0, NU1) for nu0 in NU0]
+    else:
+        oscillators = [oracle.class_c(nu0, 0.4, 0.8) for nu0 in NU0]
+    return [oracle.simulate(osc, Y0, SPAN) for osc in oscillators]
+
+
+def smooth_run(nu0):
+    """SciPy's solution of a motion without events: a function of time."""
+
+    def field(t, y):
+        force = -y[0] - 0.5 * y[1]
+        for nu in (nu0, 6.0):
+            force += 0.4 / (1 + 10 * (nu - y[1])) + 0.6
+        return y[1], force
+
+    options = dict(rtol=1e-13, atol=1e-13, max_step=0.2, dense_output=True)
+    return solve_ivp(field, (0, SPAN), Y0, "DOP853", **options).sol
+
+
+def along(run):
+    """The oracle's motion as a function of time, good to 1e-11."""
+    starts = np.array([arc.t_start for arc in run.arcs])
+    return lambda t: run.arcs[max(int(np.searchsorted(starts, t, "right")) - 1, 0)].dense(t)
+
+
+def roots(function, count=4_001):
+    """Zeros of a function of time over the run, found on a fine grid."""
+    ts = np.linspace(0, SPAN, count)
+    values = np.array([function(t) for t in ts])
+    places = np.flatnonzero(values[:-1] * values[1:] < 0)
+    return [brentq(function, ts[i], ts[i + 1], xtol=1e-13) for i in places]
+
+
+def integral(function, knots):
+    """The integral of a function of time that is smooth between the knots."""
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    total = 0.0
+    for a, b in pairwise(knots):
+        parts = np.linspace(a, b, max(2, int(np.ceil((b - a) / 0.1)) + 1))
+        for left, right in pairwise(parts):
+            middle, half = 0.5 * (left + right), 0.5 * (right - left)
+            total += half * sum(
+                w * function(middle + half * x) for x, w in zip(nodes, weights, strict=True)
+            )
+    return total
+
+
+def examples():
+    """What the page on observables defines."""
+    page = (Path(__file__).parents[1] / "docs" / "observables.md").read_text(encoding="utf-8")
+    names = {}
+    exec("\n".join(re.findall(r"^```python\n(.+?)^```$", page, re.MULTILINE | re.DOTALL)), names)
+    return names
+
+
+PAGE = examples()
+Largest, Energy, Points, Samples = (PAGE[n] for n in ("Largest", "Energy", "Points", "Samples"))
+height = PAGE["height"]
+
+
+@pytest.mark.slow(first=True)
+@each
+def test_extrema_are_those_of_the_oracle(name):
+    found = swept(CASES[name], Largest(10.0))
+    for i, run in enumerate(runs(name)):
+        extrema = [loop for arc in run.arcs for loop in arc.loops if loop.axis == 0]
+        assert found.extrema[i, 0] == len(extrema)
+        late = max(abs(loop.x1) for loop in extrema if loop.t > 10)
+        np.testing.assert_allclose(found.largest[i, 0], late, **CLOSE)
+
+
+@each
+def test_integrals_are_those_of_the_oracle(name):
+    found = swept(CASES[name], Energy())
+    for i, run in enumerate(runs(name)):
+        knots = sorted({0.0, SPAN, *(event.t for event in run.events)})
+        motion = along(run)
+        square = integral(lambda t, motion=motion: motion(t)[0] ** 2, knots)
+        np.testing.assert_allclose(found.square[i, 0], square, rtol=1e-8)
+        np.testing.assert_allclose(found.rms[i, 0], np.sqrt(square / SPAN), rtol=1e-8)
+    # What is fed and not lost is in the mass and its spring, to the tolerance.
+    np.testing.assert_allclose(found.fed - found.lost, found.gained, **CLOSE)
+
+
+@each
+def test_points_of_a_section_are_those_of_the_oracle(name):
+    found = swept(CASES[name], Points())
+    for i, motion in enumerate(map(along, runs(name))):
+        passed = roots(lambda t, motion=motion: height(None, *motion(t)))
+        assert height(None, *Y0) < 0  # it begins below
+        ups, downs = passed[::2], passed[1::2]
+        assert found["count"][i, 0] == len(ups) > 3
+        expected = np.array([[t, *motion(t)] for t in ups[:8]])
+        for k, name in enumerate(("t", "x1", "x2")):
+            np.testing.assert_allclose(found[name][i, 0, : len(expected)], expected[:, k], **CLOSE)
+        above = sum(downs) - sum(ups[: len(downs)])
+        np.testing.assert_allclose(found.above[i, 0], above, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow(first=True)
+@each
+def test_states_at_fixed_times_are_those_of_the_oracle(name):
+    found = swept(CASES[name], Samples())
+    assert np.all(found["count"] == 33)
+    for i, run in enumerate(runs(name)):
+        expected = np.array([run.at(t) for t in np.linspace(0.0, SPAN, 33)])
+        np.testing.assert_allclose(found.x1[i, 0], expected[:, 0], **CLOSE)
+        np.testing.assert_allclose(found.x2[i, 0], expected[:, 1], **CLOSE)
+
+
+class Everything:
+    """How often it was asked at each kind of moment, and the largest and smallest x2 of extrema."""
+
+    at = (jb.AtEvents(), jb.AtExtrema("x2"), jb.AtTimes([1.0, 2.0]))
+
+    def init(self, osc, x1, x2):
+        return jnp.zeros(3), x2, x2
+
+    def rates(self, osc, motion):
+        return motion.a, motion.x2
+
+    def update(self, state, event):
+        counts, low, high = state
+        counts = counts + jnp.where(jnp.arange(3) == event.moment, 1.0, 0.0)
+        extreme = jnp.where(event.moment == 1, event.x2, low)
+        low, high = jnp.minimum(low, extreme), jnp.maximum(high, extreme)
+        return counts, low, high
+
+    def finish(self, state, end):
+        counts, low, high = state
+        asked = dict(zip(("events", "extrema", "times"), counts, strict=True))
+        rise, way = end.integrals
+        return asked | {"low": low, "high": high, "rise": rise, "way": way}
+
+
+@each
+def test_extrema_of_the_velocity_last_through_stick_phases(name):
+    found = swept(CASES[name], Everything())
+    assert np.all(found.times == 2)
+    for i, run in enumerate(runs(name)):
+        assert found.events[i, 0] == len(run.events)
+        values = [arc.dense(t)[1] for arc in run.arcs for t in (arc.t_start, arc.t_end)]
+        values += [loop.x2 for arc in run.arcs for loop in arc.loops]
+        np.testing.assert_allclose(found.high[i, 0], max(values), **CLOSE)
+        np.testing.assert_allclose(found.low[i, 0], min(values), **CLOSE)
+        # The integrals of x2' and x2 are what x2 and x1 went.
+        np.testing.assert_allclose(found["rise"][i, 0], run.y_end[1] - Y0[1], **CLOSE)
+        np.testing.assert_allclose(found.way[i, 0], run.y_end[0] - Y0[0], **CLOSE)
+
+
+@pytest.mark.slow(first=True)
+def test_a_smooth_motion_gives_results_too():
+    points, found = swept(FAST, Points()), swept(FAST, Energy())
+    for i, nu0 in enumerate(FAST[1]["nu0"]):
+        motion = smooth_run(nu0)
+        ups = roots(lambda t, motion=motion: height(None, *motion(t)))[::2]
+        assert points["count"][i, 0] == len(ups)
+        square = integral(lambda t, motion=motion: motion(t)[0] ** 2, [0.0, SPAN])
+        np.testing.assert_allclose(found.square[i, 0], square, rtol=1e-8)
+    np.testing.assert_allclose(found.fed - found.lost, found.gained, **CLOSE)
+
+
+def test_rest_and_a_mass_that_is_stuck_for_ever_are_integrated():
+    held = jb.sweep(jb.presets.class_a, {"nu0": [0.0]}, y0=(0.25, 0.0), t1=3.0, observe=Energy())
+    assert held.status == jb.Status.STUCK_FOREVER
+    np.testing.assert_allclose(held.rms, 0.25, rtol=1e-15)
+
+
+def test_a_store_knows_moments_apart(tmp_path):
+    def count(moment):
+        class Count(Largest):
+            def __init__(self):
+                super().__init__(0.0)
+                self.at = (moment,)
+
+        return Count()
+
+    def again(moment):
+        make, axes = FAST
+        return jb.sweep(make, axes, t1=5.0, observe=count(moment), store=tmp_path / "a.zarr")
+
+    def other(osc, x1, x2):
+        return x1 - 0.4 * x2 - 0.2
+
+    again(jb.AtSection(height))
+    again(jb.AtSection(height))
+    for moment in (jb.AtSection(other), jb.AtSection(height, 1), jb.AtExtrema("x1")):
+        with pytest.raises(ValueError, match="which differs in observe"):
+            again(moment)
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: jb.AtExtrema("x3"), 'of must be "x1" or "x2", got \'x3\''),
+        (lambda: jb.AtSection(3.0), "function must be a function of osc, x1 and x2"),
+        (lambda: jb.AtSection(height, 2), "direction must be -1, 0 or 1, got 2"),
+        (lambda: jb.AtTimes([1.0, 1.0]), "times must be finite, >= 0 and increasing"),
+        (lambda: jb.AtTimes([]), r"times must be of shape \(n\)"),
+    ],
+)
+def test_impossible_moments_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+    reducer = Largest(10.0)
+    reducer.at = "x1"
+    with pytest.raises(ValueError, match=r"observe\.at must be a tuple of AtEvents, AtExtrema"):
+        swept(FAST, reducer)
+    with pytest.raises(ValueError, match="derivatives must be none, where observe has `at` or"):
+        jb.sweep(*FAST, t1=5.0, observe=Largest(0.0), derivatives="nu0")
