@@ -125,7 +125,7 @@ def _nu0(osc: Oscillator) -> Any:
     return osc.belts[0].velocity
 
 
-def as_json(values: Sequence[CriticalValue]) -> list[dict[str, Any]]:
+def table_as_json(values: Sequence[CriticalValue]) -> list[dict[str, Any]]:
     """The table as it stands in critical_values.json."""
     return [
         {
@@ -283,7 +283,7 @@ def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> Figure:
             panel.oscillator,
             [_transient(trajectory, cycle) for trajectory in trajectories],
             cycles=cycles,
-            equilibria=_equilibria(panel.oscillator),
+            equilibria=_rests_of(panel.oscillator),
             xlim=portraits.xlim,
             ylim=portraits.ylim,
             ax=ax,
@@ -299,7 +299,7 @@ def _with_symbols(remark: str) -> str:
     return remark.replace("p3", "$p_3$").replace("nu0", r"$\nu_0$")
 
 
-def _equilibria(osc: Oscillator) -> Equilibria:
+def _rests_of(osc: Oscillator) -> Equilibria:
     """Where the mass can rest. A subcritical Hopf point repels, whatever rounding says of it."""
     found = equilibria(_with_two_belts(osc))
     attracts = np.asarray(found.stable) & ~(np.abs(np.asarray(found.rate)) < 1e-9)
@@ -567,7 +567,7 @@ def reproduce(
         draw("fig01", draw_model)
         draw("fig02", draw_classes)
         values = critical_values()
-        text = json.dumps(as_json(values), indent=2)
+        text = json.dumps(table_as_json(values), indent=2)
         (folder / "critical_values.json").write_text(text + "\n", encoding="utf-8")
 
         panels = {name: figure.panels(values) for name, figure in PORTRAITS.items()}

@@ -44,7 +44,7 @@ from ..numerics.continuation import Stop
 from ..numerics.newton import NEWTON_STEPS
 from ..results import Status, describe
 from .guesses import nearest, settled_loops
-from .labels import Found, Label
+from .labels import AttractingCycle, Label
 from .systems import (
     NOWHERE,
     AbstractSystem,
@@ -234,7 +234,7 @@ class AbstractCondition(eqx.Module):
         """What changes where it holds, beside a label; cycles: the attracting ones, in order."""
         return None
 
-    def beginnings(self, cycles: Sequence[Found]) -> Sequence[Loop | None]:
+    def beginnings(self, cycles: Sequence[AttractingCycle]) -> Sequence[Loop | None]:
         """Of the attracting cycles those to begin from; None: its own guess."""
         return (None,)
 

@@ -47,7 +47,7 @@ from .systems import (
 #: power of it over the velocity at which the friction law bends, 1/p3 for Conti's law.
 DEPARTURE = 1e-5
 #: Integration steps for each arc of that orbit; it takes long to leave.
-STEPS = 48
+DEPARTURE_STEPS = 48
 
 
 class Encounter(CycleSystem):
@@ -315,13 +315,13 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
 
     def linearized(unknowns):
         z, p = unknowns
-        value, matrix = system(STEPS).linearized(osc_at, z, p)
+        value, matrix = system(DEPARTURE_STEPS).linearized(osc_at, z, p)
         _, slope = jax.jvp(lambda p: begins(z, p), (p,), (jnp.ones(1),))
         row = jnp.zeros((2, value.size)).at[:, :2].set(jnp.eye(2)).at[:, -1].set(slope)
         return value.at[closing].set(begins(z, p)), matrix.at[closing].set(row)
 
     z, p = newton(linearized, (z, guess)).z
-    value = system(2 * STEPS).residual(osc_at(p), z).at[closing].set(begins(z, p))
+    value = system(2 * DEPARTURE_STEPS).residual(osc_at(p), z).at[closing].set(begins(z, p))
     exists = jnp.any(meets) & (last < SIZES[0]) & admissible(osc_at(p), system(1).ordinary, z)
     return p[0], jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)
 
