@@ -283,11 +283,10 @@ def _points_along(problem: _Problem, track: "_Track", u: np.ndarray, direction: 
     span = np.full((2, u.size), np.inf) * np.array([[-1.0], [1.0]])
     span[:, -2:] = problem.limits.T
     return continue_curve(
-        _curve_residual,
+        _curve_linearized,
         u,
         direction,
         args=track.args,
-        jacobian=_curve_jacobian,
         span=(span[0], span[1]),
         step=problem.step,
         min_step=1e-2 * problem.step,
@@ -463,8 +462,8 @@ class _Track(NamedTuple):
         return self.args[2]
 
     @property
-    def problem(self) -> tuple[Any, Any, Any]:
-        return _curve_residual, _curve_jacobian, self.args
+    def problem(self) -> tuple[Any, Any]:
+        return _curve_linearized, self.args
 
     def unknowns(self, u: np.ndarray) -> np.ndarray:
         """Those of the system."""
@@ -501,12 +500,7 @@ def _parts(u: Array, args):
     return functools.partial(vary, osc, indices), system, system.shaped(u[:-2] / weights), u[-2:]
 
 
-def _curve_residual(u: Array, args) -> Array:
-    osc_of, system, x, p = _parts(u, args)
-    return system.residual(osc_of(p), x)
-
-
-def _curve_jacobian(u: Array, args) -> tuple[Array, Array]:
+def _curve_linearized(u: Array, args) -> tuple[Array, Array]:
     osc_of, system, x, p = _parts(u, args)
     value, matrix = system.linearized(osc_of, x, p)
     return value, matrix.at[:, :-2].divide(args[3][None])
