@@ -31,7 +31,7 @@ from ..model.oscillator import Oscillator
 from ..model.parameters import vary
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
-from ..numerics.newton import newton
+from ..numerics.newton import HOLDS, newton
 from ..results import EventKind, Status
 from .conditions import AbstractCycleCondition, Line, SpecialPoint
 from .guesses import HINT_BUDGET, least_push, orbit_after_stick
@@ -168,7 +168,7 @@ class AbstractTangency(AbstractCycleCondition):
         value, residual = _tangent_departure(
             still, trail.indices[1 - held], codes, *belts, jnp.full(1, guess)
         )
-        if not (residual < 1e-9 and abs(value - guess) < 3 * trail.step):
+        if not (residual < HOLDS and abs(value - guess) < 3 * trail.step):
             return None
         values = (float(value), 0.0) if held else (0.0, float(value))
         return SpecialPoint("BeltAtRest", (resting,), values, float(residual))

@@ -19,6 +19,9 @@ from jaxtyping import Array
 NEWTON_STEPS = 12
 #: Longer Newton steps are cut to this length: guesses are good to that.
 LONGEST_NEWTON_STEP = 0.5
+#: Equations with smaller errors hold. Of 337 cycles of oscillators at random Newton's method left
+#: 3e-13 at most; from guesses that are none it left rounding, too, or 7e-4 and more.
+HOLDS = 1e-9
 #: Steps of this length are rounding: unknowns are of size one.
 STEP_ROUNDING = 1e-13
 
