@@ -179,7 +179,7 @@ class Portraits(NamedTuple):
         symbol = rf"\nu_0^\{self.point.removeprefix('nu_')}"
         relations = [
             (self.before, rf"\nu_0 = {self.before:.2f} > {symbol}", None),
-            (critical.computed, rf"\nu_0 = {symbol} = {critical.computed:.5g}", critical.cycle),
+            (critical.computed, rf"\nu_0 = {symbol} = {_shown(critical.computed)}", critical.cycle),
             *((nu0, rf"\nu_0 = {nu0:.2f} < {symbol}", None) for nu0 in self.after),
         ]
         panels = []
@@ -189,6 +189,11 @@ class Portraits(NamedTuple):
             starts = tuple((centre + x1, x2) for x1, x2 in self.starts)
             panels.append(Panel(f"({letter}) ${relation}$", osc, starts, cycle))
         return panels
+
+
+def _shown(value: float) -> str:
+    """To five digits; those that are round, as 0.35 is, as they are."""
+    return f"{value:g}" if abs(value - round(value, 2)) < 1e-9 else f"{value:.5f}"
 
 
 class SimulatedCycle(NamedTuple):
@@ -296,7 +301,7 @@ def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> Figure:
 
 def _with_symbols(remark: str) -> str:
     """A remark as for the terminal, where symbols are words, in symbols."""
-    return remark.replace("p3", "$p_3$").replace("nu0", r"$\nu_0$")
+    return remark.replace("p3", "$p_3$").replace("nu0", r"$\nu_0$").replace(" -", " \N{MINUS SIGN}")
 
 
 def _rests_of(osc: Oscillator) -> Equilibria:
