@@ -45,7 +45,8 @@ LOOKED_FOR: tuple[type[AbstractCondition], ...] = (
     GrazingEdge,
     FoldOfCycles,
 )
-#: Intervals narrower than this fraction of the span are good guesses for Newton's method.
+#: Intervals narrower than this fraction of the span are good guesses for Newton's method. On the
+#: paper's path 1/100 finds the same points as fast, 1/1600 in a third more time.
 NEAR = 1 / 400
 
 
