@@ -6,6 +6,7 @@ import signal
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 
 import jaxbelt as jb
@@ -27,8 +28,6 @@ def swept(observe, store=None):
 
 def child(store: Path, cache: Path, begins, observe: str) -> None:
     """Sweep into the store in small blocks."""
-    import jax
-
     from jaxbelt.sweeps import store as stores
 
     jax.config.update("jax_enable_x64", True)
@@ -45,11 +44,13 @@ def campaign(folder: Path, observe: str, kills: int, seed: int) -> dict[str, int
     """Kill so many processes; every block that is called done has to be right each time, and every
     store that is finished has to be what an uninterrupted sweep gives, bit for bit."""
     rng, whole = random.Random(seed), swept(observe)
+    # Where the sweep above has left its program, or else of the children alone.
+    cache = Path(jax.config.jax_compilation_cache_dir or folder / "cache")
     told = {"killed": 0, "stores": 0, "blocks seen done": 0}
     store = folder / "0.zarr"
     while told["killed"] < kills:
         begins = PROCESSES.Event()
-        process = PROCESSES.Process(target=child, args=(store, folder / "cache", begins, observe))
+        process = PROCESSES.Process(target=child, args=(store, cache, begins, observe))
         process.start()
         assert begins.wait(120)
         time.sleep(rng.uniform(0, LONGEST))
@@ -66,7 +67,7 @@ def campaign(folder: Path, observe: str, kills: int, seed: int) -> dict[str, int
             told["stores"] += 1
             store = folder / f"{told['stores']}.zarr"
     begins = PROCESSES.Event()
-    process = PROCESSES.Process(target=child, args=(store, folder / "cache", begins, observe))
+    process = PROCESSES.Process(target=child, args=(store, cache, begins, observe))
     process.start()
     process.join(120)
     assert process.exitcode == 0 and Kept(store).identical_values(whole)

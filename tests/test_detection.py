@@ -88,6 +88,7 @@ def test_a_path_in_the_damping():
     assert fold == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_folds_of_a_law_that_jumps():
     """Belt 0 holds 0.5 and drags with 0.4: beyond its folds, to both sides, there is no cycle."""
     belts = (jb.Belt(0.3, jb.Coulomb(1.0, 0.8), load=0.5), jb.Belt(0.35, jb.Conti(1.0, 0.6, 10.0)))
