@@ -172,6 +172,9 @@ def corrected(linearized, args, u, tangent, length) -> Corrected:
 def _correct(linearized, args, u: Array, tangent: Array, step: Array) -> Corrected:
     """Newton's method in the plane normal to the tangent, `step` ahead of u."""
 
+    # n equations and that of the plane, for n + 1 unknowns:
+    #   | matrix, [n, n + 1] |        | value                    |
+    #   | tangent, [n + 1]   | dv = - | tangent . (v - u) - step |
     def squared(v):
         value, matrix = linearized(v, args)
         value = jnp.append(value, tangent @ (v - u) - step)
@@ -184,7 +187,7 @@ def _correct(linearized, args, u: Array, tangent: Array, step: Array) -> Correct
         longest=jnp.inf,
         settled=lambda last, before: last <= SMALLEST_CORRECTION,
     )
-    # The kernel of the Jacobian, for the tangent.
+    # The kernel of `matrix`, for the tangent: what the same equations give for (0, .., 0, 1).
     kernel = jnp.linalg.solve(solved.matrix, jnp.zeros_like(u).at[-1].set(1.0))
     sign, _ = jnp.linalg.slogdet(solved.matrix)
     size = solved.lengths[solved.iterations - 1]
