@@ -261,6 +261,7 @@ def test_square_root_law_near_the_hopf_point():
     assert 2 * near - far == pytest.approx(1, abs=2e-4)
 
 
+@pytest.mark.slow(first=True)
 def test_a_batch_of_cycles_is_each_of_them():
     nus = jnp.array([0.45, -0.3, 0.6])
     batch = jax.jit(jax.vmap(lambda nu: jb.find_cycle(jb.presets.class_b(nu, 0.35), START)))(nus)

@@ -36,9 +36,11 @@ from .conditions import BifurcationPoint
 from .systems import small_newton
 from .tangencies import NonsmoothFold
 
-#: Integration steps of order twelve for the slip phase.
+#: Integration steps of order twelve for the slip phase: with half as many folds move by 2e-12, with
+#: twice as many by 5e-15.
 SLIP_STEPS = 64
-#: The band of the first solution, and how many there are from it to the one wanted.
+#: The band of the first solution, and how many there are from it to the one wanted: so bands up to
+#: 1e-2 are reached; with three, or from 1e-8, up to 1e-3.
 FIRST, STAGES = 1e-6, 4
 #: Bands from which the search for the band of a given fold starts.
 TYPICAL = 1e-4
