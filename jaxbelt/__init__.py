@@ -162,13 +162,13 @@ __all__ = [
 # Matplotlib is imported when something is drawn, not before.
 
 
-def _draw(result: Any, ax: Any, **options: Any) -> Any:
-    from .plotting.draw import draw
+def _with_matplotlib(result: Any, ax: Any, **options: Any) -> Any:
+    from .plotting.draw import draw_result
 
-    return draw(result, ax, **options)
+    return draw_result(result, ax, **options)
 
 
-draw_with(_draw)
+draw_with(_with_matplotlib)
 
 
 def __getattr__(name: str) -> Any:

@@ -125,7 +125,7 @@ def _nu0(osc: Oscillator) -> Any:
     return osc.belts[0].velocity
 
 
-def as_json(values: Sequence[CriticalValue]) -> list[dict[str, Any]]:
+def table_as_json(values: Sequence[CriticalValue]) -> list[dict[str, Any]]:
     """The table as it stands in critical_values.json."""
     return [
         {
@@ -179,7 +179,7 @@ class Portraits(NamedTuple):
         symbol = rf"\nu_0^\{self.point.removeprefix('nu_')}"
         relations = [
             (self.before, rf"\nu_0 = {self.before:.2f} > {symbol}", None),
-            (critical.computed, rf"\nu_0 = {symbol} = {critical.computed:.5g}", critical.cycle),
+            (critical.computed, rf"\nu_0 = {symbol} = {_shown(critical.computed)}", critical.cycle),
             *((nu0, rf"\nu_0 = {nu0:.2f} < {symbol}", None) for nu0 in self.after),
         ]
         panels = []
@@ -189,6 +189,11 @@ class Portraits(NamedTuple):
             starts = tuple((centre + x1, x2) for x1, x2 in self.starts)
             panels.append(Panel(f"({letter}) ${relation}$", osc, starts, cycle))
         return panels
+
+
+def _shown(value: float) -> str:
+    """To five digits; those that are round, as 0.35 is, as they are."""
+    return f"{value:g}" if abs(value - round(value, 2)) < 1e-9 else f"{value:.5f}"
 
 
 class SimulatedCycle(NamedTuple):
@@ -283,7 +288,7 @@ def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> Figure:
             panel.oscillator,
             [_transient(trajectory, cycle) for trajectory in trajectories],
             cycles=cycles,
-            equilibria=_equilibria(panel.oscillator),
+            equilibria=_rests_of(panel.oscillator),
             xlim=portraits.xlim,
             ylim=portraits.ylim,
             ax=ax,
@@ -296,10 +301,10 @@ def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> Figure:
 
 def _with_symbols(remark: str) -> str:
     """A remark as for the terminal, where symbols are words, in symbols."""
-    return remark.replace("p3", "$p_3$").replace("nu0", r"$\nu_0$")
+    return remark.replace("p3", "$p_3$").replace("nu0", r"$\nu_0$").replace(" -", " \N{MINUS SIGN}")
 
 
-def _equilibria(osc: Oscillator) -> Equilibria:
+def _rests_of(osc: Oscillator) -> Equilibria:
     """Where the mass can rest. A subcritical Hopf point repels, whatever rounding says of it."""
     found = equilibria(_with_two_belts(osc))
     attracts = np.asarray(found.stable) & ~(np.abs(np.asarray(found.rate)) < 1e-9)
@@ -567,7 +572,7 @@ def reproduce(
         draw("fig01", draw_model)
         draw("fig02", draw_classes)
         values = critical_values()
-        text = json.dumps(as_json(values), indent=2)
+        text = json.dumps(table_as_json(values), indent=2)
         (folder / "critical_values.json").write_text(text + "\n", encoding="utf-8")
 
         panels = {name: figure.panels(values) for name, figure in PORTRAITS.items()}

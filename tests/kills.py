@@ -16,6 +16,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -55,7 +56,6 @@ def swept(observe, store=None, t1=100.0, **options):
 
 def child(store: Path, cache: Path, begins, observe: str) -> None:
     """Sweep into the store in small blocks."""
-    import jax
 
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", str(cache))
@@ -71,11 +71,13 @@ def campaign(folder: Path, observe: str, kills: int, seed: int) -> dict[str, int
     """Kill so many processes; every block that is called done has to be right each time, and every
     store that is finished has to be what an uninterrupted sweep gives, bit for bit."""
     rng, whole = random.Random(seed), swept(observe)
+    # Where the sweep above has left its program, or else of the children alone.
+    cache = Path(jax.config.jax_compilation_cache_dir or folder / "cache")
     told = {"killed": 0, "stores": 0, "blocks seen done": 0}
     store = folder / "0.zarr"
     while told["killed"] < kills:
         begins = PROCESSES.Event()
-        process = PROCESSES.Process(target=child, args=(store, folder / "cache", begins, observe))
+        process = PROCESSES.Process(target=child, args=(store, cache, begins, observe))
         process.start()
         assert begins.wait(120)
         time.sleep(rng.uniform(0, LONGEST))
@@ -92,7 +94,7 @@ def campaign(folder: Path, observe: str, kills: int, seed: int) -> dict[str, int
             told["stores"] += 1
             store = folder / f"{told['stores']}.zarr"
     begins = PROCESSES.Event()
-    process = PROCESSES.Process(target=child, args=(store, folder / "cache", begins, observe))
+    process = PROCESSES.Process(target=child, args=(store, cache, begins, observe))
     process.start()
     process.join(120)
     assert process.exitcode == 0 and Kept(store).identical_values(whole)

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import lists
 import numpy as np
 import oracle
 import oracle_cycles
@@ -14,6 +15,8 @@ from jaxbelt.sweeps.datasets import numbered, renumber
 from jaxbelt.sweeps.events import append, word_events
 
 SPAN = 40.0
+#: Room for the arcs of a run of `simulate`, as in tests/test_simulate.py, for one program.
+ARCS = 4096
 #: Both integrate with this tolerance.
 TIGHT = 1e-10
 #: Of the states: a run of 40 units of time at 1e-10 keeps 1e-8 here (see the numbers that the test
@@ -46,15 +49,12 @@ def sweep_of(kind, table, **options):
 
 def simulated(kind: str, table: np.ndarray):
     make = getattr(jb.presets, f"class_{kind}")
-
-    @jax.jit
-    @jax.vmap
-    def run(parameters):
-        osc, ts = make(*parameters), jnp.array([SPAN])
-        out = jb.simulate(osc, (3.0, 0.0), SPAN, ts=ts, rtol=TIGHT, atol=TIGHT, max_segments=1024)
-        return out.ys[0], out.modes[0], jnp.sum(out.events.kind > 0), out.status
-
-    return [np.asarray(out) for out in run(tuple(jnp.asarray(row) for row in table))]
+    runs = [
+        jb.simulate(make(*one), (3.0, 0.0), SPAN, rtol=TIGHT, atol=TIGHT, max_segments=ARCS)
+        for one in table.T.tolist()
+    ]
+    found = [(run.ys[-1], run.modes[-1], len(run.events.t), run.status) for run in runs]
+    return [np.stack([np.asarray(one) for one in column]) for column in zip(*found, strict=True)]
 
 
 @pytest.mark.parametrize("kind", ["b", pytest.param("d", marks=pytest.mark.slow)])
@@ -76,7 +76,8 @@ def test_final_states_and_events_equal_those_of_simulate(kind, record_property):
 def test_slow_passages_of_an_edge_keep_the_time():
     """Some 900 and 200 in a run: errors in the times of landings would add up."""
     table = lanes("c", 10_000, seed=7)[:, [153, 41]]
-    dataset = sweep_of("c", table, t1=SPAN, y0=(3.0, 0.0), rtol=TIGHT, atol=TIGHT)
+    oscillators = [jb.presets.class_c(*parameters) for parameters in table.T.tolist()]
+    dataset = lists.swept(oscillators, t1=SPAN, y0=(3.0, 0.0), rtol=TIGHT, atol=TIGHT)
     for i, parameters in enumerate(table.T.tolist()):
         run = oracle.simulate(oracle.class_c(*parameters), (3.0, 0.0), SPAN)
         assert dataset.n_events[i] == len(run.events) > 150
@@ -114,7 +115,6 @@ def test_an_excursion_within_one_step_is_found():
 
     As for `simulate` in tests/test_simulate.py, but not so close: the steps are longer here."""
     law = jb.Coulomb(static=1e-9, kinetic=1e-9)
-    gap = np.array([1e-6, -1e-6])
 
     def boundary(gap):
         return jb.Oscillator(0.0, (jb.Belt(1.0 - gap, law), jb.Belt(50.0, law)))
@@ -122,9 +122,9 @@ def test_an_excursion_within_one_step_is_found():
     def edge(gap):
         return jb.Oscillator(0.0, (jb.Belt(50.0, law), jb.Belt(60.0, law, lower=1.0 - gap)))
 
-    for make in (boundary, edge):
-        dataset = jb.sweep(make, {"gap": gap}, y0=(-1.0, 0.0), t1=12.0)
-        assert dataset.n_events.values.tolist() == [4, 0]
+    oscillators = [make(gap) for make in (boundary, edge) for gap in (1e-6, -1e-6)]
+    dataset = lists.swept(oscillators, y0=(-1.0, 0.0), t1=12.0)
+    assert dataset.n_events.values.tolist() == [4, 0, 4, 0]
 
 
 class Logarithmic(jb.AbstractFriction):
@@ -136,6 +136,7 @@ class Logarithmic(jb.AbstractFriction):
         return self.static - 0.1 * jnp.log1p(20 * jnp.maximum(speed, -0.02))
 
 
+@pytest.mark.slow(first=True)
 def test_three_belts_with_other_laws():
     def make(nu):
         return jb.Oscillator(
@@ -244,13 +245,8 @@ def test_early_labels_equal_those_of_long_runs(kind):
 def test_a_cycle_that_crosses_without_sticking():
     """Negative damping drives it, dry friction of two belts limits it: it converges, slowly."""
     law = jb.Coulomb(static=0.1, kinetic=0.1)
-
-    def make(damping):
-        return jb.Oscillator(damping, (jb.Belt(1.0, law), jb.Belt(-1.0, law)))
-
-    dataset = jb.sweep(make, {"damping": [-0.05]}, y0=(1.5, 0.0), observe="attractor").isel(
-        damping=0
-    )
+    osc = jb.Oscillator(-0.05, (jb.Belt(1.0, law), jb.Belt(-1.0, law)))
+    dataset = lists.swept([osc], y0=(1.5, 0.0), observe="attractor").isel(case=0)
     mu = oracle.coulomb(0.1, 0.1)
     there = oracle.Oscillator(-0.05, (oracle.Belt(1.0, *mu), oracle.Belt(-1.0, *mu)))
     run = oracle.simulate(there, (1.5, 0.0), 600.0)

@@ -179,7 +179,8 @@ def test_fold_of_small_cycles(short):
 
 
 def test_a_hopf_point_is_no_fold_of_cycles():
-    point = jb.refine(jb.FoldOfCycles(), class_b(0.27), where=nu0)
+    # More damping than at the degenerate Hopf point of the test above.
+    point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.55, (jb.Belt(0.35, BELL),)), where=nu0)
     assert point.status == Status.NO_FOLD and jnp.isnan(point.value)
 
 
@@ -192,6 +193,20 @@ def test_convergence_is_quadratic():
     assert np.all(fast[1:] <= np.maximum(20 * fast[:-1] ** 2, 1e-12))
 
 
+def test_a_batch_of_hopf_points_and_the_slope_of_their_curve():
+    """Of class (a), 1 + p3 nu = sqrt(p3 (mus - p1)/zeta)."""
+
+    def value(zeta):
+        osc = jb.Oscillator(zeta, (jb.Belt(0.2, jb.Conti(1.0, 0.6, 10.0)),))
+        return jb.refine(jb.Hopf(), osc, where=nu0).value
+
+    zetas = jnp.array([0.45, 0.5, 0.55])
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(value)))(zetas)
+    np.testing.assert_allclose(values, (2 / np.sqrt(zetas) - 1) / 10, atol=1e-14)
+    np.testing.assert_allclose(slopes, -0.1 * zetas**-1.5, rtol=1e-12)
+
+
+@pytest.mark.slow(first=True)
 def test_a_batch_of_folds_and_the_slope_of_their_curve():
     def fold(nu1):
         osc = jb.presets.class_b(0.53 - 2.4 * (nu1 - 0.35), nu1)

@@ -220,11 +220,11 @@ def test_reproduce_writes_the_table_and_every_figure(reproduced, values):
     for name in names:
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
     written = json.loads((folder / "critical_values.json").read_text(encoding="utf-8"))
-    assert written == reproduce.as_json(values)
+    assert written == reproduce.table_as_json(values)
 
 
 def test_critical_values_json(values):
-    rows = json.loads(json.dumps(reproduce.as_json(values)))
+    rows = json.loads(json.dumps(reproduce.table_as_json(values)))
     keys = ["class", "point", "kind", "printed", "computed", "residual", "iterations"]
     assert [list(row) for row in rows] == [keys] * 9
     assert [(r["class"], r["point"], r["kind"], r["printed"]) for r in rows] == [

@@ -50,7 +50,7 @@ def test_each_is_vmap():
 
 def test_runs_with_other_numbers_of_events_compile_nothing():
     osc = jb.presets.class_b(0.45, 0.35)
-    first = jb.simulate(osc, (3.0, 0.0), 40.0)
+    first = jb.simulate(osc, (3.0, 0.0), 40.0, max_segments=4096)  # as in tests/test_simulate.py
     compiled = []
 
     def listen(name, *_, **__):
@@ -59,7 +59,7 @@ def test_runs_with_other_numbers_of_events_compile_nothing():
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        second = jb.simulate(osc, (3.0, 0.0), 30.0)
+        second = jb.simulate(osc, (3.0, 0.0), 30.0, max_segments=4096)
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     assert second.events.t.size < first.events.t.size

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.bifurcations.conditions import AbstractCondition, CycleEquation, Line
-from jaxbelt.bifurcations.scan import KINDS
+from jaxbelt.bifurcations.scan import LOOKED_FOR
 
 
 class PeriodIs(CycleEquation):
@@ -137,7 +137,7 @@ def test_numbers_in_conditions_are_data():
     assert compiled == []
 
 
-@pytest.mark.parametrize("kind", [*KINDS, jb.NonsmoothFold, jb.CornerCollision])
+@pytest.mark.parametrize("kind", [*LOOKED_FOR, jb.NonsmoothFold, jb.CornerCollision])
 def test_every_kind_of_the_package_carries_its_words(kind: type[AbstractCondition]):
     assert kind.__doc__ and kind.__doc__ != AbstractCondition.__doc__
     assert kind.caption and kind.line.name and kind.line.colour

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
-from jaxbelt.bifurcations.path import Path
+from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.numerics.continuation import Stop
 
 EDGE = EventKind.EDGE
@@ -265,7 +265,7 @@ def test_a_small_cycle_that_sticks_until_the_edge():
     osc = jb.presets.class_d(-0.6, 0.175, 1.16, 1.5)
     points = jb.scan(osc, nu0, (0.165, 0.18), resolution=8)
     assert [point.condition for point in points] == [jb.SlidingExchange((0, 1))]
-    path = Path(osc, nu0, (0.165, 0.18))
+    path = ParameterPath(osc, nu0, (0.165, 0.18))
     path.look([0.17, 0.178])
     for nu, belt in ((0.17, 0), (0.178, 1)):
         label = path.label(nu)

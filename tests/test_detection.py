@@ -13,7 +13,7 @@ from laws import BELL, NESTED, bell, nested
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
-from jaxbelt.bifurcations.path import Path
+from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import distinct
 from jaxbelt.cycles.shooting import loop_events
@@ -88,6 +88,7 @@ def test_a_path_in_the_damping():
     assert fold == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_folds_of_a_law_that_jumps():
     """Belt 0 holds 0.5 and drags with 0.4: beyond its folds, to both sides, there is no cycle."""
     belts = (jb.Belt(0.3, jb.Coulomb(1.0, 0.8), load=0.5), jb.Belt(0.35, jb.Conti(1.0, 0.6, 10.0)))
@@ -194,7 +195,7 @@ def two_cycles(nu):
 
 def test_two_cycles_with_one_sequence_of_events():
     """One of them begins as it just touches the edge of belt 1, where belt 0 would hold it back."""
-    path = Path(two_cycles(-0.06341), nu0, (-0.3, -0.02))
+    path = ParameterPath(two_cycles(-0.06341), nu0, (-0.3, -0.02))
     points = search(path)
     assert [point.condition for point in points] == [jb.GrazingEdge(1), jb.Hopf(), jb.Hopf()]
     path.look([-0.06341])
@@ -223,7 +224,7 @@ def test_a_corner_where_only_the_sign_of_what_arrives_changes():
 @pytest.mark.slow
 def test_nested_cycles_in_one_mode():
     """Each ends in a fold, where the other one goes on."""
-    path = Path(
+    path = ParameterPath(
         jb.Oscillator(0.5, (jb.Belt(1.0, NESTED),)), lambda osc: osc.damping, (0.497, 0.508)
     )
     points = search(path, resolution=32)

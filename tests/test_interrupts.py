@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import jax
 import kills
 import pytest
 
@@ -42,10 +43,16 @@ sweep(20, 1e6) if sys.argv[1] == "long" else sweep(3000, 300.0)
 SOON = 2.0
 
 
-def interrupted(command: list[str], delay: float, ready: bool) -> tuple[float, int, str]:
-    """Seconds until the process ended, its exit code, and what it wrote last."""
-    # Without a cache of compiled programs, so that there is something to compile.
+def interrupted(
+    command: list[str], delay: float, ready: bool, cache: bool
+) -> tuple[float, int, str]:
+    """Seconds until the process ended, its exit code, and what it wrote last.
+
+    cache: whether it may read compiled programs; else there is something to compile.
+    """
     environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    if cache and jax.config.jax_compilation_cache_dir:
+        environment["JAX_COMPILATION_CACHE_DIR"] = jax.config.jax_compilation_cache_dir
     pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     process = subprocess.Popen(command, **pipes)
     if ready:
@@ -60,7 +67,8 @@ def interrupted(command: list[str], delay: float, ready: bool) -> tuple[float, i
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("when, delay", [("many", 3.0), ("long", 3.0), ("compiling", 3.0)])
 def test_an_interrupt_ends_a_sweep_and_says_what_became_of_it(when, delay):
-    seconds, code, errors = interrupted([sys.executable, "-c", SWEEP, when], delay, ready=True)
+    command, cache = [sys.executable, "-c", SWEEP, when], when != "compiling"
+    seconds, code, errors = interrupted(command, delay, ready=True, cache=cache)
     assert code == -signal.SIGINT, errors
     last = errors.strip().splitlines()[-1]
     assert (
@@ -74,7 +82,7 @@ def test_an_interrupt_ends_the_command(tmp_path):
     axes = ["nu0=-0.6:0.55:3000", "nu1=-0.5:0.5:3000"]
     out = ["--out", str(tmp_path / "plane.nc")]
     command = [sys.executable, "-c", "from jaxbelt.cli import app; app()", "sweep", *axes, *out]
-    seconds, code, errors = interrupted(command, 10.0, ready=False)
+    seconds, code, errors = interrupted(command, 10.0, ready=False, cache=True)
     assert code == 130 and "interrupted after " in errors and "Traceback" not in errors
     assert seconds < SOON
     assert not list(tmp_path.iterdir())

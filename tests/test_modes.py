@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import lists
 import numpy as np
 import pytest
 
@@ -149,6 +150,7 @@ class Seen(NamedTuple):
 
 
 LONG, AT_ONCE = 8.0, 1e-6  # more than a period; less than any arc of the table
+ARCS = 4096  # room for as many as in tests/test_simulate.py, for one program
 
 
 def ints(codes) -> tuple[int, ...]:
@@ -156,7 +158,7 @@ def ints(codes) -> tuple[int, ...]:
 
 
 def by_simulate(osc: Oscillator, y) -> Seen:
-    run = jb.simulate(osc, y, LONG)
+    run = jb.simulate(osc, y, LONG, max_segments=ARCS)
     events, arcs = run.events, run.arcs
     after = next(mode for mode in np.asarray(arcs.mode) if np.any(mode != arcs.mode[0]))
     return Seen(
@@ -197,11 +199,11 @@ FIRST = FirstEvent()
 
 def by_sweep(osc: Oscillator, y) -> Seen:
     def mode_at(t1):
-        found = jb.sweep(lambda: osc, {"x1": [y[0]], "x2": [y[1]]}, t1=t1, observe="final")
-        return ints(np.asarray(found.mode_end)[0, 0])
+        found = lists.swept([osc], y0=y, t1=t1, observe="final")
+        return ints(np.asarray(found.mode_end)[0])
 
-    run = jb.sweep(lambda: osc, {"x1": [y[0]], "x2": [y[1]]}, t1=LONG, observe=FIRST)
-    t, kind, number = np.asarray(run["first"])[0, 0]
+    run = lists.swept([osc], y0=y, t1=LONG, observe=FIRST)
+    t, kind, number = np.asarray(run["first"])[0]
     return Seen(mode_at(AT_ONCE), (EventKind(int(kind)), int(number)), mode_at(t + AT_ONCE))
 
 
@@ -217,7 +219,7 @@ def test_transition(row: Row, engine: Callable):
 @pytest.mark.parametrize("rest", RESTS, ids=[rest.name for rest in RESTS])
 def test_rest(rest: Rest):
     """An end that is no event. An equilibrium is no end for a run of `simulate`: it stays."""
-    run = jb.simulate(rest.osc, rest.y, LONG)
+    run = jb.simulate(rest.osc, rest.y, LONG, max_segments=ARCS)
     ends = rest.status != Status.EQUILIBRIUM
     assert run.status == (rest.status if ends else Status.OK) and run.events.t.size == 0
     np.testing.assert_allclose(run.ys, np.broadcast_to(rest.y, run.ys.shape), atol=1e-15)
@@ -225,8 +227,7 @@ def test_rest(rest: Rest):
 
     assert jb.find_cycle(rest.osc, rest.y).status == rest.status
 
-    axes = {"x1": [rest.y[0]], "x2": [rest.y[1]]}
-    found = jb.sweep(lambda: rest.osc, axes, t1=LONG, observe="attractor").squeeze()
+    found = lists.swept([rest.osc], y0=rest.y, t1=LONG, observe="attractor").squeeze()
     kind = "stuck" if rest.status == Status.STUCK_FOREVER else "equilibrium"
     assert jb.decoded(found).kind == kind and found.n_events == 0
     assert (found.x1_min, found.x1_max) == (rest.y[0], rest.y[0])

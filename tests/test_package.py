@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -77,6 +78,37 @@ def test_module_imports_only_from_above_it(module: str):
     inside = [name for name in imported_names(module) if name.partition(".")[0] == "jaxbelt"]
     above = LADDER[: LADDER.index(module)]
     assert [name for name in inside if rung(name) not in above] == []
+
+
+def defined_names(module: str) -> set[str]:
+    """What a module defines at its top level."""
+    names = set()
+    for node in ast.parse(MODULES[module].read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            leaves = (leaf for target in targets for leaf in ast.walk(target))
+            names |= {leaf.id for leaf in leaves if isinstance(leaf, ast.Name)}
+    return names
+
+
+def test_no_two_modules_define_different_things_under_one_name():
+    """But for commands, each named as the function that it calls. Nor does what comes from another
+    package have a name that is defined here."""
+    modules = [module for module in LADDER if not module.startswith("commands.")]
+    defined = {module: defined_names(module) for module in modules}
+    times = Counter(
+        name for names in defined.values() for name in {name.lstrip("_") for name in names}
+    )
+    assert [name for name in times if times[name] > 1] == []
+    foreign = {
+        name.rpartition(".")[2]
+        for module in LADDER
+        for name in imported_names(module)
+        if name.partition(".")[0] != "jaxbelt"
+    }
+    assert foreign & set().union(*defined.values()) == set()
 
 
 #: Ways to import a module, or to reach an imported one, that import statements do not show.

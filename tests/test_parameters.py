@@ -163,10 +163,10 @@ def fold():
 
 @pytest.mark.parametrize("entry", ENTRIES.values(), ids=ENTRIES.keys())
 def test_every_entry_refuses_before_it_computes(entry, fold):
-    begin = time.monotonic()
+    begin = time.process_time()
     with pytest.raises(ValueError, match=r"^where must be "):
         entry(fold)
-    assert time.monotonic() - begin < 1.0  # much less than compiling takes
+    assert time.process_time() - begin < 1.0  # much less than compiling takes
 
 
 def test_the_distance_to_a_point_is_that_of_the_parameter():

@@ -9,8 +9,8 @@ Half of the oscillators are of round numbers, on which boundaries, edges and equ
 import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+import lists
 import numpy as np
 import pytest
 
@@ -19,7 +19,9 @@ from jaxbelt import EventKind, Status
 from jaxbelt.sweeps import threads as sweep_threads
 
 #: Time of the runs, and at which times they are compared.
-T1, SAMPLES = 15.0, 33
+T1 = 15.0
+#: As many, and room for as many arcs, as in tests/test_simulate.py, for one program.
+SAMPLES, ARCS = 241, 4096
 #: Tolerance of states and times: rounding, grown by what the motion amplifies. Runs are integrated
 #: to 1e-10; those of one relation take the same steps.
 CLOSE = 1e-9
@@ -212,7 +214,7 @@ class Run(NamedTuple):
 
 def run(osc: jb.Oscillator, y0: np.ndarray, t0: float = 0.0, t1: float = T1, ts=None) -> Run:
     ts = np.linspace(t0, t1, SAMPLES) if ts is None else ts
-    found = jb.simulate(osc, y0, t1, t0=t0, ts=ts, max_segments=512)
+    found = jb.simulate(osc, y0, t1, t0=t0, ts=ts, max_segments=ARCS)
     happened = found.events
     events = [
         Event(t, EventKind(kind), belt, _concerned(osc, kind, belt, x1))
@@ -338,7 +340,7 @@ def test_a_belt_without_load_holds_nothing():
     (rest,) = jb.equilibria(osc)
     found = run(osc, np.array([float(rest.x1), 0.0]))
     assert found.status == Status.OK
-    dataset = swept([osc], "attractor")
+    dataset = lists.swept([osc], STARTS, observe="attractor")
     assert np.all(jb.decoded(dataset).kind == "equilibrium") and not np.any(dataset.sticks)
 
 
@@ -460,22 +462,11 @@ STARTS = {"x1": np.array([-2.0, -0.85, 0.0, 0.85, 2.0]), "x2": np.array([-1.0, 0
 SWEPT = 1e-6
 
 
-def swept(oscillators, observe: str, cases=None, **starts):
-    """All of some oscillators from all starts; one program for all lists of oscillators."""
-    structure = jax.tree.structure(oscillators[0])
-    columns = [
-        np.array([float(leaf) for leaf in leaves])
-        for leaves in zip(*map(jax.tree.leaves, oscillators), strict=True)
-    ]
-
-    def make(case):
-        which = jnp.asarray(case).astype(int)
-        return jax.tree.unflatten(structure, [jnp.asarray(column)[which] for column in columns])
-
-    cases = np.arange(len(oscillators), dtype=float) if cases is None else cases
+def swept(oscillators, observe: str, **axes):
+    """All of some oscillators from all starts."""
     t1 = {"t1": 40.0} if observe == "final" else {}
-    axes = {"case": cases, **(STARTS | starts)}
-    return jb.sweep(make, axes, observe=observe, progress=False, **t1)
+    cases = {"case": np.arange(len(oscillators), dtype=float)}
+    return lists.swept(oscillators, cases | STARTS | axes, observe=observe, **t1)
 
 
 @functools.cache
@@ -558,10 +549,10 @@ def test_an_image_has_the_same_attractors(image_of, seed):
 @pytest.mark.parametrize("observe", ["final", "attractor"])
 def test_a_lane_does_not_know_of_the_others(observe, monkeypatch):
     oscillators, whole = [osc for osc, _ in cases(0)], original_sweep(observe, 0)
-    backwards = swept(oscillators, observe, cases=np.arange(len(oscillators), dtype=float)[::-1])
+    backwards = swept(oscillators, observe, case=np.arange(len(oscillators), dtype=float)[::-1])
     assert backwards.isel(case=slice(None, None, -1)).equals(whole)
     # How signatures are numbered depends on which there are.
-    alone = swept(oscillators, observe, cases=np.array([7.0]), x1=np.array([2.0]))
+    alone = swept(oscillators, observe, case=np.array([7.0]), x1=np.array([2.0]))
     one = whole.sel(case=[7.0], x1=[2.0])
     assert alone.drop_vars("signature", errors="ignore").equals(
         one.drop_vars("signature", errors="ignore")

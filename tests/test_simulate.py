@@ -210,6 +210,7 @@ def test_derivatives_agree_with_richardson_differences_of_the_oracle():
         np.testing.assert_array_less(np.abs(computed[:, i] - value) / scale, 1e-7)
 
 
+@pytest.mark.slow(first=True)
 def test_reverse_mode_equals_forward_mode():
     reverse, _ = jax.jit(jax.jacrev(outcome, has_aux=True))(PARAMETERS)
     for a, b in zip(reverse, forward_derivatives()[0], strict=True):
@@ -302,7 +303,7 @@ def test_a_stick_phase_forgets_the_start():
 
 def one_of_class_d(nu, y0, edges):
     osc = jb.presets.class_d(nu[0], nu[1], edges[0], edges[1])
-    return simulate(osc, y0, 30.0, ts=jnp.linspace(0.0, 30.0, 31), max_segments=512)
+    return simulate(osc, y0, SPAN / 2, ts=SAMPLES / 2)
 
 
 all_of_class_d = jax.jit(jax.vmap(one_of_class_d))
@@ -319,13 +320,15 @@ def mixed_lanes():
 
 def test_vmap_equals_a_loop():
     lanes = mixed_lanes()
-    single, batch = jax.jit(one_of_class_d), all_of_class_d(*lanes)
+    batch = all_of_class_d(*lanes)
     seen = set()
     for i in range(24):
-        alone = single(*(column[i] for column in lanes))
+        alone = one_of_class_d(*(column[i] for column in lanes))
         assert alone.status == batch.status[i]
-        np.testing.assert_array_equal(alone.events.kind, batch.events.kind[i])
-        np.testing.assert_allclose(alone.events.t, batch.events.t[i], rtol=0, atol=1e-12)
+        n = len(alone.events.t)
+        np.testing.assert_array_equal(alone.events.kind, batch.events.kind[i, :n])
+        assert not np.any(batch.events.kind[i, n:])
+        np.testing.assert_allclose(alone.events.t, batch.events.t[i, :n], rtol=0, atol=1e-12)
         np.testing.assert_allclose(alone.ys, batch.ys[i], rtol=0, atol=1e-12)
         seen |= set(np.asarray(alone.events.kind).tolist())
     assert seen >= {1, 2, 3, 4}
@@ -600,7 +603,7 @@ def test_a_pseudo_focus_with_a_belt_at_rest_is_reached_in_finite_time(x2):
 
 
 def test_a_used_up_budget_gives_what_there_is():
-    run = jb.simulate(jb.presets.class_b(-0.2, 0.35), (3.0, 0.0), 100.0, max_segments=16)
+    run = simulate(jb.presets.class_b(-0.2, 0.35), (3.0, 0.0), 1e5)
     assert run.status == Status.TOO_MANY_SEGMENTS
     assert "max_segments" in jb.describe(run.status)
     assert np.all(np.isfinite(run.ys[run.ts < run.arcs.t[-1]]))

@@ -97,7 +97,7 @@ def test_a_store_is_what_the_sweep_gives(path, whole):
     assert jb.verify(path) == stores.Verified((0, 1, 2, 3, 4), (), (), True)
 
 
-@pytest.mark.parametrize("observe", ["final", "attractor"])
+@pytest.mark.parametrize("observe", [pytest.param("final", marks=pytest.mark.slow), "attractor"])
 def test_derivatives_and_vectors_are_kept(tmp_path, observe):
     options = dict(t1=20.0, observe=observe, derivatives=("nu0",), progress=False)
     expected = jb.sweep(jb.presets.class_b, AXES, **options)
@@ -312,6 +312,7 @@ def test_an_interrupt_keeps_what_is_done(tmp_path, whole, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes of POSIX")
-def test_kills_at_random_moments_do_no_harm(tmp_path):
-    told = kills.campaign(tmp_path, "final", kills=20, seed=1)
+@pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.slow)])
+def test_kills_at_random_moments_do_no_harm(tmp_path, count):
+    told = kills.campaign(tmp_path, "final", kills=count, seed=1)
     assert told["blocks seen done"] > 0

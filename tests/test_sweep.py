@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import lists
 import matplotlib.pyplot as plt
 import numpy as np
 import oracle
@@ -56,12 +57,9 @@ def test_axes_of_starts_and_of_functions_with_fixed_arguments(dataset):
 
 def test_a_mass_at_rest_is_near_no_edge():
     # x1 = x2 = x2' = 0, between the intervals of two belts: no way is short against a speed of 0.
-    def between(damping):
-        law = jb.Conti(1.0, 0.6, 10.0)
-        belts = jb.Belt(-0.9, law, lower=0.8), jb.Belt(0.3, law, upper=-0.82)
-        return jb.Oscillator(damping, belts)
-
-    rest = jb.sweep(between, {"damping": [0.25]}, y0=(0.0, 0.0), t1=50.0)
+    law = jb.Conti(1.0, 0.6, 10.0)
+    belts = jb.Belt(-0.9, law, lower=0.8), jb.Belt(0.3, law, upper=-0.82)
+    rest = lists.swept([jb.Oscillator(0.25, belts)], y0=(0.0, 0.0), t1=50.0)
     assert (rest.status == Status.OK) & (rest.x1_end == 0) & (rest.x2_end == 0)
 
 

@@ -41,10 +41,10 @@ from ..model.parameters import leaf_index, parameter, vary
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.continuation import Stop
-from ..numerics.newton import NEWTON_STEPS
+from ..numerics.newton import HOLDS, NEWTON_STEPS
 from ..results import Status, describe
 from .guesses import nearest, settled_loops
-from .labels import Found, Label
+from .labels import AttractingCycle, Label
 from .systems import (
     NOWHERE,
     AbstractSystem,
@@ -234,7 +234,7 @@ class AbstractCondition(eqx.Module):
         """What changes where it holds, beside a label; cycles: the attracting ones, in order."""
         return None
 
-    def beginnings(self, cycles: Sequence[Found]) -> Sequence[Loop | None]:
+    def beginnings(self, cycles: Sequence[AttractingCycle]) -> Sequence[Loop | None]:
         """Of the attracting cycles those to begin from; None: its own guess."""
         return (None,)
 
@@ -380,7 +380,7 @@ def solved_point(osc, index, system: CycleSystem, z0, status) -> BifurcationPoin
     at_point = vary(osc, index, p)
     # By the last steps: the residual costs an integration more, and who asks for it gets it.
     last, before = steps[jnp.maximum(iterations - 1, 0)], steps[jnp.maximum(iterations - 2, 0)]
-    converged = (status != Status.OK) | (last * jnp.minimum(last / before, 1.0) < 1e-9)
+    converged = (status != Status.OK) | (last * jnp.minimum(last / before, 1.0) < HOLDS)
     status = jnp.where(converged, status, Status.NO_CONVERGENCE.value)
     size, error = accuracy(*lax.stop_gradient((at_point, system, z, matrix)))
     cycle, slope = cycle_of(at_point, system.ordinary, z, iterations, status, size)
@@ -495,7 +495,7 @@ def _solved_rest(condition: AbstractRestCondition, osc, index, guess) -> Bifurca
     u, steps, size, error = small_newton(equations, osc, start)
     exists = system.exists(vary(osc, index, u[-1:]), u[:-1])
     judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
-    judged = jnp.where(size < 1e-9, judged, Status.NO_CONVERGENCE.value)
+    judged = jnp.where(size < HOLDS, judged, Status.NO_CONVERGENCE.value)
     status = jnp.where(status == Status.OK, judged, status)
     return _point_without_cycle(osc, index, u[-1], steps, size, error, status, condition.no_cycle)
 

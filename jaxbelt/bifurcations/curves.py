@@ -154,9 +154,9 @@ def bifurcation_curve(
     inside = np.all((limits[:, 0] <= start) & (start <= limits[:, 1]))
     require(inside, "span", f"around the point {start.tolist()}", limits.tolist())
     problem = _Problem(point.condition, osc, indices, limits, step, max_points)
-    ahead = _follow(problem, point, 1.0)
+    ahead = _side(problem, point, 1.0)
     closed = ahead.end is Stop.CLOSED
-    behind = _Side(ahead.rows[:1], [], Stop.CLOSED) if closed else _follow(problem, point, -1.0)
+    behind = _Side(ahead.rows[:1], [], Stop.CLOSED) if closed else _side(problem, point, -1.0)
     rows = [*reversed(behind.rows[1:]), *ahead.rows]
     names = [names_of(osc)[number] for number in numbers]
     return BifurcationCurve(
@@ -204,15 +204,15 @@ class _Side(NamedTuple):
     end: Stop
 
 
-def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
-    """The curve to one side of a point: piece by piece, each with one signature and one mesh."""
+def _side(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
+    """The curve to one side of a point: leg by leg, each with one signature and one mesh."""
     track, u = _Track.begun(problem, point)
     origin, direction = u[-2:], sign * track.tangent(u)
     rows: list[_Row] = []
     special: list[SpecialPoint] = []
     while True:
-        points, found, beyond, end = _piece(problem, track, u, direction, origin)
-        rows += [_row(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
+        points, found, beyond, end = _leg(problem, track, u, direction, origin)
+        rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
         special += found
         last = points[-1][0].u if points else u
         if end is not Stop.LEFT_SPAN and (limit := _limit(problem, track, rows, last, end)):
@@ -236,10 +236,10 @@ def _follow(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
         track, u = _Track.begun(problem, further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
-        rows.append(_row(problem, track, u, track.look(u)))
+        rows.append(_row_at(problem, track, u, track.look(u)))
 
 
-class _Piece(NamedTuple):
+class _Leg(NamedTuple):
     """Points with what is seen there, where there is such a motion; the next one, where there is
     none; the points of codimension two between them."""
 
@@ -249,9 +249,9 @@ class _Piece(NamedTuple):
     end: Stop
 
 
-def _piece(problem: _Problem, track: "_Track", u, direction, origin) -> _Piece:
+def _leg(problem: _Problem, track: "_Track", u, direction, origin) -> _Leg:
     points, special = [], []
-    for at in _steps(problem, track, u, direction):
+    for at in _points_along(problem, track, u, direction):
         if points:
             at = _closing(track, points[-1][0], at, origin) or at
         points.append((at, track.look(at.u)))
@@ -259,10 +259,10 @@ def _piece(problem: _Problem, track: "_Track", u, direction, origin) -> _Piece:
             special += _between(problem, track, points[-2], points[-1])
         if not points[-1][1].exists:
             beyond, _ = points.pop()
-            return _Piece(points, special, beyond, Stop.STOPPED)
+            return _Leg(points, special, beyond, Stop.STOPPED)
         if at.end is not None:
-            return _Piece(points, special, None, at.end)
-    return _Piece(points, special, None, Stop.STEP_TOO_SMALL)
+            return _Leg(points, special, None, at.end)
+    return _Leg(points, special, None, Stop.STEP_TOO_SMALL)
 
 
 def _closing(track: "_Track", before: CurvePoint, after: CurvePoint, origin) -> CurvePoint | None:
@@ -279,15 +279,14 @@ def _closing(track: "_Track", before: CurvePoint, after: CurvePoint, origin) -> 
     return after._replace(u=at.u, tangent=at.tangent, end=Stop.CLOSED)
 
 
-def _steps(problem: _Problem, track: "_Track", u: np.ndarray, direction: np.ndarray):
+def _points_along(problem: _Problem, track: "_Track", u: np.ndarray, direction: np.ndarray):
     span = np.full((2, u.size), np.inf) * np.array([[-1.0], [1.0]])
     span[:, -2:] = problem.limits.T
     return continue_curve(
-        _residual,
+        _curve_linearized,
         u,
         direction,
         args=track.args,
-        jacobian=_jacobian,
         span=(span[0], span[1]),
         step=problem.step,
         min_step=1e-2 * problem.step,
@@ -296,7 +295,7 @@ def _steps(problem: _Problem, track: "_Track", u: np.ndarray, direction: np.ndar
     )
 
 
-def _row(problem: _Problem, track: "_Track", u: np.ndarray, seen: Seen) -> _Row:
+def _row_at(problem: _Problem, track: "_Track", u: np.ndarray, seen: Seen) -> _Row:
     osc = vary(problem.osc, problem.indices, jnp.asarray(u[-2:]))
     kind = problem.condition.kind_along(osc, seen.multiplier)
     return _Row(u[-2:], kind, seen.multiplier, seen.residual, track.place(u))
@@ -463,8 +462,8 @@ class _Track(NamedTuple):
         return self.args[2]
 
     @property
-    def problem(self) -> tuple[Any, Any, Any]:
-        return _residual, _jacobian, self.args
+    def problem(self) -> tuple[Any, Any]:
+        return _curve_linearized, self.args
 
     def unknowns(self, u: np.ndarray) -> np.ndarray:
         """Those of the system."""
@@ -476,7 +475,7 @@ class _Track(NamedTuple):
 
     def look(self, u: np.ndarray) -> Seen:
         """What is seen at a solution, in numbers."""
-        seen = _look(self.args, jnp.asarray(u))
+        seen = _seen_at(self.args, jnp.asarray(u))
         tests = {name: float(value) for name, value in seen.tests.items()}
         return Seen(tests, bool(seen.exists), float(seen.multiplier), float(seen.residual))
 
@@ -501,19 +500,14 @@ def _parts(u: Array, args):
     return functools.partial(vary, osc, indices), system, system.shaped(u[:-2] / weights), u[-2:]
 
 
-def _residual(u: Array, args) -> Array:
-    osc_of, system, x, p = _parts(u, args)
-    return system.residual(osc_of(p), x)
-
-
-def _jacobian(u: Array, args) -> tuple[Array, Array]:
+def _curve_linearized(u: Array, args) -> tuple[Array, Array]:
     osc_of, system, x, p = _parts(u, args)
     value, matrix = system.linearized(osc_of, x, p)
     return value, matrix.at[:, :-2].divide(args[3][None])
 
 
 @jit
-def _look(args, u: Array) -> Seen:
+def _seen_at(args, u: Array) -> Seen:
     osc_of, system, x, p = _parts(u, args)
     return system.look(osc_of(p), x)
 

@@ -39,7 +39,7 @@ from ..sweeps.sweep import sweep
 from .conditions import BifurcationPoint
 from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere
 from .labels import Label
-from .path import Path
+from .path import ParameterPath
 from .scan import by_value, edges_touched, search
 
 #: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
@@ -123,7 +123,7 @@ def bifurcation_diagram(
     many values of the parameter are computed. `ValueError` names an impossible argument.
     """
     require(isinstance(rows, int) and rows > 0, "rows", "a positive integer", repr(rows))
-    path = Path(osc, where, span)
+    path = ParameterPath(osc, where, span)
     points = search(path, resolution)
     # A point on an end of the span has one side only.
     inner = [point for point in points if path.first < float(point.value) < path.last]
@@ -150,7 +150,7 @@ def bifurcation_diagram(
     )
 
 
-def _nodes(path: Path, a: float, b: float, rows: int) -> np.ndarray:
+def _nodes(path: ParameterPath, a: float, b: float, rows: int) -> np.ndarray:
     """Values from a to b, dense at both ends, which are left out where they are special."""
     count = max(9, round(rows * (b - a) / path.length))
     inner = 0.5 * (1 - np.cos(np.linspace(0, np.pi, count)))
@@ -381,7 +381,7 @@ def _bounds(make, names, values, numbers, step, lines) -> list[BifurcationCurve]
 
     def points_on(along: int, fixed: float) -> tuple[BifurcationPoint, ...]:
         pair = {names[along]: span[along][0], names[1 - along]: fixed}
-        return search(Path(make(**pair), where[along], span[along]))
+        return search(ParameterPath(make(**pair), where[along], span[along]))
 
     curves: list[BifurcationCurve] = []
     # The next lines are searched while curves are followed from those before.
@@ -424,7 +424,7 @@ class _Piece(NamedTuple):
     stretch: int
 
 
-def _equilibrium_pieces(path: Path, nodes: Sequence[np.ndarray]) -> list[_Piece]:
+def _equilibrium_pieces(path: ParameterPath, nodes: Sequence[np.ndarray]) -> list[_Piece]:
     found = _stacked(candidates, map(path.at, np.concatenate(nodes)))
     pieces = []
     for stretch, rows in enumerate(_consecutive(nodes)):
@@ -449,7 +449,9 @@ def _equilibrium_pieces(path: Path, nodes: Sequence[np.ndarray]) -> list[_Piece]
     return pieces
 
 
-def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Label]) -> list[_Piece]:
+def _cycle_pieces(
+    path: ParameterPath, nodes: Sequence[np.ndarray], labels: Sequence[Label]
+) -> list[_Piece]:
     wanted: list[tuple[int, np.ndarray, list[Loop]]] = []
     for stretch in range(len(labels)):
         for loops in path.followed(nodes[stretch].tolist()):
@@ -469,7 +471,7 @@ def _cycle_pieces(path: Path, nodes: Sequence[np.ndarray], labels: Sequence[Labe
     return pieces
 
 
-def _as_pieces(path: Path, found: "_Rows", groups, stretches) -> list[_Piece]:
+def _as_pieces(path: ParameterPath, found: "_Rows", groups, stretches) -> list[_Piece]:
     pieces = []
     for stretch, values, rows in zip(stretches, groups, _consecutive(groups), strict=True):
         fine = found.status[rows] == Status.OK
@@ -496,7 +498,7 @@ class _Rows(NamedTuple):
 
 
 @jit
-def _row(cycle: Cycle) -> _Rows:
+def _row_of_branch(cycle: Cycle) -> _Rows:
     osc, chain = cycle.oscillator, cycle.chain
     stuck = jnp.any((chain.codes == 0) & chain.used[:, None], axis=0)
     speeds = jnp.stack([belt.velocity / osc.omega for belt in osc.belts])
@@ -529,15 +531,15 @@ def _stacked(program, items: Iterable[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
 
-def _attracting(path: Path, values: np.ndarray, loops: Sequence[Loop]) -> _Rows:
+def _attracting(path: ParameterPath, values: np.ndarray, loops: Sequence[Loop]) -> _Rows:
     ok = jnp.asarray(Status.OK.value)
     pairs = zip(values, cut(loops), strict=True)
-    return _stacked(_row, (polish(path.at(value), loop, ok) for value, loop in pairs))
+    return _stacked(_row_of_branch, (polish(path.at(value), loop, ok) for value, loop in pairs))
 
 
-def _repelling(path: Path, values: np.ndarray, arounds: np.ndarray) -> _Rows:
+def _repelling(path: ParameterPath, values: np.ndarray, arounds: np.ndarray) -> _Rows:
     pairs = zip(values.tolist(), arounds.tolist(), strict=True)
-    return _stacked(_row, (path.unstable(value, around) for value, around in pairs))
+    return _stacked(_row_of_branch, (path.unstable(value, around) for value, around in pairs))
 
 
 # --- from pieces to branches ----------------------------------------------------------------------
@@ -562,7 +564,9 @@ def _joined(pieces: Sequence[_Piece], points: Sequence[BifurcationPoint]) -> lis
             for i, piece in enumerate(pieces)
             if piece.stretch in (at, at + 1)
         ]
-        pairs = sorted((_apart(a, b), i, j) for (i, a), (j, b) in combinations(enumerate(ends), 2))
+        pairs = sorted(
+            (_distance(a, b), i, j) for (i, a), (j, b) in combinations(enumerate(ends), 2)
+        )
         taken: set[int] = set()
         for distance, i, j in pairs:
             if distance < SAME and not taken & {i, j}:
@@ -589,7 +593,7 @@ def _end(number: int, piece: _Piece, *, right: bool) -> _End:
     return _End(number, right, (branch.kind, float(branch.x1_min[row]), float(branch.x1_max[row])))
 
 
-def _apart(a: _End, b: _End) -> float:
+def _distance(a: _End, b: _End) -> float:
     """How far apart two ends are, relative to the motion there."""
     (kind, *x), (other, *y) = a.place, b.place
     size = max(x[1] - x[0], y[1] - y[0], 0.1)

@@ -29,6 +29,7 @@ from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.continuation import Stop
+from ..numerics.newton import HOLDS
 from ..results import Status
 from .conditions import AbstractCycleCondition, Line
 from .crossings import arrival_tests
@@ -262,7 +263,7 @@ def end_near_edge(osc: Oscillator, loop: Loop, belt: int | Array, wanted: float 
         for i, one in enumerate(osc.belts):
             r, began = (one.velocity - osc.omega * v for v in (x2, entry[1]))
             touches = (jnp.abs(codes[i]) < 1.5) | (jnp.abs(after[i]) < 1.5)
-            near = on_edge & ~stuck & touches & (jnp.abs(began) > 1e-9)
+            near = on_edge & ~stuck & touches & (jnp.abs(began) > HOLDS)
             to_boundaries.append(jnp.where(near, jnp.abs(r), jnp.inf))
         # Slip onset may be: in the mode before the edge, or, if it is left by it, in that after.
         held = jnp.where((codes == 0) & (jnp.abs(after) < 1.5), 0.0, after)

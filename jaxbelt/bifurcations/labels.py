@@ -1,4 +1,4 @@
-"""What the oscillator does at one value of a parameter, in short: `Label`, and `Found` cycles."""
+"""What the oscillator does at one value of a parameter: `Label`, and each `AttractingCycle`."""
 
 from collections import Counter
 from collections.abc import Hashable
@@ -37,7 +37,7 @@ class Label(NamedTuple):
         return sum(not sticks(path) for path in self.cycles)
 
 
-class Found(NamedTuple):
+class AttractingCycle(NamedTuple):
     """An attracting cycle: its itinerary, and a loop of it, with room for more arcs.
 
     The loop of one that does not stick solves the equations of the cycle, but where `approach` did

@@ -1,4 +1,4 @@
-"""A path in one parameter, and what the oscillator does along it: `Path`.
+"""A path in one parameter, and what the oscillator does along it: `ParameterPath`.
 
 What the oscillator does at one value of the parameter is summed up in a label: the kind and the
 stability of every equilibrium, and the itinerary of every attracting cycle, that is, the modes that
@@ -41,7 +41,7 @@ from ..numerics.compiling import each, jit
 from ..results import Status
 from .conditions import AbstractCondition
 from .guesses import settled_loops
-from .labels import Found, Label
+from .labels import AttractingCycle, Label
 
 #: Values of the parameter in one batch.
 BATCH = 32
@@ -56,7 +56,7 @@ DIFFERENCE = 1e-3
 EXPECTED = 1e-3
 
 
-class Path:
+class ParameterPath:
     """A path in one parameter: its labels, each computed once, and loops of the cycles in them."""
 
     def __init__(self, osc, where, span, conditions: Sequence[AbstractCondition] = ()):
@@ -75,7 +75,7 @@ class Path:
         self.length = self.last - self.first
         self.name = names_of(osc)[int(self.index)]
         self.labels: dict[float, Label] = {}
-        self.cycles: dict[float, list[Found]] = {}
+        self.cycles: dict[float, list[AttractingCycle]] = {}
         self.unstable_cycles: dict[tuple[float, int], Cycle] = {}
         # From which value to which other one, from which cycle to which, of those that do not
         # stick; None where there is none.
@@ -143,7 +143,7 @@ class Path:
         new = np.array(sorted({float(v) for v in values} - self.labels.keys()))
         for batch in (new[i : i + BATCH] for i in range(0, new.size, BATCH)):
             filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
-            seen = jax.tree.map(np.asarray, _look(self.osc, self.index, jnp.asarray(filled)))
+            seen = jax.tree.map(np.asarray, _motions(self.osc, self.index, jnp.asarray(filled)))
             for lane, value in enumerate(batch.tolist()):
                 self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen))
         self._share()
@@ -157,22 +157,24 @@ class Path:
             and not (self.labels[a] == self.labels[b] and self._all_go_on(a, b))
         ]
 
-    def _take(self, value: float, seen: "_Seen") -> None:
+    def _take(self, value: float, seen: "_Motions") -> None:
         """Label a value by what was seen there."""
         exists = seen.kind > 0
         modes = map(tuple, without_idle(self.at(value), seen.modes[exists]).tolist())
         rests = tuple(
             zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), modes, strict=True)
         )
-        found: list[Found] = []
+        found: list[AttractingCycle] = []
         loops = [jax.tree.map(lambda x, i=i: x[i], seen.loop) for i in range(len(seen.status))]
         for loop, status in zip(loops, seen.status.tolist(), strict=True):
             one = self._settled(value, loop) if status == Status.OK else None
-            if one is not None and _number(one, found) is None:
+            if one is not None and _number_among(one, found) is None:
                 found.append(one)
         if not found and not any(stable for _, stable, _ in rests):
             # Nothing holds the orbits but a cycle that they approach slowly.
-            found.append(self._settled(value, loops[-1], closes=False) or Found((), loops[-1]))
+            found.append(
+                self._settled(value, loops[-1], closes=False) or AttractingCycle((), loops[-1])
+            )
         self.cycles[value] = found
         self._name(value, rests)
 
@@ -182,7 +184,7 @@ class Path:
         marks = tuple(condition.mark(osc, loops) for condition in self.conditions)
         self.labels[value] = Label(rests, tuple(one.path for one in cycles), marks)
 
-    def _settled(self, value: float, loop: Loop, *, closes: bool = True) -> Found | None:
+    def _settled(self, value: float, loop: Loop, *, closes: bool = True) -> AttractingCycle | None:
         """The attracting cycle that a loop is nearly one of, or else leads to, or None.
 
         A loop that sticks is one of it. Any other may only seem to repeat. closes: whether it is
@@ -190,7 +192,7 @@ class Path:
         """
         osc, ok = self.at(value), jnp.asarray(Status.OK.value)
         if closes and sticks(path := itinerary(osc, loop)):
-            return Found(path, loop)
+            return AttractingCycle(path, loop)
         # Where the cycle has other loops than those from which it is solved for, or meets a
         # boundary, it is followed.
         ways = (lambda: polish(osc, cut([loop])[0], ok), lambda: find_cycle(osc, loop.entries[0]))
@@ -199,7 +201,7 @@ class Path:
                 # Not the equilibrium, to which a cycle may shrink.
                 if np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST:
                     loop = jax.tree.map(np.asarray, as_loop(cycle, ROOM))
-                    return Found(itinerary(osc, loop), loop)
+                    return AttractingCycle(itinerary(osc, loop), loop)
         return None
 
     def _share(self) -> None:
@@ -245,7 +247,7 @@ class Path:
         places = [place_of(one) for one in (loop, expected, found.loop)]
         if apart(places[1], places[2]) > EXPECTED * (1 + 300 * apart(places[0], places[1])):
             return None
-        at = _number(found, self.cycles[value])
+        at = _number_among(found, self.cycles[value])
         if at is None:
             others = self.cycles[value]
             # In place of one that was only taken to be there.
@@ -291,7 +293,7 @@ class Path:
         return self.labels[float(value)]
 
 
-def _number(cycle: Found, among: Sequence[Found]) -> int | None:
+def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> int | None:
     """The number of a cycle among others, or None."""
     for number, other in enumerate(among):
         if other.path == cycle.path:
@@ -305,7 +307,7 @@ def _fits(loop: Loop, other: Loop) -> bool:
     return np.array_equal(loop.codes, other.codes) and np.array_equal(loop.ends, other.ends)
 
 
-class _Seen(NamedTuple):
+class _Motions(NamedTuple):
     """Equilibria, [rows], and of every orbit its status and last loop, [starts, ROOM]."""
 
     kind: Any
@@ -316,11 +318,11 @@ class _Seen(NamedTuple):
 
 
 @jit
-def _look(osc: Oscillator, index: Array, values: Array) -> _Seen:
-    return each(lambda p: _look_at(vary(osc, index, p[None])))(values)
+def _motions(osc: Oscillator, index: Array, values: Array) -> _Motions:
+    return each(lambda p: _motions_at(vary(osc, index, p[None])))(values)
 
 
-def _look_at(osc: Oscillator) -> _Seen:
+def _motions_at(osc: Oscillator) -> _Motions:
     rests = equilibria(osc)
     loop, status = settled_loops(osc, rests, ROOM)
-    return _Seen(rests.kind, rests.stable, rests.modes, status, loop)
+    return _Motions(rests.kind, rests.stable, rests.modes, status, loop)

@@ -45,6 +45,7 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index, vary
 from ..numerics.compiling import jit
+from ..numerics.newton import HOLDS
 from ..results import Status
 from .conditions import (
     AbstractRestCondition,
@@ -141,7 +142,7 @@ def hopf_limit(kind: str, trail: Trail, vanishes: Callable, *args: Array) -> Spe
     given = trail.osc, trail.indices, trail.system.chain.codes[0]
     found, residual = _special_hopf(*given, guess, vanishes, *args)
     values = np.asarray(found[1:])
-    if not (residual < 1e-9 and np.linalg.norm(values - trail.values[-1]) < 2 * trail.step):
+    if not (residual < HOLDS and np.linalg.norm(values - trail.values[-1]) < 2 * trail.step):
         return None
     return SpecialPoint(kind, (), (float(values[0]), float(values[1])), float(residual))
 

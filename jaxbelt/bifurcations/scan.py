@@ -28,12 +28,12 @@ from .conditions import AbstractCondition, BifurcationPoint, unexplained_point
 from .crossings import CrossingSliding, SlidingExchange
 from .edges import GrazingEdge
 from .folds import FoldOfCycles
-from .path import ROOM, Path
+from .path import ROOM, ParameterPath
 from .rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
 from .tangencies import GrazingSliding
 
 #: The kinds that are looked for, those first that are likelier or whose programs compile sooner.
-KINDS: tuple[type[AbstractCondition], ...] = (
+LOOKED_FOR: tuple[type[AbstractCondition], ...] = (
     Hopf,
     GrazingSliding,
     CrossingSliding,
@@ -45,7 +45,8 @@ KINDS: tuple[type[AbstractCondition], ...] = (
     GrazingEdge,
     FoldOfCycles,
 )
-#: Intervals narrower than this fraction of the span are good guesses for Newton's method.
+#: Intervals narrower than this fraction of the span are good guesses for Newton's method. On the
+#: paper's path 1/100 finds the same points as fast, 1/1600 in a third more time.
 NEAR = 1 / 400
 
 
@@ -71,10 +72,10 @@ def scan(
     the value where it happens, good to about 1e-9 of the span. `ValueError` names an impossible
     argument.
     """
-    return search(Path(osc, where, span, conditions), resolution)
+    return search(ParameterPath(osc, where, span, conditions), resolution)
 
 
-def search(path: Path, resolution: int = 96) -> tuple[BifurcationPoint, ...]:
+def search(path: ParameterPath, resolution: int = 96) -> tuple[BifurcationPoint, ...]:
     """Every bifurcation point on a path, in order; its labels are kept with it."""
     points = [point for at in path.breaks for point in _at_break(path, at)]
     ends = [path.first, *(v for at in path.breaks for v in path.beside(at)), path.last]
@@ -120,7 +121,9 @@ def by_value(points: Sequence[BifurcationPoint]) -> tuple[BifurcationPoint, ...]
     return tuple(sorted(points, key=lambda point: float(point.value)))
 
 
-def edges_touched(path: Path, values: np.ndarray, around: int) -> tuple[BifurcationPoint, ...]:
+def edges_touched(
+    path: ParameterPath, values: np.ndarray, around: int
+) -> tuple[BifurcationPoint, ...]:
     """Where the unstable cycle begins or ceases to pass a contact edge.
 
     values: in order, in a stretch in which nothing else happens. Those at which no such cycle is
@@ -144,7 +147,7 @@ def edges_touched(path: Path, values: np.ndarray, around: int) -> tuple[Bifurcat
             condition.found_from(path.osc, path.index, value, loop)
             for value in (a, b)
             for loop in [as_loop(unstable(value), ROOM)]
-            for kind in KINDS
+            for kind in LOOKED_FOR
             for condition in kind.of_unstable_cycles(path.edged)
         )
         points_inside = (point for point in solved if point is not None and a < point.value < b)
@@ -165,17 +168,19 @@ def edges_touched(path: Path, values: np.ndarray, around: int) -> tuple[Bifurcat
 # --- what makes the difference between two values -------------------------------------------------
 
 
-def _explained(path: Path, a: float, b: float) -> BifurcationPoint | None:
+def _explained(path: ParameterPath, a: float, b: float) -> BifurcationPoint | None:
     """A bifurcation point between two values that differ, or None."""
     before, after = path.label(a), path.label(b)
     marks = zip(path.conditions, before.marks, after.marks, strict=True)
     own = [condition for condition, mark, other in marks if mark != other]
-    kinds = [condition for kind in KINDS for condition in kind.between(before, after, path.edged)]
+    kinds = [
+        condition for kind in LOOKED_FOR for condition in kind.between(before, after, path.edged)
+    ]
     return _first_found(path, a, b, [*own, *kinds])
 
 
 def _first_found(
-    path: Path, a: float, b: float, conditions: Sequence[AbstractCondition]
+    path: ParameterPath, a: float, b: float, conditions: Sequence[AbstractCondition]
 ) -> BifurcationPoint | None:
     """The first of the conditions that holds within an interval."""
     for condition in conditions:
@@ -189,13 +194,13 @@ def _first_found(
     return None
 
 
-def _at_break(path: Path, value: float) -> list[BifurcationPoint]:
+def _at_break(path: ParameterPath, value: float) -> list[BifurcationPoint]:
     """The points where the varied belt is at rest or runs with another one."""
     interval = path.beside(value)
     path.look(interval)
     found = []
     for belts in path.coinciding(value):
-        conditions = [condition for kind in KINDS for condition in kind.at_coincidence(belts)]
+        conditions = [condition for kind in LOOKED_FOR for condition in kind.at_coincidence(belts)]
         found.append(_first_found(path, *interval, conditions))
     points = [point for point in found if point is not None]
     if not points and path.label(interval[0]) != path.label(interval[1]):

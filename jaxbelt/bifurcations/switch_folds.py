@@ -36,9 +36,11 @@ from .conditions import BifurcationPoint
 from .systems import small_newton
 from .tangencies import NonsmoothFold
 
-#: Integration steps of order twelve for the slip phase.
-STEPS = 64
-#: The band of the first solution, and how many there are from it to the one wanted.
+#: Integration steps of order twelve for the slip phase: with half as many folds move by 2e-12, with
+#: twice as many by 5e-15.
+SLIP_STEPS = 64
+#: The band of the first solution, and how many there are from it to the one wanted: so bands up to
+#: 1e-2 are reached; with three, or from 1e-8, up to 1e-3.
 FIRST, STAGES = 1e-6, 4
 #: Bands from which the search for the band of a given fold starts.
 TYPICAL = 1e-4
@@ -106,7 +108,7 @@ def _fold(point, index, v_star):
 
     start = jnp.append(jnp.array([1.0, 1.0, 1.0]), point.value)
     u, residuals = lax.scan(stage, lax.stop_gradient(start), bands)
-    return _known(u[3], v_star, residuals[-1])
+    return _where_found(u[3], v_star, residuals[-1])
 
 
 @jit
@@ -115,10 +117,10 @@ def _band(point, index, value):
     u, _, residual, _ = small_newton(
         lambda value, u: _equations(point, index, u, value, jnp.exp(u[3])), value, start
     )
-    return _known(value, jnp.exp(u[3]), residual)
+    return _where_found(value, jnp.exp(u[3]), residual)
 
 
-def _known(value, v_star, residual) -> SwitchFold:
+def _where_found(value, v_star, residual) -> SwitchFold:
     residual = residual * v_star  # the equations are in units of v_star
     found = residual < 1e-12
     value, v_star, residual = (
@@ -164,6 +166,6 @@ def _cycle_equations(point, osc: Oscillator, v_star: Array, unknowns: Array) -> 
     x1_end = x1 + nu / osc.omega * tau
     x2_end = (nu - sign * v_star * jnp.exp(-tau)) / osc.omega
     onset = mode_acceleration(osc, held, x1_end, x2_end) + sign * capacity(osc, held)
-    mesh = jnp.full(STEPS, 1 / STEPS)
+    mesh = jnp.full(SLIP_STEPS, 1 / SLIP_STEPS)
     start = flow(osc, slip, mesh, jnp.stack([x1, x2]), -duration)
     return jnp.stack([onset, start[0] - x1_end, start[1] - x2_end])

@@ -26,7 +26,7 @@ from ..cycles.shooting import Chain, Loop, jacobian, meshed, residual, residual_
 from ..model.oscillator import Oscillator
 from ..model.parameters import vary
 from ..motion.arcs import Ends
-from ..numerics.newton import Equations, newton, solve
+from ..numerics.newton import HOLDS, Equations, newton, solve
 from ..results import Status
 
 #: Unknowns of a cycle count this much in the length of a step along a curve, beside the two
@@ -202,7 +202,7 @@ class CycleSystem(AbstractSystem):
         ok, error = jnp.asarray(Status.OK.value), jnp.max(jnp.abs(self.residual(osc, x)))
         cycle, slope = cycle_of(osc, self.ordinary, x, jnp.asarray(0), ok, error)
         tests, is_meant, multiplier = self.watch(osc, x, slope)
-        exists = (cycle.status == Status.OK) & (error < 1e-9) & is_meant
+        exists = (cycle.status == Status.OK) & (error < HOLDS) & is_meant
         return Seen({**velocity_tests(osc), **tests}, exists, multiplier, error)
 
     def place(self, x):

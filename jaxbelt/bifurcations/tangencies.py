@@ -31,7 +31,7 @@ from ..model.oscillator import Oscillator
 from ..model.parameters import vary
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
-from ..numerics.newton import newton
+from ..numerics.newton import HOLDS, newton
 from ..results import EventKind, Status
 from .conditions import AbstractCycleCondition, Line, SpecialPoint
 from .guesses import HINT_BUDGET, least_push, orbit_after_stick
@@ -47,7 +47,7 @@ from .systems import (
 #: power of it over the velocity at which the friction law bends, 1/p3 for Conti's law.
 DEPARTURE = 1e-5
 #: Integration steps for each arc of that orbit; it takes long to leave.
-STEPS = 48
+DEPARTURE_STEPS = 48
 
 
 class Encounter(CycleSystem):
@@ -168,7 +168,7 @@ class AbstractTangency(AbstractCycleCondition):
         value, residual = _tangent_departure(
             still, trail.indices[1 - held], codes, *belts, jnp.full(1, guess)
         )
-        if not (residual < 1e-9 and abs(value - guess) < 3 * trail.step):
+        if not (residual < HOLDS and abs(value - guess) < 3 * trail.step):
             return None
         values = (float(value), 0.0) if held else (0.0, float(value))
         return SpecialPoint("BeltAtRest", (resting,), values, float(residual))
@@ -315,13 +315,13 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
 
     def linearized(unknowns):
         z, p = unknowns
-        value, matrix = system(STEPS).linearized(osc_at, z, p)
+        value, matrix = system(DEPARTURE_STEPS).linearized(osc_at, z, p)
         _, slope = jax.jvp(lambda p: begins(z, p), (p,), (jnp.ones(1),))
         row = jnp.zeros((2, value.size)).at[:, :2].set(jnp.eye(2)).at[:, -1].set(slope)
         return value.at[closing].set(begins(z, p)), matrix.at[closing].set(row)
 
     z, p = newton(linearized, (z, guess)).z
-    value = system(2 * STEPS).residual(osc_at(p), z).at[closing].set(begins(z, p))
+    value = system(2 * DEPARTURE_STEPS).residual(osc_at(p), z).at[closing].set(begins(z, p))
     exists = jnp.any(meets) & (last < SIZES[0]) & admissible(osc_at(p), system(1).ordinary, z)
     return p[0], jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)
 

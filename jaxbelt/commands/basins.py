@@ -24,6 +24,7 @@ from .options import (
     make_console,
     oscillator,
     plain_errors,
+    say,
 )
 
 
@@ -97,5 +98,4 @@ def basins(
             writer.writerow(["x1", "x2", "label"])
             for (i, j), label in np.ndenumerate(np.asarray(found.label)):
                 writer.writerow([float(grid[0][i]), float(grid[1][j]), int(label)])
-    for line in (*lines, f"Written: {', '.join(map(str, written))}"):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    say(console, lines, written)

@@ -24,6 +24,7 @@ from .options import (
     make_console,
     oscillator,
     plain_errors,
+    say,
 )
 
 #: Short names of parameters that may be varied.
@@ -92,9 +93,7 @@ def diagram(
             save(figure, written[0])
         write_branches(found, written[1])
         write_points(found.points, written[2])
-    lines = [repr(found), *map(repr, found.points)]
-    for line in (*lines, f"Written: {', '.join(map(str, written))}"):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    say(console, [repr(found), *map(repr, found.points)], written)
 
 
 def _where(osc: jb.Oscillator, name: str) -> Any:

@@ -1,7 +1,6 @@
 """`jaxbelt map`: the regions of a plane of two parameters."""
 
 import csv
-import functools
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +9,7 @@ import typer
 
 import jaxbelt as jb
 
-from .options import CLASSES, Class, make_console, plain_errors
+from .options import Class, class_along, make_console, plain_errors, say
 
 
 def region_map(
@@ -48,16 +47,9 @@ def region_map(
 
     console = make_console()
     with plain_errors():
-        if system not in CLASSES:
-            raise ValueError(f"class must be a, b, c or d, got {system}")
-        for name in axes:
-            if name not in CLASSES[system]:
-                known = ", ".join(CLASSES[system])
-                raise ValueError(f"axes of class {system} must be among {known}, got {name}")
+        make = class_along(system, axes)
         if cells < 2:
             raise ValueError(f"cells must be at least 2, got {cells}")
-        fixed = {name: value for name, value in CLASSES[system].items() if name not in axes}
-        make = functools.partial(getattr(jb.presets, f"class_{system}"), **fixed)
         # Other numbers of cells, lest cells lie on the line where both are the same.
         values = {axes[0]: np.linspace(*p, cells), axes[1]: np.linspace(*q, cells + 1)}
         with console.status("sweeping, then following curves (the first minutes are compilation)"):
@@ -71,8 +63,7 @@ def region_map(
             save(figure, written[0])
         write_cells(found, written[1])
         write_rows(found.table(), written[2])
-    for line in (repr(found), f"Written: {', '.join(map(str, written))}"):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    say(console, [repr(found)], written)
 
 
 def write_cells(found: jb.RegionMap, path: Path) -> None:

@@ -1,8 +1,9 @@
 """What the commands share: options that describe an oscillator, errors in one sentence."""
 
+import functools
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -58,6 +59,12 @@ def make_console() -> Console:
     return console if console.is_terminal else Console(width=200)
 
 
+def say(console: Console, lines: Iterable[str], written: Iterable[Path]) -> None:
+    """Print lines as they are, and which files were written."""
+    for line in (*lines, f"Written: {', '.join(map(str, written))}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
 Class = Annotated[str, typer.Option("--class", help="The paper's class of contact: a, b, c or d.")]
 Nu0 = Annotated[float | None, typer.Option(help="Velocity of belt 0.")]
 Nu1 = Annotated[float | None, typer.Option(help="Velocity of belt 1 (classes b, c, d).")]
@@ -81,6 +88,20 @@ def oscillator(system, arguments, belt, damping, omega) -> jb.Oscillator:
     given = {name: value for name, value in arguments.items() if value is not None}
     belts = belts_of_class(system, given) if not belt else _belts_in_full(belt, given)
     return jb.Oscillator(damping, belts, omega)
+
+
+def class_along(
+    system: str, axes: Iterable[str], others: tuple[str, ...] = ()
+) -> Callable[..., jb.Oscillator]:
+    """A class as a function of its arguments that are axes; others: further names of axes."""
+    if system not in CLASSES:
+        raise ValueError(f"class must be a, b, c or d, got {system}")
+    names = (*CLASSES[system], *others)
+    for name in axes:
+        if name not in names:
+            raise ValueError(f"axes of class {system} must be among {', '.join(names)}, got {name}")
+    fixed = {name: value for name, value in CLASSES[system].items() if name not in axes}
+    return functools.partial(getattr(jb.presets, f"class_{system}"), **fixed)
 
 
 def belts_of_class(system: str, given: dict[str, float]) -> tuple[jb.Belt, ...]:

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Annotated
 
+import rich.table
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from .options import make_console, plain_errors
 
@@ -53,8 +53,8 @@ def reproduce(
         console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
 
 
-def _table_of(values) -> Table:
-    table = Table(title="Critical velocities nu0 of the paper, recomputed")
+def _table_of(values) -> rich.table.Table:
+    table = rich.table.Table(title="Critical velocities nu0 of the paper, recomputed")
     for name in ("class", "point", "kind"):
         table.add_column(name)
     for name in ("printed", "computed", "difference", "residual", "iterations"):

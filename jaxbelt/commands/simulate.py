@@ -22,6 +22,7 @@ from .options import (
     make_console,
     oscillator,
     plain_errors,
+    say,
 )
 
 
@@ -118,8 +119,7 @@ def simulate(
             save(figure, written[0])
         write_samples(trajectory, written[1])
         write_events(trajectory, written[2])
-    for line in (repr(trajectory), f"Written: {', '.join(map(str, written))}"):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    say(console, [repr(trajectory)], written)
     if int(trajectory.status) >= jb.Status.TOO_MANY_SEGMENTS:
         raise typer.Exit(1)
 

@@ -1,6 +1,5 @@
 """`jaxbelt sweep`: a class of the paper from every point of a grid."""
 
-import functools
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +8,7 @@ import typer
 
 import jaxbelt as jb
 
-from .options import CLASSES, Class, check_out, make_console, plain_errors
+from .options import Class, check_out, class_along, make_console, plain_errors, say
 
 
 def sweep(
@@ -75,20 +74,13 @@ def sweep(
     """
     console = make_console()
     with plain_errors():
-        if system not in CLASSES:
-            raise ValueError(f"class must be a, b, c or d, got {system}")
         if out.suffix not in (".nc", ".zarr"):
             raise ValueError(f"out must end in .nc or .zarr, got {out}")
         part = None if blocks is None else parse_blocks(blocks)
         if part and out.suffix != ".zarr":
             raise ValueError(f"out must end in .zarr where blocks are given, got {out}")
         values = dict(map(parse_axis, axes))
-        for name in values:
-            if name not in (*CLASSES[system], "x1", "x2"):
-                known = ", ".join((*CLASSES[system], "x1", "x2"))
-                raise ValueError(f"axes of class {system} must be among {known}, got {name}")
-        fixed = {name: value for name, value in CLASSES[system].items() if name not in values}
-        make = functools.partial(getattr(jb.presets, f"class_{system}"), **fixed)
+        make = class_along(system, values, ("x1", "x2"))
         if t1 is None and observe != "attractor":
             t1 = 100.0
         asked: dict[str, Any] = dict(
@@ -109,8 +101,7 @@ def sweep(
             written.append(out.with_suffix(".png"))
             shown = variable or ("kind" if observe == "attractor" else "x1_end")
             _draw(dataset, shown, written[1])
-    for line in (repr(dataset), f"Written: {', '.join(map(str, written))}"):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    say(console, [repr(dataset)], written)
 
 
 def _draw(dataset: Any, variable: str, out: Path) -> None:

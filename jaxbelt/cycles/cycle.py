@@ -21,7 +21,7 @@ from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import Arcs
 from ..numerics.compiling import each, jit
-from ..numerics.newton import solve
+from ..numerics.newton import HOLDS, solve
 from ..results import Status, describe
 from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
 from .shooting import (
@@ -181,10 +181,9 @@ def cycle_of(
     forwards, slope = closure(osc, chain, z)
     if error is None:
         error = forwards
-        status = _first_failure(
-            status, closure(osc, chain.halved, z)[0] < 1e-9, Status.NO_CONVERGENCE
-        )
-        status = _first_failure(status, error < 1e-9, Status.NO_CONVERGENCE)
+        with_halved_steps, _ = closure(osc, chain.halved, z)
+        status = _first_failure(status, with_halved_steps < HOLDS, Status.NO_CONVERGENCE)
+        status = _first_failure(status, error < HOLDS, Status.NO_CONVERGENCE)
     status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
     known = functools.partial(jnp.where, status == Status.OK)
@@ -269,7 +268,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
 
 
 #: Loops that are compared in one batch, and how often the interval between two of them is refined:
-#: 32^3 parts of it tell the guess to a thousandth, from where Newton's method converges.
+#: 31^3 parts of the way from 1e-4 to 10 tell the guess to a two-thousandth of itself.
 LOOPS_TRIED, REFINEMENTS = 32, 3
 
 

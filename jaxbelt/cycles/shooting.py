@@ -45,7 +45,7 @@ from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import one_kernel
 from ..numerics.extrapolation import Scheme, increments, scheme
-from ..numerics.newton import Equations
+from ..numerics.newton import HOLDS, Equations
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
@@ -407,20 +407,19 @@ def _factors_and_slopes(osc, along: Oscillator, chain: Chain, following, z: Arra
 
 
 def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """Whether every arc stays inside its mode and has a duration >= 0, up to rounding.
+    """Whether every arc stays inside its mode and has a duration >= 0, as far as equations hold.
 
     Both ends are looked at; between them x1, x2 and the needed force are monotone.
     """
-    slack = 1e-9
 
     def one(codes, unknown, following):
         mode = mode_of(codes)
-        fine = unknown[2] >= -slack
+        fine = unknown[2] >= -HOLDS
         for y in (unknown, following):
             inside = jnp.stack([*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])])
             needed = mode_acceleration(osc, mode, y[0], y[1])
-            held = ~mode.any_stuck | (jnp.abs(needed) <= capacity(osc, mode) + slack)
-            fine = fine & jnp.all(inside >= -slack) & held
+            held = ~mode.any_stuck | (jnp.abs(needed) <= capacity(osc, mode) + HOLDS)
+            fine = fine & jnp.all(inside >= -HOLDS) & held
         return fine
 
     each = jax.vmap(one)(chain.codes, z, jnp.roll(z, -1, axis=0))

@@ -21,7 +21,7 @@ from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index, parameter
 from ..numerics.compiling import jit
 from ..results import Status, describe
-from .selection import ITERATIONS, LONGEST_STEP, Selection, selection_of
+from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of
 
 #: Targets are met to this fraction of their size (or of one, where they are smaller).
 MET = 1e-9
@@ -124,7 +124,7 @@ def design(
         # Damping vanishes with the miss, for quadratic convergence.
         damping = damping * np.max(gram) * np.max(np.abs(miss)) + 1e-14
         step = -matrix.T @ np.linalg.solve(gram + damping * np.eye(len(miss)), miss)
-        return u + step * min(1.0, LONGEST_STEP / max(np.max(np.abs(step)), 1e-300))
+        return u + step * min(1.0, LONGEST_CHANGE / max(np.max(np.abs(step)), 1e-300))
 
     achieved, slopes, cycle = evaluate(u)
     miss, wanted = off(np.asarray(achieved))

@@ -38,7 +38,7 @@ from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
 from ..results import Status, describe
 from .record import WINDOW, Record, record_of
-from .selection import ITERATIONS, LONGEST_STEP, Selection, selection_of
+from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of
 
 #: Each stage joins so many neighbouring windows.
 JOIN = 3
@@ -91,7 +91,7 @@ def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Recor
 
 
 @jit
-def _search(starts, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
+def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
     """Adam from many starts, (u [starts, p], shift [starts]): where each ends, and its misfit."""
     import optax  # a quarter of a second that only this search needs
 
@@ -115,7 +115,7 @@ def _search(starts, selection: Selection, osc: Oscillator, record: Record, eps, 
     return unknown, gradient(unknown)[0]
 
 
-def _candidates(selection, u, osc, record: Record, starts: int):
+def _first_guesses(selection, u, osc, record: Record, starts: int):
     """The ends of the search, best first, each with its window starts; near ones count once."""
     # The velocity over which tanh changes its sign. Steps of the scheme are stable up to 2.8 over
     # the slope of the friction there; two belts of one velocity double it.
@@ -126,7 +126,7 @@ def _candidates(selection, u, osc, record: Record, starts: int):
     spread = rng.standard_normal((starts, u.size + 1))
     spread[0] = 0.0
     first = (jnp.asarray(u + 0.3 * spread[:, :-1]), jnp.asarray(spread[:, -1]))
-    found: Any = _search(first, selection, osc, record, jnp.asarray(eps), steps)
+    found: Any = _adam(first, selection, osc, record, jnp.asarray(eps), steps)
     ends, shifts, misfits = map(np.asarray, jax.tree.leaves(found))
     chosen: list[int] = []
     for i in np.argsort(misfits):
@@ -224,7 +224,7 @@ def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float) -> _
         if not np.isfinite(point.chi2) or damping > 1e5:
             break
         du, dstarts = _damped_step(point.blocks, damping)
-        shorter = min(1.0, LONGEST_STEP / max(np.max(np.abs(du)), 1e-300))
+        shorter = min(1.0, LONGEST_CHANGE / max(np.max(np.abs(du)), 1e-300))
         moved = point.starts.copy()
         moved[fresh] += np.clip(shorter * dstarts, -0.5, 0.5)
         trial = at(point.u + shorter * du, moved, point.evaluations + 1)
@@ -346,7 +346,7 @@ def fit(
     require(freedom > 0, "ts", f"more data than the {u.size + 2} unknowns", data)
     tell(f"search: {starts} starts, {len(record.starts)} windows of {WINDOW} time units")
     best, count, evaluations = None, 0, 0
-    for guess, states, misfit in _candidates(selection, u, oscillator, record, starts):
+    for guess, states, misfit in _first_guesses(selection, u, oscillator, record, starts):
         count += 1
         tell(f"candidate {count}: misfit {misfit:.3g} of the smooth formulation")
         point, joined = _follow_up(linearized, guess, states, data, tell)

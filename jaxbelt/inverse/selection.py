@@ -13,7 +13,7 @@ from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_groups, names_of
 
 #: Most steps of a damped Newton iteration, and the longest, in units of `Selection.values`' u.
-ITERATIONS, LONGEST_STEP = 40, 0.4
+ITERATIONS, LONGEST_CHANGE = 40, 0.4
 
 
 class Selection(eqx.Module):

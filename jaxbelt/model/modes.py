@@ -525,14 +525,13 @@ class EdgeFocus(eqx.Module):
     """Leading-order motion around a point (edge, 0) with the field a_L on its left, a_R right.
 
     exists: a_L > 0 > a_R, so that the mass at rest there is pushed back from both sides. The
-    velocity at successive crossings behaves like exp(rate t); a loop takes loop_time * |x2|.
-    With u = 1/|x2| at the crossings a loop leads from u to u - contraction - bend/u^2 + O(1/u^3);
-    bend is a bound of that coefficient's size.
+    velocity at successive crossings behaves like exp(rate t). With u = 1/|x2| at the crossings a
+    loop leads from u to u - contraction - bend/u^2 + O(1/u^3); bend is a bound of that
+    coefficient's size.
     """
 
     exists: Array
     rate: Array
-    loop_time: Array
     contraction: Array
     bend: Array
 
@@ -558,8 +557,8 @@ def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFoc
     Of the half-loop on one side, from (edge, v) to (edge, -w), with x2' = -a - (x1 - edge) +
     b x2 + c x2^2 + d x2^3 there: 1/w = 1/v - k - e v^2 + O(v^3), where k = 2 b / (3 a) and
     e = 2 d/(5 a) + 2 b c/(15 a^2) + 4 b^3/(135 a^3) - 2 b/(15 a^3), with -c for c on the left, by
-    inserting the series into the orbit x1(x2). Both sides add up. rate is the sum of k over
-    2/a_L + 2/|a_R|, which is loop_time.
+    inserting the series into the orbit x1(x2). Both sides add up. A loop takes
+    (2/a_L + 2/|a_R|) |x2|; rate is the sum of k over that factor.
     """
     sides = [field_at_rest(osc, mode, edge) for mode in (left, right)]
     exists = (sides[0][0] > 0) & (sides[1][0] < 0)
@@ -570,7 +569,7 @@ def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFoc
         slowness = slowness + 1 / a
         terms = (2 * d / (5 * a), 2 * b * c / (15 * a**2), 4 * (b / a) ** 3 / 135, b / (7.5 * a**3))
         bend = bend + sum(map(jnp.abs, terms))
-    return EdgeFocus(exists, contraction / (2 * slowness), 2 * slowness, contraction, bend)
+    return EdgeFocus(exists, contraction / (2 * slowness), contraction, bend)
 
 
 def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array) -> Array:

@@ -41,7 +41,7 @@ class Stop(enum.Enum):
 
     LEFT_SPAN = "it leaves the given span"
     STEP_TOO_SMALL = "no step is short enough for Newton's method"
-    STOPPED = "the given condition on its points no longer holds"
+    STOPPED = "the condition that it is of no longer holds"
     CLOSED = "it is closed, and back where it began"
     POINT_COUNT = "the number of points asked for is reached"
 
@@ -50,20 +50,19 @@ class CurvePoint(NamedTuple):
     """A point of a curve.
 
     u: the solution, [n + 1]; tangent: of unit length, in the sense of the motion, [n + 1];
-    arclength: along the chords from the start; iterations: Newton steps that it took; end: why the
-    curve ends here, None where it goes on; orientation: sign of the determinant.
+    iterations: Newton steps that it took; end: why the curve ends here, None where it goes on;
+    orientation: sign of the determinant.
     """
 
     u: np.ndarray
     tangent: np.ndarray
-    arclength: float
     iterations: int
     end: Stop | None
     orientation: float
 
 
 def continue_curve(
-    residual: Callable[..., Array],
+    linearized: Callable[..., tuple[Array, Array]],
     start: ArrayLike | tuple,
     direction: ArrayLike | tuple,
     *,
@@ -73,18 +72,14 @@ def continue_curve(
     min_step: float = 1e-8,
     max_step: float = 0.1,
     max_points: int = 1000,
-    goes_on: Callable[[np.ndarray], bool] | None = None,
-    jacobian: Callable[..., tuple[Array, Array]] | None = None,
 ) -> Iterator[CurvePoint]:
-    """The points of the curve residual(u, args) = 0 from near `start`, as they are found.
+    """The points of the curve F(u, args) = 0 from near `start`, as they are found.
 
-    residual: maps u, [n + 1], to [n], and is traced once; keep the function and pass what varies as
-    `args`, any pytree of arrays. start: a guess of the first point. direction: [n + 1], the way to
-    go from there, as its angle with the tangent tells. span: smallest and largest u, numbers or
-    [n + 1]; the curve ends with a point on the first side that it meets. step, min_step, max_step:
-    lengths of the first, the shortest and the longest chord. goes_on: asked of every u; where it
-    says no the curve ends, with the last point for which it said yes. jacobian: gives the residual
-    and its matrix, [n, n + 1], where that is cheaper than by differentiation.
+    linearized: gives F, [n], and its matrix, [n, n + 1], at u, [n + 1], and is traced once; keep
+    the function and pass what varies as `args`, any pytree of arrays. start: a guess of the first
+    point. direction: [n + 1], the way to go from there, as its angle with the tangent tells. span:
+    smallest and largest u, numbers or [n + 1]; the curve ends with a point on the first side that
+    it meets. step, min_step, max_step: lengths of the first, the shortest and the longest chord.
 
     The last point says why it is the last. Where Newton's method fails at the start there is no
     point. `ValueError` names an impossible argument.
@@ -103,56 +98,43 @@ def continue_curve(
     # A number that is no array would be a constant of the program, compiled anew for every value.
     args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, args)
 
-    solve = functools.partial(corrected, residual, jacobian, args)
+    solve = functools.partial(corrected, linearized, args)
 
     first = solve(u0, way / np.linalg.norm(way), 0.0)
     if not first.found:
         return
-    point = _point(first, 0.0)
-    origin = point
-    for count in range(2, max_points + 2):
-        if count > max_points:
-            yield point._replace(end=Stop.POINT_COUNT)
-            return
-        new, step, end = _next_point(solve, point, step, (min_step, max_step), goes_on)
+    point = _point(first)
+    for _ in range(max_points - 1):
+        new, step = _next_point(solve, point, step, (min_step, max_step))
         if new is None:
-            yield point._replace(end=end)
+            yield point._replace(end=Stop.STEP_TOO_SMALL)
             return
         yield point
         if np.any(new.u < limits[0]) or np.any(new.u > limits[1]):
             yield _at_limit(solve, point, new, limits)._replace(end=Stop.LEFT_SPAN)
             return
-        if count > 2 and _passes(origin, point, new):
-            yield origin._replace(
-                arclength=point.arclength + float(np.linalg.norm(origin.u - point.u)),
-                end=Stop.CLOSED,
-            )
-            return
         point = new
+    yield point._replace(end=Stop.POINT_COUNT)
 
 
-def _point(solved, arclength: float) -> CurvePoint:
+def _point(solved: "Corrected") -> CurvePoint:
     iterations, orientation = int(solved.iterations), float(solved.orientation)
-    return CurvePoint(solved.u, solved.tangent, arclength, iterations, None, orientation)
+    return CurvePoint(solved.u, solved.tangent, iterations, None, orientation)
 
 
-def _next_point(solve, point: CurvePoint, step: float, steps, goes_on):
-    """The next point, the step to try after it; or None, and why there is none."""
+def _next_point(solve, point: CurvePoint, step: float, steps) -> tuple[CurvePoint | None, float]:
+    """The next point, None where no step is short enough, and the step to try after it."""
     shortest, longest = steps
-    end = Stop.STEP_TOO_SMALL
     while step >= shortest:
         solved = solve(point.u, point.tangent, step)
         turned = float(solved.tangent @ point.tangent)
         same_branch = float(solved.orientation) == point.orientation
-        allowed = bool(solved.found) and turned > STRAIGHT and same_branch
-        if allowed and (goes_on is None or goes_on(solved.u)):
-            chord = float(np.linalg.norm(solved.u - point.u))
-            new = _point(solved, point.arclength + chord)
+        if solved.found and turned > STRAIGHT and same_branch:
+            new = _point(solved)
             quick = new.iterations <= CORRECTIONS // 2 and turned > 0.5 * (1 + STRAIGHT)
-            return new, min(longest, 1.5 * step if quick else step), None
-        end = Stop.STOPPED if allowed else Stop.STEP_TOO_SMALL
+            return new, min(longest, 1.5 * step if quick else step)
         step *= 0.5
-    return None, step, end
+    return None, step
 
 
 def _at_limit(solve, point: CurvePoint, beyond: CurvePoint, limits) -> CurvePoint:
@@ -167,19 +149,7 @@ def _at_limit(solve, point: CurvePoint, beyond: CurvePoint, limits) -> CurvePoin
     normal = np.zeros_like(guess)
     normal[axis] = np.sign(change[axis])
     solved = solve(guess, normal, 0.0)
-    u = solved.u if solved.found else guess
-    chord = float(np.linalg.norm(u - point.u))
-    return _point(solved._replace(u=u), point.arclength + chord)
-
-
-def _passes(origin: CurvePoint, before: CurvePoint, after: CurvePoint) -> bool:
-    """Whether the step from one point to the next passes the first point of the curve."""
-    chord = after.u - before.u
-    length = float(np.linalg.norm(chord))
-    along = float((origin.u - before.u) @ chord) / length
-    off = float(np.linalg.norm(origin.u - before.u - along / length * chord))
-    same_way = float(origin.tangent @ after.tangent) > STRAIGHT
-    return 0 < along <= length and off < 0.5 * length and same_way
+    return _point(solved if solved.found else solved._replace(u=guess))
 
 
 class Corrected(NamedTuple):
@@ -192,23 +162,21 @@ class Corrected(NamedTuple):
     found: Any
 
 
-def corrected(residual, jacobian, args, u, tangent, length) -> Corrected:
+def corrected(linearized, args, u, tangent, length) -> Corrected:
     """The point of the curve in the plane normal to the tangent, `length` ahead of u; in NumPy."""
     given = (jnp.asarray(u), jnp.asarray(tangent), jnp.asarray(length))
-    return jax.tree.map(np.asarray, _correct(residual, jacobian, args, *given))
+    return jax.tree.map(np.asarray, _correct(linearized, args, *given))
 
 
 @jit
-def _correct(residual, jacobian, args, u: Array, tangent: Array, step: Array) -> Corrected:
+def _correct(linearized, args, u: Array, tangent: Array, step: Array) -> Corrected:
     """Newton's method in the plane normal to the tangent, `step` ahead of u."""
 
-    def linearized(v):
-        if jacobian is not None:
-            return jacobian(v, args)
-        return residual(v, args), jax.jacfwd(lambda v: residual(v, args))(v)
-
+    # n equations and that of the plane, for n + 1 unknowns:
+    #   | matrix, [n, n + 1] |        | value                    |
+    #   | tangent, [n + 1]   | dv = - | tangent . (v - u) - step |
     def squared(v):
-        value, matrix = linearized(v)
+        value, matrix = linearized(v, args)
         value = jnp.append(value, tangent @ (v - u) - step)
         return value, jnp.concatenate([matrix, tangent[None]])
 
@@ -219,7 +187,7 @@ def _correct(residual, jacobian, args, u: Array, tangent: Array, step: Array) ->
         longest=jnp.inf,
         settled=lambda last, before: last <= SMALLEST_CORRECTION,
     )
-    # The kernel of the Jacobian, for the tangent.
+    # The kernel of `matrix`, for the tangent: what the same equations give for (0, .., 0, 1).
     kernel = jnp.linalg.solve(solved.matrix, jnp.zeros_like(u).at[-1].set(1.0))
     sign, _ = jnp.linalg.slogdet(solved.matrix)
     size = solved.lengths[solved.iterations - 1]

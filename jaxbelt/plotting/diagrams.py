@@ -22,7 +22,7 @@ from ..cycles.cycle import Cycle
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.oscillator import Oscillator
 from .phase import draw_equilibrium
-from .style import BELT_COLOURS, belt_colour, figure_of, new_axes, new_figure, spread
+from .style import BELT_COLOURS, belt_colour, draw_key, figure_of, new_axes, new_figure, spread
 
 UNSTABLE_COLOUR = "0.6"
 #: Parameters by the end of their path in the oscillator; % is the number of the belt.
@@ -261,7 +261,7 @@ def _region_colour(name: str) -> tuple[float, float, float]:
     return float(red), float(green), float(blue)
 
 
-def draw_region_map(regions: RegionMap, figure: Figure, note: str = "") -> Axes:
+def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
     """The map above, below it a sketch of the phase portrait of each region, in its example."""
     names = [name for name in regions.regions if _has_area(regions, name)]
     columns = 5
@@ -279,8 +279,7 @@ def draw_region_map(regions: RegionMap, figure: Figure, note: str = "") -> Axes:
         axis.axis("off")
     for axis, name in zip(axes.flat, names, strict=False):
         _draw_sketch(axis, regions.oscillator(name), regions.cycles[name], name)
-    if note:
-        lower.supxlabel(note, fontsize="small")
+    draw_key(lower)
     return ax
 
 
@@ -294,11 +293,11 @@ def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle], name: str) 
     x1 = float(rests.x1[0])
     for i, belt in enumerate(osc.belts):
         level = float(belt.velocity / osc.omega)
-        ax.axhline(level, color=belt_colour(i), linewidth=0.9, zorder=1)
+        ax.axhline(level, color=belt_colour(i), linewidth=0.9, zorder=1, label=f"belt {i}")
     for cycle, loop in zip(cycles, loops, strict=True):
-        style: dict[str, Any] = {"linewidth": 1.4}
+        style: dict[str, Any] = {"linewidth": 1.4, "label": "stable cycle"}
         if not cycle.stable:
-            style = {"linewidth": 0.9, "linestyle": (0, (3, 2))}
+            style = {"linewidth": 0.9, "linestyle": (0, (3, 2)), "label": "unstable cycle"}
         ax.plot(*loop.T, color="black", zorder=3, **style)
     for row in rests:
         draw_equilibrium(ax, row)

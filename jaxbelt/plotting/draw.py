@@ -9,7 +9,7 @@ from ..bifurcations.diagrams import BifurcationDiagram, RegionMap
 from .diagrams import plot_curves, plot_diagram, plot_region_map
 
 
-def draw(result: Any, ax: Axes | None, **options: Any) -> Axes:
+def draw_result(result: Any, ax: Axes | None, **options: Any) -> Axes:
     """Draw a result into the axes (None: new ones), which are returned; options: of its `plot`."""
     match result:
         case BifurcationCurve():

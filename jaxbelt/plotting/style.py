@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 #: One colour a belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
 BELT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
@@ -57,14 +57,14 @@ def journal_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def draw_key(figure: Figure, note: str = "", *, ncols: int | None = None) -> None:
+def draw_key(figure: Figure | SubFigure, note: str = "", *, ncols: int | None = None) -> None:
     """Below the axes of a figure a note, and one key for all that they label, in so many columns
     (None: in one line)."""
     by_label: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             by_label.setdefault(label, handle)
-    first = [label for label in by_label if label.startswith("to ")]
+    first = [label for label in by_label if label.startswith(("to ", "belt "))]
     labels = [*first, *(label for label in KEY_ORDER if label in by_label)]
     figure.legend(
         [by_label[label] for label in labels],

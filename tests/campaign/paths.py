@@ -19,7 +19,7 @@ from math import inf, isfinite
 
 import numpy as np
 
-from jaxbelt.bifurcations.path import Path
+from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import place_of
 
@@ -360,7 +360,7 @@ def check(case: Case, seed: int) -> Report:
     rng = np.random.default_rng(seed)
     begun = time.perf_counter()
     first, last = case.span
-    path = Path(package.oscillator(case.at(0.5 * (first + last))), case.where, case.span)
+    path = ParameterPath(package.oscillator(case.at(0.5 * (first + last))), case.where, case.span)
     points = search(path)
     report = Report(case, points, [])
     at_scan = time.perf_counter() - begun
@@ -389,7 +389,7 @@ def check(case: Case, seed: int) -> Report:
     return report
 
 
-def _compare(path: Path, brute: Brute, value: float, report: Report) -> None:
+def _compare(path: ParameterPath, brute: Brute, value: float, report: Report) -> None:
     """The label of `scan` and that of the engine at one value."""
     label, ours = brute.labels[value], path.label(value)
     if not label.decided:
