@@ -38,7 +38,7 @@ def states_at(osc: Oscillator, final: RunState, records: ArcRecord, ts, rtol, at
     beyond = ts > final.t
     since = jnp.where(beyond, 0.0, ts - arcs.t)
     stuck = jnp.any(arcs.mode == 0, axis=1)
-    ys = _flown(*lax.stop_gradient((osc, rtol, atol, numbers, arcs, beyond, since, stuck)))
+    ys = _sampled(*lax.stop_gradient((osc, rtol, atol, numbers, arcs, beyond, since, stuck)))
     ys = with_derivatives(osc, arcs.y, since, arcs.mode, ys)
     afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
     ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)
@@ -46,7 +46,7 @@ def states_at(osc: Oscillator, final: RunState, records: ArcRecord, ts, rtol, at
     return jnp.where(beyond[:, None], afterwards, ys)[:wanted], modes[:wanted]
 
 
-def _flown(osc: Oscillator, rtol, atol, numbers, arcs: ArcRecord, beyond, since, stuck):
+def _sampled(osc: Oscillator, rtol, atol, numbers, arcs: ArcRecord, beyond, since, stuck):
     """The states at a time `since` the entries of arcs, [samples, 2]; numbers: of the arcs."""
 
     def at(osc, rtol, atol, arc, since, stuck, goes_on, before, y):

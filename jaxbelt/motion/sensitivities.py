@@ -36,7 +36,7 @@ from .integrators import State, density, slip_field
 
 #: A step of order twelve times the density of steps that is wanted there. Of 5,000 arcs of random
 #: oscillators nine in ten were then right to 1e-12, all to 1e-8.
-STRIDE = 0.3
+LENGTH = 0.3
 #: Most steps of an arc.
 MOST_STEPS = 64
 GROUP = 4
@@ -103,7 +103,7 @@ def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State) ->
     is_even = jnp.abs(last - first) < 1e-3 * first
     ratio = jnp.where(is_even, 2.0, last / first)
     mean = jnp.where(is_even, first, (last - first) / jnp.log(ratio))
-    steps = jnp.ceil(jnp.abs(lax.stop_gradient(duration)) * mean / STRIDE)
+    steps = jnp.ceil(jnp.abs(lax.stop_gradient(duration)) * mean / LENGTH)
     steps = jnp.clip(steps, 1.0, MOST_STEPS)
 
     def place(number):
@@ -113,10 +113,13 @@ def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State) ->
         graded = jnp.log1p(share * (ratio**POWER - 1)) / jnp.log(ratio**POWER)
         return jnp.where(is_even, share, graded)
 
+    def field(y):
+        return slip_field(osc, mode, y)
+
     def advance(y, number):
         def step():
             h = duration * (place(number + 1) - place(number))
-            (change,) = increments(functools.partial(slip_field, osc, mode), y, h, _ORDER_12)
+            (change,) = increments(field, y, h, _ORDER_12)
             return y[0] + change[0], y[1] + change[1]
 
         return lax.cond(any_lane(number < steps), step, lambda: y), None
@@ -176,7 +179,7 @@ def _sensitivities_at_ends(varied, rest, arcs: Arc, left: Array, entry: Sensitiv
         def passed(varied, x1, x2, left):
             return _passed(eqx.combine(varied, rest), arc, (x1, x2), left)
 
-        return _columns(passed, varied, *arc.entry, left)
+        return _slopes_of(passed, varied, *arc.entry, left)
 
     is_t1 = jnp.where(jnp.arange(entry.t.size) == 3, 1.0, 0.0)
 
@@ -196,7 +199,7 @@ def _sensitivities_at_ends(varied, rest, arcs: Arc, left: Array, entry: Sensitiv
     return lax.scan(advance, entry, (lax.map(jacobian, (arcs, left)), arcs.used))[1]
 
 
-def _columns(function, varied, *numbers):
+def _slopes_of(function, varied, *numbers):
     """The derivatives of a function's results, scalars: of each by the numbers and then by what
     varies, [numbers + varied]."""
     first, total = len(numbers), len(numbers) + count(varied)
@@ -345,6 +348,6 @@ def _sample_slopes(varied, rest, entries: Array, since: Array, codes: Array, end
             osc = eqx.combine(varied, rest)
             return _carried(osc, mode, (x1, x2), since, (end[0], end[1]))
 
-        return jnp.stack(_columns(carried, varied, entry[0], entry[1], since))
+        return jnp.stack(_slopes_of(carried, varied, entry[0], entry[1], since))
 
     return lax.map(of_sample, (entries, since, codes, ends))

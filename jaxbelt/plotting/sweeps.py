@@ -28,7 +28,9 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     the sweep are not one or two.
     """
     ax = new_axes() if ax is None else ax
-    values = _attractors(dataset) if variable == "kind" else dataset[variable].squeeze(drop=True)
+    values = (
+        _words_for_kinds(dataset) if variable == "kind" else dataset[variable].squeeze(drop=True)
+    )
     require(values.ndim in (1, 2), "dataset", "a sweep with one or two axes", f"{values.ndim}")
     names = [f"{dataset[name].long_name}  {_math_name(name)}" for name in map(str, values.dims)]
     if values.ndim == 1:
@@ -65,7 +67,7 @@ def _math_name(name: str) -> str:
     )
 
 
-def _attractors(dataset: xr.Dataset) -> xr.DataArray:
+def _words_for_kinds(dataset: xr.Dataset) -> xr.DataArray:
     """What each run leads to, in words."""
     kind = decoded(dataset[["kind"]]).kind
     words = kind.astype(object)

@@ -52,7 +52,7 @@ class Motion(eqx.Module):
     forces: Array
 
 
-class _Seen(eqx.Module):
+class _Watched(eqx.Module):
     """What is known of the runs: the reducer's state, the side of each section, and the number of
     fixed times that are past, each [lanes]."""
 
@@ -104,7 +104,7 @@ class Along(Observer):
             value, rate = value_and_rate(function, osc, lanes.mode, lanes.x1, lanes.x2)
             sides.append(side_of(value, rate, jnp.ones_like(value)))
         passed = tuple(jnp.zeros_like(lanes.events) for _ in self._times())
-        return _Seen(init(osc, lanes.x1, lanes.x2), tuple(sides), passed)
+        return _Watched(init(osc, lanes.x1, lanes.x2), tuple(sides), passed)
 
     def integrals(self, osc, lanes):
         """Zeros: integrals of runs that begin."""
@@ -115,7 +115,7 @@ class Along(Observer):
     # --- steps
 
     def follow(self, take_step, osc, window, one, lanes, t1, rtol, atol):
-        seen: _Seen = lanes.memory
+        seen: _Watched = lanes.memory
         until = t1
         for (_, times), passed in zip(self._times(), seen.passed, strict=True):
             until = jnp.minimum(until, _next(times, passed))
@@ -156,7 +156,7 @@ class Along(Observer):
         memory = replace(seen, sides=tuple(sides), passed=tuple(passed))
         return replace(new, memory=memory)
 
-    def _ask(self, seen: _Seen, osc, lanes: Lanes, delta, wanted, number: int) -> _Seen:
+    def _ask(self, seen: _Watched, osc, lanes: Lanes, delta, wanted, number: int) -> _Watched:
         """The state after an update at a moment that is `delta` away from the lanes."""
         a = jnp.where(lanes.mode.any_stuck, 0.0, lanes.a)
         t, x1 = lanes.t + delta, lanes.x1 + delta * (lanes.x2 + 0.5 * delta * a)
@@ -169,7 +169,7 @@ class Along(Observer):
         none = jnp.zeros(t.shape, int)
         return self._update(seen, (t, x1, x2, none, none - 1), number, totals, wanted)
 
-    def _update(self, seen: _Seen, place: Any, number: int, totals, wanted) -> _Seen:
+    def _update(self, seen: _Watched, place: Any, number: int, totals, wanted) -> _Watched:
         """The state after an update where it is wanted; place: t, x1, x2, kind and belt."""
         t, x1, x2, kind, belt = place
         event = RunEvent(t, x1, x2, kind, belt, jnp.full(t.shape, number), totals)
@@ -216,7 +216,7 @@ class Along(Observer):
             )
         return totals
 
-    def _held(self, seen: _Seen, osc, before: Lanes, after: Lanes, holds) -> _Seen:
+    def _held(self, seen: _Watched, osc, before: Lanes, after: Lanes, holds) -> _Watched:
         """Moments within a stick phase, or rest: x1 moves evenly."""
 
         def at(theta):
@@ -253,7 +253,9 @@ class Along(Observer):
             seen = self._times_held(seen, osc, at, before, after, k, number, times)
         return seen
 
-    def _times_held(self, seen: _Seen, osc, at, before, after, k: int, number: int, times) -> _Seen:
+    def _times_held(
+        self, seen: _Watched, osc, at, before, after, k: int, number: int, times
+    ) -> _Watched:
         """The fixed times of a stick phase; and those at the start of a run."""
         busy = after.run >= 0
 

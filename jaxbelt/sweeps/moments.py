@@ -88,13 +88,13 @@ def bytecode(code: CodeType) -> str:
     return f"{code.co_code.hex()} {code.co_names} {constants}"
 
 
-KINDS = (AtEvents, AtExtrema, AtSection, AtTimes)
+MOMENTS = (AtEvents, AtExtrema, AtSection, AtTimes)
 
 
 def checked(at: Any) -> tuple[Any, ...]:
     """The moments of a reducer, or a `ValueError`."""
-    fits = isinstance(at, tuple) and at and all(isinstance(one, KINDS) for one in at)
-    names = ", ".join(kind.__name__ for kind in KINDS)
+    fits = isinstance(at, tuple) and at and all(isinstance(one, MOMENTS) for one in at)
+    names = ", ".join(kind.__name__ for kind in MOMENTS)
     require(fits, "observe.at", f"a tuple of {names}", repr(at))
     return at
 
@@ -107,7 +107,7 @@ def per_lane(osc: Oscillator) -> Any:
 def section_of(moment: AtSection | AtExtrema) -> Callable[..., Array]:
     """The function of (osc, mode, x1, x2), arrays [lanes], whose zeros are the moments."""
     if isinstance(moment, AtExtrema):
-        return _velocity if moment.of == "x1" else _acceleration
+        return _velocity if moment.of == "x1" else _x2_rate
     function = moment.function
 
     def value(osc, mode, x1, x2):
@@ -120,7 +120,7 @@ def _velocity(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     return x2
 
 
-def _acceleration(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+def _x2_rate(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     """x2', and 0 where it is 0 but for rounding, as at slip onset; its derivative stays."""
     a = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
     return jnp.where(jnp.abs(a) < force_rounding(x1), a - lax.stop_gradient(a), a)

@@ -38,7 +38,7 @@ def attractors(dataset: "xarray.Dataset") -> "xarray.Dataset":
     starts = [name for name in ("x1", "x2") if name in dataset.kind.dims]
     require(starts, "dataset", "one with an axis x1 or x2 of starts", f"{dataset.kind.dims}")
     others = [name for name in dataset.kind.dims if name not in starts]
-    labels = _labels(dataset, others, starts)
+    labels = _labels_of_starts(dataset, others, starts)
     order = (*others, *starts)
     sizes = [dataset.sizes[name] for name in others]
     count = int(labels.max(initial=0)) + 1
@@ -72,7 +72,9 @@ def _nothing(dtype: np.dtype) -> np.ndarray:
     return np.asarray(np.nan if np.issubdtype(dtype, np.floating) else 0, dtype)
 
 
-def _labels(dataset: "xarray.Dataset", others: list[str], starts: list[str]) -> np.ndarray:
+def _labels_of_starts(
+    dataset: "xarray.Dataset", others: list[str], starts: list[str]
+) -> np.ndarray:
     """Numbers of the attractors, [.., starts], in the order in which they are met, or -1."""
     order = (*others, *starts)
     sizes = [dataset.sizes[name] for name in others]

@@ -107,7 +107,7 @@ def sweep(
     _check_where(question, store, executor, blocks, audit)
     if store is None:
         results = Memory(question.table)
-        _do_runs(question, results, progress)
+        _do_and_show(question, results, progress)
         told = _audited(question, results, audit) if audit else {}
         return results.dataset(question.attributes() | told)
     return _kept(question, Path(store), executor, blocks, progress, audit)
@@ -119,7 +119,7 @@ def _kept(
     """The sweep in a store, or as far as that part of its blocks goes."""
     with Store.opened(path, question, part) as results:
         if results.to_do:
-            _do_runs(question, results, progress, executor)
+            _do_and_show(question, results, progress, executor)
         if part is None:
             results.finish()
         if audit and results.root.attrs.get("audited", 0) < len(chosen(question.grid.runs, audit)):
@@ -129,7 +129,7 @@ def _kept(
     return results.dataset()
 
 
-def _do_runs(
+def _do_and_show(
     question: Question, results: Memory | Store, progress: bool | None, executor: Any = None
 ) -> None:
     """Do the runs that the results lack, here or on a cluster."""
