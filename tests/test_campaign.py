@@ -243,3 +243,32 @@ def test_small_campaign(arguments, capsys):
 def test_campaign(arguments, capsys):
     wrong = command.main([*arguments.split(), "--show", "3"])
     assert wrong == 0, capsys.readouterr().out
+
+
+def test_derivatives_of_an_edge_that_is_barely_passed():
+    """Found by a campaign: beyond by 1.2e-10, so that x1 is on the edge to rounding at both ends,
+    and the sweep lost the derivatives of one passage."""
+    laws = (
+        ("conti", 1.020586219515656, 0.3964259333796029, 7.49304765013548, 0.2542711091782788),
+        ("conti", 0.5401517146606191, 0.34166043817551817, 11.217674230517941, 0.0),
+        ("conti", 0.5847799015530727, 0.3457138888107467, 1.0411984665091287, 0.0),
+    )
+    upper, lower = -0.3073823557564196, -0.5309339032867204
+    belts = (
+        Belt(-1.0802115851973795, laws[0], 1.2580428931955348, upper=upper),
+        Belt(-0.043782329051282876, laws[2], 0.0, lower=lower),
+        Belt(-1.0009542901629669, laws[1], 1.3075515641175743, lower=lower, upper=upper),
+    )
+    case = cases.Case(
+        Oscillator(0.5540927456151249, belts), (-1.138081268179836, 1.1912261823560164), 4.0, "edge"
+    )
+    mine = compare.run(case, tol=1e-15)
+    assert [event[0] for event in mine.sequence] == [EDGE, EDGE]
+    assert mine.t[1] - mine.t[0] < 1e-4
+    along = (0.91, 0.34, 0.0, -0.78), (-0.69, 0.0, 0.62, 0.0), (-0.01, 0.53, 0.62, -0.78)
+    direction = (-0.77, 0.71), 0.2, along
+    right = derivatives.derivative(case, mine, direction)
+    assert np.max(np.abs(right)) > 1e3
+    for by in ("simulate", "sweep"):
+        (told,) = package.derivatives([case], [direction], 1e-13, by)
+        np.testing.assert_allclose(told, right, rtol=1e-3)

@@ -49,6 +49,8 @@ def event_between(before: Sequence[Any], after: Sequence[Any]) -> tuple[Any, Any
 def events_of(modes: np.ndarray | Sequence[Sequence[int]]) -> Signature:
     """The events of a loop through modes, contact codes [modes, belts], and back to the first."""
     modes = np.asarray(modes)
+    if not modes.size:
+        return ()  # no belt exerts a force
     kinds, belts = event_between([*modes.T], [*np.roll(modes, -1, axis=0).T])
     return tuple((EventKind(k), int(b)) for k, b in zip(kinds, belts, strict=True) if k)
 

@@ -270,8 +270,10 @@ def _way_to_edge(x1: tuple[Array, Array], new: _Attempt, reach) -> tuple[Array, 
     way, speed = edge - new.x1, jnp.abs(new.x2)
     near = jnp.abs(way) * jnp.maximum(speed, SLOW * jnp.abs(new.a)) < reach * speed * speed
     there = jnp.abs(way) <= ULPS * jnp.abs(new.x1)
-    slope = jnp.where(near, new.x2, 1.0)
-    delta = jnp.where(near, way, jnp.where(there, 0.0, NEVER)) / slope
+    slope = jnp.where(near | there & (speed > NO_STEP), new.x2, 1.0)
+    # On the edge no time is left, but that time has its derivatives.
+    nothing = way - lax.stop_gradient(way)
+    delta = jnp.where(near, way, jnp.where(there, nothing, NEVER)) / slope
     delta = jnp.where(near, delta - 0.5 * new.a * delta**2 / slope, delta)
     return edge, near | there, delta
 
