@@ -22,7 +22,7 @@ from jaxtyping import Array
 from ..model.events import event_between
 from ..model.modes import Mode, at_focus, is_at_rest, mode_of_state, select
 from ..model.oscillator import Oscillator
-from ..numerics.compiling import any_lane, one_kernel
+from ..numerics.compiling import any_lane, in_turn, one_kernel
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
 from .integrators import Adaptive, State
@@ -133,11 +133,9 @@ def _segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[RunState
     return RunState(t, end.y, mode, end.signs, status, done), record
 
 
-@eqx.filter_custom_jvp
-def arcs_of_run(
+def _followed_arcs(
     osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int
 ) -> tuple[RunState, ArcRecord]:
-    """The chain of arcs from y0: the final state and the stacked records, NaN where unused."""
     y = (y0[0], y0[1])
     mode = mode_of_state(osc, *y)
     finite = jnp.all(jnp.isfinite(y0))
@@ -189,6 +187,15 @@ def arcs_of_run(
     return eqx.tree_at(lambda s: s.status, final, unfinished), records
 
 
+@eqx.filter_custom_jvp
+def arcs_of_run(
+    osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int
+) -> tuple[RunState, ArcRecord]:
+    """The chain of arcs from y0: the final state and the stacked records, NaN where unused."""
+    numbers = map(jnp.asarray, (y0, t0, t1, rtol, atol))
+    return in_turn(functools.partial(_followed_arcs, max_segments=max_segments))(osc, *numbers)
+
+
 @arcs_of_run.def_jvp
 def _(primals, tangents):
     osc, y0, t0, t1, *_ = primals
@@ -205,7 +212,7 @@ def _(primals, tangents):
         captured=records.captured,
         used=used,
     )
-    entries, ends = sensitivities(varied, rest, arcs, t1 - records.t)
+    entries, ends = in_turn(sensitivities)(varied, rest, arcs, t1 - records.t)
     start = [
         jnp.zeros_like(value) if slope is None else slope
         for value, slope in zip((y0, t0, t1), tangents[1:4], strict=True)

@@ -8,7 +8,7 @@ from jax import lax
 
 from ..model.modes import Mode, select, stick_velocity
 from ..model.oscillator import Oscillator
-from ..numerics.compiling import one_kernel
+from ..numerics.compiling import in_turn, one_kernel
 from ..results import Status
 from .integrators import Adaptive, slip_field
 from .runs import ArcRecord, RunState, stacked_codes
@@ -38,7 +38,8 @@ def states_at(osc: Oscillator, final: RunState, records: ArcRecord, ts, rtol, at
     beyond = ts > final.t
     since = jnp.where(beyond, 0.0, ts - arcs.t)
     stuck = jnp.any(arcs.mode == 0, axis=1)
-    ys = _sampled(*lax.stop_gradient((osc, rtol, atol, numbers, arcs, beyond, since, stuck)))
+    given = lax.stop_gradient((osc, rtol, atol, numbers, arcs, beyond, since, stuck))
+    ys = in_turn(_sampled)(*given)
     ys = with_derivatives(osc, arcs.y, since, arcs.mode, ys)
     afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
     ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)

@@ -29,7 +29,7 @@ from ..model.modes import (
     stick_velocity,
 )
 from ..model.oscillator import Oscillator
-from ..numerics.compiling import any_lane, one_kernel
+from ..numerics.compiling import any_lane, in_turn, one_kernel
 from ..numerics.extrapolation import increments, scheme
 from .arcs import stick_arc
 from .integrators import State, density, slip_field
@@ -104,12 +104,12 @@ def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State) ->
     ratio = jnp.where(is_even, 2.0, last / first)
     mean = jnp.where(is_even, first, (last - first) / jnp.log(ratio))
     steps = jnp.ceil(jnp.abs(lax.stop_gradient(duration)) * mean / LENGTH)
-    steps = jnp.clip(steps, 1.0, MOST_STEPS)
+    steps = jnp.minimum(steps, MOST_STEPS)
 
     def place(number):
         # As if the logarithm of the density were linear: of that density the integral up to s is
         # proportional to ratio^s - 1.
-        share = jnp.minimum(number / steps, 1.0)
+        share = jnp.minimum(number / jnp.maximum(steps, 1.0), 1.0)
         graded = jnp.log1p(share * (ratio**POWER - 1)) / jnp.log(ratio**POWER)
         return jnp.where(is_even, share, graded)
 
@@ -310,21 +310,9 @@ def _(primals, tangents):
     osc, entries, since, codes, states = primals
     along, entries_along, since_along, *_ = tangents
     varied, rest = split(osc, along)
-    blocks = _in_blocks((entries, since, codes, lax.stop_gradient(states)))
-
-    def slopes_of(block):
-        entries, since, codes, states = block
-
-        def work():
-            return _sample_slopes(varied, rest, entries, since, codes, states)
-
-        # Never skipped but where no sample is known. A kernel that is not in a branch of its own
-        # has no second derivatives in a loop (JAX 0.10).
-        nothing = jnp.zeros((ROWS, 2, 3 + count(varied)))
-        return lax.cond(any_lane(jnp.any(~jnp.isnan(since))), work, lambda: nothing)
-
-    slopes = lax.map(slopes_of, blocks)
-    by_x1, by_x2, by_time, *by_parameters = jnp.moveaxis(_in_rows(slopes, since.size), -1, 0)
+    rows = entries, since, codes, lax.stop_gradient(states)
+    slopes = in_turn(_slopes_of_samples)(varied, rest, *rows)
+    by_x1, by_x2, by_time, *by_parameters = jnp.moveaxis(slopes, -1, 0)
     moved = jnp.zeros(states.shape)
     if entries_along is not None:
         moved = moved + by_x1 * entries_along[:, :1] + by_x2 * entries_along[:, 1:]
@@ -335,10 +323,26 @@ def _(primals, tangents):
     return with_derivatives(*primals), moved
 
 
+def _slopes_of_samples(varied, rest, entries: Array, since: Array, codes: Array, ends: Array):
+    """Derivatives of samples, [samples, 2, 3 + parameters]: by the entry, the time since it, and
+    the parameters."""
+
+    def slopes_of(block):
+        def work():
+            return _slopes_of_some(varied, rest, *block)
+
+        # Never skipped but where no sample is known. A kernel that is not in a branch of its own
+        # has no second derivatives in a loop (JAX 0.10).
+        nothing = jnp.zeros((ROWS, 2, 3 + count(varied)))
+        return lax.cond(any_lane(jnp.any(~jnp.isnan(block[1]))), work, lambda: nothing)
+
+    blocks = _in_blocks((entries, since, codes, ends))
+    return _in_rows(lax.map(slopes_of, blocks), since.size)
+
+
 @one_kernel
-def _sample_slopes(varied, rest, entries: Array, since: Array, codes: Array, ends: Array) -> Array:
-    """Derivatives of some samples, [samples, 2, 3 + parameters]: by the entry, the time since it,
-    and the parameters."""
+def _slopes_of_some(varied, rest, entries: Array, since: Array, codes: Array, ends: Array) -> Array:
+    """`_slopes_of_samples` of as many as fit into one piece of machine code."""
 
     def of_sample(row):
         entry, since, codes, end = row

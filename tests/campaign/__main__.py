@@ -41,7 +41,7 @@ def main(arguments=None):
 
             for case, answer, (verdict, mine) in zip(batch, told, pool.map(one, zip(batch, told))):
                 verdicts[case.kind, verdict] += 1
-                if verdict == "same" and options.what in ("grazing", "derivatives"):
+                if verdict == "same" and _has_derivatives(mine, options):
                     right.append((case, mine))
                 if verdict in ("same", "tolerance") or (
                     verdict == "corner" and not options.corners
@@ -165,6 +165,14 @@ def _ask(package, batch, options):
     if options.what == "attractors":
         return package.labels(batch, options.tol)
     return package.simulated(batch, options.tol)
+
+
+def _has_derivatives(mine, options):
+    """Whether derivatives of the engine's run are asked: near grazing always, else of runs that go
+    on until T and come near to no other outcome."""
+    if options.what == "derivatives":
+        return mine.t_end == options.span and 0 == mine.status and mine.margin > 1e-6
+    return options.what == "grazing"
 
 
 def _differentiate(runs, verdicts, disagreements, rng, options):
