@@ -113,12 +113,6 @@ def force_rounding(x1: Array, scale: Array | float = 1.0) -> Array:
     return 1e-12 * (scale + jnp.abs(x1))
 
 
-def is_at_rest(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
-    """Whether x2 and x2' vanish in a slip mode, up to rounding."""
-    a = mode_acceleration(osc, mode, x1, x2)
-    return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < force_rounding(x1)
-
-
 def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
     """Keep the stuck belts of `mode` stuck if they can hold the needed force, else let them slip.
 
