@@ -312,7 +312,7 @@ def test_an_interrupt_keeps_what_is_done(tmp_path, whole, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes of POSIX")
-@pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.slow(first=True))])
 def test_kills_at_random_moments_do_no_harm(tmp_path, count):
     told = kills.campaign(tmp_path, "final", kills=count, seed=1)
     assert told["blocks seen done"] > 0
