@@ -19,7 +19,7 @@ import pytest
 import jaxbelt as jb
 from jaxbelt import EventKind, Oscillator, Status
 from jaxbelt.cycles.orbits import follow
-from jaxbelt.model.events import event_between
+from jaxbelt.model.events import event_between, events_of
 from jaxbelt.numerics.compiling import jit
 
 CROSS, EDGE, SLIP, STICK = EventKind.CROSS, EventKind.EDGE, EventKind.SLIP, EventKind.STICK
@@ -231,3 +231,7 @@ def test_rest(rest: Rest):
     kind = "stuck" if rest.status == Status.STUCK_FOREVER else "equilibrium"
     assert jb.decoded(found).kind == kind and found.n_events == 0
     assert (found.x1_min, found.x1_max) == (rest.y[0], rest.y[0])
+
+
+def test_a_loop_of_no_modes_has_no_events():
+    assert events_of(()) == () and events_of(np.zeros((3, 0))) == ()
