@@ -3,6 +3,7 @@
 from collections import Counter
 from itertools import pairwise
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -219,6 +220,26 @@ def test_a_corner_where_only_the_sign_of_what_arrives_changes():
     expected = [jb.CornerCollision(1), jb.CornerCollision(1), jb.GrazingEdge(1)]
     assert [point.condition for point in points] == expected
     assert points[1].value == pytest.approx(0.398440689452, abs=1e-11)
+
+
+@pytest.mark.slow
+def test_an_orbit_that_still_grows_is_no_cycle():
+    """From beside an unstable equilibrium it takes hundreds of arcs until it first sticks."""
+    belts = (
+        jb.Belt(0.95, jb.Stribeck(1.2, 0.72, 0.15), 2.0, upper=0.35),
+        jb.Belt(0.93, jb.Conti(0.5, 0.3, 1.0), 2.0),
+    )
+    osc = jb.Oscillator(0.05, belts, omega=0.5)
+    path = ParameterPath(osc, lambda osc: osc.belts[1].velocity, (0.932, 0.935))
+    path.look([0.9333, 0.93331195])
+    assert [len(path.cycles[value]) for value in (0.9333, 0.93331195)] == [1, 1]
+
+
+def test_nothing_happens_where_a_belt_without_load_is_as_fast():
+    osc = jb.presets.class_b(0.2, 0.22)
+    osc = eqx.tree_at(lambda osc: osc.belts[1].load, osc, 0.0)
+    kinds = [point.kind for point in jb.scan(osc, nu0, (0.2, 0.25))]
+    assert kinds == []
 
 
 @pytest.mark.slow

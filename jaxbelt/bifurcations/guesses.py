@@ -85,7 +85,8 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
     differences of the last three tops form a geometric sequence, so its limit is known (Aitken). If
     that is much nearer to the last top than this is to any equilibrium, the orbit from there is
     followed next, for on the way there may be a boundary. What even then has not settled counts as
-    settled, its last loop as the one that repeats.
+    settled, its last loop as the one that repeats. Not where the mass sticks in that one: such an
+    orbit is followed on: from the end of the stick phase it repeats exactly.
     """
 
     def attempt(state):
@@ -100,7 +101,10 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
         distance = jnp.min(jnp.where(rests.kind > 0, jnp.abs(tops[2] - rests.x1), jnp.inf))
         away = jnp.abs(limit - tops[2]) < 0.2 * distance
         pending = orbit.status == Status.NOT_SETTLED
+        inside = (rows > last[1]) & (rows <= last[2])
+        has_stuck = jnp.any(inside & jnp.any(orbit.codes == STUCK, axis=-1))
         is_cycle = pending & (last[0] >= 0) & (before != 0) & (jnp.abs(ratio) < 1) & away
+        is_cycle = is_cycle & ~has_stuck
         start = jnp.where(is_cycle, jnp.stack([limit, jnp.zeros(())]), orbit.y)
         return number + 1, start, orbit, last, pending, is_cycle
 

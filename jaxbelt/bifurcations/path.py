@@ -123,18 +123,20 @@ class ParameterPath:
         return belts
 
     def _coincidences(self) -> list[float]:
-        """Where the belt that is varied is at rest, or runs with another one."""
-        if self.belt < 0:
+        """Where the belt that is varied is at rest, or runs with another one; both with a load."""
+        if self.belt < 0 or not self.osc.belts[self.belt].load:
             return []
-        others = [float(b.velocity) for i, b in enumerate(self.osc.belts) if i != self.belt]
+        others = [
+            float(b.velocity) for i, b in enumerate(self.osc.belts) if i != self.belt and b.load
+        ]
         inside = [v for v in {0.0, *others} if self.first <= v <= self.last]
         return sorted(inside)
 
     def coinciding(self, value: float) -> list[tuple[int, ...]]:
         """The varied belt and each that runs at one velocity with it there; itself, if at rest."""
-        others = enumerate(self.osc.belts)
+        others = [(i, b) for i, b in enumerate(self.osc.belts) if i != self.belt and b.load]
         pairs: list[tuple[int, ...]] = [
-            (self.belt, i) for i, b in others if i != self.belt and float(b.velocity) == value
+            (self.belt, i) for i, b in others if float(b.velocity) == value
         ]
         return [*pairs, (self.belt,)] if value == 0 else pairs
 

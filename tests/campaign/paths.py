@@ -384,7 +384,7 @@ def check(case: Case, seed: int) -> Report:
                 report.wrong.append(f"change at {low:.9g}..{high:.9g}: {names[0]} | {names[1]}")
     report.undecided = sum(not label.decided for label in brute.labels.values())
     for point in points:
-        _both_sides(case, point, special, brute, report)
+        _both_sides(path, point, special, brute, report)
     report.seconds = at_scan, time.perf_counter() - begun - at_scan
     return report
 
@@ -397,14 +397,12 @@ def _compare(path: ParameterPath, brute: Brute, value: float, report: Report) ->
     report.labels += 1
     for one in path.cycles[value]:
         if one.path:
-            rows = np.asarray(one.loop.entries)[np.asarray(one.loop.used)]
-            start = tuple(rows[int(np.argmax(rows[:, 0]))].tolist())
-            cycle = brute.learn(value, start)
+            cycle = brute.learn(value, _start_on(one.loop))
             place = place_of(one.loop)
             if (
                 cycle is None
                 or cycle.modes != one.path
-                or np.max(np.abs(cycle.place - place)) > 1e-4
+                or np.any(np.abs(cycle.place - place) > 1e-4 * np.maximum(1.0, np.abs(place)))
             ):
                 report.wrong.append(
                     f"at {value:.12g} scan has {one.path} {place.round(6)}: {cycle}"
@@ -415,20 +413,37 @@ def _compare(path: ParameterPath, brute: Brute, value: float, report: Report) ->
         report.wrong.append(f"at {value:.12g} rests {ours.equilibria}, engine {label.rests}")
 
 
-def _both_sides(case: Case, point, special, brute: Brute, report: Report) -> None:
-    """Whether something changes at a point of `scan`."""
-    at, (first, last) = float(point.value), case.span
+def _both_sides(path: ParameterPath, point, special, brute: Brute, report: Report) -> None:
+    """Whether something changes at a point of `scan`.
+
+    The engine starts on the cycles of `scan`, too: it says whether they are there, but from a few
+    starts it need not find them.
+    """
+    at, (first, last) = float(point.value), brute.case.span
     others = [abs(at - other) for other in special if other != at]
     away = min([1e-4 * (last - first), *(gap / 3 for gap in others)])
     if away < 1e-9 or at - away < first or at + away > last:
         return
-    sides = [brute.look(at - away), brute.look(at + away)]
+    path.look([at - away, at + away])
+    sides = [brute.look(side, _starts_on_cycles(path, side)) for side in (at - away, at + away)]
     for label, other, value in ((*sides, at + away), (*sides[::-1], at - away)):
         for cycle in label.cycles:
             if all(cycle.modes != one.modes for one in other.cycles):
                 brute.learn(value, cycle.state)
     if all(side.decided for side in sides) and sides[0].name == sides[1].name:
         report.wrong.append(f"nothing changes at {point!r}: {_words(sides[0])}")
+
+
+def _starts_on_cycles(path: ParameterPath, value: float) -> list[tuple[float, float]]:
+    """A state on each of the cycles that `scan` has there."""
+    return [_start_on(one.loop) for one in path.cycles[value] if one.path]
+
+
+def _start_on(loop) -> tuple[float, float]:
+    """The state of a loop with the largest x1."""
+    rows = np.asarray(loop.entries)[np.asarray(loop.used)]
+    x1, x2 = rows[int(np.argmax(rows[:, 0]))].tolist()
+    return x1, x2
 
 
 def _words(label: Label) -> str:
