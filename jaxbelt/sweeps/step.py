@@ -270,10 +270,8 @@ def _way_to_edge(x1: tuple[Array, Array], new: _Attempt, reach) -> tuple[Array, 
     way, speed = edge - new.x1, jnp.abs(new.x2)
     near = jnp.abs(way) * jnp.maximum(speed, SLOW * jnp.abs(new.a)) < reach * speed * speed
     there = jnp.abs(way) <= ULPS * jnp.abs(new.x1)
-    slope = jnp.where(near | there & (speed > NO_STEP), new.x2, 1.0)
-    # On the edge no time is left, but that time has its derivatives.
-    nothing = way - lax.stop_gradient(way)
-    delta = jnp.where(near, way, jnp.where(there, nothing, NEVER)) / slope
+    slope = jnp.where(near, new.x2, 1.0)
+    delta = jnp.where(near, way, jnp.where(there, 0.0, NEVER)) / slope
     delta = jnp.where(near, delta - 0.5 * new.a * delta**2 / slope, delta)
     return edge, near | there, delta
 
@@ -331,11 +329,10 @@ def take_step(
     shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
     delta = materialise(jnp.where(lands, at.delta, 0.0), one)
 
-    # The Taylor step to the bound, if there is one.
-    x1 = new.x1 + delta * (new.x2 + 0.5 * delta * new.a)
-    x2 = jnp.where(lands & ~at.on_edge, at.x2, new.x2 + delta * new.a)
-    if window.x1 is not None:
-        x1 = jnp.where(lands & at.on_edge, at.x1, x1)
+    bound = at.x2 if window.x1 is None else jnp.where(at.on_edge, at.x1, at.x2)
+    x1, x2 = _bridged(lands, at.on_edge, delta, bound, new)
+    a_end = _quotient(osc, window, one, x1, x2)
+    delta, x1, x2 = _with_its_derivatives(lands, at.on_edge, delta, bound, new, (x1, x2, a_end))
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
     pace, proposed = _next_size(lanes, new, going, accepted)
     stands = shortened & (at.theta * h < NO_STEP)
@@ -359,6 +356,37 @@ def take_step(
         upper=upper,
         integrals=_integrated(rates, osc, lanes, new, delta, x1, x2, kept) if rates else None,
     )
+
+
+def _bridged(lands, on_edge, delta, bound, new: _Attempt) -> tuple[Array, Array]:
+    """The state after the Taylor step to a bound, of lanes that land on one; else at its start."""
+    x1 = new.x1 + delta * (new.x2 + 0.5 * delta * new.a)
+    x2 = new.x2 + delta * new.a
+    return jnp.where(lands & on_edge, bound, x1), jnp.where(lands & ~on_edge, bound, x2)
+
+
+@jax.custom_jvp
+def _with_its_derivatives(lands, on_edge, delta, bound, new: _Attempt, end):
+    """The time of the Taylor step and the state at its end, (x1, x2, x2'), which is given.
+
+    The derivatives are those of the exact passage, to the second order in the time. Those of the
+    series that gives the time itself would lack the first.
+    """
+    return delta, *end[:2]
+
+
+@_with_its_derivatives.defjvp
+def _(primals, tangents):
+    lands, on_edge, delta, _, _, (x1, x2, a) = primals
+    _, _, _, d_bound, d_new, _ = tangents
+    moved1 = d_new.x1 + delta * (d_new.x2 + 0.5 * delta * d_new.a)
+    moved2 = d_new.x2 + delta * d_new.a
+    slope = jnp.where(on_edge, x2, a)
+    way = d_bound - jnp.where(on_edge, moved1, moved2)
+    late = jnp.where(lands, way / jnp.where(slope == 0, 1.0, slope), 0.0)
+    d_x1 = jnp.where(lands & on_edge, d_bound, moved1 + late * x2)
+    d_x2 = jnp.where(lands & ~on_edge, d_bound, moved2 + late * a)
+    return (delta, x1, x2), (late, d_x1, d_x2)
 
 
 def _integrated(rates, osc, lanes: Lanes, new: _Attempt, delta, x1, x2, kept) -> Any:
