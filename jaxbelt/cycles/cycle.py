@@ -20,7 +20,7 @@ from ..model.events import Signature
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import Arcs
-from ..numerics.compiling import each, jit
+from ..numerics.compiling import any_lane, each, jit
 from ..numerics.newton import HOLDS, solve
 from ..results import Status, describe
 from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
@@ -39,7 +39,8 @@ from .shooting import (
     room_of,
 )
 
-#: The same where those leave a larger error than EXACT, as halved steps tell it.
+#: Integration steps per slip arc where ARC_STEPS leave a larger error in the equations than EXACT,
+#: as halved steps tell it.
 FINE_STEPS, EXACT = 32, 1e-11
 
 
@@ -181,8 +182,6 @@ def cycle_of(
     forwards, slope = closure(osc, chain, z)
     if error is None:
         error = forwards
-        with_halved_steps, _ = closure(osc, chain.halved, z)
-        status = _first_failure(status, with_halved_steps < HOLDS, Status.NO_CONVERGENCE)
         status = _first_failure(status, error < HOLDS, Status.NO_CONVERGENCE)
     status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
@@ -221,26 +220,45 @@ def _if_it_fits(status: Array, count: Array, size: int) -> Array:
 
 
 def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
-    """The cycle that a loop nearly is; where it is known, with as many steps as it takes."""
-    cycle = polish(osc, loop, status)
-    if is_concrete(cycle) and int(status) == Status.OK:
-        inexact = int(cycle.status) == Status.NO_CONVERGENCE or integration_error(cycle) > EXACT
-        cycle = polish(osc, loop, status, steps=FINE_STEPS) if inexact else cycle
-    return cycle
+    """The cycle that a loop nearly is, with as many integration steps as it takes."""
+    cycle, error = _polished(osc, loop, status, ARC_STEPS)
+    if not is_concrete((cycle, error, status)):
+        return _finer_where_needed(osc, loop, status, cycle, error)
+    inexact = bool(_is_inexact(cycle, error)) and int(status) == Status.OK
+    return polish(osc, loop, status, FINE_STEPS) if inexact else cycle
+
+
+def _is_inexact(cycle: Cycle, error: Array) -> Array:
+    return (cycle.status == Status.NO_CONVERGENCE) | (error > EXACT)
+
+
+def _finer_where_needed(osc: Oscillator, loop: Loop, status: Array, cycle: Cycle, error: Array):
+    """`exactly` under a trace: a chain of FINE_STEPS, those that are not needed of length zero."""
+
+    def fine():
+        return polish(osc, loop, status, FINE_STEPS)
+
+    def same():
+        padding = [(0, 0)] * (cycle.chain.mesh.ndim - 1) + [(0, FINE_STEPS - ARC_STEPS)]
+        return eqx.tree_at(lambda c: c.chain.mesh, cycle, jnp.pad(cycle.chain.mesh, padding))
+
+    inexact = lax.stop_gradient(_is_inexact(cycle, error)) & (status == Status.OK)
+    return lax.cond(any_lane(inexact), fine, same)
 
 
 @jit
-def integration_error(cycle: Cycle) -> Array:
-    """The largest error in the shooting equations with every integration step halved."""
-    return closure(cycle.oscillator, cycle.chain.halved, cycle.unknowns)[0]
-
-
-@jit
-def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -> Cycle:
-    """The cycle that a loop nearly is, by Newton's method; one program for all that need it."""
+def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[Cycle, Array]:
+    """The cycle that a loop nearly is, and the error in its equations with halved steps."""
     chain, guess = meshed(lax.stop_gradient(osc), loop, steps)
     solved = solve(ClosedChain(chain), osc, guess)
-    return cycle_of(osc, chain, solved.z, solved.iterations, status)[0]
+    error, _ = closure(osc, chain.halved, solved.z)
+    status = _first_failure(status, error < HOLDS, Status.NO_CONVERGENCE)
+    return cycle_of(osc, chain, solved.z, solved.iterations, status)[0], error
+
+
+def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -> Cycle:
+    """The cycle that a loop nearly is, by Newton's method; one program for all that need it."""
+    return _polished(osc, loop, status, steps)[0]
 
 
 def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Cycle:

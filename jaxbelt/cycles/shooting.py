@@ -43,7 +43,7 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..motion.integrators import density
-from ..numerics.compiling import one_kernel
+from ..numerics.compiling import any_lane, one_kernel
 from ..numerics.extrapolation import Scheme, increments, scheme
 from ..numerics.newton import HOLDS, Equations
 
@@ -194,7 +194,15 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     def advance(state, fraction):
         return _step(field, state, slip_time * fraction, _FINE), None
 
-    slipped, _ = lax.scan(advance, start, mesh)
+    def advance_some(state, fractions):
+        # What pads a mesh is not worth a step.
+        some = any_lane(jnp.any(fractions > 0))
+        return lax.cond(some, lambda: lax.scan(advance, state, fractions)[0], lambda: state), None
+
+    if mesh.size > ARC_STEPS and mesh.size % ARC_STEPS == 0:
+        slipped, _ = lax.scan(advance_some, start, mesh.reshape(-1, ARC_STEPS))
+    else:
+        slipped, _ = lax.scan(advance, start, mesh)
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
     stuck_end = jnp.stack([y[0] + v * duration, v])
     if extra is not None:
