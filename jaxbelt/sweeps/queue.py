@@ -10,6 +10,7 @@ A pass of the loop is
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -107,6 +108,16 @@ def idle(program: Program, shared, width: int, columns: int) -> Stream:
     return Stream(lanes, rows, jnp.zeros((), jnp.int32), jnp.ones(width))
 
 
+def differentiable(stream: Stream) -> Stream:
+    """The numbers of a stream that may have derivatives; None in place of all others."""
+
+    def constants(stream):
+        return [stream.one, stream.lanes.h, stream.lanes.pace, *stream.lanes.mode.codes]
+
+    floats = eqx.filter(stream, eqx.is_inexact_array)
+    return eqx.tree_at(constants, floats, replace_fn=lambda _: None)
+
+
 def _ordered(values: dict[str, Any]) -> list[str]:
     return sorted(values)
 
@@ -133,6 +144,19 @@ class _Desk(eqx.Module):
     filled: Array
     numbers: Array
     columns: list[Array]
+
+
+def _split(desk: _Desk) -> tuple[_Desk, _Desk]:
+    """The numbers of a desk that may have derivatives, and all others, each with None elsewhere."""
+    floats = eqx.filter(desk, eqx.is_inexact_array)
+    floats = eqx.tree_at(lambda d: d.stream, floats, differentiable(desk.stream))
+    return eqx.partition(
+        desk, jax.tree.map(lambda leaf: leaf is not None, floats, is_leaf=_is_none)
+    )
+
+
+def _is_none(leaf) -> bool:
+    return leaf is None
 
 
 def _refill(program: Program, shared, rtol, limit, block, begun, available, desk: _Desk) -> _Desk:
@@ -192,13 +216,12 @@ def _at_work(stream: Stream) -> Array:
     return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
 
 
-def _fill(program: Program):
+def _fill(program: Program) -> Callable:
     """The inner loop: works until the block of runs is taken, the desk is full, or in pass `until`.
 
-    As one piece of machine code, which may close over no array.
+    It closes over no array, so that it can be one piece of machine code.
     """
 
-    @one_kernel
     def fill(shared, t1, rtol, atol, limit, block, begun, available, last, until, desk):
         def unfinished(desk):
             left = (desk.begun < available) | (last & _at_work(desk.stream))
@@ -236,44 +259,16 @@ def advance(program: Program, shared, t1, rtol, atol, limit, queue, call: Call, 
     queue: columns [runs + lanes], the starts and the parameters that differ. Returns the stream,
     the number of runs taken, whether there is more to do, and, in order of completion, numbers of
     runs (-1 where there is none) and results [columns, runs + 3 lanes].
-
-    Two loops, because on the CPU only loops on small arrays can be one kernel. The inner loop sees
-    small ones only: as many new runs, and as many results, as there are lanes.
     """
-    width = stream.one.size
-    size = queue[0].size + 2 * width
-    # Differences of pass numbers stay right where they overflow.
-    until = stream.passes + call.passes
-    fill = _fill(program)
+    one_piece = one_kernel(_fill(program))
 
-    def outer(state):
-        stream, taken, written, numbers, results = state
-        zero = jnp.zeros_like(taken)
-        block = tuple(lax.dynamic_slice(column, (taken,), (width,)) for column in queue)
-        available = jnp.minimum(call.count - taken, width)
-        last = call.drain & (taken + available >= call.count)
-        nothing = [jnp.zeros_like(stream.one) for _ in results]
-        desk = _Desk(stream, zero, zero, jnp.full(width, -1, dtype=jnp.int32), nothing)
-        begun = call.first + taken
-        desk = fill(shared, t1, rtol, atol, limit, block, begun, available, last, until, desk)
-        numbers = lax.dynamic_update_slice(numbers, desk.numbers, (written,))
-        pairs = zip(results, desk.columns, strict=True)
-        results = [lax.dynamic_update_slice(whole, part, (written,)) for whole, part in pairs]
-        return desk.stream, taken + desk.begun, written + desk.filled, numbers, results
+    def fill(block, block_slopes, *where, desk, slopes):
+        return one_piece(shared, t1, rtol, atol, limit, block, *where, desk), None
 
-    def more(stream, taken):
-        return (taken < call.count) | (call.drain & _at_work(stream))
-
-    def unfinished(state):
-        stream, taken, *_ = state
-        return more(stream, taken) & (stream.passes - until < 0)
-
-    n_columns = sum(math.prod(shape) for shape in layout(program, shared).values())
-    numbers = jnp.full(size, -1, dtype=jnp.int32)
-    results = [jnp.full(size, jnp.nan) for _ in range(n_columns)]
-    start = (stream, call.taken, jnp.zeros((), jnp.int32), numbers, results)
-    stream, taken, _, numbers, results = lax.while_loop(unfinished, outer, start)
-    return stream, taken, more(stream, taken), numbers, jnp.stack(results)
+    (stream, _), *rest, results, _ = _worked_off(
+        program, shared, fill, call, (queue, None), (stream, None)
+    )
+    return stream, *rest, jnp.stack(results)
 
 
 def advance_with_derivatives(program, shared, t1, rtol, atol, limit, queue, call: Call, stream):
@@ -282,23 +277,100 @@ def advance_with_derivatives(program, shared, t1, rtol, atol, limit, queue, call
     stream: a stream and the derivatives of its floats, [directions, ...]; the results have the same
     first axis, behind the values themselves.
     """
-    stream, slopes = stream
-    floats, others = eqx.partition(stream, eqx.is_inexact_array)
+    plain = _fill(program)
 
-    def of_floats(rows, floats):
-        stream_out, taken, more, numbers, results = advance(
-            program, shared, t1, rtol, atol, limit, rows, call, eqx.combine(floats, others)
-        )
-        floats, others_out = eqx.partition(stream_out, eqx.is_inexact_array)
-        return (results, floats), (others_out, taken, more, numbers)
+    @one_kernel
+    def one_piece(given, block, block_slopes, where, desk, slopes):
+        floats, others = _split(desk)
 
-    def column(direction, slope):
-        return jax.jvp(of_floats, (queue[0], floats), (direction, slope), has_aux=True)
+        def of_floats(block, floats):
+            return _split(plain(*given, block, *where, eqx.combine(floats, others)))
 
-    out = jax.vmap(column, out_axes=(None, 0, None))(queue[1:], slopes)
-    (results, floats), (columns, slopes), (others, taken, more, numbers) = out
-    results = jnp.concatenate([results[None], columns])
-    return (eqx.combine(floats, others), slopes), taken, more, numbers, results
+        def column(*slopes):
+            return jax.jvp(of_floats, (block, floats), slopes, has_aux=True)
+
+        floats, slopes, others = jax.vmap(column, out_axes=(None, 0, None))(block_slopes, slopes)
+        return eqx.combine(floats, others), slopes
+
+    def fill(block, block_slopes, *where, desk, slopes):
+        given = shared, t1, rtol, atol, limit
+        return one_piece(given, block, block_slopes, where, desk, slopes)
+
+    queues = tuple(queue[0]), tuple(jnp.moveaxis(queue[1:], 0, 1))
+    stream, *rest, results, slopes = _worked_off(program, shared, fill, call, queues, stream)
+    both = [jnp.concatenate([one[None], more]) for one, more in zip(results, slopes, strict=True)]
+    return stream, *rest, jnp.stack(both, axis=1)
+
+
+def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, streams):
+    """What `advance` does, by a function for the inner loop; of derivatives, too.
+
+    queues: the columns, and their derivatives, [directions, runs + lanes]; streams: the stream, and
+    the derivatives of its floats; None where there are none.
+
+    Two loops, because on the CPU only loops on small arrays can be one kernel. The inner loop sees
+    small ones only: as many new runs, and as many results, as there are lanes.
+    """
+    queue, queue_slopes = queues
+    stream, slopes = streams
+    width, columns = stream.one.size, _columns_of(program, shared)
+    size = queue[0].size + 2 * width
+    directions = () if queue_slopes is None else queue_slopes[0].shape[:1]
+    # Differences of pass numbers stay right where they overflow.
+    until = stream.passes + call.passes
+
+    def blocks(taken, columns):
+        return tuple(lax.dynamic_slice_in_dim(one, taken, width, axis=-1) for one in columns)
+
+    def put(wholes, parts, written):
+        pairs = zip(wholes, parts, strict=True)
+        return [lax.dynamic_update_slice_in_dim(a, b, written, axis=-1) for a, b in pairs]
+
+    def outer(state):
+        (stream, slopes), taken, written, numbers, results, result_slopes = state
+        zero, none = jnp.zeros_like(taken), jnp.full(width, -1, dtype=jnp.int32)
+        block = blocks(taken, queue)
+        available = jnp.minimum(call.count - taken, width)
+        last = call.drain & (taken + available >= call.count)
+        desk = _Desk(stream, zero, zero, none, [jnp.zeros(width)] * columns)
+        block_slopes, desk_slopes = None, None
+        if queue_slopes is not None:
+            block_slopes = blocks(taken, queue_slopes)
+            nothing = [jnp.zeros((*directions, width))] * columns
+            parts = slopes, nothing
+            desk_slopes = eqx.tree_at(lambda d: (d.stream, d.columns), _split(desk)[0], parts)
+        where = call.first + taken, available, last, until
+        desk, desk_slopes = fill(block, block_slopes, *where, desk=desk, slopes=desk_slopes)
+        numbers = lax.dynamic_update_slice(numbers, desk.numbers, (written,))
+        results = put(results, desk.columns, written)
+        if desk_slopes is not None:
+            slopes, result_slopes = (
+                desk_slopes.stream,
+                put(result_slopes, desk_slopes.columns, written),
+            )
+        taken, written = taken + desk.begun, written + desk.filled
+        return (desk.stream, slopes), taken, written, numbers, results, result_slopes
+
+    def more(stream, taken):
+        return (taken < call.count) | (call.drain & _at_work(stream))
+
+    def unfinished(state):
+        (stream, _), taken, *_ = state
+        return more(stream, taken) & (stream.passes - until < 0)
+
+    numbers = jnp.full(size, -1, dtype=jnp.int32)
+    results = [jnp.full(size, jnp.nan) for _ in range(columns)]
+    result_slopes = (
+        [jnp.full((*directions, size), jnp.nan) for _ in range(columns)] if directions else []
+    )
+    start = streams, call.taken, jnp.zeros((), jnp.int32), numbers, results, result_slopes
+    streams, taken, _, numbers, results, slopes = lax.while_loop(unfinished, outer, start)
+    return streams, taken, more(streams[0], taken), numbers, results, slopes
+
+
+def _columns_of(program: Program, shared) -> int:
+    """How many columns the results have."""
+    return sum(math.prod(shape) for shape in layout(program, shared).values())
 
 
 def _rank(flags: Array) -> Array:

@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +20,15 @@ from jaxtyping import Array
 
 from ..numerics.compiling import wide
 from .lanes import Program
-from .queue import ROUNDS_PER_PASS, STEPS_PER_ROUND, Call, advance, advance_with_derivatives, idle
+from .queue import (
+    ROUNDS_PER_PASS,
+    STEPS_PER_ROUND,
+    Call,
+    advance,
+    advance_with_derivatives,
+    differentiable,
+    idle,
+)
 
 #: Steps that a run may take for each 100 units of time before it is given up. On its way to a
 #: pseudo-focus beside a slow belt it may pass ten thousand events in that time.
@@ -118,7 +125,7 @@ def _first_stream(program: Program, shared, columns: int, derivatives: int) -> A
     stream = idle(program, shared, WIDTH.get(jax.default_backend(), 2**17), columns)
     if not derivatives:
         return stream
-    floats = eqx.filter(stream, eqx.is_inexact_array)
+    floats = differentiable(stream)
     return stream, jax.tree.map(lambda x: jnp.zeros((derivatives, *x.shape), x.dtype), floats)
 
 
