@@ -12,9 +12,10 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     numerics/       derivatives extrapolation newton continuation roots
     model/          friction oscillator parameters modes events equilibria
     presets         the published systems
-    motion/         integrators arcs sensitivities runs sampling smoothing simulate
+    kernel/         lanes step events rounds
+    motion/         integrators arcs sensitivities sampling batches runs smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
-    sweeps/         lanes step events marks observers moments along attractor queue threads audit
+    sweeps/         marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   refine path scan curves diagrams switch_folds

@@ -52,9 +52,13 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
     """`value` as a float64 array of the given shape (None: any length), or a `ValueError`.
 
     Python numbers and integer arrays are converted; a 32-bit float is refused, because the digits
-    that it lacks are not there to be restored.
+    that it lacks are not there to be restored. What is known stays known inside a trace.
     """
-    return jnp.asarray(as_numbers(value, field, shape), dtype=jnp.float64)
+    numbers = as_numbers(value, field, shape)
+    if isinstance(numbers, Tracer):
+        return jnp.asarray(numbers, dtype=jnp.float64)
+    with jax.ensure_compile_time_eval():
+        return jnp.asarray(numbers, dtype=jnp.float64)
 
 
 def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array | np.ndarray:

@@ -47,7 +47,7 @@ ADVICE = {
     ),
     Status.TOO_MANY_SEGMENTS: (
         "The budget of segments was used up before t1; what was computed until then is given. "
-        "Pass a larger max_segments or an earlier t1."
+        "Pass a larger max_segments (in a batch or a derivative max_events, too) or an earlier t1."
     ),
     Status.TOO_MANY_STEPS: (
         "The integrator used up its steps within one segment; what was computed until then is "

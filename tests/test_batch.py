@@ -10,9 +10,9 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
+from jaxbelt.kernel.events import append, word_events
 from jaxbelt.sweeps.attractor import signature
 from jaxbelt.sweeps.datasets import numbered, renumber
-from jaxbelt.sweeps.events import append, word_events
 
 SPAN = 40.0
 #: Room for the arcs of a run of `simulate`, as in tests/test_simulate.py, for one program.

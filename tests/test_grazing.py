@@ -11,7 +11,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.sweeps.lanes import Program
+from jaxbelt.kernel.lanes import Program
 from jaxbelt.sweeps.observers import Final
 from jaxbelt.sweeps.queue import layout
 from jaxbelt.sweeps.threads import run

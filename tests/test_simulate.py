@@ -319,6 +319,8 @@ def mixed_lanes():
 
 
 def test_vmap_equals_a_loop():
+    """A batch is integrated in another way; both keep the tolerance, 1e-10, and some runs magnify
+    what they are off by a hundred times."""
     lanes = mixed_lanes()
     batch = all_of_class_d(*lanes)
     seen = set()
@@ -328,8 +330,8 @@ def test_vmap_equals_a_loop():
         n = len(alone.events.t)
         np.testing.assert_array_equal(alone.events.kind, batch.events.kind[i, :n])
         assert not np.any(batch.events.kind[i, n:])
-        np.testing.assert_allclose(alone.events.t, batch.events.t[i, :n], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(alone.ys, batch.ys[i], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(alone.events.t, batch.events.t[i, :n], rtol=0, atol=2e-10)
+        np.testing.assert_allclose(alone.ys, batch.ys[i], rtol=0, atol=2e-10)
         seen |= set(np.asarray(alone.events.kind).tolist())
     assert seen >= {1, 2, 3, 4}
 

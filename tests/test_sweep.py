@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.cli import app
+from jaxbelt.kernel.lanes import Observer, Variable
 from jaxbelt.sweeps import store
-from jaxbelt.sweeps.lanes import Observer, Variable
 from jaxbelt.sweeps.threads import CHUNK
 
 NU0, NU1 = np.linspace(-0.6, 0.55, 4), np.array([0.35, -0.2])

@@ -12,6 +12,7 @@ half a loop around a focus within it, which `MAX_ARC` and `MAX_FRACTION` exclude
 
 import functools
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,11 +30,13 @@ from ..model.modes import (
     select,
 )
 from ..model.oscillator import Oscillator
-from ..numerics.compiling import any_lane, in_turn, one_kernel
+from ..numerics.compiling import any_lane, in_turn, of_lane, one_kernel, with_batches
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
+from .batches import LANES_AT_ONCE, PAGE, Batch, Group, blank_book, followed_together
 from .integrators import Adaptive, State
-from .sensitivities import Arc, in_one_row, sensitivities, split
+from .sampling import arcs_at, sampled
+from .sensitivities import Arc, in_one_row, sensitivities, split, with_derivatives
 
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
 #: because near-grazing events amplify them.
@@ -200,19 +203,120 @@ def _followed_arcs(
     return eqx.tree_at(lambda s: s.status, final, unfinished), records
 
 
+class Rules(NamedTuple):
+    """What is fixed when runs are compiled: room for their arcs; whether edges may be met."""
+
+    max_segments: int
+    edges: bool
+
+
+def _alone(osc: Oscillator, y0, t0, t1, ts, rtol, atol, *, rules: Rules):
+    """`arcs_of_run` of one run."""
+    final, records = _followed_arcs(osc, y0, t0, t1, rtol, atol, rules.max_segments)
+    return final, records, sampled(osc, records, ts, rtol, atol)
+
+
+def _together(lane, axis_size, batched, osc, y0, t0, t1, ts, rtol, atol, *, rules: Rules):
+    """`arcs_of_run` of a batch."""
+    args = osc, y0, t0, t1, ts, rtol, atol
+    one, rows = of_lane(lane, batched, args)
+    shapes = jax.eval_shape(one, [leaf[0] for leaf in rows])
+    width = min(LANES_AT_ONCE, -(-axis_size // 8) * 8)
+    room = shapes[1].t.shape[0]
+    batch = Batch(width, -(-room // PAGE) * PAGE, room, len(osc.belts), rules.edges)
+    groups = -(-axis_size // width)
+
+    def by_group(leaf):
+        # Lanes that are left over do nothing: they start nowhere.
+        padding = jnp.full((groups * width - axis_size, *leaf.shape[1:]), jnp.nan, leaf.dtype)
+        return jnp.concatenate([leaf, padding]).reshape(groups, width, *leaf.shape[1:])
+
+    def spread(leaf, flag):
+        return leaf if flag else jnp.broadcast_to(leaf, (axis_size, *jnp.shape(leaf)))
+
+    flags = batched
+    y0, t0, t1, ts = (spread(leaf, flag) for leaf, flag in zip(args[1:5], flags[1:5], strict=True))
+    # One tolerance for all: the smallest.
+    rtol, atol = jnp.min(rtol), jnp.min(atol)
+    of_group, leaves = of_lane(lambda osc: osc, (flags[0],), (osc,))
+
+    def group(book, rows):
+        leaves, y0, t0, t1, ts = rows
+        osc = of_group(leaves)
+        out, book = followed_together(
+            osc, (y0[:, 0], y0[:, 1]), t1 - t0, (ts - t0[:, None]).T, rtol, atol, batch, book
+        )
+        return book, _as_runs(out, t0, t1, shapes)
+
+    rows_of_groups = jax.tree.map(by_group, (leaves, y0, t0, t1, ts))
+    blank = blank_book(of_group([leaf[0] for leaf in rows_of_groups[0]]), batch)
+    _, (found, alone) = lax.scan(group, blank, rows_of_groups)
+    found, alone = jax.tree.map(
+        lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:axis_size], (found, alone)
+    )
+
+    def again():
+        def turn(row):
+            alone, found, rows = row
+            return lax.cond(alone, lambda: one(rows), lambda: found)
+
+        return lax.map(turn, (alone, found, rows))
+
+    return lax.cond(jnp.any(alone), again, lambda: found)
+
+
+def _as_runs(group: Group, t0: Array, t1: Array, shapes) -> tuple[Any, Array]:
+    """The runs of a group as `arcs_of_run` gives them, [lanes, ..], and which to follow alone."""
+    lanes, arcs = group.lanes, group.arcs
+    used = arcs.pop("used")
+    t0_row = t0[None]
+
+    def column(name, blank):
+        value = (
+            jnp.stack(arcs[name], axis=-1) if isinstance(arcs[name], tuple | list) else arcs[name]
+        )
+        there = used.reshape(*used.shape, *[1] * (value.ndim - 2))
+        blank = jnp.broadcast_to(blank, value.shape).astype(value.dtype)
+        return jnp.where(there, value, blank)
+
+    blank = _unused(shapes[1].mode.shape[1])
+    records = {name: column(name, getattr(blank, name)) for name in arcs}
+    for name in ("t", "event_t"):
+        records[name] = records[name] + t0_row
+    # As in a run by itself: at t1 itself.
+    is_end = used & arcs["in_time"]
+    records["event_t"] = jnp.where(is_end, t1[None], records["event_t"])
+    records = ArcRecord(**{name: jnp.swapaxes(value, 0, 1) for name, value in records.items()})
+    ended = lanes.status == Status.PSEUDO_FOCUS.value
+    nowhere = lanes.status == Status.NOT_FINITE.value
+    final = RunState(
+        t=jnp.where(lanes.done & ~ended & ~nowhere, t1, t0 + lanes.t),
+        y=(lanes.x1, lanes.x2),
+        mode=lanes.mode,
+        signs=(jnp.ones_like(lanes.x1), jnp.ones_like(lanes.x1)),
+        status=lanes.status,
+        done=lanes.done,
+    )
+    samples = jnp.moveaxis(jnp.where(nowhere[None, None], jnp.nan, group.samples), -1, 0)
+    out = jax.tree.map(
+        lambda leaf, like: leaf.astype(like.dtype), (final, records, samples), shapes
+    )
+    return out, group.alone
+
+
 @eqx.filter_custom_jvp
-def arcs_of_run(
-    osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int
-) -> tuple[RunState, ArcRecord]:
-    """The chain of arcs from y0: the final state and the stacked records, NaN where unused."""
-    numbers = map(jnp.asarray, (y0, t0, t1, rtol, atol))
-    return in_turn(functools.partial(_followed_arcs, max_segments=max_segments))(osc, *numbers)
+def arcs_of_run(osc: Oscillator, y0, t0, t1, ts, rtol, atol, rules: Rules):
+    """The chain of arcs from y0: the final state, the stacked records, NaN where unused, and the
+    states at the times ts, [samples, 2], without derivatives (those past the end are not told)."""
+    numbers = map(jnp.asarray, (y0, t0, t1, ts, rtol, atol))
+    parts = (functools.partial(part, rules=rules) for part in (_alone, _together))
+    return with_batches(*parts)(osc, *numbers)
 
 
 @arcs_of_run.def_jvp
 def _(primals, tangents):
     osc, y0, t0, t1, *_ = primals
-    final, records = arcs_of_run(*primals)
+    final, records, samples = arcs_of_run(*primals)
     varied, rest = split(osc, tangents[0])
     used = ~jnp.isnan(records.event_t)
     arcs = Arc(
@@ -232,7 +336,7 @@ def _(primals, tangents):
     ]
     inputs = in_one_row(*start, tangents[0])
     entries, ends = entries.along(inputs), ends.along(inputs)
-    nothing = jax.tree.map(lambda _: None, (final, records))
+    nothing = jax.tree.map(lambda _: None, (final, records, samples))
     last = jax.tree.map(lambda leaf: leaf[-1], ends)
 
     def rows(leaf):
@@ -243,14 +347,14 @@ def _(primals, tangents):
         return jnp.stack([one.x1, one.x2], axis=1)
 
     def places(run):
-        final, records = run
+        final, records, _ = run
         events = records.event_t, records.event_y
         return final.t, final.y, records.t, records.y, records.duration, *events
 
     moved = [entries.t, states(entries), ends.t - entries.t, ends.t, states(ends)]
     moved = last.t, (last.x1, last.x2), *map(rows, moved)
     moved = eqx.tree_at(places, nothing, moved, is_leaf=lambda leaf: leaf is None)
-    return (final, records), moved
+    return (final, records, samples), moved
 
 
 def _unused(belts: int) -> ArcRecord:
@@ -270,3 +374,16 @@ def _unused(belts: int) -> ArcRecord:
         in_time=none > 0,
         captured=none > 0,
     )
+
+
+def states_at(osc: Oscillator, final: RunState, records: ArcRecord, samples: Array, ts: Array):
+    """States and modes at the times ts, with derivatives; samples: the states, without."""
+    # Past the end of the last arc the run either rests, with a reason, or is unknown.
+    rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
+    arcs, _, since = arcs_at(records, ts)
+    beyond = ts > final.t
+    since = jnp.where(beyond, 0.0, since)
+    ys = with_derivatives(osc, arcs.y, since, arcs.mode, lax.stop_gradient(samples))
+    afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
+    modes = jnp.where(beyond[:, None], stacked_codes(final.mode), arcs.mode)
+    return jnp.where(beyond[:, None], afterwards, ys), modes

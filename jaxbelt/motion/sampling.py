@@ -1,18 +1,17 @@
 """Samples of a run at given times: each from the arc that it lies in, all in parallel."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array
 
 from ..model.modes import Mode, select, stick_velocity
 from ..model.oscillator import Oscillator
-from ..numerics.compiling import in_turn, one_kernel
-from ..results import Status
+from ..numerics.compiling import one_kernel
 from .integrators import Adaptive, slip_field
-from .runs import ArcRecord, RunState, stacked_codes
-from .sensitivities import with_derivatives
 
 #: Lanes in which samples are computed.
 SAMPLED = 32
@@ -24,30 +23,30 @@ def _slip_flow(osc, mode, y, integrator):
     return integrator.flow(functools.partial(slip_field, osc, mode), y)
 
 
-def states_at(osc: Oscillator, final: RunState, records: ArcRecord, ts, rtol, atol):
-    """States and modes at the times ts, each from the arc that it lies in."""
-    entries = jnp.where(jnp.isnan(records.t), jnp.inf, lax.stop_gradient(records.t))
-    wanted = ts.size
-    if wanted:
-        ts = jnp.pad(ts, (0, -wanted % SAMPLED), mode="edge")
-    # Past the end of the last arc the run either rests, with a reason, or is unknown.
-    rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
+def arcs_at(records, ts: Array) -> tuple[Any, Array, Array]:
+    """Of each time the arc that it lies in, its number, and the time since its entry.
 
+    records: arcs as a tree of arrays [arcs, ..], among them t and duration, NaN where unused.
+    """
+    entries = jnp.where(jnp.isnan(records.t), jnp.inf, lax.stop_gradient(records.t))
     numbers = jnp.maximum(jnp.searchsorted(entries, ts, side="right") - 1, 0)
     arcs = jax.tree.map(lambda leaf: leaf[numbers], records)
-    beyond = ts > final.t
-    since = jnp.where(beyond, 0.0, ts - arcs.t)
+    return arcs, numbers, ts - arcs.t
+
+
+def sampled(osc: Oscillator, records, ts: Array, rtol, atol) -> Array:
+    """The states at the times ts, [samples, 2]; past the end of an arc those at its end."""
+    wanted = ts.size
+    if not wanted:
+        return jnp.zeros((0, 2))
+    ts = jnp.pad(ts, (0, -wanted % SAMPLED), mode="edge")
+    arcs, numbers, since = arcs_at(records, ts)
+    since = jnp.minimum(since, arcs.duration)
     stuck = jnp.any(arcs.mode == 0, axis=1)
-    given = lax.stop_gradient((osc, rtol, atol, numbers, arcs, beyond, since, stuck))
-    ys = in_turn(_sampled)(*given)
-    ys = with_derivatives(osc, arcs.y, since, arcs.mode, ys)
-    afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
-    ys = jnp.where(jnp.isnan(arcs.t)[:, None], jnp.nan, ys)
-    modes = jnp.where(beyond[:, None], stacked_codes(final.mode), arcs.mode)
-    return jnp.where(beyond[:, None], afterwards, ys)[:wanted], modes[:wanted]
+    return _flown_in_pieces(osc, rtol, atol, numbers, arcs, since, stuck)[:wanted]
 
 
-def _sampled(osc: Oscillator, rtol, atol, numbers, arcs: ArcRecord, beyond, since, stuck):
+def _flown_in_pieces(osc: Oscillator, rtol, atol, numbers, arcs, since, stuck) -> Array:
     """The states at a time `since` the entries of arcs, [samples, 2]; numbers: of the arcs."""
 
     def at(osc, rtol, atol, arc, since, stuck, goes_on, before, y):
@@ -63,7 +62,7 @@ def _sampled(osc: Oscillator, rtol, atol, numbers, arcs: ArcRecord, beyond, sinc
     # from where the next one's arc begins; so, too, where under a trace the times do not increase.
     first = jnp.arange(since.size) % max(since.size // SAMPLED, 1) == 0
     before = jnp.roll(since, 1)
-    goes_on = (numbers == jnp.roll(numbers, 1)) & (before <= since) & ~beyond & ~first
+    goes_on = (numbers == jnp.roll(numbers, 1)) & (before <= since) & ~first
     rows = jax.tree.map(
         lambda leaf: jnp.swapaxes(leaf.reshape(SAMPLED, -1, *leaf.shape[1:]), 0, 1),
         (arcs, since, stuck, goes_on, before),

@@ -16,8 +16,7 @@ from ..model.modes import contact, has_edges
 from ..model.oscillator import Oscillator, check_oscillator
 from ..numerics.compiling import jit
 from ..results import EventKind, Status, describe
-from .runs import arcs_of_run, stacked_codes
-from .sampling import states_at
+from .runs import Rules, arcs_of_run, stacked_codes, states_at
 from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
 
@@ -108,32 +107,32 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
 
 
 @jit
-def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, max_segments, resolution) -> Trajectory:
-    final, records = arcs_of_run(osc, y0, t0, t1, rtol, atol, max_segments)
-    # Events first, in a stable order; the rest is padding.
-    has_event = records.kind > 0
-    order = jnp.argsort(~has_event, stable=True)
-    has_event = has_event[order]
+def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution) -> Trajectory:
+    grid = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution) if ts is None else ts
+    final, records, samples = arcs_of_run(osc, y0, t0, t1, grid, rtol, atol, rules)
+    count = jnp.cumsum(records.kind > 0)
+    wanted = jnp.arange(1, max_events + 1)
+    happened = wanted <= count[-1]
+    rows = jnp.minimum(jnp.searchsorted(count, wanted), count.size - 1)
     events = Events(
-        t=jnp.where(has_event, records.event_t[order], jnp.nan),
-        y=jnp.where(has_event[:, None], records.event_y[order], jnp.nan),
-        kind=jnp.where(has_event, records.kind[order], 0),
-        belt=jnp.where(has_event, records.belt[order], -1),
+        t=jnp.where(happened, records.event_t[rows], jnp.nan),
+        y=jnp.where(happened[:, None], records.event_y[rows], jnp.nan),
+        kind=jnp.where(happened, records.kind[rows], 0),
+        belt=jnp.where(happened, records.belt[rows], -1),
     )
+    too_many = count[-1] > max_events
+    status = jnp.where(too_many, Status.TOO_MANY_SEGMENTS.value, final.status)
+    ys, modes = states_at(osc, final, records, samples, grid)
     if ts is None:
         # An even grid, and between its points the entries of the arcs, which are known already.
-        grid = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)
-        ys, modes = states_at(osc, final, records, grid, rtol, atol)
         unused = jnp.isnan(records.t)
         ts = jnp.concatenate([grid, jnp.where(unused, t1, records.t)])
         ys = jnp.concatenate([ys, jnp.where(unused[:, None], ys[-1], records.y)])
         modes = jnp.concatenate([modes, jnp.where(unused[:, None], modes[-1], records.mode)])
         order = jnp.argsort(ts)
         ts, ys, modes = ts[order], ys[order], modes[order]
-    else:
-        ys, modes = states_at(osc, final, records, ts, rtol, atol)
     arcs = Arcs(records.t, records.y, records.mode, records.duration)
-    return Trajectory(ts, ys, modes, events, arcs, final.status)
+    return Trajectory(ts, ys, modes, events, arcs, status)
 
 
 def simulate(
@@ -149,6 +148,7 @@ def simulate(
     v_star: ArrayLike = 1e-3,
     eps: ArrayLike = 1e-3,
     max_segments: int | None = None,
+    max_events: int | None = None,
 ) -> Trajectory:
     """The motion of the oscillator from y0 over [t0, t1].
 
@@ -161,7 +161,8 @@ def simulate(
     tanh(r/eps) in place of sgn(r). The last two have no events.
 
     max_segments: budget of arcs; None chooses one from the time span. A run that uses it up
-    returns what it has, with the status TOO_MANY_SEGMENTS.
+    returns what it has, with the status TOO_MANY_SEGMENTS. max_events: room for its events, under a
+    transformation; None chooses that, too. Where it was too small, the status is the same.
 
     Works under `jax.jit`, `jax.vmap` (batches), `jax.jacfwd` and `jax.jacrev`. There the lengths
     are padded (see `Events`); outside they are cut to what happened.
@@ -219,8 +220,21 @@ def simulate(
         "a positive integer",
         max_segments,
     )
+    if max_events is None:
+        per_time = 16 if has_edges(osc) else 4
+        is_known = is_concrete((osc, y0, t0, t1, ts, rtol, atol))
+        max_events = (
+            max_segments if is_known else min(max_segments, _power_of_two(per_time * span, 64))
+        )
+    require(
+        isinstance(max_events, int) and max_events > 0,
+        "max_events",
+        "a positive integer",
+        max_events,
+    )
+    rules = Rules(max_segments, has_edges(osc))
     trajectory = _filippov(
-        osc, y0, t0, t1, ts, rtol, atol, max_segments=max_segments, resolution=resolution
+        osc, y0, t0, t1, ts, rtol, atol, rules=rules, max_events=max_events, resolution=resolution
     )
     return _without_padding(trajectory, trim_samples=ts is None)
 

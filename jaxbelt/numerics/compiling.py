@@ -1,7 +1,7 @@
 """All that leans on what JAX, XLA and Equinox do not promise, behind one switch.
 
-- `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `in_turn`, `wide` and
-  `any_lane` save time of running.
+- `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `in_turn`, `with_batches`,
+  `wide` and `any_lane` save time of running.
 - `depends` and `passed_through` look at what a function does with its arguments.
 - `require_own_threads` looks at whether JAX was in use before a process was forked.
 
@@ -154,33 +154,54 @@ def in_turn(function: Callable) -> Callable:
     gives the same to the last bit as outside of a batch. Its derivatives, and all of it on other
     devices, are as they were.
     """
-    turns = _as_turns(function)
+
+    def turns(lane, axis_size, batched, *args):
+        one, rows = of_lane(lane, batched, args)
+        return lax.map(one, rows)
+
+    return with_batches(function, turns, everywhere=False)
+
+
+def of_lane(function: Callable, batched, args) -> tuple[Callable, list[Any]]:
+    """A function of the leaves that are batched, a list, and all of these: what the function gives
+    for one lane."""
+    leaves, structure = jax.tree.flatten(args)
+    flags = jax.tree.leaves(batched)
+
+    def one(rows):
+        rows = iter(rows)
+        own = [next(rows) if flag else leaf for flag, leaf in zip(flags, leaves, strict=True)]
+        return function(*jax.tree.unflatten(structure, own))
+
+    return one, [leaf for flag, leaf in zip(flags, leaves, strict=True) if flag]
+
+
+def with_batches(function: Callable, batch: Callable, *, everywhere: bool = True) -> Callable:
+    """The same function of arrays, that closes over none; a batch of it is what
+    batch(function, axis_size, batched, *args) gives.
+
+    batched: a tree of flags like args. Derivatives of batches are as they were. everywhere: on
+    other devices than the CPU, too.
+    """
+    lanes = _as_lanes(function, batch)
 
     @functools.wraps(function)
     def call(*args):
-        usable = jax.default_backend() == "cpu" and _usable("batches lane by lane", _try_turns)
-        return (turns if usable else function)(*args)
+        here = everywhere or jax.default_backend() == "cpu"
+        usable = here and _usable("batches by a rule of one's own", _try_lanes)
+        return (lanes if usable else function)(*args)
 
     return call
 
 
-def _as_turns(function: Callable) -> Callable:
+def _as_lanes(function: Callable, batch: Callable) -> Callable:
     @jax.custom_batching.custom_vmap
     def lane(*args):
         return function(*args)
 
     @lane.def_vmap
     def _(axis_size, batched, *args):
-        leaves, structure = jax.tree.flatten(args)
-        is_batched = jax.tree.leaves(batched)
-
-        def one(rows):
-            rows = iter(rows)
-            own = [next(rows) if b else leaf for b, leaf in zip(is_batched, leaves, strict=True)]
-            return lane(*jax.tree.unflatten(structure, own))
-
-        rows = [leaf for b, leaf in zip(is_batched, leaves, strict=True) if b]
-        out = lax.map(one, rows)
+        out = batch(lane, axis_size, batched, *args)
         return out, jax.tree.map(lambda _: True, out)
 
     @jax.custom_jvp
@@ -194,9 +215,12 @@ def _as_turns(function: Callable) -> Callable:
     return alone
 
 
-def _try_turns() -> bool:
-    found = jax.vmap(_as_turns(lambda x, y: x * y), (0, None))(np.array([1.0, 2.0]), 3.0)
-    return found.tolist() == [3.0, 6.0]
+def _try_lanes() -> bool:
+    def twice(lane, axis_size, batched, x, y):
+        return (2 if tuple(batched) == (True, False) else 0) * x * y
+
+    found = jax.vmap(_as_lanes(lambda x, y: x * y, twice), (0, None))(np.array([1.0, 2.0]), 3.0)
+    return found.tolist() == [6.0, 12.0]
 
 
 # --- one piece of machine code --------------------------------------------------------------------

@@ -1,9 +1,6 @@
-"""Many runs at once: the throughput kernel, `sweep` and `basins`.
+"""Sweeps: runs in bulk through the lanes of `kernel`; `sweep` and `basins`.
 
-- `lanes`: the state of the runs that the kernel advances together, a lane each, and `Observer`,
-  the base of what can be asked of them;
-- `step`: one Runge-Kutta step of all lanes; `events`: what follows where a step lands on a guard;
-  `marks`: states that later ones are compared with, to find what repeats;
+- `marks`: states that later ones are compared with, to find what repeats;
 - `observers`, `attractor`: what can be asked: final states, a user's reducer, attractors;
 - `moments`, `along`: reducers that see what is between the events, too;
 - `queue`: the compiled loop that fills lanes from a queue of runs; `threads`: a loop on each core;
@@ -14,5 +11,6 @@
 - `shares`: the attractors that several starts lead to, and how many lead to each;
 - `basins`: the same for starts of one oscillator.
 
-A new observable is a subclass of `lanes.Observer` in a file of its own; `sweep` takes it as it is.
+A new observable is a subclass of `kernel.lanes.Observer` in a file of its own; `sweep` takes it as
+it is.
 """

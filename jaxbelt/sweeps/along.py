@@ -17,10 +17,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from ..kernel.events import event_kinds
+from ..kernel.lanes import Lanes, Observer, choose
+from ..kernel.step import LANDING
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator
-from .events import event_kinds
-from .lanes import Lanes, Observer, choose
 from .moments import (
     AtEvents,
     AtTimes,
@@ -33,7 +34,6 @@ from .moments import (
     value_and_rate,
 )
 from .observers import RunEnd, RunEvent
-from .step import LANDING
 
 #: Parts of a stick phase in which a crossing of a section is looked for.
 PARTS = 4

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..cycles.settling import REPEATED, way_left
+from ..kernel.events import append, event_kinds, word_events
+from ..kernel.lanes import Lanes, Observer, Passage, Variable, materialise
 from ..model.events import signature_name
 from ..model.modes import begins_at_rest, select, settling_margin
 from ..model.oscillator import Oscillator
 from ..results import Status
-from .events import append, event_kinds, word_events
-from .lanes import Lanes, Observer, Passage, Variable, materialise
 from .marks import Mark
 
 #: What a run leads to, in the order of their codes.

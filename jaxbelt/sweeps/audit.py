@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from ..kernel.events import word_events
+from ..kernel.lanes import Program
 from ..model.events import of_one_loop
 from ..model.modes import FOCUS_RADIUS
 from ..results import Status
 from .attractor import CYCLE, UNDECIDED
-from .events import word_events
-from .lanes import Program
 from .observers import Final
 from .queue import by_name, layout
 from .threads import CHUNK, run

@@ -18,11 +18,11 @@ from jaxtyping import Array, ArrayLike
 from ..checks import as_array, check_finite, require
 from ..cycles.attractors import Runs, is_same
 from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
+from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator, check_oscillator
 from .attractor import KINDS, Attractor
 from .datasets import decoded, flags
-from .lanes import Program
 from .question import LONG_ENOUGH
 from .queue import column_of, layout
 from .sweep import sweep

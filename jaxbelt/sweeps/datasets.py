@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..kernel.lanes import Program, Variable
 from ..results import Status
 from .grid import Blocks, Grid
-from .lanes import Program, Variable
 from .queue import by_name, layout
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..checks import as_array, check_finite, is_concrete, require
+from ..kernel.lanes import Observer, Program
 from ..model.oscillator import Oscillator, check_scalars
-from .lanes import Observer, Program
 from .threads import CHUNK
 
 

@@ -4,8 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..model.modes import Mode, select
-from .lanes import Lanes, materialise
+from ..kernel.lanes import Lanes, code_of, materialise
+from ..model.modes import select
 
 
 class Mark(eqx.Module):
@@ -51,11 +51,3 @@ class Mark(eqx.Module):
             jnp.maximum(2 * self.limit, 1),
         )
         return select(new, here, eqx.tree_at(lambda m: m.age, self, age)), new
-
-
-def code_of(mode: Mode) -> Array:
-    """A mode as one number."""
-    total = jnp.zeros(())
-    for i, code in enumerate(mode.codes):
-        total = total + (code + 2) * 5.0**i
-    return total

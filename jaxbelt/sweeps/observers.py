@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .events import event_kinds
-from .lanes import Observer, Variable, choose
+from ..kernel.events import event_kinds
+from ..kernel.lanes import Observer, Variable, choose
 from .marks import Mark
 
 #: What contact codes stand for.

@@ -13,11 +13,11 @@ import jax
 import numpy as np
 
 from ..checks import as_array, check_positive, require, require_usable_jax
+from ..kernel.lanes import Observer, Program
 from .along import Along
 from .attractor import Attractor
 from .datasets import Table
 from .grid import Grid
-from .lanes import Observer, Program
 from .moments import AtEvents, bytecode, checked
 from .observers import Final, Reduce
 from .threads import CHUNK

@@ -21,13 +21,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import Mode, at_focus, mode_acceleration, mode_of_state
+from ..kernel.events import pass_events
+from ..kernel.lanes import Lanes, Program, choose
+from ..kernel.rounds import lanes_at_start
+from ..kernel.step import take_step, window_of
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import one_kernel
 from ..results import Status
-from .events import pass_events
-from .lanes import Lanes, Program, choose
-from .step import STEP_SAFETY, first_step, take_step, window_of
 
 #: Steps between two looks at the events, and looks between two refills: events and refills cost
 #: about as much as a step, and a lane that waits for them is idle.
@@ -58,31 +58,7 @@ def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> Oscillato
 
 def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
     """Lanes at the start of their runs."""
-    mode = mode_of_state(osc, x1, x2)
-    finite = jnp.isfinite(x1) & jnp.isfinite(x2)
-    for leaf in jax.tree.leaves(osc):
-        finite = finite & ~jnp.isnan(leaf)
-    rests = at_focus(osc, x1, x2) if program.edges else jnp.zeros_like(finite)
-    status = jnp.where(rests, Status.PSEUDO_FOCUS.value, Status.OK.value)
-    status = jnp.where(finite, status, Status.NOT_FINITE.value)
-    zero = jnp.zeros_like(x1)
-    lanes = Lanes(
-        run=run,
-        begun=jnp.full_like(run, passes),
-        t=zero,
-        x1=x1,
-        x2=x2,
-        a=mode_acceleration(osc, mode, x1, x2) + zero,
-        h=zero + first_step(rtol),
-        pace=zero + STEP_SAFETY / first_step(rtol),
-        mode=Mode(tuple(code + zero for code in mode.codes)),
-        events=jnp.zeros_like(run),
-        status=status.astype(run.dtype),
-        done=~finite | rests,
-        lower=x2,
-        upper=x2,
-        memory=None,
-    )
+    lanes = lanes_at_start(osc, run, x1, x2, passes, rtol, edges=program.edges)
     memory, integrals = program.observer.start(osc, lanes), program.observer.integrals(osc, lanes)
     return replace(lanes, memory=memory, integrals=integrals)
 
@@ -146,17 +122,12 @@ class _Desk(eqx.Module):
     columns: list[Array]
 
 
-def _split(desk: _Desk) -> tuple[_Desk, _Desk]:
+def _floats_of(desk: _Desk) -> tuple[_Desk, _Desk]:
     """The numbers of a desk that may have derivatives, and all others, each with None elsewhere."""
     floats = eqx.filter(desk, eqx.is_inexact_array)
     floats = eqx.tree_at(lambda d: d.stream, floats, differentiable(desk.stream))
-    return eqx.partition(
-        desk, jax.tree.map(lambda leaf: leaf is not None, floats, is_leaf=_is_none)
-    )
-
-
-def _is_none(leaf) -> bool:
-    return leaf is None
+    kept = jax.tree.map(lambda leaf: leaf is not None, floats, is_leaf=lambda leaf: leaf is None)
+    return eqx.partition(desk, kept)
 
 
 def _refill(program: Program, shared, rtol, limit, block, begun, available, desk: _Desk) -> _Desk:
@@ -200,7 +171,8 @@ def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> 
     osc, observer = _oscillators(program, shared, rows), program.observer
 
     def round_(_, lanes):
-        lanes, passage = pass_events(program, osc, lanes, t1, rtol)
+        rules = dict(edges=program.edges, captures=program.captures)
+        lanes, passage = pass_events(osc, lanes, t1, rtol, **rules)
         lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
         window = window_of(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
 
@@ -281,10 +253,10 @@ def advance_with_derivatives(program, shared, t1, rtol, atol, limit, queue, call
 
     @one_kernel
     def one_piece(given, block, block_slopes, where, desk, slopes):
-        floats, others = _split(desk)
+        floats, others = _floats_of(desk)
 
         def of_floats(block, floats):
-            return _split(plain(*given, block, *where, eqx.combine(floats, others)))
+            return _floats_of(plain(*given, block, *where, eqx.combine(floats, others)))
 
         def column(*slopes):
             return jax.jvp(of_floats, (block, floats), slopes, has_aux=True)
@@ -338,7 +310,7 @@ def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, st
             block_slopes = blocks(taken, queue_slopes)
             nothing = [jnp.zeros((*directions, width))] * columns
             parts = slopes, nothing
-            desk_slopes = eqx.tree_at(lambda d: (d.stream, d.columns), _split(desk)[0], parts)
+            desk_slopes = eqx.tree_at(lambda d: (d.stream, d.columns), _floats_of(desk)[0], parts)
         where = call.first + taken, available, last, until
         desk, desk_slopes = fill(block, block_slopes, *where, desk=desk, slopes=desk_slopes)
         numbers = lax.dynamic_update_slice(numbers, desk.numbers, (written,))

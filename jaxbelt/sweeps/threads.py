@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..kernel.lanes import Program
 from ..numerics.compiling import wide
-from .lanes import Program
 from .queue import (
     ROUNDS_PER_PASS,
     STEPS_PER_ROUND,

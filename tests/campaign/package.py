@@ -234,6 +234,7 @@ def _trajectories(structure, T, tol, max_segments):
             rtol=tol,
             atol=tol,
             max_segments=max_segments,
+            max_events=max_segments,
         )
         return found.ys[-1], found.modes[-1], found.events, found.status
 

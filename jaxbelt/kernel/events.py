@@ -22,14 +22,18 @@ from ..model.modes import (
 )
 from ..model.oscillator import Oscillator
 from ..results import EventKind, Status
-from .lanes import Lanes, Passage, Program
+from .lanes import Lanes, Passage
 from .step import NO_STEP, STEP_SAFETY, first_step
 
 
 def pass_events(
-    program: Program, osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array
+    osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array, *, edges: bool, captures: bool
 ) -> tuple[Lanes, Passage]:
-    """Lanes that stand on a guard go on; stick phases are passed to their end, or to t1."""
+    """Lanes that stand on a guard go on; stick phases are passed to their end, or to t1.
+
+    edges: whether a contact edge may be met; captures: whether a run ends where a pseudo-focus
+    captures it.
+    """
     landed = (lanes.h < 0) & ~lanes.done
     # A lane may also have landed where x2 = 0, which is no guard.
     number = guard_passed(osc, lanes.mode, lanes.x1, lanes.x2)
@@ -38,7 +42,7 @@ def pass_events(
     fired = landed & (number >= 0) & ~at_rest
     rests = landed & at_rest & ((number >= 0) | (lanes.h >= -NO_STEP))
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
-    captured = fired & after.captured & program.captures
+    captured = fired & after.captured & captures
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
 
     stuck = after.mode.any_stuck & ~captured & ~lanes.done
@@ -51,12 +55,13 @@ def pass_events(
     mode = select(captured, lanes.mode, mode)
     new_x1 = jnp.where(stuck, jnp.where(ends, x1 + x2 * left, phase.x1), x1)
     t = jnp.where(stuck & ends | rests, t1, lanes.t + duration)
-    a, h = _set_off(program, osc, lanes, mode, new_x1, x2, fired, released, rtol)
+    a, h = _set_off(edges, osc, lanes, mode, new_x1, x2, fired, released, rtol)
     forever = stuck & jnp.isinf(phase.duration)
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
     passage = Passage(
         landed=landed,
         fired=fired,
+        number=number,
         before=lanes.mode,
         mode=after.mode,
         t=lanes.t,
@@ -86,13 +91,13 @@ def pass_events(
     return lanes, passage
 
 
-def _set_off(program, osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> tuple[Array, Array]:
+def _set_off(edges, osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> tuple[Array, Array]:
     """x2' and the step size with which the lanes go on in a mode."""
     a = mode_acceleration(osc, mode, x1, x2)
     # Slip onset is tangent: x2' = 0 there up to rounding, for a law without a jump.
     a = jnp.where(jnp.abs(a) < force_rounding(x1), 0.0, a)
     h = jnp.where(fired, first_step(rtol), jnp.abs(lanes.h))
-    if program.edges:
+    if edges:
         # In a corner one event follows the other at once: a lane that stands on the next guard,
         # and goes on through it, has landed there.
         corner = (fired | released) & ~mode.any_stuck & (guard_passed(osc, mode, x1, x2) >= 0)

@@ -148,7 +148,7 @@ class _Attempt(eqx.Module):
     integrals: Any
 
 
-def _attempt(osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol, rates) -> _Attempt:
+def attempt(osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol, rates) -> _Attempt:
     """One Runge-Kutta step of all lanes; rates: see `take_step`."""
     x1, x2, stages = lanes.x1, lanes.x2, [lanes.a]
     slopes = [rates(osc, lanes.mode, lanes.t, x1, x2)] if rates else []
@@ -316,7 +316,7 @@ def take_step(
     left = t1 - lanes.t
     going = window.active & (lanes.h > 0) & (left > 0)
     h = jnp.where(going, jnp.minimum(lanes.h, left), 0.0)
-    new = _attempt(osc, window, one, lanes, h, rtol, atol, rates)
+    new = attempt(osc, window, one, lanes, h, rtol, atol, rates)
     path = _interpolate(one, lanes, new)
     at = _landing(window, one, lanes, new, path, rtol)
 

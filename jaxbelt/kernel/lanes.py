@@ -50,14 +50,16 @@ class Lanes(eqx.Module):
 class Passage(eqx.Module):
     """What one call of `events.pass_events` did to the lanes, arrays [lanes].
 
-    landed: the last step ended on a guard or where x2 = 0. fired: it was a guard; `before` and
-    `mode` are the modes on both sides of it, at (t, x1, x2). captured: by a pseudo-focus. rests: at
-    rest up to rounding. stuck: a stick phase followed, of that duration; released: it ended before
-    t1, by slip onset or at an edge; forever: it never ends.
+    landed: the last step ended on a guard or where x2 = 0. fired: it was a guard, the one of that
+    number, see `modes.guard_passed`; `before` and `mode` are the modes on both sides of it, at
+    (t, x1, x2). captured: by a pseudo-focus. rests: at rest up to rounding. stuck: a stick phase
+    followed, of that duration; released: it ended before t1, by slip onset or at an edge; forever:
+    it never ends.
     """
 
     landed: Array
     fired: Array
+    number: Array
     before: Mode
     mode: Mode
     t: Array
@@ -78,6 +80,23 @@ def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
         return jnp.where(condition.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
     return jax.tree.map(pick, on_true, on_false)
+
+
+def code_of(mode: Mode) -> Array:
+    """A mode as one number, whose digits to the base 5 are its contact codes."""
+    total = jnp.zeros(())
+    for i, code in enumerate(mode.codes):
+        total = total + (code + 2) * 5.0**i
+    return total
+
+
+def codes_in(number: Array, belts: int) -> list[Array]:
+    """The contact codes, one for each belt, of which `code_of` made the number."""
+    codes = []
+    for _ in range(belts):
+        codes.append(number % 5 - 2)
+        number = number // 5
+    return codes
 
 
 def materialise(value: Array, one: Array) -> Array:

@@ -1,0 +1,113 @@
+"""Lanes at the start of their runs, and rounds of them that are written down."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..model.modes import Mode, at_focus, mode_acceleration, mode_of_state
+from ..model.oscillator import Oscillator
+from ..results import Status
+from .events import pass_events
+from .lanes import Lanes, code_of
+from .step import STEP_SAFETY, attempt, first_step, take_step, window_of
+
+#: Steps of a round that is written down.
+LOGGED_STEPS = 4
+
+
+def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, *, edges: bool) -> Lanes:
+    """Lanes at the start of their runs, without what an observer adds; edges: see `window_of`."""
+    mode = mode_of_state(osc, x1, x2)
+    finite = jnp.isfinite(x1) & jnp.isfinite(x2)
+    for leaf in jax.tree.leaves(osc):
+        finite = finite & ~jnp.isnan(leaf)
+    rests = at_focus(osc, x1, x2) if edges else jnp.zeros_like(finite)
+    status = jnp.where(rests, Status.PSEUDO_FOCUS.value, Status.OK.value)
+    status = jnp.where(finite, status, Status.NOT_FINITE.value)
+    zero = jnp.zeros_like(x1)
+    return Lanes(
+        run=run,
+        begun=jnp.full_like(run, passes),
+        t=zero,
+        x1=x1,
+        x2=x2,
+        a=mode_acceleration(osc, mode, x1, x2) + zero,
+        h=zero + first_step(rtol),
+        pace=zero + STEP_SAFETY / first_step(rtol),
+        mode=Mode(tuple(code + zero for code in mode.codes)),
+        events=jnp.zeros_like(run),
+        status=status.astype(run.dtype),
+        done=~finite | rests,
+        lower=x2,
+        upper=x2,
+        memory=None,
+    )
+
+
+class Round(eqx.Module):
+    """What happened to the lanes in a round, arrays [.., lanes].
+
+    t, x1, x2: where the lanes stood first, past what ended the step before: fired, whether that was
+    the guard of that number, captured, by a pseudo-focus; mode: the code of the mode from there on,
+    see `code_of`. stuck: they stuck then; released: that ended in time. rests: they are at rest.
+    ts, x1s, x2s: before the first step and after each, steps + 1 arrays; mode_after: theirs.
+    """
+
+    t: Array
+    x1: Array
+    x2: Array
+    fired: Array
+    number: Array
+    captured: Array
+    mode: Array
+    stuck: Array
+    released: Array
+    rests: Array
+    ts: tuple[Array, ...]
+    x1s: tuple[Array, ...]
+    x2s: tuple[Array, ...]
+    mode_after: Array
+
+
+def one_round(osc: Oscillator, lanes: Lanes, one, t1, rtol, atol, *, edges: bool):
+    """The lanes past the events and LOGGED_STEPS steps further, and the `Round`."""
+    lanes, passage = pass_events(osc, lanes, t1, rtol, edges=edges, captures=True)
+    window = window_of(osc, lanes, edges=edges, extrema=None)
+
+    def step(lanes, _):
+        lanes = take_step(osc, window, one, lanes, t1, rtol, atol)
+        return lanes, (lanes.t, lanes.x1, lanes.x2)
+
+    first = lanes.t, lanes.x1, lanes.x2
+    after, rest = lax.scan(step, lanes, length=LOGGED_STEPS)
+    ts, x1s, x2s = ((a, *(b[i] for i in range(LOGGED_STEPS))) for a, b in zip(first, rest))
+    kept = Round(
+        t=passage.t,
+        x1=passage.x1,
+        x2=passage.x2,
+        fired=passage.fired,
+        number=passage.number,
+        captured=passage.captured,
+        mode=code_of(passage.mode),
+        stuck=passage.stuck,
+        released=passage.released,
+        rests=passage.rests,
+        ts=ts,
+        x1s=x1s,
+        x2s=x2s,
+        mode_after=code_of(lanes.mode),
+    )
+    return after, kept
+
+
+def flown_on(osc: Oscillator, one, mode: Mode, x1, x2, h, *, edges: bool) -> tuple[Array, Array]:
+    """The states (x1, x2) one step of size h later, in the field of a slip mode, arrays [lanes]."""
+    run = jnp.zeros(x1.shape, jnp.int32)
+    lanes = lanes_at_start(osc, run, x1, x2, jnp.zeros((), jnp.int32), jnp.ones(()), edges=edges)
+    a = mode_acceleration(osc, mode, x1, x2)
+    lanes = eqx.tree_at(lambda n: (n.mode, n.a), lanes, (mode, a))
+    window = window_of(osc, lanes, edges=edges, extrema=None)
+    new = attempt(osc, window, one, lanes, h, jnp.ones(()), jnp.ones(()), None)
+    return new.x1, new.x2

@@ -1,0 +1,215 @@
+"""Many runs of `simulate` at once, through the lanes of `kernel`.
+
+Runs are done in groups, side by side. A round of a group is some steps of all its lanes, and what
+happens to them on the way is written down, round after round. The arcs of a run, their events and
+its samples are then looked up in these books.
+
+Few runs end in a way that the lanes do not tell to the last, at rest on a guard, say. These are
+followed again, each by itself.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..kernel.lanes import Lanes, codes_in
+from ..kernel.rounds import LOGGED_STEPS, Round, flown_on, lanes_at_start, one_round
+from ..model.events import event_between
+from ..model.modes import Mode
+from ..model.oscillator import Oscillator
+from ..numerics.compiling import one_kernel
+from ..results import Status
+
+#: Lanes of a group, at most, and rounds that one piece of machine code makes.
+LANES_AT_ONCE, PAGE = 128, 8
+#: The tolerance of a lane's steps over that of the run. A run by itself is far more accurate than
+#: its tolerance, and is to be the same in a batch; at order eight a hundred times the accuracy
+#: takes 1.8 times the steps.
+SHARE = 1e-2
+#: Tolerances below this are those of rounding.
+LEAST_TOLERANCE = 1e-13
+
+
+class Batch(NamedTuple):
+    """What all groups of a batch have in common.
+
+    width: lanes of a group; rounds: room for so many; rows: room for the arcs of a run; belts: how
+    many; edges: whether a contact edge may be met.
+    """
+
+    width: int
+    rounds: int
+    rows: int
+    belts: int
+    edges: bool
+
+
+class Group(NamedTuple):
+    """The runs of a group, arrays [.., lanes].
+
+    lanes: at the end; arcs: columns of `runs.ArcRecord` by name, [rows, lanes]; samples: [samples,
+    2, lanes]; alone: runs that have to be followed by themselves.
+    """
+
+    lanes: Lanes
+    arcs: dict[str, Any]
+    samples: Array
+    alone: Array
+
+
+def blank_book(osc, batch: Batch) -> Round:
+    """Room for the rounds of a group, [rounds, ..]; osc: an oscillator of the lanes."""
+    one = jnp.ones(batch.width)
+
+    def kept(osc):
+        lanes = _begun(osc, (one, one), one[0], batch)
+        return one_round(osc, lanes, one, one, one[0], one[0], edges=batch.edges)[1]
+
+    shapes = jax.eval_shape(kept, osc)
+    return jax.tree.map(lambda s: jnp.zeros((batch.rounds, *s.shape), s.dtype), shapes)
+
+
+def _begun(osc, y0, rtol, batch: Batch) -> Lanes:
+    run = jnp.zeros(batch.width, jnp.int32)
+    return lanes_at_start(osc, run, *y0, jnp.zeros((), jnp.int32), rtol, edges=batch.edges)
+
+
+def followed_together(
+    osc: Oscillator, y0, span, ts, rtol, atol, batch: Batch, book: Round
+) -> tuple[Group, Round]:
+    """The runs of a group, and its book, in place of an older one.
+
+    osc: leaves are scalars or [lanes]; y0: (x1, x2), [lanes] each; span: t1 - t0, [lanes]; ts:
+    times since t0, [samples, lanes].
+    """
+    one = jnp.ones(batch.width)
+    tolerances = [jnp.maximum(SHARE * tol, LEAST_TOLERANCE) for tol in (rtol, atol)]
+    lanes = _begun(osc, y0, tolerances[0], batch)
+    lanes, book, used = _written(osc, lanes, one, span, tolerances, batch, book)
+    inside = (jnp.arange(batch.rounds) < used)[:, None]
+    arcs, fits = _arcs(book, inside, batch)
+    samples = _samples(osc, book, inside, one, ts, batch)
+    begins_nowhere = lanes.status == Status.NOT_FINITE.value
+    known = lanes.done & fits & ~jnp.any(book.rests & inside, axis=0) & ~_is_lost(lanes)
+    return Group(lanes, arcs, samples, ~known & ~begins_nowhere), book
+
+
+def _is_lost(lanes: Lanes) -> Array:
+    return ~(jnp.isfinite(lanes.x1) & jnp.isfinite(lanes.x2) & jnp.isfinite(lanes.a))
+
+
+def _written(osc, lanes, one, span, tolerances, batch: Batch, book) -> tuple[Lanes, Round, Array]:
+    """Rounds until the lanes are done, or there is no more room: the lanes at the end, the book,
+    and how many rounds there were."""
+
+    @one_kernel
+    def page(osc, lanes, one, span, rtol, atol):
+        def advance(lanes, _):
+            return one_round(osc, lanes, one, span, rtol, atol, edges=batch.edges)
+
+        return lax.scan(advance, lanes, length=PAGE)
+
+    def unfinished(state):
+        lanes, _, number = state
+        return jnp.any(~lanes.done & ~_is_lost(lanes)) & (number < batch.rounds)
+
+    def turn(state):
+        lanes, book, number = state
+        lanes, new = page(osc, lanes, one, span, *tolerances)
+        put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=number, axis=0)
+        return lanes, jax.tree.map(put, book, new), number + PAGE
+
+    return lax.while_loop(unfinished, turn, (lanes, book, jnp.asarray(0)))
+
+
+def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Array]:
+    """The arcs of the lanes, and whether there was room for them.
+
+    In each round there may be two: the phase in which a lane sticks, and its steps.
+    """
+    # What ended the steps is written in the round after.
+    next_inside = jnp.append(inside[1:], inside[:1] & False, axis=0)
+    fires = jnp.roll(book.fired, -1, axis=0) & next_inside
+    first, last = book.ts[0], book.ts[-1]
+    slips = inside & ((last > first) | fires)
+    exists = jnp.stack([book.stuck & inside, slips], axis=1).reshape(-1, batch.width)
+    count = jnp.cumsum(exists, axis=0)
+    wanted, total = jnp.arange(1, batch.rows + 1), count[-1]
+    there = wanted[:, None] <= total[None]
+    places = jnp.where(there, _searched(count, wanted[:, None], "left"), 0)
+    row, is_slip = places // 2, places % 2 == 1
+    after = jnp.minimum(row + 1, batch.rounds - 1)
+
+    def at(column, row=row):
+        return jnp.take_along_axis(column, row, axis=0)
+
+    def either(slip, stick):
+        return jnp.where(is_slip, slip, stick)
+
+    fires, leaves = is_slip & at(fires), ~is_slip & at(book.released)
+    happens = fires | leaves
+    codes = codes_in(either(at(book.mode_after), at(book.mode)), batch.belts)
+    next_codes = codes_in(either(at(book.mode, after), at(book.mode_after)), batch.belts)
+    kind, belt = event_between(tuple(codes), tuple(next_codes))
+    t, t_end = either(at(first), at(book.t)), either(at(last), at(first))
+    x2_end = either(at(book.x2s[-1]), at(book.x2s[0]))
+    arcs = dict(
+        t=t,
+        y=(either(at(book.x1s[0]), at(book.x1)), either(at(book.x2s[0]), at(book.x2))),
+        mode=codes,
+        duration=t_end - t,
+        kind=jnp.where(happens, kind, 0),
+        belt=jnp.where(happens, belt, 0),
+        event_t=t_end,
+        event_y=(
+            either(at(book.x1s[-1]), at(book.x1s[0])),
+            jnp.where(fires, at(book.x2, after), x2_end),
+        ),
+        fired=jnp.where(fires, at(book.number, after), -1),
+        in_time=(wanted[:, None] == total[None]) & ~happens,
+        captured=fires & at(book.captured, after),
+        used=there,
+    )
+    return arcs, (total > 0) & (total <= batch.rows)
+
+
+def _searched(columns: Array, values: Array, side: str) -> Array:
+    """`searchsorted` in each of the columns [.., lanes], for values [.., lanes or 1]."""
+    find = functools.partial(jnp.searchsorted, side=side, method="scan_unrolled")
+    values = jnp.broadcast_to(values, (values.shape[0], columns.shape[1]))
+    return jax.vmap(find, (1, 1), 1)(columns, values)
+
+
+def _samples(osc, book: Round, inside: Array, one, ts, batch: Batch) -> Array:
+    """The states of the lanes at some times, each from the step that it lies in."""
+
+    def rows(*columns):
+        return jnp.stack(columns, axis=1).reshape(-1, batch.width)
+
+    begins, ends = rows(book.t, *book.ts[:-1]), rows(*book.ts)
+    known = jnp.repeat(inside, LOGGED_STEPS + 1, axis=0)
+    places = jnp.maximum(_searched(jnp.where(known, begins, jnp.inf), ts, "right") - 1, 0)
+    row, is_first = places // (LOGGED_STEPS + 1), places % (LOGGED_STEPS + 1) == 0
+
+    def at(column, places=places):
+        return jnp.take_along_axis(column, places, axis=0)
+
+    x1, x2 = at(rows(book.x1, *book.x1s[:-1])), at(rows(book.x2, *book.x2s[:-1]))
+    begin_t = at(begins)
+    since = jnp.clip(ts - begin_t, 0.0, at(ends) - begin_t)
+    mode = at(book.mode_after, row)
+
+    @one_kernel
+    def sample(osc, one, x1, x2, since, mode, is_first):
+        slip = Mode(tuple(jnp.where(is_first, 1.0, c) for c in codes_in(mode, batch.belts)))
+        flown = flown_on(osc, one, slip, x1, x2, since, edges=batch.edges)
+        # In the first place a lane is stuck.
+        carried = x1 + x2 * since, x2
+        return tuple(jnp.where(is_first, a, b) for a, b in zip(carried, flown, strict=True))
+
+    each = x1, x2, since, mode, is_first
+    return lax.map(lambda row: jnp.stack(sample(osc, one, *row)), each)
