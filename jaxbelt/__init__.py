@@ -17,7 +17,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         lanes step events marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
-    bifurcations/   refine path scan curves diagrams switch_folds
+    bifurcations/   path scan refine curves diagrams switch_folds
     inverse/        selection record fit design
     plotting/       style phase diagrams sweeps model draw
     paper           the paper's table and figures
