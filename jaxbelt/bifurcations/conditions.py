@@ -211,9 +211,17 @@ class AbstractCondition(eqx.Module):
         system, x, status = self.prepared(osc, guess)
 
         def attempt(family, unknowns):
-            return self.solved(family, system, *unknowns, status)
+            x, p = unknowns
+            return self.solved(family, system, x, p, status)
 
-        return variation.settle(attempt, (x, value))
+        point, settled = variation.settle(attempt, (x, value))
+        if settled is True:
+            return point
+        fails = (point.status == Status.OK) & ~jnp.asarray(settled)
+        numbers = ("value", "residual", "error", "multiplier")
+        known = {name: jnp.where(fails, jnp.nan, getattr(point, name)) for name in numbers}
+        status = jnp.where(fails, Status.NO_CONVERGENCE.value, point.status)
+        return replace(point, **known, status=status)
 
     def point(
         self, variation: Variation, osc: Oscillator, value: Any, size: int

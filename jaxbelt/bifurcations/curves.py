@@ -154,10 +154,12 @@ def bifurcation_curve(
     variation = _varied_by_two(point.oscillator, where, near, limits)
     start = variation.values_of(point.oscillator, limits, near)
     if start is None:
-        told = f"that of the point, within {limits.tolist()}"
-        require(False, "where", f"a function that gives every oscillator near {told}", "none there")
+        raise ValueError(
+            "where must be a function that gives the oscillator of the point, got one that does so "
+            f"at no values near those of the span {limits.tolist()}"
+        )
     inside = np.all((limits[:, 0] <= start) & (start <= limits[:, 1]))
-    require(inside, "span", f"around the point {np.asarray(start).tolist()}", limits.tolist())
+    require(inside, "span", f"around the point {start.tolist()}", limits.tolist())
     return follow_point(variation, point, start, limits, step=step, max_points=max_points)
 
 
@@ -165,7 +167,8 @@ def _varied_by_two(osc: Oscillator, where: Any, at: Any, limits: np.ndarray) -> 
     """What is varied: two leaves of the oscillator, or what a function of two numbers gives."""
     if callable(where):
         values = tuple(np.mean(limits, axis=1).tolist() if at is None else at.tolist())
-        return Variation.of_function(where, values, "where")
+        make: Any = where
+        return Variation.of_function(make, values, "where")
     two = isinstance(where, tuple | list) and len(where) == 2
     require(two, "where", "two functions, or one of both parameters", repr(where))
     require(at is None, "at", "left out where `where` selects the parameters", repr(at))
@@ -443,9 +446,7 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np
 def _limit(problem: _Problem, track: "_Track", rows: list[_Row], u, end: Stop):
     """What the curve ends in where there is no such motion, if that is near its point u."""
     values = np.array([row.values for row in rows[-3:]])
-    trail = Trail(
-        problem.variation, problem.step, values, track.system, track.unknowns(u), end
-    )
+    trail = Trail(problem.variation, problem.step, values, track.system, track.unknowns(u), end)
     return problem.condition.limit(trail)
 
 
@@ -500,7 +501,8 @@ class _Track(NamedTuple):
             solved = corrected(_curve_linearized, args, unknowns[0], normal, ahead)
             return solved, (solved.u, solved.u[-2:])
 
-        return self.variation.settle(attempt, (start, (start + length * normal)[-2:]))
+        solved, settled = self.variation.settle(attempt, (start, (start + length * normal)[-2:]))
+        return solved._replace(found=solved.found & settled)
 
     def unknowns(self, u: np.ndarray) -> np.ndarray:
         """Those of the system."""
@@ -533,9 +535,7 @@ class _Track(NamedTuple):
         return solved.tangent
 
 
-def _curve_linearized(
-    u: Array, args: tuple[Family, AbstractSystem, Array]
-) -> tuple[Array, Array]:
+def _curve_linearized(u: Array, args: tuple[Family, AbstractSystem, Array]) -> tuple[Array, Array]:
     family, system, weights = args
     value, matrix = system.linearized(family.at, system.shaped(u[:-2] / weights), u[-2:])
     return value, matrix.at[:, :-2].divide(weights[None])

@@ -84,8 +84,8 @@ class BifurcationDiagram(eqx.Module):
 
     points: the special points in order, as from `scan`, and those at which an unstable cycle
     touches a contact edge; branches: of equilibria, then of cycles; regions: (first, last, name) of
-    every stretch between points of `scan`, see `region_name`; oscillator: the one that was given, of
-    a function that at the first value; name: of the parameter, as the path to it, or that of the
+    every stretch between points of `scan`, see `region_name`; oscillator: the one that was given,
+    of a function that at the first value; name: of the parameter, as the path to it, or that of the
     function's argument. `plot()` draws it.
     """
 

@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
 from ..checks import as_array, check_finite, require
 from ..cycles.attractors import (
     SOLVED,

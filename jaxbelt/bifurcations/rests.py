@@ -145,9 +145,10 @@ def hopf_limit(kind: str, trail: Trail, vanishes: Callable, *args: Array) -> Spe
         found, residual = _special_hopf(family, codes, start, vanishes, *args)
         return (found, residual), (found[:1], found[1:])
 
-    found, residual = trail.variation.settle(attempt, (x1[:1], trail.values[-1]))
+    (found, residual), settled = trail.variation.settle(attempt, (x1[:1], trail.values[-1]))
     values = np.asarray(found[1:])
-    if not (residual < HOLDS and np.linalg.norm(values - trail.values[-1]) < 2 * trail.step):
+    near = np.linalg.norm(values - trail.values[-1]) < 2 * trail.step
+    if not (settled and residual < HOLDS and near):
         return None
     return SpecialPoint(kind, (), (float(values[0]), float(values[1])), float(residual))
 

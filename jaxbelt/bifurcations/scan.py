@@ -77,8 +77,13 @@ def scan(
     return search(ParameterPath(osc, where, span, conditions), resolution)
 
 
-def search(path: ParameterPath, resolution: int = 96) -> tuple[BifurcationPoint, ...]:
-    """Every bifurcation point on a path, in order; its labels are kept with it."""
+def search(
+    path: ParameterPath, resolution: int = 96, near: float = NEAR
+) -> tuple[BifurcationPoint, ...]:
+    """Every bifurcation point on a path, in order; its labels are kept with it.
+
+    near: from the ends of intervals narrower than this fraction of it points are solved for.
+    """
     points = [point for at in path.breaks for point in _at_break(path, at)]
     ends = [path.first, *(v for at in path.breaks for v in path.beside(at)), path.last]
     width = (path.last - path.first) / resolution
@@ -92,7 +97,7 @@ def search(path: ParameterPath, resolution: int = 96) -> tuple[BifurcationPoint,
         values: list[float] = []
         for a, b in intervals:
             is_narrow = b - a <= NEAR * path.length
-            point = _explained(path, a, b) if is_narrow else None
+            point = _explained(path, a, b) if b - a <= near * path.length else None
             if point is not None:
                 # The interval on the other side of a fold may have led to it already.
                 if not any(_is_same_point(point, other) for other in points):

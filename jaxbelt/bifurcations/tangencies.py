@@ -169,8 +169,8 @@ class AbstractTangency(AbstractCycleCondition):
             return (p, residual), (p,)
 
         still = trail.variation.held(held, stopping.value)
-        (value,), residual = still.settle(attempt, (np.array([guess]),))
-        if not (residual < HOLDS and abs(value - guess) < 3 * trail.step):
+        ((value,), residual), settled = still.settle(attempt, (np.array([guess]),))
+        if not (settled and residual < HOLDS and abs(value - guess) < 3 * trail.step):
             return None
         values = (float(value), stopping.value) if held else (stopping.value, float(value))
         return SpecialPoint("BeltAtRest", (stopping.belt,), values, float(residual))

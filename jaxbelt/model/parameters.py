@@ -8,10 +8,10 @@ parameter and every function. Where a function is not linear, what was solved fo
 is tangent to it at a guess is solved for again in the one that is tangent at the solution, until
 both are one oscillator there (`Variation.settle`). That is Newton's method once more.
 
-`where` selects leaves by their place. Two parameters may have one value, and two belts may share one friction law; what tells parameters
-apart is their place among the leaves of the oscillator, as JAX counts them. So `where` is asked on
-a copy of the oscillator whose leaves are nothing but themselves: whatever comes back is one of
-them, or it is not a parameter.
+`where` selects leaves by their place. Two parameters may have one value, and two belts may share
+one friction law; what tells parameters apart is their place among the leaves of the oscillator, as
+JAX counts them. So `where` is asked on a copy of the oscillator whose leaves are nothing but
+themselves: whatever comes back is one of them, or it is not a parameter.
 """
 
 import inspect
@@ -141,27 +141,12 @@ def _told(chosen: Any) -> str:
     return f"a whole {type(chosen).__name__}" if isinstance(chosen, eqx.Module) else repr(chosen)
 
 
-def vary(osc: Oscillator, index: int | Array, p: Array) -> Oscillator:
-    """The oscillator with the parameters of these numbers, one or [k], replaced by p, [k].
-
-    Where the numbers are arrays, one program serves all parameters.
-    """
+def vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
+    """The oscillator with the parameter of that number replaced by p, [1]."""
     leaves, structure = jax.tree.flatten(osc)
-    numbers = [index] if isinstance(index, int) or index.ndim == 0 else index
-    known = is_concrete((osc, index, p))
     # What is known is taken apart in NumPy, which compiles nothing.
-    for which, value in zip(numbers, np.asarray(p) if known else p, strict=True):
-        if known or isinstance(index, int):
-            leaves[int(which)] = jnp.asarray(value)
-        else:
-            leaves = [jnp.where(which == i, value, leaf) for i, leaf in enumerate(leaves)]
+    leaves[index] = jnp.asarray(np.asarray(p)[0]) if is_concrete(p) else p[0]
     return jax.tree.unflatten(structure, leaves)
-
-
-def parameter(osc: Oscillator, index: int | Array) -> Array:
-    """The parameter of that number."""
-    leaves = jax.tree.leaves(osc)
-    return leaves[int(index)] if is_concrete(index) else jnp.stack(leaves)[index]
 
 
 # --- oscillators by a parameter -------------------------------------------------------------------
@@ -189,7 +174,9 @@ class Family(eqx.Module):
             if slope is None or (is_concrete(slope) and not np.any(slope)):
                 continue
             # An edge may be infinite, and a parameter NaN: that moves what depends on it only.
-            moves = [one.where(row == 0, 0.0, row * by) for row, by in zip(slope, shift, strict=True)]
+            moves = [
+                one.where(row == 0, 0.0, row * by) for row, by in zip(slope, shift, strict=True)
+            ]
             leaves[place] = jnp.asarray(sum(moves, start=one.asarray(leaf)))
         return jax.tree.unflatten(structure, leaves)
 
@@ -197,6 +184,16 @@ class Family(eqx.Module):
         """Those of the velocities of the belts, [k] each."""
         slopes = jax.tree.unflatten(jax.tree.structure(self.oscillator), self.slopes)
         return [belt.velocity for belt in slopes.belts]
+
+    def zeros(self, which: tuple[int, ...]) -> list[float]:
+        """The value of the one parameter at which a belt is at rest, or two run at one velocity;
+        none where that does not change."""
+        at = [*(float(self.oscillator.belts[belt].velocity) for belt in which), 0.0]
+        slopes = self.velocity_slopes()
+        along = [*(float(slopes[belt][0]) for belt in which), 0.0]
+        if along[0] == along[1]:
+            return []
+        return [float(self.origin[0]) + (at[1] - at[0]) / (along[0] - along[1])]
 
 
 @dataclass(frozen=True)
@@ -235,8 +232,8 @@ class Variation:
     ) -> "Variation":
         """The oscillators that a function gives, `values` being some that are possible.
 
-        `ValueError`, naming `argument`, for a function of other arguments or results, for one that JAX
-        cannot differentiate, and where an argument makes no difference.
+        `ValueError`, naming `argument`, for a function of other arguments or results, for one that
+        JAX cannot differentiate, and where an argument makes no difference.
         """
         words = ("", "one number", "two numbers")[len(values)]
         expected = f"a function of {words} that returns an Oscillator"
@@ -266,8 +263,8 @@ class Variation:
         except (TypeError, jax.errors.JAXTypeError) as error:
             came = str(error).partition("\n")[0]
             raise ValueError(
-                f"{argument} must be {expected}, made of what JAX can differentiate (jnp.sqrt, say, "
-                f"not math.sqrt), got {type(error).__name__}: {came}"
+                f"{argument} must be {expected}, made of what JAX can differentiate (jnp.sqrt, "
+                f"say, not math.sqrt), got {type(error).__name__}: {came}"
             ) from error
         return found
 
@@ -318,7 +315,8 @@ class Variation:
 
     def oscillators(self, rows: np.ndarray) -> Oscillator:
         """Those at many values, [rows, k], as one with a row in each leaf."""
-        make = self.make if self.line is None else lambda *p: self.line.at(jnp.stack(p))
+        line = self.line
+        make = self.make if line is None else lambda *p: line.at(jnp.stack(p))
         return eqx.filter_vmap(make)(*(jnp.asarray(column) for column in rows.T))
 
     def coincidences(self, first: float, last: float) -> dict[float, list[tuple[int, ...]]]:
@@ -326,9 +324,12 @@ class Variation:
         numbers each, and then where a belt comes to rest, its number; all of them with a load."""
         found: dict[float, list[tuple[int, ...]]] = {}
         belts = range(len(self.oscillator(np.array([first])).belts))
-        zeros = self._zeros_on_line if self.line is not None else self._zeros_between
         for which in [*combinations(belts, 2), *((belt,) for belt in belts)]:
-            for value in zeros(which, first, last):
+            line = self.line
+            zeros = self._zeros(which, first, last) if line is None else line.zeros(which)
+            for value in zeros:
+                if not first <= value <= last:
+                    continue
                 osc = self.oscillator(np.array([value]))
                 if not all(float(osc.belts[belt].load) for belt in which):
                     continue
@@ -336,17 +337,8 @@ class Variation:
                 found.setdefault(next(near, value), []).append(which)
         return found
 
-    def _zeros_on_line(self, which, first, last):
-        family = self.line
-        slopes, osc = family.velocity_slopes(), family.oscillator
-        at = [float(osc.belts[belt].velocity) for belt in which] + [0.0]
-        along = [float(slopes[belt][0]) for belt in which] + [0.0]
-        if along[0] == along[1]:
-            return []
-        value = float(family.origin[0]) + (at[1] - at[0]) / (along[0] - along[1])
-        return [value] if first <= value <= last else []
-
-    def _zeros_between(self, which, first, last):
+    def _zeros(self, which: tuple[int, ...], first: float, last: float) -> list[float]:
+        """As `Family.zeros`, between two values."""
         from scipy.optimize import brentq, minimize_scalar  # late, as only functions need them
 
         def difference(osc):
@@ -362,7 +354,8 @@ class Variation:
             return []
         zeros = rows[v == 0].tolist()
         for k in np.flatnonzero(v[:-1] * v[1:] < 0):
-            zeros.append(float(brentq(at, rows[k], rows[k + 1], xtol=ROUNDING)))
+            root: Any = brentq(at, rows[k], rows[k + 1], xtol=ROUNDING)
+            zeros.append(float(root))
         size = np.abs(v)
         # Where it comes to zero and turns back.
         inner = (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:]) & (v[:-2] * v[2:] > 0)
@@ -408,14 +401,16 @@ class Variation:
                 break
         return value
 
-    def settle(self, attempt: Callable[[Family, Any], tuple[Any, Any]], unknowns: Any) -> Any:
-        """What an attempt finds in the family that is tangent where it ends.
+    def settle(
+        self, attempt: Callable[[Family, Any], tuple[Any, Any]], unknowns: Any
+    ) -> tuple[Any, Any]:
+        """What an attempt finds in the family that is tangent where it ends, and whether it is.
 
         attempt: of a family and the unknowns to begin from, the last ones of which are the
-        parameters, [k]; gives what it found and the unknowns there. Returns the first.
+        parameters, [k]; gives what it found and the unknowns there.
         """
         if self.line is not None:
-            return attempt(self.line, unknowns)[0]
+            return attempt(self.line, unknowns)[0], True
         family, found = self.family(unknowns[-1]), None
         if not is_outermost(family, unknowns):
 
@@ -424,7 +419,9 @@ class Variation:
                 return lax.stop_gradient(attempt(fixed, unknowns)[1]), None
 
             unknowns, _ = lax.scan(again, unknowns, length=TRACED_PASSES - 1)
-            return attempt(self.family(unknowns[-1]), unknowns)[0]
+            family = self.family(unknowns[-1])
+            found, (*_, p) = attempt(family, unknowns)
+            return found, _agree(*lax.stop_gradient((family.at(p), self.oscillator(p))))
         for _ in range(PASSES):
             found, unknowns = attempt(family, unknowns)
             values = np.asarray(unknowns[-1])
@@ -432,8 +429,8 @@ class Variation:
                 break
             before, family = family, self.family(values)
             if _agree(before.at(values), family.oscillator):
-                break
-        return found
+                return found, True
+        return found, False
 
     def values_of(self, osc: Oscillator, span: np.ndarray, start: Any = None) -> np.ndarray | None:
         """Where an oscillator lies among those of the variation, [k]; None where it is none.
@@ -454,7 +451,7 @@ class Variation:
         if self.line is not None:
             guesses = [self.line.origin]
         elif start is None:
-            inner = [np.linspace(*ends, GUESSES + 2)[1:-1] for ends in span]
+            inner = [np.linspace(a, b, GUESSES + 2)[1:-1] for a, b in span]
             guesses = [np.array(one) for one in product(*inner)]
         values = min(guesses, key=lambda one: np.nan_to_num(np.sum(misses(one) ** 2), nan=np.inf))
         for _ in range(PASSES):
@@ -480,7 +477,8 @@ def varied(osc: Any, where: Any, values: Sequence[Any]) -> Variation:
     if callable(osc) and not isinstance(osc, Oscillator):
         alone = "left out where osc is a function of the parameter"
         require(where is None, "where", alone, repr(where))
-        return Variation.of_function(osc, values)
+        make: Any = osc
+        return Variation.of_function(make, values)
     check_oscillator(osc)
     return Variation.of_leaves(osc, [leaf_index(osc, where)])
 
@@ -506,8 +504,13 @@ def _numbers(osc: Oscillator) -> np.ndarray:
     return np.concatenate(leaves)
 
 
-def _agree(osc: Oscillator, other: Oscillator) -> bool:
+def _agree(osc: Oscillator, other: Oscillator) -> Any:
     """Whether two oscillators are the same but for rounding."""
-    a, b = _numbers(osc), _numbers(other)
+    one: Any = np if is_concrete((osc, other)) else jnp
+    agree: Any = True
     with np.errstate(invalid="ignore"):
-        return bool(np.all((a == b) | (np.abs(a - b) <= ROUNDING * (1 + np.abs(b)))))
+        for a, b in zip(*map(jax.tree.leaves, (osc, other)), strict=True):
+            if _is_real(a):
+                a, b = one.asarray(a), one.asarray(b)
+                agree &= one.all((a == b) | (one.abs(a - b) <= ROUNDING * (1 + one.abs(b))))
+    return agree

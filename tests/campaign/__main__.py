@@ -1,4 +1,5 @@
-"""Campaigns: `python -m tests.campaign final|simulate|derivatives|attractors|grazing|paths|refine`."""
+"""Campaigns: `python -m tests.campaign WHAT`, WHAT being final, simulate, derivatives, attractors,
+grazing, paths or refine."""
 
 import argparse
 import functools

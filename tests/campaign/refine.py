@@ -44,6 +44,7 @@ def run(seed: int, calls: int, *, first: int = 0, out=print) -> int:
                 if verdict not in GOOD:
                     out(f"path {number} {case.parameter} from {guess!r}: {verdict} {found!r}")
                     out(f"    {point!r}\n    {case.oscillator!r}")
+        out(f"path {number}: {len(known)} points, {sum(told.values())} calls")
         number += 1
     for (verdict, away), count in sorted(told.items()):
         out(f"{verdict} from {away:g}: {count}")
