@@ -10,7 +10,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     numerics/       compiling
     checks          arguments, checked at the public edge
     numerics/       derivatives extrapolation newton continuation roots
-    model/          friction oscillator parameters modes events equilibria
+    model/          friction oscillator parameters variations modes events equilibria
     presets         the published systems
     motion/         integrators arcs sensitivities runs sampling smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals

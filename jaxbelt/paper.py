@@ -25,7 +25,7 @@ from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, unstable_cycle
 from .model.equilibria import Equilibria, equilibria
 from .model.oscillator import Belt, Oscillator
-from .model.parameters import varied
+from .model.variations import varied
 from .motion.simulate import Trajectory, simulate
 from .plotting.diagrams import draw_region_map, plot_diagram
 from .plotting.model import draw_mechanical_model, plot_convergence, plot_friction_law

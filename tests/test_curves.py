@@ -10,7 +10,8 @@ from scipy.optimize import brentq
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.tangencies import _departure
-from jaxbelt.model.parameters import Variation, leaf_index
+from jaxbelt.model.parameters import leaf_index
+from jaxbelt.model.variations import Variation
 from jaxbelt.numerics.continuation import Stop
 
 

@@ -13,7 +13,8 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.model.parameters import Variation, leaf_index, vary
+from jaxbelt.model.parameters import leaf_index, vary
+from jaxbelt.model.variations import Variation
 
 #: Where the fixed point of class (a) changes its stability, eq. (28) of the paper.
 HOPF = (np.sqrt(8) - 1) / 10
@@ -60,6 +61,15 @@ def test_a_function_that_is_not_linear_has_a_tangent():
     assert error(at) == 0 and 1e-10 < error(at + step) < 5e-10
     held = made.held(0, 0.3)
     assert held.names == ("q",) and nu0(held.oscillator([0.7])) == pytest.approx(0.21, rel=1e-15)
+
+
+def test_arguments_that_are_left():
+    left = functools.partial(jb.presets.class_c, nu1=0.3)
+    made = Variation.of_function(left, (0.1, 0.2))
+    assert made.names == ("nu0", "sigma")
+    assert made.oscillator(np.array([0.1, 0.2])).belts[1].lower == 0.2
+    made = Variation.of_function(lambda *p: jb.presets.class_b(*p), (0.1, 0.2))
+    assert made.names == ("p", "q")
 
 
 def test_where_an_oscillator_lies():

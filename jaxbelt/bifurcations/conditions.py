@@ -37,7 +37,7 @@ from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import SIZES, Chain, Loop, cut, meshed
 from ..model.equilibria import candidates
 from ..model.oscillator import Oscillator
-from ..model.parameters import Family, Variation
+from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.continuation import Stop

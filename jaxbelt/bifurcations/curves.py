@@ -19,7 +19,8 @@ from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, check_finite, require
 from ..model.oscillator import Oscillator
-from ..model.parameters import Family, Variation, leaf_index
+from ..model.parameters import leaf_index
+from ..model.variations import Family, Variation
 from ..numerics.compiling import jit
 from ..numerics.continuation import Corrected, CurvePoint, Stop, continue_curve, corrected
 from ..results import Status, draw

@@ -32,7 +32,7 @@ from ..cycles.cycle import Cycle, find_cycle, polish, unstable_cycle
 from ..cycles.shooting import Loop, cut
 from ..model.equilibria import EquilibriumKind, candidates, equilibria
 from ..model.oscillator import Oscillator
-from ..model.parameters import Variation
+from ..model.variations import Variation
 from ..numerics.compiling import jit
 from ..results import Status, draw
 from ..sweeps.datasets import decoded

@@ -35,7 +35,7 @@ from ..cycles.settling import AT_REST
 from ..cycles.shooting import SIZES, Loop, cut
 from ..model.equilibria import equilibria
 from ..model.oscillator import Oscillator
-from ..model.parameters import varied
+from ..model.variations import varied
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .conditions import AbstractCondition

@@ -13,16 +13,17 @@ import numpy as np
 
 from ..checks import as_array, check_finite, is_concrete, require
 from ..model.oscillator import Oscillator, check_oscillator
-from ..model.parameters import Variation, leaf_index, varied
+from ..model.parameters import leaf_index
+from ..model.variations import Variation, varied
 from ..numerics.compiling import is_outermost
 from ..results import Status
 from .conditions import AbstractCondition, BifurcationPoint
 from .path import ParameterPath
 from .scan import search
 
-#: Where Newton's method ends so near to the guess, there is no look for a nearer point; nor where it
-#: ends so near, if its first step was no longer than that. Of a thousand guesses two led farther
-#: than to the next point, by 0.018 and 0.029, their first steps 0.4 and 0.5 long.
+#: Where Newton's method ends so near to the guess, there is no look for a nearer point; nor where
+#: it ends so near, if its first step was no longer than that. Of a thousand guesses two led beyond
+#: the next point, to others 0.018 and 0.029 away; their first steps were 0.4 and 0.5 long.
 NEAR_GUESS, QUITE_NEAR, SHORT_STEP = 0.015, 0.05, 0.25
 #: How far to both sides of the guess points are looked for where it fails, one after the other, and
 #: in how many intervals first.

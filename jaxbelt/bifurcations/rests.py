@@ -43,7 +43,8 @@ from ..model.modes import (
     select,
 )
 from ..model.oscillator import Oscillator
-from ..model.parameters import Family, Variation, leaf_index
+from ..model.parameters import leaf_index
+from ..model.variations import Family, Variation
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status

@@ -24,7 +24,7 @@ from ..cycles.attractors import extent
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import Chain, Loop, jacobian, meshed, residual, residual_and_blocks
 from ..model.oscillator import Oscillator
-from ..model.parameters import Family
+from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.newton import HOLDS, Equations, newton, solve
 from ..results import Status

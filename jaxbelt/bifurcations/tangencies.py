@@ -27,7 +27,7 @@ from ..cycles.orbits import Orbit, follow, last_loop, loop_of
 from ..cycles.shooting import SIZES, Chain, Loop, admissible, meshed, trace_of
 from ..model.modes import STUCK, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
-from ..model.parameters import Family
+from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS, newton
