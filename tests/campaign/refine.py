@@ -3,7 +3,7 @@
 Along random paths, those of the campaign `paths`, `scan` finds points. From either side of each, at
 several distances, `refine` is asked for its condition, as a user would. It is right where it gives
 the point, or another one of that kind that is no farther from the guess: one between the two, or
-one that is nearer on the other side of the guess. Whether such a one is there `scan` has to say,
+one that is nearer on the other side of the guess. Whether something happens there `scan` has to say,
 too, on a short path across it.
 """
 
@@ -70,10 +70,9 @@ def _verdict(case: paths.Case, point, guess: float, found) -> str:
         return "found"
     if abs(value - guess) > abs(at - guess):
         return "wrong"
-    # `scan` has to know it, too.
+    # `scan` has to know it, too; by another name, where two things happen at once.
     osc, ends = package.oscillator(case.at(guess)), (value - 2e-3, value + 1.9e-3)
     beside = jb.scan(osc, case.where, ends, resolution=16)
-    same = any(p.condition == found.condition and abs(p.value - value) < SAME for p in beside)
-    if not same:
+    if not any(p.status == Status.OK and abs(p.value - value) < SAME for p in beside):
         return "wrong"
     return "between" if (value - guess) * (at - guess) > 0 else "nearer"
