@@ -63,10 +63,10 @@ def refine(
     variation, near, value = _begun(osc, where, at)
     condition.check(near)
     point = condition.point(variation, near, value, max_arcs or condition.room)
-    return _nearest(point, variation, value) if is_outermost(near, value, point) else point
+    return _bracketed(point, variation, value) if is_outermost(near, value, point) else point
 
 
-def _nearest(point: BifurcationPoint, variation: Variation, value: Any) -> BifurcationPoint:
+def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> BifurcationPoint:
     """The point, or one of its kind that is nearer to the guess, from what `scan` does there."""
     condition, guess = point.condition, float(value[0])
     away = abs(float(point.value) - guess) if int(point.status) == Status.OK else np.inf

@@ -34,7 +34,7 @@ SAME_NUMBER = 1e-9
 #: 1e-2, 1e-4, 1e-8, 1e-16. Inside of a trace, where nobody looks, it is done so often in any case.
 PASSES, TRACED_PASSES = 12, 5
 #: Values between which zeros of velocities are looked for, and how near two are taken for one.
-SAMPLES, MERGED = 257, 1e-7
+VALUES_SEEN, MERGED = 257, 1e-7
 #: Guesses along each side of a plane for where an oscillator lies in it.
 GUESSES = 9
 
@@ -235,7 +235,7 @@ class Variation:
         def at(value):
             return float(difference(self.oscillator(np.array([value]))))
 
-        rows = np.linspace(first, last, SAMPLES)
+        rows = np.linspace(first, last, VALUES_SEEN)
         v = difference(self.oscillators(rows[:, None]))
         if np.all(v == v[0]):
             return []

@@ -3,8 +3,8 @@
 Along random paths, those of the campaign `paths`, `scan` finds points. From either side of each, at
 several distances, `refine` is asked for its condition, as a user would. It is right where it gives
 the point, or another one of that kind that is no farther from the guess: one between the two, or
-one that is nearer on the other side of the guess. Whether something happens there `scan` has to say,
-too, on a short path across it.
+one that is nearer on the other side of the guess. Whether something happens there `scan` has to
+say, too, on a short path across it.
 """
 
 import time
