@@ -357,6 +357,9 @@ def _between(problem: _Problem, track: "_Track", before, after) -> list[SpecialP
             return _Probe(part, value, at.u[-2:], max(seen.residual, abs(value)))
 
         try:
+            # Beside a singular point what is solved for anew at an end may be on the other side.
+            if probe(0.0).test * probe(1.0).test > 0:
+                raise _SingularError
             root: Any = brentq(lambda part, probe=probe: probe(part).test, 0.0, 1.0, xtol=1e-14)
             special = probe(root)
         except _SingularError:
