@@ -69,21 +69,28 @@ def refine(
 def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> BifurcationPoint:
     """The point, or one of its kind that is nearer to the guess, from what `scan` does there."""
     condition, guess = point.condition, float(value[0])
-    away = abs(float(point.value) - guess) if int(point.status) == Status.OK else np.inf
+    away = _away(point, guess)
     near = QUITE_NEAR if point.steps[0] <= SHORT_STEP else NEAR_GUESS
     if away <= (REACHES[0] if condition.has_several else near):
         return point
     for reach in REACHES:
-        first, last = (_possible(variation, guess, guess + side * reach) for side in (-1, 1))
-        if away <= reach or not first < last:
+        ends = (guess + side * min(reach, away) for side in (-1, 1))
+        first, last = (_possible(variation, guess, end) for end in ends)
+        if not first < last:
             break
         path = ParameterPath(variation, None, (first, last), [condition])
         # From farther off, too, than in `scan`: these paths are short.
         found = search(path, INTERVALS, near=1.0)
         of_kind = [one for one in found if one.condition == condition and one.status == Status.OK]
         if of_kind:
-            return min(of_kind, key=lambda one: abs(float(one.value) - guess))
+            return min([*of_kind, point], key=lambda one: _away(one, guess))
+        if away <= reach:
+            break
     return point
+
+
+def _away(point: BifurcationPoint, guess: float) -> float:
+    return abs(float(point.value) - guess) if int(point.status) == Status.OK else np.inf
 
 
 def _possible(variation: Variation, guess: float, end: float) -> float:
