@@ -10,7 +10,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     numerics/       compiling
     checks          arguments, checked at the public edge
     numerics/       derivatives extrapolation newton continuation roots
-    model/          friction oscillator parameters modes events equilibria
+    model/          friction oscillator parameters variations modes events equilibria
     presets         the published systems
     kernel/         lanes step events rounds
     motion/         integrators arcs sensitivities sampling batches runs smoothing simulate
@@ -18,7 +18,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
-    bifurcations/   refine path scan curves diagrams switch_folds
+    bifurcations/   path scan refine curves diagrams switch_folds
     inverse/        selection record fit design
     plotting/       style phase diagrams sweeps model draw
     paper           the paper's table and figures

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .bifurcations.conditions import AbstractCondition
@@ -26,7 +25,7 @@ from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, unstable_cycle
 from .model.equilibria import Equilibria, equilibria
 from .model.oscillator import Belt, Oscillator
-from .model.parameters import leaf_index
+from .model.variations import varied
 from .motion.simulate import Trajectory, simulate
 from .plotting.diagrams import draw_region_map, plot_diagram
 from .plotting.model import draw_mechanical_model, plot_convergence, plot_friction_law
@@ -105,9 +104,9 @@ def critical_values() -> tuple[CriticalValue, ...]:
         rows = [published for published in PUBLISHED if published.system == system]
         osc = _with_two_belts(paper_oscillator(system, rows[0].printed))
         wanted = {row: CONDITIONS[system, row.point] for row in rows}
-        index = jnp.asarray(np.array(leaf_index(osc, _nu0)))
+        velocity = varied(osc, _nu0, ())
         for row in rows:
-            point = wanted[row].found_from(osc, index, row.printed + AWAY)
+            point = wanted[row].found_from(velocity, row.printed + AWAY)
             if point is None or point.condition != wanted[row]:
                 values[row] = CriticalValue(*row, math.nan, math.nan, 0, None)
                 continue

@@ -67,7 +67,8 @@ ADVICE = {
     Status.TOO_MANY_ARCS: "A loop has more arcs than there is room for: pass a larger max_arcs.",
     Status.NO_CONVERGENCE: (
         "Newton's method did not converge from this guess; there may be no such solution near it, "
-        "or none that this side of it leads to: try a guess on the other side."
+        "or none that this side of it leads to: try a guess on the other side. Every bifurcation "
+        "point in an interval is found by jb.scan with a span around it."
     ),
     Status.NOT_ADMISSIBLE: (
         "The solution of the equations leaves its modes (an arc passes a boundary, or ends before "
@@ -80,17 +81,21 @@ ADVICE = {
     Status.NOT_TOUCHED: (
         "No cycle comes near the boundary or an edge of that belt here, so no such point is near, "
         "or the cycle ends in it and exists on its other side only; try another belt or another "
-        "value of the parameter."
+        "value of the parameter, or jb.scan with a span around it."
     ),
     Status.OTHER_KIND: (
         "The cycle does touch the boundary at a point near here, but the point is of another kind: "
-        "a nonsmooth fold ends the cycle, at a grazing point it goes on to both sides."
+        "a nonsmooth fold ends the cycle, at a grazing point it goes on to both sides. jb.scan "
+        "with a span around it tells every point there."
     ),
     Status.NO_FOLD: (
         "No loop of the orbits around the equilibrium is extremal in its growth, or none that is "
-        "closes nearby: no two cycles meet near here."
+        "closes nearby: no two cycles meet near here. jb.scan with a span tells where they do."
     ),
-    Status.NO_FIXED_POINT: "There is no fixed point in a smooth field whose trace could vanish.",
+    Status.NO_FIXED_POINT: (
+        "There is no fixed point in a smooth field whose trace could vanish. Where there is one "
+        "elsewhere, jb.scan with a span finds its points."
+    ),
     Status.UNEXPLAINED: (
         "What the oscillator does changes here, and no condition known to the search explains how. "
         "Simulate on both sides."

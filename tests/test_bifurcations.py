@@ -135,6 +135,44 @@ def test_a_guess_that_fits_no_such_point_is_told_so(condition, nu, status):
     point = jb.refine(condition, class_b(nu), where=nu0)
     assert point.status == status
     assert jnp.isnan(point.value) and jb.describe(status) in repr(point)
+    # Who knows more of it is told, too.
+    assert "jb.scan with a span" in repr(point)
+
+
+@pytest.mark.parametrize("offset", [-0.03, -0.004, 0.004, 0.03])
+def test_a_fold_from_where_newtons_method_alone_does_not_find_it(offset):
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(nu):
+        return jb.Oscillator(0.5, (jb.Belt(nu, law, 0.8), jb.Belt(0.5, law, 0.8)), 1.3)
+
+    def other(nu):
+        mu, static = oracle.conti(1.0, 0.6, 10.0)
+        belts = (oracle.Belt(nu, mu, static, 0.8), oracle.Belt(0.5, mu, static, 0.8))
+        return oracle.Oscillator(0.5, belts, 1.3)
+
+    expected = oracle_cycles.nonsmooth_fold(other, (0.4826, 0.4828), 0)
+    point = jb.refine(jb.NonsmoothFold(0), make(expected + offset), where=nu0)
+    assert point.status == Status.OK and point.kind == "NonsmoothFold"
+    assert point.value == pytest.approx(expected, abs=1e-10)
+    assert abs(point.value - expected) <= point.error + 1e-11
+
+
+@pytest.mark.parametrize("offset", [-0.03, -1e-3, 1e-3, 0.03])
+def test_grazing_from_where_newtons_method_alone_does_not_find_it(offset):
+    """A thousandth from where belt 0 is at rest, beyond which there is no such cycle."""
+
+    def other(nu):
+        (mu, static), (mu1, static1) = oracle.conti(1.0, 0.6, 8.0), oracle.conti(1.1, 0.6, 12.0)
+        belts = (oracle.Belt(nu, mu, static, 1.0), oracle.Belt(0.3, mu1, static1, 1.0))
+        return oracle.Oscillator(0.4, belts, 1.0)
+
+    expected = oracle_cycles.grazing(other, (-0.002, -0.001), 1)
+    belts = jb.Belt(expected + offset, jb.Conti(1, 0.6, 8)), jb.Belt(0.3, jb.Conti(1.1, 0.6, 12))
+    point = jb.refine(jb.GrazingSliding(1), jb.Oscillator(0.4, belts), where=nu0)
+    assert point.status == Status.OK and point.condition == jb.GrazingSliding(1)
+    # The cycle takes long to leave belt 0: the error of the integration grows on the way.
+    assert abs(point.value - expected) <= point.error + 1e-11 < 1e-8
 
 
 @pytest.mark.parametrize("nu", [0.483, 0.4867, 0.52])

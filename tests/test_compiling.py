@@ -333,11 +333,31 @@ def test_without_what_vmap_leaves_alone(untried):
 def test_without_a_look_into_traced_programs(untried):
     untried.delattr(jax.extend.core, "Var")
 
-    def function(p, q, r, s):
-        return [1.0, s, p, jnp.abs(q), r, 2 * r]
+    def function(p, q):
+        return [1.0, p - q, 2 * p / 3]
 
-    found = warned_once("a look into traced programs", compiling.passed_through, function, 4)
-    assert found == [2, None, None, 1]
+    assert not warned_once("a look into traced programs", compiling.is_affine, function, 2)
+
+
+@needs_tricks
+@pytest.mark.parametrize(
+    "function, expected",
+    [
+        (lambda p: [p, 1.0], True),
+        (lambda p: [0.3 - 2 * p / 3, jnp.where(True, p, 0.0), jnp.asarray(p)], True),
+        (lambda p: [jax.jit(lambda x: -x)(p) + jnp.sum(jnp.ones(3))], True),
+        (lambda p: [jnp.stack([p, 2 * p])[1]], False),  # indexing is not looked into
+        (lambda p: [p * p], False),
+        (lambda p: [1 / p], False),
+        (lambda p: [jnp.abs(p)], False),
+        (lambda p: [jnp.where(p > 0, p, 0.0)], False),
+        (lambda p: [lax.stop_gradient(p)], False),
+        (lambda p: [jnp.sqrt(p)], False),
+        (lambda p: [jnp.round(p)], False),
+    ],
+)
+def test_what_is_linear_but_for_constants(function, expected):
+    assert compiling.is_affine(function, 1) == expected
 
 
 @needs_tricks

@@ -212,9 +212,9 @@ def test_a_corner_in_which_the_cycle_ends():
     inside, beyond = (jb.presets.class_c(0.233547455622 + d, -0.25, 0.4) for d in (-0.01, 0.01))
     point = jb.refine(jb.CornerCollision(0), inside, where=nu0)
     assert point.value == pytest.approx(0.233547455622, abs=1e-11)
+    # There no loop is to be followed; the cycle is found nearby.
     point = jb.refine(jb.CornerCollision(0), beyond, where=nu0)
-    assert point.status == Status.NOT_TOUCHED and "other side" in repr(point)
-    assert jnp.isnan(point.value) and jnp.isnan(point.residual)
+    assert point.value == pytest.approx(0.233547455622, abs=1e-11)
 
 
 @pytest.mark.slow

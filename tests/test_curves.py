@@ -10,7 +10,8 @@ from scipy.optimize import brentq
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.tangencies import _departure
-from jaxbelt.model.parameters import leaf_index, vary
+from jaxbelt.model.parameters import leaf_index
+from jaxbelt.model.variations import Variation
 from jaxbelt.numerics.continuation import Stop
 
 
@@ -54,14 +55,13 @@ def errors(curve, osc, where, condition, rows):
     Refined over the parameter that the curve crosses, the other one as in the row.
     """
     found = []
-    indices = [jnp.asarray(leaf_index(osc, one)) for one in where]
+    both = Variation.of_leaves(osc, [leaf_index(osc, one) for one in where])
     for row in rows:
         values, chord = curve.values[row], curve.values[row + 1] - curve.values[row - 1]
         free = int(np.argmin(np.abs(chord)))
-        held = vary(osc, indices[1 - free], jnp.asarray(values[1 - free])[None])
+        held = both.held(1 - free, float(values[1 - free]))
         solved = [
-            condition.found_from(held, indices[free], float(values[free]) + offset)
-            for offset in (-1e-3, 1e-3)
+            condition.found_from(held, float(values[free]) + offset) for offset in (-1e-3, 1e-3)
         ]
         points = [point for point in solved if point is not None]
         assert curve.kinds[row] in {point.kind for point in points}

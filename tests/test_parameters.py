@@ -10,7 +10,7 @@ from laws import Lorentz
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.switch_folds import switch_band, switch_fold
-from jaxbelt.model.parameters import leaf_groups, leaf_index, names_of, set_alone, vary
+from jaxbelt.model.parameters import leaf_groups, leaf_index, names_of, vary
 
 OSC = jb.presets.class_b(nu0=0.3, nu1=0.35)
 
@@ -175,24 +175,3 @@ def test_the_distance_to_a_point_is_that_of_the_parameter():
     assert distance == pytest.approx(0.3 - 0.263654916039, abs=1e-11)
     with pytest.raises(ValueError, match=r"^where must be "):
         jb.distance_to(jb.Hopf(), where=double)(cycle)
-
-
-# --- arguments of a function that are parameters --------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "make, numbers",
-    [
-        (jb.presets.class_b, [1, 9]),
-        (lambda nu0, nu1: jb.presets.class_b(nu1, nu0), [9, 1]),
-        (lambda nu0, nu1: jb.presets.class_d(nu0, 0.4, nu1, 1.0), [1, 15]),
-        # One edge of both belts; equal numbers, but not the parameter itself; one not used.
-        (lambda nu0, nu1: jb.presets.class_c(nu0, 0.4, nu1), None),
-        (lambda nu0, nu1: jb.presets.class_b(nu0**2, nu1), None),
-        (lambda nu0, nu1: jb.presets.class_b(nu0 + nu1, nu1), None),
-        (lambda nu0, nu1: jb.presets.class_b(nu0, jnp.abs(nu1)), None),
-        (lambda nu0, nu1: jb.presets.class_b(nu0, 0.35), None),
-    ],
-)
-def test_an_argument_that_is_one_parameter(make, numbers):
-    assert set_alone(make, ("nu0", "nu1")) == numbers

@@ -14,7 +14,7 @@ PART = (
     "test_simulate.py::test_error_falls_with_the_tolerance",
     "test_cycles.py::test_sticking_cycle_is_that_of_the_oracle",
     "test_coincidences.py::test_audits_find_nothing[final]",
-    "test_parameters.py::test_an_argument_that_is_one_parameter",
+    "test_variations.py::test_hopf_points_in_closed_form",
     "test_processes.py::test_a_forked_child_is_told_to_be_spawned",
 )
 #: More of the same.

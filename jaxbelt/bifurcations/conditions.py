@@ -37,11 +37,11 @@ from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import SIZES, Chain, Loop, cut, meshed
 from ..model.equilibria import candidates
 from ..model.oscillator import Oscillator
-from ..model.parameters import leaf_index, parameter, vary
+from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.continuation import Stop
-from ..numerics.newton import HOLDS, NEWTON_STEPS
+from ..numerics.newton import HOLDS, NEWTON_STEPS, STEP_ROUNDING
 from ..results import Status, describe
 from .guesses import nearest, settled_loops
 from .labels import AttractingCycle, Label
@@ -87,31 +87,44 @@ class SpecialPoint(NamedTuple):
 class Trail(NamedTuple):
     """The last stretch of a curve, as its condition is asked where it leads.
 
-    osc, indices: the oscillator and the numbers of the two parameters; step: between rows; values:
-    of the parameters in the last rows, three at most, [rows, 2]; system, x: of the last row; end:
-    why the stretch ends there.
+    variation: of the two parameters; step: between rows; values: of the parameters in the last
+    rows, three at most, [rows, 2]; system, x: of the last row; end: why the stretch ends there.
     """
 
-    osc: Oscillator
-    indices: Array
+    variation: Variation
     step: float
     values: np.ndarray
     system: Any
     x: np.ndarray
     end: Stop
 
-    def stopping(self) -> tuple[int, int] | None:
-        """A belt that comes to rest: which parameter its velocity is, 0 or 1, and its number."""
-        velocities = [
-            leaf_index(self.osc, lambda osc, k=k: osc.belts[k].velocity)
-            for k in range(len(self.osc.belts))
-        ]
-        for held, index in enumerate(np.asarray(self.indices).tolist()):
-            if index in velocities and len(self.values) == 3:
-                _, before, last = np.abs(self.values[:, held])
-                if 0 < last < min(before, 2 * self.step):
-                    return held, velocities.index(index)
+    def stopping(self) -> "Stopping | None":
+        """A belt that comes to rest and whose velocity one of the parameters alone decides."""
+        if len(self.values) < 3:
+            return None
+        oscs = [self.variation.oscillator(row) for row in self.values]
+        slopes = self.variation.family(self.values[-1]).velocity_slopes()
+        for held in (0, 1):
+            for belt, slope in enumerate(slopes):
+                v = np.array([float(osc.belts[belt].velocity) for osc in oscs])
+                near = 0 < abs(v[-1]) < min(abs(v[-2]), 2 * self.step * abs(slope[held]))
+                if slope[held] != 0 and slope[1 - held] == 0 and near:
+                    along = self.variation.held(1 - held, self.values[-1, 1 - held])
+                    return Stopping(held, belt, along.rest_of(belt, self.values[-1, held]), v)
         return None
+
+
+class Stopping(NamedTuple):
+    """A belt that comes to rest at the end of a curve.
+
+    held: which parameter decides its velocity, 0 or 1; belt: its number; value: of that parameter
+    where it is at rest; velocities: in the last rows.
+    """
+
+    held: int
+    belt: int
+    value: float
+    velocities: np.ndarray
 
 
 class AbstractCondition(eqx.Module):
@@ -125,6 +138,8 @@ class AbstractCondition(eqx.Module):
     family: ClassVar[str] = ""
     #: Whether orbits beside a point are slow to settle, so that it is seen from farther off only.
     slow: ClassVar[bool] = False
+    #: Whether one loop may be near to several such points, in different arcs.
+    has_several: ClassVar[bool] = False
     #: Whether branches of a diagram go on through a point.
     joins: ClassVar[bool] = True
     #: Whether its curve ends where the signature changes.
@@ -181,25 +196,54 @@ class AbstractCondition(eqx.Module):
         """What its system of equations begins from; `size`: room for the arcs of a loop."""
 
     @abc.abstractmethod
-    def solve(self, osc: Oscillator, index: int | Array, guess: Any) -> "BifurcationPoint":
-        """The point near a guess, in the parameter of that number, without a name."""
+    def prepared(self, osc: Oscillator, guess: Any) -> tuple[AbstractSystem, Any, Array]:
+        """The system near a guess, its unknowns there, and a status."""
 
-    def point(self, osc: Oscillator, index: int | Array, size: int) -> "BifurcationPoint":
-        """The point near an oscillator, in the parameter of that number."""
+    @abc.abstractmethod
+    def solved(
+        self, family: Family, system: Any, x: Any, p: Any, status: Array
+    ) -> tuple["BifurcationPoint", tuple[Any, Array]]:
+        """The point near a guess (x, p) in a family of oscillators, without a name; and (x, p)
+        there."""
+
+    def solve(
+        self, variation: Variation, osc: Oscillator, value: Any, guess: Any
+    ) -> "BifurcationPoint":
+        """The point near a guess, without a name; osc: the oscillator at that value, [1]."""
+        system, x, status = self.prepared(osc, guess)
+
+        def attempt(family, unknowns):
+            x, p = unknowns
+            return self.solved(family, system, x, p, status)
+
+        point, settled = variation.settle(attempt, (x, value))
+        if settled is True:
+            return point
+        fails = (point.status == Status.OK) & ~jnp.asarray(settled)
+        numbers = ("value", "residual", "error", "multiplier")
+        known = {name: jnp.where(fails, jnp.nan, getattr(point, name)) for name in numbers}
+        status = jnp.where(fails, Status.NO_CONVERGENCE.value, point.status)
+        return replace(point, **known, status=status)
+
+    def point(
+        self, variation: Variation, osc: Oscillator, value: Any, size: int
+    ) -> "BifurcationPoint":
+        """The point near an oscillator, that at a value, [1], of what is varied."""
         data = self.as_data()
-        return replace(data.solve(osc, index, data.guess(osc, size)), condition=self)
+        return replace(data.solve(variation, osc, value, data.guess(osc, size)), condition=self)
 
     def found_from(
-        self, osc: Oscillator, index: Array, value: float, loop: Loop | None = None
+        self, variation: Variation, value: float, loop: Loop | None = None
     ) -> "BifurcationPoint | None":
-        """The point that is found from that value of the parameter, or None.
+        """The point that is found from that value of what is varied, or None.
 
         One of a family is named as what it is. loop: of the cycle that it is about, where that is
         known.
         """
-        at, data = vary(osc, index, jnp.asarray(np.array([value]))), self.sought.as_data()
-        guess = data.guess(at, data.room) if loop is None else data.guess_near(loop)
-        point = data.solve(at, index, guess)
+        data, start = self.sought.as_data(), np.array([value])
+        osc = variation.oscillator(start)
+        guess = data.guess(osc, data.room) if loop is None else data.guess_near(loop)
+        point = data.solve(variation, osc, start, guess)
         if int(point.status) != Status.OK:
             return None
         return replace(point, condition=self.sought.named(point))
@@ -316,7 +360,10 @@ class Unexplained(AbstractCondition):
     def guess(self, osc, size):
         raise ValueError("condition must be one that can be refined, got Unexplained()")
 
-    def solve(self, osc, index, guess):
+    def prepared(self, osc, guess):
+        raise NotImplementedError
+
+    def solved(self, family, system, x, p, status):
         raise NotImplementedError
 
     def followed(self, point):
@@ -346,8 +393,11 @@ class AbstractCycleCondition(AbstractCondition):
     ) -> tuple[CycleSystem, Array, Array]:
         """The system of the cycle near a loop, its unknowns there, and a status; compiled."""
 
-    def solve(self, osc, index, guess):
-        return solved_point(osc, index, *_prepared(self, osc, *guess))
+    def prepared(self, osc, guess):
+        return _prepared(self, osc, *guess)
+
+    def solved(self, family, system, x, p, status):
+        return solved_point(family, system, x, p, status)
 
     def guess_near(self, loop):
         return cut([loop], more=self.more_arcs)[0], jnp.asarray(Status.OK.value)
@@ -370,23 +420,23 @@ def _prepared(condition: AbstractCycleCondition, osc: Oscillator, loop: Loop, st
 
 
 @jit
-def solved_point(osc, index, system: CycleSystem, z0, status) -> BifurcationPoint:
-    """The solution near a guess z0 of the unknowns; one program serves a kind of system."""
-    p0 = lax.stop_gradient(parameter(osc, index)[None])
+def solved_point(family: Family, system: CycleSystem, z0, p0, status):
+    """The solution near a guess (z0, p0) of the unknowns; one program serves a kind of system."""
     # Without a guess Newton's method ends at once.
     z0 = jnp.where(status == Status.OK, z0, jnp.nan)
-    z, p, steps, matrix = solve_system(osc, index, system, z0, p0)
+    z, p, steps, matrix = solve_system(family, system, z0, lax.stop_gradient(p0))
     iterations = jnp.sum(~jnp.isnan(steps))
-    at_point = vary(osc, index, p)
+    at_point = family.at(p)
     # By the last steps: the residual costs an integration more, and who asks for it gets it.
     last, before = steps[jnp.maximum(iterations - 1, 0)], steps[jnp.maximum(iterations - 2, 0)]
     converged = (status != Status.OK) | (last * jnp.minimum(last / before, 1.0) < HOLDS)
+    converged = converged | (last < STEP_ROUNDING)
     status = jnp.where(converged, status, Status.NO_CONVERGENCE.value)
     size, error = accuracy(*lax.stop_gradient((at_point, system, z, matrix)))
     cycle, slope = cycle_of(at_point, system.ordinary, z, iterations, status, size)
     status, multiplier = system.judge(at_point, z, cycle, slope)
     known = functools.partial(jnp.where, status == Status.OK)
-    return BifurcationPoint(
+    point = BifurcationPoint(
         condition=UNNAMED,
         value=known(p[0], jnp.nan),
         residual=known(size, jnp.nan),
@@ -394,10 +444,11 @@ def solved_point(osc, index, system: CycleSystem, z0, status) -> BifurcationPoin
         steps=steps,
         error=known(error, jnp.nan),
         multiplier=known(multiplier, jnp.nan),
-        oscillator=vary(osc, index, known(p, jnp.nan)),
+        oscillator=family.at(known(p, jnp.nan)),
         cycle=cycle,
         status=status,
     )
+    return point, (z, p)
 
 
 class CycleEquation(AbstractCycleCondition):
@@ -471,12 +522,16 @@ class AbstractRestCondition(AbstractCondition):
     def system(self, osc: Oscillator, guess: Any) -> tuple[RestSystem, Any, Array]:
         """The system near a guess, its unknowns there, and a status; compiled."""
 
-    def solve(self, osc, index, guess):
-        return _solved_rest(self, osc, index, guess)
+    def prepared(self, osc, guess):
+        return _prepared_rest(self, osc, guess)
+
+    def solved(self, family, system, x, p, status):
+        why = jnp.asarray(self.no_cycle.value)
+        return _solved_rest(family, system, x, p, status, why)
 
     def followed(self, point):
         osc, data = point.oscillator, self.as_data()
-        return _prepared_rest(data, osc, data.guess(osc, self.room))[:2]
+        return data.prepared(osc, data.guess(osc, self.room))[:2]
 
 
 @jit
@@ -485,35 +540,33 @@ def _prepared_rest(condition: AbstractRestCondition, osc: Oscillator, guess):
 
 
 @jit
-def _solved_rest(condition: AbstractRestCondition, osc, index, guess) -> BifurcationPoint:
-    system, x, status = condition.system(lax.stop_gradient(osc), guess)
+def _solved_rest(family: Family, system: RestSystem, x0, p0, status, why):
+    def equations(family, u):
+        return system.residual(family.at(u[-1:]), u[:-1])
 
-    def equations(osc, u):
-        return system.residual(vary(osc, index, u[-1:]), u[:-1])
-
-    start = jnp.append(x, parameter(osc, index))
-    u, steps, size, error = small_newton(equations, osc, start)
-    exists = system.exists(vary(osc, index, u[-1:]), u[:-1])
+    u, steps, size, error = small_newton(equations, family, jnp.append(x0, p0))
+    x, p = u[:-1], u[-1:]
+    exists = system.exists(family.at(p), x)
     judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
     judged = jnp.where(size < HOLDS, judged, Status.NO_CONVERGENCE.value)
     status = jnp.where(status == Status.OK, judged, status)
-    return _point_without_cycle(osc, index, u[-1], steps, size, error, status, condition.no_cycle)
+    return _point_without_cycle(family, p, steps, size, error, status, why), (x, p)
 
 
-def _point_without_cycle(osc, index, p, steps, size, error, status, why: Status):
+def _point_without_cycle(family: Family, p, steps, size, error, status, why):
     iterations = jnp.sum(~jnp.isnan(steps))
     known = functools.partial(jnp.where, status == Status.OK)
-    at_point = vary(osc, index, known(p, jnp.nan)[None])
+    at_point = family.at(known(p, jnp.nan))
     nan = jnp.full((SIZES[0], 3), jnp.nan)
-    n = len(osc.belts)
+    n = len(at_point.belts)
     chain = Chain(
         jnp.ones((SIZES[0], n)), jnp.full(SIZES[0], Ends(n).unused), jnp.zeros((SIZES[0], 1))
     )
     none = jnp.asarray(jnp.nan)
-    cycle = Cycle(at_point, chain, nan, none, none, iterations, jnp.asarray(why.value))
+    cycle = Cycle(at_point, chain, nan, none, none, iterations, why)
     return BifurcationPoint(
         condition=UNNAMED,
-        value=known(p, jnp.nan),
+        value=known(p[0], jnp.nan),
         residual=known(size, jnp.nan),
         iterations=iterations,
         steps=steps,
@@ -525,9 +578,10 @@ def _point_without_cycle(osc, index, p, steps, size, error, status, why: Status)
     )
 
 
-def unexplained_point(osc: Oscillator, index: int, value: float, width: float) -> BifurcationPoint:
+def unexplained_point(variation: Variation, value: float, width: float) -> BifurcationPoint:
     """A point where something changes, within an interval of that width, that nothing explains."""
-    p, error, none = jnp.asarray(value), jnp.asarray(width), jnp.asarray(jnp.nan)
+    p, error, none = np.array([value]), jnp.asarray(width), jnp.asarray(jnp.nan)
     ok, steps = jnp.asarray(Status.OK.value), jnp.full(NEWTON_STEPS, jnp.nan)
-    point = _point_without_cycle(osc, index, p, steps, none, error, ok, Status.UNEXPLAINED)
-    return replace(point, status=jnp.asarray(Status.UNEXPLAINED.value))
+    why = jnp.asarray(Status.UNEXPLAINED.value)
+    point = _point_without_cycle(variation.family(p), jnp.asarray(p), steps, none, error, ok, why)
+    return replace(point, status=why)

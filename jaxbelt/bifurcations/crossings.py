@@ -169,6 +169,11 @@ class SlidingExchange(AbstractCycleCondition):
         return [cls((min(belts), max(belts)))] if len(belts) == 2 else []
 
     def limit(self, trail):
-        if trail.stopping() is None:
+        stopping = trail.stopping()
+        if stopping is None:
             return None
-        return SpecialPoint("BeltAtRest", self.belts, (0.0, 0.0), 0.0)
+        # Both belts come to rest at once, so what is free goes in proportion with the velocity.
+        (before, last), v = trail.values[1:, 1 - stopping.held], stopping.velocities
+        free = float(last - v[-1] * ((last - before) / (v[-1] - v[-2])))
+        values = (free, stopping.value) if stopping.held else (stopping.value, free)
+        return SpecialPoint("BeltAtRest", self.belts, values, 0.0)

@@ -9,20 +9,20 @@ point of codimension two. There the signature may change; the condition is then 
 beyond, and the curve goes on from there with the signature that is found.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, check_finite, require
 from ..model.oscillator import Oscillator
-from ..model.parameters import leaf_index, names_of, parameter, vary
+from ..model.parameters import leaf_index
+from ..model.variations import Family, Variation
 from ..numerics.compiling import jit
-from ..numerics.continuation import CurvePoint, Stop, continue_curve, corrected
+from ..numerics.continuation import Corrected, CurvePoint, Stop, continue_curve, corrected
 from ..results import Status, draw
 from .conditions import AbstractCondition, BifurcationPoint, SpecialPoint, Trail
 from .systems import AbstractSystem, Seen
@@ -128,37 +128,73 @@ class BifurcationCurve(eqx.Module):
 
 def bifurcation_curve(
     point: BifurcationPoint,
-    where: tuple[Callable[[Oscillator], Any], Callable[[Oscillator], Any]],
+    where: tuple[Callable[[Oscillator], Any], Callable[[Oscillator], Any]]
+    | Callable[..., Oscillator],
     span: tuple[tuple[float, float], tuple[float, float]],
     *,
+    at: tuple[float, float] | None = None,
     step: float = 0.01,
     max_points: int = 1000,
 ) -> BifurcationCurve:
     """The curve of a bifurcation point in two parameters, to both sides of it.
 
-    point: from `refine` or `scan`, with status OK; where: selects the two parameters; span: first
-    and last value of each; step: length between neighbours; max_points: on each side.
-    `ValueError` names an impossible argument.
+    point: from `refine` or `scan`, with status OK; where: selects the two parameters, or is a
+    function of both that returns the oscillator, `make(p, q)`; span: first and last value of each;
+    at: see below; step: length between neighbours; max_points: on each side. `ValueError` names an
+    impossible argument.
+
+    With `make` the curve begins where make(p, q) is the oscillator of the point, however that was
+    found: with `make` at a fixed q, or in any other way. So (p, q) need not be told; where one
+    oscillator is at several places of the plane (of `p**2`, say), `at` is near the one meant.
     """
     require(isinstance(point, BifurcationPoint), "point", "a BifurcationPoint", repr(point))
     require(int(point.status) == Status.OK, "point", "one with status OK", repr(point))
-    two = isinstance(where, tuple | list) and len(where) == 2
-    require(two, "where", "two functions", repr(where))
-    osc = point.oscillator
-    numbers = [leaf_index(osc, one) for one in where]
-    indices = jnp.asarray(np.array(numbers))
-    require(numbers[0] != numbers[1], "where", "two different parameters", "one twice")
     limits = np.stack([np.asarray(as_array(ends, "span", (2,))) for ends in span])
     check_finite(limits, "span")
-    start = np.array([float(parameter(osc, number)) for number in numbers])
+    near = None if at is None else np.asarray(as_array(at, "at", (2,)))
+    variation = _varied_by_two(point.oscillator, where, near, limits)
+    start = variation.values_of(point.oscillator, limits, near)
+    if start is None:
+        raise ValueError(
+            "where must be a function that gives the oscillator of the point, got one that does so "
+            f"at no values near those of the span {limits.tolist()}"
+        )
     inside = np.all((limits[:, 0] <= start) & (start <= limits[:, 1]))
     require(inside, "span", f"around the point {start.tolist()}", limits.tolist())
-    problem = _Problem(point.condition, osc, indices, limits, step, max_points)
-    ahead = _side(problem, point, 1.0)
+    return follow_point(variation, point, start, limits, step=step, max_points=max_points)
+
+
+def _varied_by_two(osc: Oscillator, where: Any, at: Any, limits: np.ndarray) -> Variation:
+    """What is varied: two leaves of the oscillator, or what a function of two numbers gives."""
+    if callable(where):
+        values = tuple(np.mean(limits, axis=1).tolist() if at is None else at.tolist())
+        make: Any = where
+        return Variation.of_function(make, values, "where")
+    two = isinstance(where, tuple | list) and len(where) == 2
+    require(two, "where", "two functions, or one of both parameters", repr(where))
+    require(at is None, "at", "left out where `where` selects the parameters", repr(at))
+    numbers = [leaf_index(osc, one) for one in where]
+    require(numbers[0] != numbers[1], "where", "two different parameters", "one twice")
+    return Variation.of_leaves(osc, numbers)
+
+
+def follow_point(
+    variation: Variation,
+    point: BifurcationPoint,
+    start: np.ndarray,
+    limits: np.ndarray,
+    *,
+    step: float,
+    max_points: int = 1000,
+) -> BifurcationCurve:
+    """The curve of a point at `start`, [2], in what is varied, between limits, [2, 2]."""
+    problem = _Problem(point.condition, variation, limits, step, max_points)
+    ahead = _side(problem, point, start, 1.0)
     closed = ahead.end is Stop.CLOSED
-    behind = _Side(ahead.rows[:1], [], Stop.CLOSED) if closed else _side(problem, point, -1.0)
+    behind = (
+        _Side(ahead.rows[:1], [], Stop.CLOSED) if closed else _side(problem, point, start, -1.0)
+    )
     rows = [*reversed(behind.rows[1:]), *ahead.rows]
-    names = [names_of(osc)[number] for number in numbers]
     return BifurcationCurve(
         condition=point.condition,
         values=np.array([row.values for row in rows]),
@@ -168,7 +204,7 @@ def bifurcation_curve(
         places=np.array([row.place for row in rows]),
         special=(*reversed(behind.special), *ahead.special),
         ends=(behind.end, ahead.end),
-        names=(names[0], names[1]),
+        names=(variation.names[0], variation.names[1]),
     )
 
 
@@ -183,8 +219,7 @@ def is_elsewhere(place: np.ndarray, other: np.ndarray, far: float) -> bool:
 
 class _Problem(NamedTuple):
     condition: AbstractCondition
-    osc: Oscillator
-    indices: Array
+    variation: Variation
     limits: np.ndarray
     step: float
     max_points: int
@@ -204,9 +239,9 @@ class _Side(NamedTuple):
     end: Stop
 
 
-def _side(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
+def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: float) -> _Side:
     """The curve to one side of a point: leg by leg, each with one signature and one mesh."""
-    track, u = _Track.begun(problem, point)
+    track, u = _Track.begun(problem, point, start)
     origin, direction = u[-2:], sign * track.tangent(u)
     rows: list[_Row] = []
     special: list[SpecialPoint] = []
@@ -233,7 +268,7 @@ def _side(problem: _Problem, point: BifurcationPoint, sign: float) -> _Side:
         further = None if is_end else _beyond(problem, last[-2:], centre, place)
         if further is None:
             return _Side(rows, special, Stop.STOPPED)
-        track, u = _Track.begun(problem, further)
+        track, u = _Track.begun(problem, *further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
         rows.append(_row_at(problem, track, u, track.look(u)))
@@ -273,7 +308,7 @@ def _closing(track: "_Track", before: CurvePoint, after: CurvePoint, origin) -> 
         return None
     guess = before.u + part * (after.u - before.u)
     normal = np.append(np.zeros(guess.size - 2), chord)
-    at = corrected(*track.problem, guess, normal / np.linalg.norm(chord), 0.0)
+    at = track.corrected(guess, normal / np.linalg.norm(chord), 0.0)
     if not at.found or np.linalg.norm(at.u[-2:] - origin) > 1e-6 * np.linalg.norm(chord):
         return None
     return after._replace(u=at.u, tangent=at.tangent, end=Stop.CLOSED)
@@ -286,17 +321,17 @@ def _points_along(problem: _Problem, track: "_Track", u: np.ndarray, direction: 
         _curve_linearized,
         u,
         direction,
-        args=track.args,
         span=(span[0], span[1]),
         step=problem.step,
         min_step=1e-2 * problem.step,
         max_step=problem.step,
         max_points=REMESH,
+        solve=track.corrected,
     )
 
 
 def _row_at(problem: _Problem, track: "_Track", u: np.ndarray, seen: Seen) -> _Row:
-    osc = vary(problem.osc, problem.indices, jnp.asarray(u[-2:]))
+    osc = problem.variation.oscillator(u[-2:])
     kind = problem.condition.kind_along(osc, seen.multiplier)
     return _Row(u[-2:], kind, seen.multiplier, seen.residual, track.place(u))
 
@@ -314,7 +349,7 @@ def _between(problem: _Problem, track: "_Track", before, after) -> list[SpecialP
             continue
 
         def probe(part, name=name):
-            at = corrected(*track.problem, a.u, a.tangent, part * length)
+            at = track.corrected(a.u, a.tangent, part * length)
             seen = track.look(at.u)
             value = seen.tests[name]
             if not at.found or np.isnan(value):
@@ -322,6 +357,9 @@ def _between(problem: _Problem, track: "_Track", before, after) -> list[SpecialP
             return _Probe(part, value, at.u[-2:], max(seen.residual, abs(value)))
 
         try:
+            # Beside a singular point what is solved for anew at an end may be on the other side.
+            if probe(0.0).test * probe(1.0).test > 0:
+                raise _SingularError
             root: Any = brentq(lambda part, probe=probe: probe(part).test, 0.0, 1.0, xtol=1e-14)
             special = probe(root)
         except _SingularError:
@@ -377,7 +415,7 @@ def _from_both_sides(probe: Callable[[float], _Probe], low: _Probe, high: _Probe
 
 
 def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np.ndarray):
-    """The point of the same condition just beyond a change of signature, or None.
+    """The point of the same condition just beyond a change of signature, and where, or None.
 
     It is the same cycle, in much the same place.
 
@@ -386,34 +424,33 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np
     """
     condition = problem.condition
     came_from = (before - centre) / max(float(np.linalg.norm(before - centre)), 1e-12)
-    best: tuple[float, BifurcationPoint] | None = None
+    best: tuple[float, BifurcationPoint, np.ndarray] | None = None
     for free in (0, 1):
         for side in (1.0, -1.0):
             values = centre + side * 0.5 * problem.step * np.eye(2)[1 - free]
-            held = vary(problem.osc, problem.indices[1 - free], jnp.asarray(values[1 - free])[None])
+            held = problem.variation.held(1 - free, float(values[1 - free]))
             for offset in (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0):
                 guess = float(values[free]) + offset * problem.step
-                point = condition.found_from(held, problem.indices[free], guess)
+                point = condition.found_from(held, guess)
                 if point is None or is_elsewhere(point.place, place, FAR):
                     continue
                 if point.condition.lineage != condition.lineage:
                     continue
-                at = [float(parameter(point.oscillator, index)) for index in problem.indices]
-                away = np.array(at) - centre
+                at = values.copy()
+                at[free] = float(point.value)
+                away = at - centre
                 distance = float(np.linalg.norm(away))
                 fine = 0 < distance < 3 * problem.step
                 if fine and (away / distance) @ came_from < 0.7:
                     if best is None or distance < best[0]:
-                        best = distance, point
-    return None if best is None else best[1]
+                        best = distance, point, at
+    return None if best is None else best[1:]
 
 
 def _limit(problem: _Problem, track: "_Track", rows: list[_Row], u, end: Stop):
     """What the curve ends in where there is no such motion, if that is near its point u."""
     values = np.array([row.values for row in rows[-3:]])
-    trail = Trail(
-        problem.osc, problem.indices, problem.step, values, track.system, track.unknowns(u), end
-    )
+    trail = Trail(problem.variation, problem.step, values, track.system, track.unknowns(u), end)
     return problem.condition.limit(trail)
 
 
@@ -427,8 +464,8 @@ def _towards(problem: _Problem, last: np.ndarray, limit: SpecialPoint) -> list[_
     held = int(np.argmin(np.abs(end)))
     for part in 0.5 ** np.arange(1, 6):
         guess = end + part * (last - end)
-        osc = vary(problem.osc, problem.indices[held], jnp.asarray(guess[held])[None])
-        point = condition.found_from(osc, problem.indices[1 - held], float(guess[1 - held]))
+        along = problem.variation.held(held, float(guess[held]))
+        point = condition.found_from(along, float(guess[1 - held]))
         if point is None or abs(float(point.value) - guess[1 - held]) > problem.step:
             break
         guess[1 - held] = float(point.value)
@@ -441,33 +478,39 @@ def _towards(problem: _Problem, last: np.ndarray, limit: SpecialPoint) -> list[_
 
 
 class _Track(NamedTuple):
-    """The system of a curve in the unknowns u: its own, weighted, and both parameters.
+    """The system of a curve in the unknowns u: its own, weighted, and both parameters."""
 
-    args: the oscillator, the numbers of the parameters, the system, the weights.
-    """
-
-    args: tuple[Oscillator, Array, AbstractSystem, Array]
+    variation: Variation
+    system: AbstractSystem
+    weights: Array
 
     @classmethod
-    def begun(cls, problem: _Problem, point: BifurcationPoint) -> tuple["_Track", np.ndarray]:
-        """The system that is followed from a point, and u there."""
+    def begun(
+        cls, problem: _Problem, point: BifurcationPoint, pair: np.ndarray
+    ) -> tuple["_Track", np.ndarray]:
+        """The system that is followed from a point, and u there; pair: both parameters."""
         system, x = point.condition.followed(point)
-        pair = [float(parameter(point.oscillator, index)) for index in problem.indices]
         weights = system.weights(jnp.asarray(x))
         u = np.append(np.asarray(weights) * np.asarray(x).reshape(-1), pair)
-        return cls((point.oscillator, problem.indices, system, weights)), u
+        return cls(problem.variation, system, weights), u
 
-    @property
-    def system(self) -> AbstractSystem:
-        return self.args[2]
+    def corrected(self, u: ArrayLike, tangent: ArrayLike, length: float) -> Corrected:
+        """As `continuation.corrected`."""
+        start, normal = np.asarray(u), np.asarray(tangent)
 
-    @property
-    def problem(self) -> tuple[Any, Any]:
-        return _curve_linearized, self.args
+        def attempt(family, unknowns):
+            args = family, self.system, self.weights
+            # In the same plane: the first guess of u is `length` ahead, the others lie in it.
+            ahead = length if unknowns[0] is start else 0.0
+            solved = corrected(_curve_linearized, args, unknowns[0], normal, ahead)
+            return solved, (solved.u, solved.u[-2:])
+
+        solved, settled = self.variation.settle(attempt, (start, (start + length * normal)[-2:]))
+        return solved._replace(found=solved.found & settled)
 
     def unknowns(self, u: np.ndarray) -> np.ndarray:
         """Those of the system."""
-        return np.asarray(self.system.shaped(jnp.asarray(u[:-2] / np.asarray(self.args[3]))))
+        return np.asarray(self.system.shaped(jnp.asarray(u[:-2] / np.asarray(self.weights))))
 
     def place(self, u: np.ndarray) -> np.ndarray:
         """Where the motion is, see `place_of`."""
@@ -475,44 +518,38 @@ class _Track(NamedTuple):
 
     def look(self, u: np.ndarray) -> Seen:
         """What is seen at a solution, in numbers."""
-        seen = _seen_at(self.args, jnp.asarray(u))
+        osc, x = self.variation.oscillator(u[-2:]), jnp.asarray(self.unknowns(u))
+        seen = _seen_at(osc, self.system, x)
         tests = {name: float(value) for name, value in seen.tests.items()}
         return Seen(tests, bool(seen.exists), float(seen.multiplier), float(seen.residual))
 
     def remeshed(self, u: np.ndarray, tangent: np.ndarray) -> tuple["_Track", Any, Any]:
         """The same with the steps of integration spread anew, and u and the tangent in it."""
-        args = _remeshed(self.args, jnp.asarray(u))
-        scale = np.append(np.asarray(args[3]) / np.asarray(self.args[3]), [1.0, 1.0])
-        return _Track(args), scale * u, scale * tangent
+        osc, x = self.variation.oscillator(u[-2:]), jnp.asarray(self.unknowns(u))
+        system, weights = _remeshed(osc, self.system, x)
+        scale = np.append(np.asarray(weights) / np.asarray(self.weights), [1.0, 1.0])
+        return _Track(self.variation, system, weights), scale * u, scale * tangent
 
     def tangent(self, u: np.ndarray) -> np.ndarray:
         """The direction of the curve at u, in the sense in which a parameter grows."""
         for axis in (-2, -1):
-            solved = corrected(*self.problem, u, np.eye(u.size)[axis], 0.0)
+            solved = self.corrected(u, np.eye(u.size)[axis], 0.0)
             if solved.found:  # it is not where the curve turns back in this parameter
                 break
         return solved.tangent
 
 
-def _parts(u: Array, args):
-    """The oscillators by both parameters, the system, its unknowns, the parameters."""
-    osc, indices, system, weights = args
-    return functools.partial(vary, osc, indices), system, system.shaped(u[:-2] / weights), u[-2:]
-
-
-def _curve_linearized(u: Array, args) -> tuple[Array, Array]:
-    osc_of, system, x, p = _parts(u, args)
-    value, matrix = system.linearized(osc_of, x, p)
-    return value, matrix.at[:, :-2].divide(args[3][None])
+def _curve_linearized(u: Array, args: tuple[Family, AbstractSystem, Array]) -> tuple[Array, Array]:
+    family, system, weights = args
+    value, matrix = system.linearized(family.at, system.shaped(u[:-2] / weights), u[-2:])
+    return value, matrix.at[:, :-2].divide(weights[None])
 
 
 @jit
-def _seen_at(args, u: Array) -> Seen:
-    osc_of, system, x, p = _parts(u, args)
-    return system.look(osc_of(p), x)
+def _seen_at(osc: Oscillator, system: AbstractSystem, x: Array) -> Seen:
+    return system.look(osc, x)
 
 
 @jit
-def _remeshed(args, u: Array):
-    osc_of, system, x, p = _parts(u, args)
-    return (*args[:2], system.remeshed(osc_of(p), x), system.weights(x))
+def _remeshed(osc: Oscillator, system: AbstractSystem, x: Array):
+    return system.remeshed(osc, x), system.weights(x)

@@ -16,6 +16,7 @@ points are found by `scan` along a few lines across the map, and their curves ar
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple
 
@@ -31,13 +32,13 @@ from ..cycles.cycle import Cycle, find_cycle, polish, unstable_cycle
 from ..cycles.shooting import Loop, cut
 from ..model.equilibria import EquilibriumKind, candidates, equilibria
 from ..model.oscillator import Oscillator
-from ..model.parameters import set_alone
+from ..model.variations import Variation
 from ..numerics.compiling import jit
 from ..results import Status, draw
 from ..sweeps.datasets import decoded
 from ..sweeps.sweep import sweep
 from .conditions import BifurcationPoint
-from .curves import FAR, BifurcationCurve, bifurcation_curve, is_elsewhere
+from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
 from .labels import Label
 from .path import ParameterPath
 from .scan import by_value, edges_touched, search
@@ -83,8 +84,9 @@ class BifurcationDiagram(eqx.Module):
 
     points: the special points in order, as from `scan`, and those at which an unstable cycle
     touches a contact edge; branches: of equilibria, then of cycles; regions: (first, last, name) of
-    every stretch between points of `scan`, see `region_name`; oscillator: the one that was given;
-    name: of the parameter, as the path to it. `plot()` draws it.
+    every stretch between points of `scan`, see `region_name`; oscillator: the one that was given,
+    of a function that at the first value; name: of the parameter, as the path to it, or that of the
+    function's argument. `plot()` draws it.
     """
 
     points: tuple[BifurcationPoint, ...]
@@ -110,9 +112,9 @@ class BifurcationDiagram(eqx.Module):
 
 
 def bifurcation_diagram(
-    osc: Oscillator,
-    where: Callable[[Oscillator], Any],
-    span: tuple[float, float],
+    osc: Oscillator | Callable[..., Oscillator],
+    where: Callable[[Oscillator], Any] | None = None,
+    span: tuple[float, float] | None = None,
     *,
     rows: int = 160,
     resolution: int = 96,
@@ -145,7 +147,7 @@ def bifurcation_diagram(
         points=points,
         branches=tuple(_joined(pieces, inner)),
         regions=tuple((a, b, name) for (a, b), name in zip(stretches, names, strict=True)),
-        oscillator=osc,
+        oscillator=path.osc,
         name=path.name,
     )
 
@@ -277,8 +279,7 @@ def region_map(
     make: gives an `Oscillator`, such as `jb.presets.class_b`; axes: two of its arguments and their
     values, increasing. starts: where each cell is run from; what attracts none of them is not seen.
     step: between the points of the curves, in units of the larger side of the map / 1.4; lines: on
-    how many lines parallel to each axis curves are looked for, 0 for none. There are none either
-    where an argument of `make` is not one parameter of the oscillator. `ValueError` names an
+    how many lines parallel to each axis curves are looked for, 0 for none. `ValueError` names an
     impossible argument.
     """
     require(len(axes) == 2, "axes", "two arguments of make and their values", list(axes))
@@ -287,11 +288,10 @@ def region_map(
     for name, along in zip(names, values, strict=True):
         increases = along.size > 1 and np.all(np.diff(along) > 0)
         require(increases, name, "two values or more that increase", along)
-    numbers = set_alone(make, names)
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:
         cells = beside.submit(_cells, make, names, values, dict(axes), starts)
-        curves = _bounds(make, names, values, numbers, step, lines) if numbers and lines else ()
+        curves = _bounds(make, names, values, step, lines) if lines else ()
         label, cycles = cells.result()
     pair = (names[0], names[1]), (values[0], values[1])
     return RegionMap(*pair, label, tuple(curves), cycles, make)
@@ -366,10 +366,12 @@ def _at_cells(make, names, cells: Array) -> tuple[Array, Array]:
     return jax.vmap(one)(cells)
 
 
-def _bounds(make, names, values, numbers, step, lines) -> list[BifurcationCurve]:
-    """The curve of every point on a few lines, each curve once; numbers: of the two leaves."""
-    first, second = (lambda osc, index=index: jax.tree.leaves(osc)[index] for index in numbers)
-    where = first, second
+def _bounds(make, names, values, step, lines) -> list[BifurcationCurve]:
+    """The curve of every point on a few lines, each curve once."""
+
+    def at(p, q):
+        return make(**dict(zip(names, (p, q), strict=True)))
+
     span = tuple((float(along[0]), float(along[-1])) for along in values)
     step = step * max(b - a for a, b in span) / 1.4
     across = [
@@ -380,21 +382,22 @@ def _bounds(make, names, values, numbers, step, lines) -> list[BifurcationCurve]
     ]
 
     def points_on(along: int, fixed: float) -> tuple[BifurcationPoint, ...]:
-        pair = {names[along]: span[along][0], names[1 - along]: fixed}
-        return search(ParameterPath(make(**pair), where[along], span[along]))
+        return search(ParameterPath(variation.held(1 - along, fixed), None, span[along]))
 
+    limits, corner = np.array(span), [ends[0] for ends in span]
+    variation = replace(Variation.of_function(at, corner, "make"), names=names)
     curves: list[BifurcationCurve] = []
     # The next lines are searched while curves are followed from those before.
     with ThreadPoolExecutor(1) as ahead:
         searches = [(line, ahead.submit(points_on, *line)) for line in across]
         for (along, fixed), found in searches:
             for point in found.result():
-                at = np.empty(2)
-                at[along], at[1 - along] = float(point.value), fixed
+                pair = np.empty(2)
+                pair[along], pair[1 - along] = float(point.value), fixed
                 if point.status == Status.OK and not any(
-                    _lies_on(point, at, curve, step) for curve in curves
+                    _lies_on(point, pair, curve, step) for curve in curves
                 ):
-                    curves.append(bifurcation_curve(point, where, (span[0], span[1]), step=step))
+                    curves.append(follow_point(variation, point, pair, limits, step=step))
     return curves
 
 

@@ -81,6 +81,8 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
     belt: int | Array
 
+    has_several: ClassVar[bool] = True
+
     @property
     @abc.abstractmethod
     def wanted(self) -> float | Array:

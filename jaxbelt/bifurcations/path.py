@@ -19,7 +19,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from ..checks import as_array, check_finite, require
 from ..cycles.attractors import (
@@ -35,8 +34,8 @@ from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
 from ..cycles.settling import AT_REST
 from ..cycles.shooting import SIZES, Loop, cut
 from ..model.equilibria import equilibria
-from ..model.oscillator import Oscillator, check_oscillator
-from ..model.parameters import leaf_index, names_of, vary
+from ..model.oscillator import Oscillator
+from ..model.variations import varied
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .conditions import AbstractCondition
@@ -60,32 +59,33 @@ class ParameterPath:
     """A path in one parameter: its labels, each computed once, and loops of the cycles in them."""
 
     def __init__(self, osc, where, span, conditions: Sequence[AbstractCondition] = ()):
-        check_oscillator(osc)
-        for condition in conditions:
-            condition.check(osc)
-        self.conditions = tuple(conditions)
+        require(span is not None, "span", "(first, last)", "None")
         span = as_array(span, "span", (2,))
         check_finite(span, "span")
         self.first, self.last = (float(end) for end in span)
         require(self.first < self.last, "span", "(first, last) with first < last", tuple(span))
-        # As an array: one program serves all parameters.
-        self.osc, self.index = osc, jnp.asarray(np.array(leaf_index(osc, where)))
+        self.variation = varied(osc, where, (self.first,))
         for value in (self.first, self.last):
-            self.at(value).check()
+            self.variation.check(value)
+        #: The one that was given, or that at the first value.
+        self.osc = osc if isinstance(osc, Oscillator) else self.at(self.first)
+        for condition in conditions:
+            condition.check(self.osc)
+        self.conditions = tuple(conditions)
         self.length = self.last - self.first
-        self.name = names_of(osc)[int(self.index)]
+        (self.name,) = self.variation.names
         self.labels: dict[float, Label] = {}
         self.cycles: dict[float, list[AttractingCycle]] = {}
         self.unstable_cycles: dict[tuple[float, int], Cycle] = {}
         # From which value to which other one, from which cycle to which, of those that do not
         # stick; None where there is none.
         self._goes_on: dict[tuple[float, float], dict[int, int | None]] = {}
-        self.breaks = self._coincidences()
+        self._coincidences = self.variation.coincidences(self.first, self.last)
+        self.breaks = sorted(self._coincidences)
 
     def at(self, value: float) -> Oscillator:
         """The oscillator there."""
-        # Of one type, whichever that of the value: else programs are compiled twice.
-        return vary(self.osc, self.index, jnp.asarray(np.array([value])))
+        return self.variation.oscillator(np.array([value]))
 
     def unstable(self, value: float, around: int) -> Cycle:
         """The unstable cycle there around an equilibrium, or why there is none; computed once."""
@@ -103,14 +103,6 @@ class ParameterPath:
         return value - distance, value + distance
 
     @property
-    def belt(self) -> int:
-        """The belt whose velocity is varied, or -1."""
-        for belt in range(len(self.osc.belts)):
-            if leaf_index(self.osc, lambda osc, belt=belt: osc.belts[belt].velocity) == self.index:
-                return belt
-        return -1
-
-    @property
     def edged(self) -> list[int]:
         """Belts with a finite contact edge; one for each place if they share their edges."""
         belts: list[int] = []
@@ -122,30 +114,18 @@ class ParameterPath:
             known |= own
         return belts
 
-    def _coincidences(self) -> list[float]:
-        """Where the belt that is varied is at rest, or runs with another one; both with a load."""
-        if self.belt < 0 or not self.osc.belts[self.belt].load:
-            return []
-        others = [
-            float(b.velocity) for i, b in enumerate(self.osc.belts) if i != self.belt and b.load
-        ]
-        inside = [v for v in {0.0, *others} if self.first <= v <= self.last]
-        return sorted(inside)
-
     def coinciding(self, value: float) -> list[tuple[int, ...]]:
-        """The varied belt and each that runs at one velocity with it there; itself, if at rest."""
-        others = [(i, b) for i, b in enumerate(self.osc.belts) if i != self.belt and b.load]
-        pairs: list[tuple[int, ...]] = [
-            (self.belt, i) for i, b in others if float(b.velocity) == value
-        ]
-        return [*pairs, (self.belt,)] if value == 0 else pairs
+        """The pairs of belts that come to run at one velocity there, and those that come to rest
+        alone."""
+        return self._coincidences[value]
 
     def look(self, values: Sequence[float] | np.ndarray) -> None:
         """Find the labels there, in batches."""
         new = np.array(sorted({float(v) for v in values} - self.labels.keys()))
         for batch in (new[i : i + BATCH] for i in range(0, new.size, BATCH)):
             filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
-            seen = jax.tree.map(np.asarray, _motions(self.osc, self.index, jnp.asarray(filled)))
+            oscs = self.variation.oscillators(filled[:, None])
+            seen = jax.tree.map(np.asarray, _motions(oscs))
             for lane, value in enumerate(batch.tolist()):
                 self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen))
         self._share()
@@ -320,8 +300,9 @@ class _Motions(NamedTuple):
 
 
 @jit
-def _motions(osc: Oscillator, index: Array, values: Array) -> _Motions:
-    return each(lambda p: _motions_at(vary(osc, index, p[None])))(values)
+def _motions(oscs: Oscillator) -> _Motions:
+    rows, rest = eqx.partition(oscs, eqx.is_array)
+    return each(lambda row: _motions_at(eqx.combine(row, rest)))(rows)
 
 
 def _motions_at(osc: Oscillator) -> _Motions:

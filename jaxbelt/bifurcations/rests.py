@@ -43,7 +43,8 @@ from ..model.modes import (
     select,
 )
 from ..model.oscillator import Oscillator
-from ..model.parameters import leaf_index, vary
+from ..model.parameters import leaf_index
+from ..model.variations import Family, Variation
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status
@@ -138,25 +139,31 @@ def hopf_limit(kind: str, trail: Trail, vanishes: Callable, *args: Array) -> Spe
     x1 = trail.x[:, 0]
     if np.ptp(x1) > 5 * trail.step:
         return None
-    guess = jnp.asarray([x1[0], *trail.values[-1]])
-    given = trail.osc, trail.indices, trail.system.chain.codes[0]
-    found, residual = _special_hopf(*given, guess, vanishes, *args)
+    codes = trail.system.chain.codes[0]
+
+    def attempt(family, unknowns):
+        start = jnp.concatenate([jnp.asarray(one) for one in unknowns])
+        found, residual = _special_hopf(family, codes, start, vanishes, *args)
+        return (found, residual), (found[:1], found[1:])
+
+    (found, residual), settled = trail.variation.settle(attempt, (x1[:1], trail.values[-1]))
     values = np.asarray(found[1:])
-    if not (residual < HOLDS and np.linalg.norm(values - trail.values[-1]) < 2 * trail.step):
+    near = np.linalg.norm(values - trail.values[-1]) < 2 * trail.step
+    if not (settled and residual < HOLDS and near):
         return None
     return SpecialPoint(kind, (), (float(values[0]), float(values[1])), float(residual))
 
 
 @jit
-def _special_hopf(osc: Oscillator, indices, codes, guess: Array, vanishes, *args):
+def _special_hopf(family: Family, codes, guess: Array, vanishes, *args):
     """(x1, both parameters) of such a Hopf point, and the error."""
 
-    def equations(osc, u):
-        osc = vary(osc, indices, u[1:])
+    def equations(family, u):
+        osc = family.at(u[1:])
         also = vanishes(osc, codes, u[0], *args)
         return jnp.append(HopfSystem(codes).residual(osc, u[:1]), also)
 
-    u, _, residual, _ = small_newton(equations, osc, guess)
+    u, _, residual, _ = small_newton(equations, family, guess)
     return u, residual
 
 
@@ -398,8 +405,8 @@ class _RestingBeltCondition(AbstractRestCondition):
 
     def kind_along(self, osc, multiplier):
         number = leaf_index(osc, lambda osc: osc.belts[int(self.belt)].velocity)
-        index, sudden = jnp.asarray(np.array(number)), SuddenSliding(self.belt)
-        found = (sudden.found_from(osc, index, value) for value in sudden.values(0.0, 0.0))
+        velocity, sudden = Variation.of_leaves(osc, [number]), SuddenSliding(self.belt)
+        found = (sudden.found_from(velocity, value) for value in sudden.values(0.0, 0.0))
         return BeltAtRest if next(filter(None, found), None) is None else SuddenSliding
 
 

@@ -51,19 +51,21 @@ NEAR = 1 / 400
 
 
 def scan(
-    osc: Oscillator,
-    where: Callable[[Oscillator], Any],
-    span: tuple[float, float],
+    osc: Oscillator | Callable[..., Oscillator],
+    where: Callable[[Oscillator], Any] | None = None,
+    span: tuple[float, float] | None = None,
     *,
     resolution: int = 96,
     conditions: Sequence[AbstractCondition] = (),
 ) -> tuple[BifurcationPoint, ...]:
     """Every bifurcation point along a path in one parameter, in order, each as from `refine`.
 
-    osc: the oscillator; where: selects the parameter, such as `lambda osc: osc.belts[0].velocity`;
-    span: its first and last value, dimensionless like itself; resolution: how many intervals are
-    looked at first. Points of which one undoes what the other did are seen if one of these values
-    lies between them. conditions: of your own, which are looked for, too.
+    osc: the oscillator; where: selects the parameter, such as `lambda osc: osc.belts[0].velocity`.
+    Or osc, without where: a function of the parameter that returns the oscillator, of what JAX can
+    differentiate, such as `lambda s: jb.presets.class_c(-0.3, 0.3, sigma=s)`. span: its first and
+    last value, dimensionless like itself; resolution: how many intervals are looked at first.
+    Points of which one undoes what the other did are seen if one of these values lies between them.
+    conditions: of your own, which are looked for, too.
 
     Each point has `kind`, `value`, and the rest of a `BifurcationPoint`. What happens at contact
     edges is looked for where there are any; where an unstable cycle touches them only
@@ -75,8 +77,13 @@ def scan(
     return search(ParameterPath(osc, where, span, conditions), resolution)
 
 
-def search(path: ParameterPath, resolution: int = 96) -> tuple[BifurcationPoint, ...]:
-    """Every bifurcation point on a path, in order; its labels are kept with it."""
+def search(
+    path: ParameterPath, resolution: int = 96, near: float = NEAR
+) -> tuple[BifurcationPoint, ...]:
+    """Every bifurcation point on a path, in order; its labels are kept with it.
+
+    near: from the ends of intervals narrower than this fraction of it points are solved for.
+    """
     points = [point for at in path.breaks for point in _at_break(path, at)]
     ends = [path.first, *(v for at in path.breaks for v in path.beside(at)), path.last]
     width = (path.last - path.first) / resolution
@@ -90,7 +97,7 @@ def search(path: ParameterPath, resolution: int = 96) -> tuple[BifurcationPoint,
         values: list[float] = []
         for a, b in intervals:
             is_narrow = b - a <= NEAR * path.length
-            point = _explained(path, a, b) if is_narrow else None
+            point = _explained(path, a, b) if b - a <= near * path.length else None
             if point is not None:
                 # The interval on the other side of a fold may have led to it already.
                 if not any(_is_same_point(point, other) for other in points):
@@ -99,7 +106,7 @@ def search(path: ParameterPath, resolution: int = 96) -> tuple[BifurcationPoint,
                 settled.append((before, after))
                 values += [max(a, before), min(b, after)]
             elif b - a <= 1e-9 * path.length:
-                points.append(unexplained_point(path.osc, int(path.index), 0.5 * (a + b), b - a))
+                points.append(unexplained_point(path.variation, 0.5 * (a + b), b - a))
                 settled.append((a, b))
             else:
                 values += np.linspace(a, b, 3 if is_narrow else 9).tolist()
@@ -134,7 +141,7 @@ def edges_touched(
         return path.unstable(value, around)
 
     def modes(value):
-        return itinerary(path.osc, unstable(value).chain)
+        return itinerary(path.at(value), unstable(value).chain)
 
     def changes(values):
         known = [v for v in map(float, values) if unstable(v).status == Status.OK]
@@ -144,7 +151,7 @@ def edges_touched(
     while intervals:
         a, b = intervals.pop()
         solved = (
-            condition.found_from(path.osc, path.index, value, loop)
+            condition.found_from(path.variation, value, loop)
             for value in (a, b)
             for loop in [as_loop(unstable(value), ROOM)]
             for kind in LOOKED_FOR
@@ -161,7 +168,7 @@ def edges_touched(
         elif unstable(middle).status == Status.OK and b - a > 1e-9 * path.length:
             intervals += changes([a, middle, b])
         else:
-            points.append(unexplained_point(path.osc, int(path.index), middle, b - a))
+            points.append(unexplained_point(path.variation, middle, b - a))
     return by_value(points)
 
 
@@ -188,7 +195,7 @@ def _first_found(
         low, high = (path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]) if slow else (a, b)
         for value in condition.values(a, b):
             for loop in condition.beginnings(path.cycles.get(value, [])):
-                point = condition.found_from(path.osc, path.index, value, loop)
+                point = condition.found_from(path.variation, value, loop)
                 if point is not None and low <= point.value <= high:
                     return point
     return None
@@ -206,5 +213,5 @@ def _at_break(path: ParameterPath, value: float) -> list[BifurcationPoint]:
     if not points and path.label(interval[0]) != path.label(interval[1]):
         # Something else may happen just there.
         point = _explained(path, *interval)
-        points = [point or unexplained_point(path.osc, int(path.index), value, 0.0)]
+        points = [point or unexplained_point(path.variation, value, 0.0)]
     return points

@@ -24,7 +24,7 @@ from ..cycles.attractors import extent
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import Chain, Loop, jacobian, meshed, residual, residual_and_blocks
 from ..model.oscillator import Oscillator
-from ..model.parameters import vary
+from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.newton import HOLDS, Equations, newton, solve
 from ..results import Status
@@ -267,17 +267,16 @@ class _InParameter(Equations):
     system: CycleSystem
 
     def residual(self, given, z):
-        (osc, index), (own, p) = given, z
-        return self.system.residual(vary(osc, index, p), own)
+        own, p = z
+        return self.system.residual(given.at(p), own)
 
     def linearized(self, given, z):
-        osc, index = given
-        return self.system.linearized(functools.partial(vary, osc, index), *z)
+        return self.system.linearized(given.at, *z)
 
 
-def solve_system(osc, index, system, z0, p0):
+def solve_system(family: Family, system, z0, p0):
     """Unknowns, the parameter, the steps of Newton's method and the matrix of the last one."""
-    solved = solve(_InParameter(system), (osc, index), (z0, p0))
+    solved = solve(_InParameter(system), family, (z0, p0))
     return (*solved.z, solved.lengths, solved.matrix)
 
 

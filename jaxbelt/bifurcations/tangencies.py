@@ -15,7 +15,6 @@ Bernardo, C. Budd, A. Champneys, P. Kowalczyk, Piecewise-smooth Dynamical System
 """
 
 import abc
-import functools
 from typing import ClassVar
 
 import equinox as eqx
@@ -28,7 +27,7 @@ from ..cycles.orbits import Orbit, follow, last_loop, loop_of
 from ..cycles.shooting import SIZES, Chain, Loop, admissible, meshed, trace_of
 from ..model.modes import STUCK, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
-from ..model.parameters import vary
+from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS, newton
@@ -158,20 +157,23 @@ class AbstractTangency(AbstractCycleCondition):
         stopping = trail.stopping()
         if stopping is None:
             return None
-        held, resting = stopping
-        nu, free = trail.values[:, held], trail.values[:, 1 - held]
-        guess = np.polyval(np.polyfit(nu, free, 2), 0.0)
-        still = vary(trail.osc, trail.indices[held], jnp.zeros(1))
-        belts = jnp.asarray(resting), jnp.asarray(self.belt)
+        held, free = stopping.held, trail.values[:, 1 - stopping.held]
+        guess = np.polyval(np.polyfit(stopping.velocities, free, 2), 0.0)
+        belts = jnp.asarray(stopping.belt), jnp.asarray(self.belt)
         # A cycle begins at the end of its longest stick phase, which is the one on that belt.
         codes = jnp.asarray(np.asarray(trail.system.chain.codes)[0])
-        value, residual = _tangent_departure(
-            still, trail.indices[1 - held], codes, *belts, jnp.full(1, guess)
-        )
-        if not (residual < HOLDS and abs(value - guess) < 3 * trail.step):
+
+        def attempt(family, unknowns):
+            (p,) = unknowns
+            p, residual = _tangent_departure(family, codes, *belts, jnp.asarray(p))
+            return (p, residual), (p,)
+
+        still = trail.variation.held(held, stopping.value)
+        ((value,), residual), settled = still.settle(attempt, (np.array([guess]),))
+        if not (settled and residual < HOLDS and abs(value - guess) < 3 * trail.step):
             return None
-        values = (float(value), 0.0) if held else (0.0, float(value))
-        return SpecialPoint("BeltAtRest", (resting,), values, float(residual))
+        values = (float(value), stopping.value) if held else (stopping.value, float(value))
+        return SpecialPoint("BeltAtRest", (stopping.belt,), values, float(residual))
 
 
 class Tangency(AbstractTangency):
@@ -280,16 +282,16 @@ def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, A
 
 
 @jit
-def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: Array):
+def _tangent_departure(family: Family, codes, resting, touched, guess: Array):
     """Value of a parameter for which the orbit from `_departure` is tangent to another boundary.
 
     The 3N + 1 equations of an `Encounter`, but that the orbit is not closed: it begins on the
     unstable manifold. Returns the residual, too, with every integration step halved; nan where
     there is no such orbit.
     """
-    osc_at = functools.partial(vary, osc, index)
-    start = _departure(osc_at(guess), codes, resting)
-    orbit = follow(osc_at(guess), start, HINT_BUDGET)
+    osc_at, osc = family.at, family.at(guess)
+    start = _departure(osc, codes, resting)
+    orbit = follow(osc, start, HINT_BUDGET)
     names = Ends(len(osc.belts))
     exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
     side = jnp.sign(jnp.stack([belt.velocity for belt in osc.belts])[touched])
@@ -323,7 +325,7 @@ def _tangent_departure(osc: Oscillator, index, codes, resting, touched, guess: A
     z, p = newton(linearized, (z, guess)).z
     value = system(2 * DEPARTURE_STEPS).residual(osc_at(p), z).at[closing].set(begins(z, p))
     exists = jnp.any(meets) & (last < SIZES[0]) & admissible(osc_at(p), system(1).ordinary, z)
-    return p[0], jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)
+    return p, jnp.where(exists, jnp.max(jnp.abs(value)), jnp.nan)
 
 
 def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:

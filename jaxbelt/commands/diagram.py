@@ -1,6 +1,7 @@
 """`jaxbelt diagram`: equilibria, cycles and bifurcation points along a parameter."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,6 +28,8 @@ from .options import (
     say,
 )
 
+#: Arguments of classes that may be varied, other than velocities: an edge of two belts, or of one.
+EDGES = ("sigma", "sigma0", "sigma1")
 #: Short names of parameters that may be varied.
 PARAMETERS = {"nu0": "belts[0].velocity", "nu1": "belts[1].velocity", "zeta": "damping"}
 
@@ -45,7 +48,8 @@ def diagram(
         str,
         typer.Option(
             "--vary",
-            help="The parameter: nu0, nu1, zeta, or its path, such as belts[1].friction.steepness.",
+            help="The parameter: nu0, nu1, zeta, sigma, sigma0, sigma1, or its path, such as "
+            "belts[1].friction.steepness.",
         ),
     ] = "nu0",
     span: Annotated[
@@ -74,6 +78,8 @@ def diagram(
     - jaxbelt diagram --nu1 0.35
 
     - jaxbelt diagram --nu0 -0.2 --nu1 0.35 --vary zeta --span 0 1.5 --quantity x1
+
+    - jaxbelt diagram --class c --nu0 0.35 --nu1 -0.25 --vary sigma --span -1 1
     """
     from ..plotting.diagrams import plot_diagram
     from ..plotting.style import draw_key, journal_figure, journal_style, save
@@ -81,9 +87,17 @@ def diagram(
     console = make_console()
     with plain_errors():
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
-        osc = oscillator(system, arguments, belt, damping, omega)
+
+        def along(p):
+            return oscillator(system, {**arguments, parameter: p}, belt, damping, omega)
+
         with console.status("looking along the parameter (the first minute is compilation)"):
-            found = jb.bifurcation_diagram(osc, _where(osc, parameter), span, rows=rows)
+            if parameter in EDGES:
+                found = jb.bifurcation_diagram(along, span=span, rows=rows)
+                found = replace(found, name=parameter)
+            else:
+                osc = oscillator(system, arguments, belt, damping, omega)
+                found = jb.bifurcation_diagram(osc, _where(osc, parameter), span, rows=rows)
         with journal_style():
             figure = journal_figure(7.2, 4.2)
             plot_diagram(found, figure.subplots(), quantity=quantity)
@@ -101,7 +115,10 @@ def _where(osc: jb.Oscillator, name: str) -> Any:
     paths = names_of(osc)
     path = PARAMETERS.get(name, name)
     if path not in paths:
-        raise ValueError(f"vary must be nu0, nu1, zeta or one of {', '.join(paths)}, got {name}")
+        edges = ", ".join(EDGES)
+        raise ValueError(
+            f"vary must be nu0, nu1, zeta, {edges} or one of {', '.join(paths)}, got {name}"
+        )
     return lambda osc: jax.tree.leaves(osc)[paths.index(path)]
 
 

@@ -18,7 +18,7 @@ from ..bifurcations.refine import refine
 from ..checks import as_array, check_finite, require
 from ..cycles.cycle import Cycle, find_cycle
 from ..model.oscillator import Oscillator, check_oscillator
-from ..model.parameters import leaf_index, parameter
+from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
 from ..results import Status, describe
 from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of
@@ -68,7 +68,7 @@ def distance_to(
 
     def distance(cycle: Cycle) -> Array:
         osc = cycle.oscillator
-        value = parameter(osc, leaf_index(osc, where))
+        value = jax.tree.leaves(osc)[leaf_index(osc, where)]
         distances = []
         for condition in conditions:
             point = refine(condition, osc, where=where)

@@ -6,7 +6,6 @@ a copy of the oscillator whose leaves are nothing but themselves: whatever comes
 them, or it is not a parameter.
 """
 
-from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import equinox as eqx
@@ -16,7 +15,6 @@ import numpy as np
 from jaxtyping import Array
 
 from ..checks import is_concrete, require
-from ..numerics.compiling import passed_through
 from .oscillator import Oscillator
 
 
@@ -53,7 +51,7 @@ def leaf_index(osc: Oscillator, where: Any) -> int:
         "`lambda osc: osc.belts[0].velocity`"
     )
     chosen = _ask(osc, where, expected)
-    require(_is_number(osc, chosen), "where", expected, _told(chosen))
+    require(_is_parameter(osc, chosen), "where", expected, _told(chosen))
     return chosen.index
 
 
@@ -70,7 +68,7 @@ def leaf_groups(osc: Oscillator, where: Any) -> tuple[tuple[int, ...], ...]:
     chosen = _ask(osc, where, expected)
     groups = [_tuple(one) for one in _tuple(chosen)]
     flat = [leaf for group in groups for leaf in group]
-    fine = groups and all(groups) and all(_is_number(osc, leaf) for leaf in flat)
+    fine = groups and all(groups) and all(_is_parameter(osc, leaf) for leaf in flat)
     require(fine, "where", expected, _told(chosen))
     numbers = [leaf.index for leaf in flat]
     require(len(set(numbers)) == len(numbers), "where", "free of repeats", _told(chosen))
@@ -88,14 +86,19 @@ def _ask(osc: Oscillator, where: Any, expected: str) -> Any:
         raise ValueError(f"where must be {expected}, got {type(error).__name__}: {came}") from error
 
 
-def _is_number(osc: Oscillator, chosen: Any) -> bool:
-    if not isinstance(chosen, Parameter):
-        return False
-    leaf = jax.tree.leaves(osc)[chosen.index]
-    # Of a law of the user's own a leaf may be anything.
+def _is_parameter(osc: Oscillator, chosen: Any) -> bool:
+    return isinstance(chosen, Parameter) and is_number(jax.tree.leaves(osc)[chosen.index])
+
+
+def is_number(leaf: Any) -> bool:
+    """Whether it is one number, which may be varied."""
+    return (is_real(leaf) or type(leaf) is int) and np.ndim(leaf) == 0
+
+
+def is_real(leaf: Any) -> bool:
+    """Whether it is a float, or an array of them. Of a law of the user's own it may be anything."""
     dtype = getattr(leaf, "dtype", None)
-    is_real = type(leaf) in (int, float) if dtype is None else jnp.issubdtype(dtype, jnp.floating)
-    return bool(is_real) and np.ndim(leaf) == 0
+    return type(leaf) is float if dtype is None else bool(jnp.issubdtype(dtype, jnp.floating))
 
 
 def _of(osc: Oscillator) -> str:
@@ -113,39 +116,9 @@ def _told(chosen: Any) -> str:
     return f"a whole {type(chosen).__name__}" if isinstance(chosen, eqx.Module) else repr(chosen)
 
 
-def vary(osc: Oscillator, index: int | Array, p: Array) -> Oscillator:
-    """The oscillator with the parameters of these numbers, one or [k], replaced by p, [k].
-
-    Where the numbers are arrays, one program serves all parameters.
-    """
+def vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
+    """The oscillator with the parameter of that number replaced by p, [1]."""
     leaves, structure = jax.tree.flatten(osc)
-    numbers = [index] if isinstance(index, int) or index.ndim == 0 else index
-    known = is_concrete((osc, index, p))
     # What is known is taken apart in NumPy, which compiles nothing.
-    for which, value in zip(numbers, np.asarray(p) if known else p, strict=True):
-        if known or isinstance(index, int):
-            leaves[int(which)] = jnp.asarray(value)
-        else:
-            leaves = [jnp.where(which == i, value, leaf) for i, leaf in enumerate(leaves)]
+    leaves[index] = jnp.asarray(np.asarray(p)[0]) if is_concrete(p) else p[0]
     return jax.tree.unflatten(structure, leaves)
-
-
-def parameter(osc: Oscillator, index: int | Array) -> Array:
-    """The parameter of that number."""
-    leaves = jax.tree.leaves(osc)
-    return leaves[int(index)] if is_concrete(index) else jnp.stack(leaves)[index]
-
-
-def set_alone(make: Callable[..., Oscillator], names: Sequence[str]) -> list[int] | None:
-    """For each argument of `make` the number of the leaf that it is, or None.
-
-    None where an argument is not one leaf, or another leaf depends on it: an oscillator with this
-    leaf changed is then not what `make` gives.
-    """
-
-    def leaves(*values):
-        every = jax.tree.leaves(make(**dict(zip(names, values, strict=True))))
-        return [leaf if eqx.is_array_like(leaf) else 0.0 for leaf in every]
-
-    numbers = [place for place in passed_through(leaves, len(names)) if place is not None]
-    return numbers if len(numbers) == len(names) else None

@@ -2,7 +2,7 @@
 
 - `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `in_turn`, `with_batches`,
   `wide` and `any_lane` save time of running.
-- `depends` and `passed_through` look at what a function does with its arguments.
+- `depends` and `is_affine` look at what a function does with its arguments.
 - `require_own_threads` looks at whether JAX was in use before a process was forked.
 
 With JAXBELT_PLAIN=1 in the environment nothing unpromised is used, and everything works, slower.
@@ -94,6 +94,11 @@ def _probe() -> Any:
     return 0
 
 
+def is_outermost(*values: Any) -> bool:
+    """Whether the numbers in `values`, and those that are computed from here on, are known."""
+    return is_concrete((values, _probe()))
+
+
 def jit(function: Callable) -> Any:
     """`equinox.filter_jit`, compiled with the options `QUICK`.
 
@@ -110,8 +115,7 @@ def jit(function: Callable) -> Any:
     @functools.wraps(function)
     def call(*args, **kwargs):
         require_own_threads()
-        outermost = is_concrete((args, kwargs, _probe()))
-        return (quick() if outermost else plain)(*args, **kwargs)
+        return (quick() if is_outermost(args, kwargs) else plain)(*args, **kwargs)
 
     return call
 
@@ -392,56 +396,56 @@ def _depends(function: Callable, usable: bool, *args: Any) -> tuple[bool, ...]:
     return tuple(found)
 
 
-def passed_through(function: Callable[..., Sequence[Any]], count: int) -> list[int | None]:
-    """For each of `count` numbers which result of the function it is, where no other depends on it.
+def is_affine(function: Callable[..., Sequence[Any]], count: int) -> bool:
+    """Whether all that the function gives of `count` numbers is known to be linear in them, but for
+    constants.
 
-    Else None. Plain: by the values that the function gives for many numbers.
+    By its program: the numbers are added, scaled and handed on, and nothing else is done with them.
+    Plain: of no function is it known.
     """
 
     def trial():
-        return _passed_by_program(lambda p, q, r: [p, jnp.sin(q), 1.0, r, r], 3) == [0, None, None]
+        return _is_affine(lambda p, q: [p - 2 * q / 3, q, 1.0], 2) and not (
+            _is_affine(lambda p, q: [p * q], 2) or _is_affine(lambda p: [jnp.abs(p)], 1)
+        )
 
-    usable = _usable("a look into traced programs", trial)
-    return (_passed_by_program if usable else _passed_by_value)(function, count)
+    return _usable("a look into traced programs", trial) and _is_affine(function, count)
 
 
-def _passed_by_program(function: Callable[..., Sequence[Any]], count: int) -> list[int | None]:
+#: What keeps numbers linear.
+LINEAR = frozenset(
+    """add add_any sub neg copy convert_element_type broadcast_in_dim reshape squeeze
+    concatenate slice""".split()
+)
+
+
+def _is_affine(function: Callable[..., Sequence[Any]], count: int) -> bool:
+    number = jax.ShapeDtypeStruct((), jnp.float64)
+    return _depending(jax.make_jaxpr(function)(*[number] * count).jaxpr, [True] * count) is not None
+
+
+def _depending(jaxpr: Any, given: Sequence[bool]) -> list[bool] | None:
+    """Which results depend on the arguments `given`; None where one is not linear in them."""
     from jax.extend.core import Var
 
-    number = jax.ShapeDtypeStruct((), jnp.float64)
-    program = jax.make_jaxpr(function)(*[number] * count).jaxpr
-    numbers = []
-    for argument in program.invars:
-        depending = {argument}
-        for equation in program.eqns:
-            if any(isinstance(one, Var) and one in depending for one in equation.invars):
-                depending.update(equation.outvars)
-        outvars = enumerate(program.outvars)
-        places = [place for place, one in outvars if isinstance(one, Var) and one in depending]
-        unchanged = len(places) == 1 and program.outvars[places[0]] is argument
-        numbers.append(places[0] if unchanged else None)
-    return numbers
+    depending = {one for one, depends in zip(jaxpr.invars, given, strict=True) if depends}
 
+    def which(atoms):
+        return [isinstance(one, Var) and one in depending for one in atoms]
 
-def _passed_by_value(function: Callable[..., Sequence[Any]], count: int) -> list[int | None]:
-    # Both signs, and sizes from 1e-3 to 1e3: other than a number does whatever is made of it.
-    rng = np.random.default_rng(0)
-    sizes = 10 ** rng.uniform(-3, 3, (2, 64, count))
-    first, second = rng.choice([-1.0, 1.0], sizes.shape) * sizes
-
-    def results(rows):
-        return [np.asarray(result) for result in jax.vmap(function)(*jnp.asarray(rows.T))]
-
-    before, numbers = results(first), []
-    for column in range(count):
-        moved = first.copy()
-        moved[:, column] = second[:, column]
-        after = results(moved)
-        pairs = enumerate(zip(before, after, strict=True))
-        places = [place for place, pair in pairs if not np.array_equal(*pair, equal_nan=True)]
-        unchanged = len(places) == 1 and np.array_equal(after[places[0]], moved[:, column])
-        numbers.append(places[0] if unchanged else None)
-    return numbers
+    for equation in jaxpr.eqns:
+        given, name = which(equation.invars), equation.primitive.name
+        if not any(given):
+            continue
+        inner = equation.params.get("jaxpr") if name in ("jit", "pjit") else None
+        scales = (name == "mul" and sum(given) == 1) or (name == "div" and not given[1])
+        picks = name == "select_n" and not given[0]
+        linear = [True] * len(equation.outvars) if name in LINEAR or scales or picks else None
+        out = linear if inner is None else _depending(inner.jaxpr, given)
+        if out is None:
+            return None
+        depending |= {one for one, depends in zip(equation.outvars, out, strict=True) if depends}
+    return which(jaxpr.outvars)
 
 
 # --- forked processes -----------------------------------------------------------------------------

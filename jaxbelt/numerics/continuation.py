@@ -72,6 +72,7 @@ def continue_curve(
     min_step: float = 1e-8,
     max_step: float = 0.1,
     max_points: int = 1000,
+    solve: Callable[..., "Corrected"] | None = None,
 ) -> Iterator[CurvePoint]:
     """The points of the curve F(u, args) = 0 from near `start`, as they are found.
 
@@ -80,6 +81,8 @@ def continue_curve(
     point. direction: [n + 1], the way to go from there, as its angle with the tangent tells. span:
     smallest and largest u, numbers or [n + 1]; the curve ends with a point on the first side that
     it meets. step, min_step, max_step: lengths of the first, the shortest and the longest chord.
+    solve: (u, tangent, length) as in `corrected`, which it stands for where F itself is to be known
+    better at every point.
 
     The last point says why it is the last. Where Newton's method fails at the start there is no
     point. `ValueError` names an impossible argument.
@@ -98,7 +101,7 @@ def continue_curve(
     # A number that is no array would be a constant of the program, compiled anew for every value.
     args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, args)
 
-    solve = functools.partial(corrected, linearized, args)
+    solve = solve or functools.partial(corrected, linearized, args)
 
     first = solve(u0, way / np.linalg.norm(way), 0.0)
     if not first.found:

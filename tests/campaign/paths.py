@@ -121,11 +121,12 @@ def random_path(rng: np.random.Generator, structure, *, rational: bool) -> Case:
         span = first, first + width
         if rational:
             span = tuple(round(20 * end) / 20 for end in span)
-        if span[0] < span[1] and all(_is_possible(_with(osc, parameter, end)) for end in span):
+        if span[0] < span[1] and all(is_possible(_with(osc, parameter, end)) for end in span):
             return Case(osc, parameter, span, "rational" if rational else "random")
 
 
-def _is_possible(osc: engine.Oscillator) -> bool:
+def is_possible(osc: engine.Oscillator) -> bool:
+    """Whether the package takes such an oscillator."""
     try:
         package.oscillator(osc).check()
     except ValueError:

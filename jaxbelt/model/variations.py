@@ -1,0 +1,410 @@
+"""What is varied: a parameter of an oscillator, or whatever a function of numbers makes of it.
+
+A `Variation` gives the oscillator at each value of one parameter, or of two. It is made from an
+oscillator and `where`, which selects its leaves, or from a function that returns the oscillator;
+who uses it does not know from which. Compiled programs are handed a `Family`: oscillators that are
+linear in the parameters, their leaves and slopes as data, so that one program serves every
+parameter and every function. Where a function is not linear, what was solved for in the family that
+is tangent to it at a guess is solved for again in the one that is tangent at the solution, until
+both are one oscillator there (`Variation.settle`). That is Newton's method once more.
+"""
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations, product
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ..checks import is_concrete, require
+from ..numerics.compiling import depends, is_affine, is_outermost
+from .oscillator import Oscillator, check_oscillator, check_scalars
+from .parameters import is_number, is_real, leaf_index, names_of
+
+#: Numbers that differ by less, relative to their size beside 1, are the same but for rounding.
+ROUNDING = 1e-14
+#: Numbers of an oscillator that differ by less are those of a point found there.
+SAME_NUMBER = 1e-9
+#: How often a nonlinear function is linearised anew. The distance is squared every time: 1e-1,
+#: 1e-2, 1e-4, 1e-8, 1e-16. Inside of a trace, where nobody looks, it is done so often in any case.
+PASSES, TRACED_PASSES = 12, 5
+#: Values between which zeros of velocities are looked for, and how near two are taken for one.
+VALUES_SEEN, MERGED = 257, 1e-7
+#: Guesses along each side of a plane for where an oscillator lies in it.
+GUESSES = 9
+
+
+class Family(eqx.Module):
+    """Oscillators by one parameter or two, linear in them: what programs know of a variation.
+
+    oscillator: the one at `origin`, [k]; slopes: of each of its leaves by the parameters, [k, ...],
+    None where a leaf is no number.
+    """
+
+    oscillator: Oscillator
+    slopes: tuple[Any, ...]
+    origin: Any
+
+    def at(self, p: Any) -> Oscillator:
+        """The oscillator at the parameters p, [k]."""
+        leaves, structure = jax.tree.flatten(self.oscillator)
+        known = is_concrete((self, p))
+        # What is known is taken apart in NumPy, which compiles nothing.
+        one: Any = np if known else jnp
+        shift = one.asarray(p) - one.asarray(self.origin)
+        for place, (leaf, slope) in enumerate(zip(leaves, self.slopes, strict=True)):
+            if slope is None or (is_concrete(slope) and not np.any(slope)):
+                continue
+            # An edge may be infinite, and a parameter NaN: that moves what depends on it only.
+            moves = [
+                one.where(row == 0, 0.0, row * by) for row, by in zip(slope, shift, strict=True)
+            ]
+            leaves[place] = jnp.asarray(sum(moves, start=one.asarray(leaf)))
+        return jax.tree.unflatten(structure, leaves)
+
+    def velocity_slopes(self) -> list[Any]:
+        """Those of the velocities of the belts, [k] each."""
+        slopes = jax.tree.unflatten(jax.tree.structure(self.oscillator), self.slopes)
+        return [belt.velocity for belt in slopes.belts]
+
+    def zeros(self, which: tuple[int, ...]) -> list[float]:
+        """The value of the one parameter at which a belt is at rest, or two run at one velocity;
+        none where that does not change."""
+        at = [*(float(self.oscillator.belts[belt].velocity) for belt in which), 0.0]
+        slopes = self.velocity_slopes()
+        along = [*(float(slopes[belt][0]) for belt in which), 0.0]
+        if along[0] == along[1]:
+            return []
+        return [float(self.origin[0]) + (at[1] - at[0]) / (along[0] - along[1])]
+
+
+@dataclass(frozen=True)
+class Variation:
+    """What is varied: oscillators by one parameter or two.
+
+    make: gives the oscillator at numbers; names: of the parameters; line: all of them, where they
+    are linear in the parameters; else tangents: those that are known, by the parameters.
+    """
+
+    make: Callable[..., Oscillator]
+    names: tuple[str, ...]
+    line: Family | None
+    tangents: dict[tuple[float, ...], Family] = field(default_factory=dict)
+
+    @classmethod
+    def of_leaves(cls, osc: Oscillator, numbers: Sequence[int]) -> "Variation":
+        """An oscillator in which the leaves of these numbers are varied."""
+        leaves, structure = jax.tree.flatten(osc)
+        slopes: list[Any] = [None] * len(leaves)
+        for place, leaf in enumerate(leaves):
+            if is_number(leaf):
+                slopes[place] = np.array([float(number == place) for number in numbers])
+                if place in numbers:
+                    leaves[place] = jnp.asarray(np.zeros(()))
+                elif not isinstance(leaf, jax.Array):
+                    leaves[place] = jnp.asarray(np.float64(leaf))
+        line = Family(jax.tree.unflatten(structure, leaves), tuple(slopes), np.zeros(len(numbers)))
+        named = names_of(osc)
+        names = tuple(named[number] for number in numbers)
+        return cls(lambda *p: line.at(jnp.stack(p)), names, line)
+
+    @classmethod
+    def of_function(
+        cls, make: Callable[..., Oscillator], values: Sequence[Any], argument: str = "osc"
+    ) -> "Variation":
+        """The oscillators that a function gives, `values` being some that are possible.
+
+        `ValueError`, naming `argument`, for a function of other arguments or results, for one that
+        JAX cannot differentiate, and where an argument makes no difference.
+        """
+        words = ("", "one number", "two numbers")[len(values)]
+        expected = f"a function of {words} that returns an Oscillator"
+        make, names = _by_position(make, len(values), argument, expected)
+
+        def numbers(*p):
+            osc = make(*p)
+            told = f"one that returns {type(osc).__name__}"
+            require(isinstance(osc, Oscillator), argument, expected, told)
+            check_scalars(osc)
+            leaves = jax.tree.leaves(osc)
+            return [jnp.asarray(leaf) for leaf in leaves if is_real(leaf)]
+
+        try:
+            for place in range(len(values)):
+                rest = [*values[:place], *values[place + 1 :]]
+
+                def one(p, rest=rest, place=place):
+                    return numbers(*rest[:place], p, *rest[place:])
+
+                told = f"one whose argument {names[place]} makes no difference"
+                require(any(depends(one, 0.0)), argument, expected, told)
+            found = cls(make, names, None)
+            if is_affine(numbers, len(values)):
+                return cls(make, names, found._tangent(np.zeros(len(values))))
+            found._tangent(values)
+        except (TypeError, jax.errors.JAXTypeError) as error:
+            came = str(error).partition("\n")[0]
+            raise ValueError(
+                f"{argument} must be {expected}, made of what JAX can differentiate (jnp.sqrt, "
+                f"say, not math.sqrt), got {type(error).__name__}: {came}"
+            ) from error
+        return found
+
+    def _tangent(self, values: Any) -> Family:
+        """The oscillators that are tangent to the function there."""
+        structure, rest = None, []
+
+        def numbers(*p):
+            nonlocal structure, rest
+            leaves, structure = jax.tree.flatten(self.make(*p))
+            is_one = [is_real(leaf) for leaf in leaves]
+            rest = [None if one else leaf for leaf, one in zip(leaves, is_one, strict=True)]
+            pairs = zip(leaves, is_one, strict=True)
+            return [jnp.asarray(leaf, dtype=jnp.float64) for leaf, one in pairs if one]
+
+        values = np.asarray(values) if is_concrete(values) else jnp.stack([*values])
+        at = tuple(jnp.asarray(value) for value in values)
+        tangents, leaves = [], []
+        for place in range(len(at)):
+            along = tuple(jnp.asarray(np.float64(place == i)) for i in range(len(at)))
+            leaves, tangent = jax.jvp(numbers, at, along)
+            tangents.append(tangent)
+        pack: Any = np if is_concrete(tangents) else jnp
+        slopes = iter([pack.stack(rows) for rows in zip(*tangents, strict=True)])
+        found = iter(leaves)
+        whole = [next(found) if other is None else other for other in rest]
+        return Family(
+            jax.tree.unflatten(structure, whole),
+            tuple(next(slopes) if other is None else None for other in rest),
+            values,
+        )
+
+    def family(self, values: Any) -> Family:
+        """Oscillators that are linear in the parameters, and those of the variation near `values`,
+        [k]."""
+        if self.line is not None:
+            return self.line
+        if not is_concrete(values):
+            return self._tangent(values)
+        place = tuple(np.asarray(values).tolist())
+        if place not in self.tangents:
+            self.tangents[place] = self._tangent(values)
+        return self.tangents[place]
+
+    def oscillator(self, values: Any) -> Oscillator:
+        """The oscillator at these values, [k]; whether it is a possible one is not asked."""
+        return self.family(values).oscillator if self.line is None else self.line.at(values)
+
+    def oscillators(self, rows: np.ndarray) -> Oscillator:
+        """Those at many values, [rows, k], as one with a row in each leaf."""
+        line = self.line
+        make = self.make if line is None else lambda *p: line.at(jnp.stack(p))
+        return eqx.filter_vmap(make)(*(jnp.asarray(column) for column in rows.T))
+
+    def coincidences(self, first: float, last: float) -> dict[float, list[tuple[int, ...]]]:
+        """Where, between two values of the one parameter, belts come to run at one velocity, two
+        numbers each, and then where a belt comes to rest, its number; all of them with a load."""
+        found: dict[float, list[tuple[int, ...]]] = {}
+        belts = range(len(self.oscillator(np.array([first])).belts))
+        for which in [*combinations(belts, 2), *((belt,) for belt in belts)]:
+            line = self.line
+            zeros = self._zeros(which, first, last) if line is None else line.zeros(which)
+            for value in zeros:
+                if not first <= value <= last:
+                    continue
+                osc = self.oscillator(np.array([value]))
+                if not all(float(osc.belts[belt].load) for belt in which):
+                    continue
+                near = (one for one in found if self.line is None and abs(one - value) < MERGED)
+                found.setdefault(next(near, value), []).append(which)
+        return found
+
+    def _zeros(self, which: tuple[int, ...], first: float, last: float) -> list[float]:
+        """As `Family.zeros`, between two values."""
+        from scipy.optimize import brentq, minimize_scalar  # late, as only functions need them
+
+        def difference(osc):
+            velocities = [np.asarray(osc.belts[belt].velocity) for belt in which]
+            return velocities[0] - velocities[1] if len(which) == 2 else velocities[0]
+
+        def at(value):
+            return float(difference(self.oscillator(np.array([value]))))
+
+        rows = np.linspace(first, last, VALUES_SEEN)
+        v = difference(self.oscillators(rows[:, None]))
+        if np.all(v == v[0]):
+            return []
+        zeros = rows[v == 0].tolist()
+        for k in np.flatnonzero(v[:-1] * v[1:] < 0):
+            root: Any = brentq(at, rows[k], rows[k + 1], xtol=ROUNDING)
+            zeros.append(float(root))
+        size = np.abs(v)
+        # Where it comes to zero and turns back.
+        inner = (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:]) & (v[:-2] * v[2:] > 0)
+        for k in 1 + np.flatnonzero(inner & (v[1:-1] != 0)):
+            ends = rows[k - 1], rows[k + 1]
+            least = minimize_scalar(lambda p: abs(at(p)), bounds=ends, options={"xatol": ROUNDING})
+            if least.fun < MERGED**2:
+                zeros.append(float(least.x))
+        return zeros
+
+    def check(self, *values: float) -> None:
+        """Raise a `ValueError` where the oscillator at these values is impossible."""
+        if self.line is None:
+            Oscillator.check(self.make(*map(np.float64, values)))
+        else:
+            Oscillator.check(self.line.at(np.array(values)))
+
+    def held(self, axis: int, value: float) -> "Variation":
+        """The variation of the other of two parameters."""
+        free = 1 - axis
+        pair = np.zeros(2)
+        pair[axis] = value
+        line = None
+        if self.line is not None:
+            pair[free] = self.line.origin[free]
+            slopes = tuple(slope if slope is None else slope[[free]] for slope in self.line.slopes)
+            line = Family(self.line.at(pair), slopes, self.line.origin[[free]])
+
+        def make(p):
+            return self.make(*(p if place == free else value for place in (0, 1)))
+
+        return Variation(make, (self.names[free],), line)
+
+    def rest_of(self, belt: int, start: float) -> float:
+        """The value, near `start`, of the one parameter, at which a belt is at rest."""
+        value = float(start)
+        for _ in range(PASSES):
+            family = self.family(np.array([value]))
+            velocity = family.at(np.array([value])).belts[belt].velocity
+            change = -float(velocity) / float(family.velocity_slopes()[belt][0])
+            value += change
+            if not abs(change) > ROUNDING:
+                break
+        return value
+
+    def settle(
+        self, attempt: Callable[[Family, Any], tuple[Any, Any]], unknowns: Any
+    ) -> tuple[Any, Any]:
+        """What an attempt finds in the family that is tangent where it ends, and whether it is.
+
+        attempt: of a family and the unknowns to begin from, the last ones of which are the
+        parameters, [k]; gives what it found and the unknowns there.
+        """
+        if self.line is not None:
+            return attempt(self.line, unknowns)[0], True
+        family, found = self.family(unknowns[-1]), None
+        if not is_outermost(family, unknowns):
+
+            def again(unknowns, _):
+                fixed = lax.stop_gradient(self.family(unknowns[-1]))
+                return lax.stop_gradient(attempt(fixed, unknowns)[1]), None
+
+            unknowns, _ = lax.scan(again, unknowns, length=TRACED_PASSES - 1)
+            family = self.family(unknowns[-1])
+            found, (*_, p) = attempt(family, unknowns)
+            return found, _agree(*lax.stop_gradient((family.at(p), self.oscillator(p))))
+        for _ in range(PASSES):
+            found, unknowns = attempt(family, unknowns)
+            values = np.asarray(unknowns[-1])
+            if not np.all(np.isfinite(values)):
+                break
+            before, family = family, self.family(values)
+            if _agree(before.at(values), family.oscillator):
+                return found, True
+        return found, False
+
+    def values_of(self, osc: Oscillator, span: np.ndarray, start: Any = None) -> np.ndarray | None:
+        """Where an oscillator lies among those of the variation, [k]; None where it is none.
+
+        span: the first and last value of each parameter, [k, 2], between which it is looked for;
+        start: where to begin. By the method of Gauss and Newton.
+        """
+        if jax.tree.structure(osc) != jax.tree.structure(self.oscillator(span[:, 0])):
+            return None
+        wanted = _numbers(osc)
+
+        def misses(values):
+            own = _numbers(self.oscillator(values))
+            with np.errstate(invalid="ignore"):
+                return np.where(own == wanted, 0.0, wanted - own)
+
+        guesses = [start]
+        if self.line is not None:
+            guesses = [self.line.origin]
+        elif start is None:
+            inner = [np.linspace(a, b, GUESSES + 2)[1:-1] for a, b in span]
+            guesses = [np.array(one) for one in product(*inner)]
+        values = min(guesses, key=lambda one: np.nan_to_num(np.sum(misses(one) ** 2), nan=np.inf))
+        for _ in range(PASSES):
+            slopes = [one for one in self.family(values).slopes if one is not None]
+            matrix = np.concatenate([np.reshape(one, (len(values), -1)) for one in slopes], axis=1)
+            missing = misses(values)
+            square, side = matrix @ matrix.T, matrix @ np.where(np.any(matrix, 0), missing, 0.0)
+            if not np.linalg.cond(square) < 1 / ROUNDING:
+                return None
+            change = np.linalg.solve(square, side)
+            values = values + change
+            if np.max(np.abs(change)) < ROUNDING:
+                break
+        found = np.all(np.abs(misses(values)) <= SAME_NUMBER * (1 + np.abs(wanted)))
+        return values if found else None
+
+
+def varied(osc: Any, where: Any, values: Sequence[Any]) -> Variation:
+    """What an entry is to vary, by one parameter, from what it was given: an oscillator and
+    `where`, or a function alone, or what is varied. values: a possible one of the parameter."""
+    if isinstance(osc, Variation):
+        return osc
+    if callable(osc) and not isinstance(osc, Oscillator):
+        alone = "left out where osc is a function of the parameter"
+        require(where is None, "where", alone, repr(where))
+        make: Any = osc
+        return Variation.of_function(make, values)
+    check_oscillator(osc)
+    return Variation.of_leaves(osc, [leaf_index(osc, where)])
+
+
+def _by_position(make: Any, count: int, argument: str, expected: str):
+    """A function that takes so many numbers, one after another, and the names of its arguments."""
+    require(callable(make), argument, expected, repr(make))
+    try:
+        signature = inspect.signature(make)
+    except (TypeError, ValueError):
+        return make, ("p", "q")[:count]
+    given = [one for one in signature.parameters.values() if one.kind not in _ANY_NUMBER]
+    free = [one.name for one in given if one.default is one.empty]
+    if len(free) == count and any(one.kind == one.KEYWORD_ONLY for one in given):
+        # Such as functools.partial(jb.presets.class_c, nu1=0.3).
+        return lambda *p: make(**dict(zip(free, p, strict=True))), tuple(free)
+    try:
+        signature.bind(*[0.0] * count)
+    except TypeError:
+        require(False, argument, expected, f"one of {signature}")
+    return make, tuple([*(one.name for one in given), "p", "q"][:count])
+
+
+_ANY_NUMBER = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+def _numbers(osc: Oscillator) -> np.ndarray:
+    """All numbers of an oscillator in one array."""
+    leaves = [np.ravel(x) for x in jax.tree.leaves(osc) if is_real(x)]
+    return np.concatenate(leaves)
+
+
+def _agree(osc: Oscillator, other: Oscillator) -> Any:
+    """Whether two oscillators are the same but for rounding."""
+    one: Any = np if is_concrete((osc, other)) else jnp
+    agree: Any = True
+    with np.errstate(invalid="ignore"):
+        for a, b in zip(*map(jax.tree.leaves, (osc, other)), strict=True):
+            if is_real(a):
+                a, b = one.asarray(a), one.asarray(b)
+                agree &= one.all((a == b) | (one.abs(a - b) <= ROUNDING * (1 + one.abs(b))))
+    return agree
