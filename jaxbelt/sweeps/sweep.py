@@ -96,7 +96,7 @@ def sweep(
     the sweep within a second and says what became of its runs; so does `OSError` where a store
     cannot be written.
     """
-    with _interrupts_told() as known:
+    with _ends_told() as known:
         question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives)
         audit = float(as_array(audit, "audit"))
         require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
@@ -117,8 +117,8 @@ def sweep(
 
 
 @contextmanager
-def _interrupts_told() -> "Iterator[list[Memory | Store]]":
-    """Let an interrupt say what becomes of the runs, whenever it comes.
+def _ends_told() -> "Iterator[list[Memory | Store]]":
+    """Let an interrupt, or a disk that is full, say what becomes of the runs, whenever it comes.
 
     Yields a list for the results, once there is a place for them.
     """
@@ -132,6 +132,11 @@ def _interrupts_told() -> "Iterator[list[Memory | Store]]":
             else "interrupted before the first run; nothing is lost, the same call begins again"
         )
         raise KeyboardInterrupt(told) from None
+    except OSError as error:  # of a store on a full disk, say
+        if not known:
+            raise
+        told = f"{error.strerror or error}; {known[0].interrupted()}"
+        raise OSError(error.errno, told) from error
 
 
 def _kept(
@@ -162,14 +167,10 @@ def _do_and_show(
 ) -> None:
     """Do the runs that the results lack, here or on a cluster."""
     with SweepProgress(results.runs, results.done(), progress) as bar:
-        try:
-            if executor is not None and isinstance(results, Store):
-                do_on_cluster(executor, question, results, bar.advance)
-            else:
-                do_runs(question, results, results.to_do, bar.advance)
-        except OSError as error:  # of a store on a full disk, say
-            told = error.strerror or str(error)
-            raise OSError(error.errno, f"{told}; {results.interrupted()}") from error
+        if executor is not None and isinstance(results, Store):
+            do_on_cluster(executor, question, results, bar.advance)
+        else:
+            do_runs(question, results, results.to_do, bar.advance)
 
 
 def _check_where(question: Question, store, executor, blocks, audit: float) -> None:
