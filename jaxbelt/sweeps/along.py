@@ -127,8 +127,10 @@ class Along(Observer):
         rates = self.rates if hasattr(self.reducer, "rates") else None
         new = take_step(osc, window, one, lanes, until, rtol, atol, rates)
         h, reach = lax.stop_gradient(new.t - lanes.t), LANDING * jnp.sqrt(rtol)
-        ends = [tuple(materialise(x, one) for x in _state(osc, end)) for end in (lanes, new)]
-        course = Course.of_step(*ends, materialise(h, one))
+        starts, ends = (
+            tuple(materialise(x, one) for x in _state(osc, end)) for end in (lanes, new)
+        )
+        course = Course.of_step(starts, ends, materialise(h, one))
         cuts = []
         for (_, _, function), side in zip(self._sections(), seen.sides, strict=True):
             looks = [
@@ -247,7 +249,8 @@ class Along(Observer):
             return jnp.any(jnp.stack(left + [jnp.any(jnp.isfinite(_first(t))) for t in tables]))
 
         def ask(state):
-            return self._ask_next_held(*state, osc, before, after, holds)
+            seen, tables = state
+            return self._ask_next_held(seen, tables, osc, before, after, holds)
 
         return lax.while_loop(pending, ask, (seen, tables))[0]
 

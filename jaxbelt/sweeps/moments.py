@@ -247,6 +247,7 @@ def cut_of_step(side: Array, looks: Sequence[tuple[Array, Array]], h: Array, rea
             one if picked is None else tuple(map(functools.partial(jnp.where, here), one, picked))
         )
         found.append(here)
+    assert picked is not None
     k, at_part, crosses, extremum, *cubic = picked
     root = (k + _bisected(lambda theta: _polynomial(cubic, theta), at_part)) / n
     count = sum(here.astype(jnp.int32) for here in found)

@@ -156,11 +156,13 @@ def _without_doubt(
         "given, the function of the sweep, for cycles that only shooting tells apart",
         f"None; there are such at {len(doubts)} points",
     )
+    assert make is not None
     sizes = [dataset.sizes[name] for name in others]
     for point, pairs in doubts.items():
         place = dict(zip(others, np.unravel_index(point, sizes), strict=True))
         here = dataset.isel({name: int(i) for name, i in place.items()})
-        osc = make(**{name: float(here[name]) for name in here.coords if name not in NO_PARAMETERS})
+        given = (str(name) for name in here.coords if name not in NO_PARAMETERS)
+        osc = make(**{name: float(here[name]) for name in given})
         flat[point] = _settled(osc, flat[point], runs.places[point], pairs)
     return flat.reshape(labels.shape)
 
