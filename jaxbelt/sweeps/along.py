@@ -128,7 +128,7 @@ class Along(Observer):
         new = take_step(osc, window, one, lanes, until, rtol, atol, rates)
         h, reach = lax.stop_gradient(new.t - lanes.t), LANDING * jnp.sqrt(rtol)
         starts, ends = (
-            tuple(materialise(x, one) for x in _state(osc, end)) for end in (lanes, new)
+            tuple(materialise(x, one) for x in _state_and_rate(osc, end)) for end in (lanes, new)
         )
         course = Course.of_step(starts, ends, materialise(h, one))
         cuts = []
@@ -311,7 +311,7 @@ def _first(table: tuple[Array, ...]) -> Array:
     return functools.reduce(jnp.minimum, [jnp.min(part, axis=0) for part in table])
 
 
-def _state(osc: Oscillator, lanes: Lanes) -> tuple[Array, Array, Array]:
+def _state_and_rate(osc: Oscillator, lanes: Lanes) -> tuple[Array, Array, Array]:
     """x1, x2 and x2' in the mode of the lanes, which slip; without derivatives."""
     osc, lanes = lax.stop_gradient((osc, lanes))
     return lanes.x1, lanes.x2, mode_acceleration(osc, lanes.mode, lanes.x1, lanes.x2)
