@@ -185,11 +185,13 @@ while line:
             kills.swept(kills.Sum(), line.split()[0], t1=float(sys.argv[2]))
             print("finished", flush=True)
     except KeyboardInterrupt as error:
-        if str(error):  # else it came too late for the sweep
-            print("interrupted", error, flush=True)
+        # Without a message it came just before or after the sweep.
+        print("interrupted" if str(error) else "missed", error, flush=True)
 """
 #: The longest time in seconds that a sweep is left alone.
 LONGEST_OF_SESSIONS = 5.0
+#: Seconds after which a session that does not answer is ended, for each interrupt.
+LONGEST_ANSWER = 30.0
 
 
 def interrupt_campaign(folder: Path, interrupts: int, seed: int, t1=8000.0) -> dict[str, float]:
@@ -205,6 +207,8 @@ def interrupt_campaign(folder: Path, interrupts: int, seed: int, t1=8000.0) -> d
     command = [sys.executable, "-c", SESSION, str(Path(__file__).parent), str(t1)]
     pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
     with subprocess.Popen(command, **pipes) as session:
+        silent = threading.Timer((interrupts + 2) * LONGEST_ANSWER, session.kill)
+        silent.start()
         ask, answers = session.stdin, session.stdout
         assert ask and answers and answers.readline() == "ready\n"
         while told["interrupted"] < interrupts or told["stores"] == 0:
@@ -212,31 +216,46 @@ def interrupt_campaign(folder: Path, interrupts: int, seed: int, t1=8000.0) -> d
             more = told["interrupted"] < interrupts
             print(store, "compile" if more and rng.random() < 0.5 else "", file=ask, flush=True)
             assert answers.readline() == "begins\n"
-            sent = [0.0]
-
-            def interrupt(sent=sent):
-                sent[0] = time.monotonic()
-                session.send_signal(signal.SIGINT)
-
-            timer = threading.Timer(rng.uniform(0, LONGEST_OF_SESSIONS), interrupt)
-            if more:
-                timer.start()
-            answer = answers.readline()
-            took = time.monotonic() - sent[0]
-            timer.cancel()
-            if more:
-                timer.join()
+            after = rng.uniform(0, LONGEST_OF_SESSIONS) if more else None
+            answer, took = interrupted_after(session, after)
             if answer.startswith("interrupted"):
-                assert "runs are in" in answer and "the same call goes on from there" in answer
+                early = "before the first run" in answer
+                goes_on = "runs are in" in answer and "the same call goes on from" in answer
+                assert early or goes_on
                 told["interrupted"] += 1
-                told["before any block"] += " 0 of " in answer
+                told["before any block"] += early or " 0 of " in answer
                 told["longest"] = max(told["longest"], took)
                 assert not store.exists() or not jb.verify(store).bad
-            else:
-                assert answer == "finished\n" and Kept(store).identical_values(whole)
+            elif answer == "finished\n":
+                assert Kept(store).identical_values(whole)
                 told["stores"] += 1
+            else:
+                assert answer.startswith("missed")
+        silent.cancel()
         ask.close()
     return told
+
+
+def interrupted_after(session, seconds: float | None) -> tuple[str, float]:
+    """What a session that sweeps answers, and how long after the interrupt, which is left out if it
+    has finished by then, or with None."""
+    sent: list[float] = []
+
+    def interrupt():
+        sent.append(time.monotonic())
+        session.send_signal(signal.SIGINT)
+
+    timer = threading.Timer(seconds or 0.0, interrupt)
+    if seconds is not None:
+        timer.start()
+    answer = session.stdout.readline()
+    took = time.monotonic() - sent[0] if sent else 0.0
+    timer.cancel()
+    if seconds is not None:
+        timer.join()
+    if sent and answer == "finished\n":  # then it was too late, and is answered, too
+        assert session.stdout.readline().startswith("missed")
+    return answer, took
 
 
 class Kept:

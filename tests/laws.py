@@ -45,3 +45,24 @@ def nested(r):
 
 
 NESTED = Nested(jnp.asarray(3.0))
+
+
+class Bump(jb.AbstractFriction):
+    """mu(1 - v) = 1 + v/2 + gain (0.98 v - 8/3 v^3) + bump 1e-3/(1 + ((v - 0.703)/1e-3)^2).
+
+    For a belt of velocity 1 and damping 0.5, where a cycle of amplitude 0.7 attracts by `gain`. A
+    bump puts energy in where x2 comes to 0.703, and there is another cycle right outside.
+    """
+
+    static: jax.Array
+    gain: jax.Array
+    bump: jax.Array
+
+    def mu(self, speed):
+        return bumpy(speed, self.gain, self.bump)
+
+
+def bumpy(r, gain, bump):
+    v = 1.0 - r
+    rest = gain * (0.98 * v - 8 / 3 * v**3) + bump * 1e-3 / (1 + ((v - 0.703) / 1e-3) ** 2)
+    return 1.0 + 0.5 * v + rest

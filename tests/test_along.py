@@ -190,6 +190,99 @@ def test_extrema_of_the_velocity_last_through_stick_phases(name):
         np.testing.assert_allclose(found.way[i, 0], run.y_end[0] - Y0[0], **CLOSE)
 
 
+def bowl(osc, x1, x2):
+    """Passed twice on a way of 0.04."""
+    return (x1 - 0.3) ** 2 - 0.02**2
+
+
+class Passages:
+    """How often a section was passed each way, the sums of the times, and whether in order."""
+
+    at = (jb.AtSection(bowl, 1), jb.AtSection(bowl, -1))
+
+    def init(self, osc, x1, x2):
+        return jnp.zeros(2), jnp.zeros(2), jnp.zeros(()), jnp.ones(())
+
+    def update(self, state, event):
+        counts, sums, last, ordered = state
+        here = jnp.where(jnp.arange(2) == event.moment, 1.0, 0.0)
+        ordered = jnp.where(event.t > last, ordered, 0.0)
+        return counts + here, sums + here * event.t, event.t, ordered
+
+    def finish(self, state, end):
+        counts, sums, _, ordered = state
+        return {"counts": counts, "sums": sums, "ordered": ordered}
+
+
+@each
+def test_a_section_is_passed_twice_in_a_stick_phase_and_in_a_step(name):
+    found = swept(CASES[name], Passages())
+    assert np.all(found.ordered == 1)
+    stuck = 0
+    for i, run in enumerate(runs(name)):
+        motion = along(run)
+        passed = roots(lambda t, motion=motion: bowl(None, *motion(t)), count=8_001)
+        downs, ups = passed[::2], passed[1::2]
+        assert found["counts"][i, 0].values.tolist() == [len(ups), len(downs)]
+        np.testing.assert_allclose(found["sums"][i, 0], [sum(ups), sum(downs)], **CLOSE)
+        spans = [(arc.t_start, arc.t_end) for arc in run.arcs if 0 in arc.mode]
+        pairs = list(zip(downs, ups, strict=False))
+        stuck += sum(a < one and two < b for a, b in spans for one, two in pairs)
+    assert stuck > 0
+
+
+class Moments:
+    """Sums of t, x1, x2 and an integral over the moments of each sort, and integrals to the end."""
+
+    at = (jb.AtSection(height, 1), jb.AtExtrema("x1"), jb.AtTimes([7.3, 20.0, 33.1]), jb.AtEvents())
+
+    def init(self, osc, x1, x2):
+        return jnp.zeros((4, 4))
+
+    def rates(self, osc, motion):
+        return motion.x1**2, motion.forces[0]
+
+    def update(self, state, event):
+        told = jnp.stack([event.t, event.x1, event.x2, event.integrals[0]])
+        return state + jnp.where((jnp.arange(4) == event.moment)[:, None], told[None], 0.0)
+
+    def finish(self, state, end):
+        return {"sums": state, "square": end.integrals[0], "force": end.integrals[1]}
+
+
+@pytest.mark.slow(first=True)
+@each
+def test_derivatives_are_differences_of_the_oracle(name):
+    """Of sections, extrema, fixed times, events and integrals, through stick phases and edges."""
+    make, axes = CASES[name]
+    options = dict(y0=Y0, observe=Moments(), derivatives="nu0", **TIGHT)
+    found = jb.sweep(make, {**axes, "nu0": [NU0[0], NU0[2]]}, **options)
+
+    def expected(nu0):
+        right = oracle.class_b(nu0, NU1) if name == "class_b" else oracle.class_c(nu0, 0.4, 0.8)
+        run = oracle.simulate(right, Y0, SPAN)
+        motion = along(run)
+        moments = [
+            roots(lambda t: height(None, *motion(t)))[::2],
+            [loop.t for arc in run.arcs for loop in arc.loops if loop.axis == 0],
+            [7.3, 20.0, 33.1],
+            [event.t for event in run.events],
+        ]
+        knots = sorted({0.0, SPAN, *(t for times in moments for t in times)})
+        parts = [integral(lambda t: motion(t)[0] ** 2, pair) for pair in pairwise(knots)]
+        square = dict(zip(knots, [0.0, *np.cumsum(parts)], strict=True))
+        sums = [sum(np.array([t, *motion(t), square[t]]) for t in times) for times in moments]
+        return np.array([*np.ravel(sums), square[SPAN]])
+
+    for i, nu0 in enumerate((NU0[0], NU0[2])):
+        differences, error = oracle.richardson(expected, nu0, 2e-3, levels=3)
+        ours = [*found.d_sums_d_nu0[i, 0].values.ravel(), found.d_square_d_nu0[i, 0].item()]
+        # As good as the differences are, or to 1e-7 of the largest.
+        room = 1e-7 * np.max(np.abs(differences)) + 10 * error
+        assert np.all(np.abs(np.array(ours) - differences) < room)
+        assert np.all(room < 1e-5 * np.max(np.abs(differences)))
+
+
 @pytest.mark.slow(first=True)
 def test_a_smooth_motion_gives_results_too():
     points, found = swept(FAST, Points()), swept(FAST, Energy())
@@ -248,5 +341,3 @@ def test_impossible_moments_are_named(make, message):
     reducer.at = "x1"
     with pytest.raises(ValueError, match=r"observe\.at must be a tuple of AtEvents, AtExtrema"):
         swept(FAST, reducer)
-    with pytest.raises(ValueError, match="derivatives must be none, where observe has `at` or"):
-        jb.sweep(*FAST, t1=5.0, observe=Largest(0.0), derivatives="nu0")

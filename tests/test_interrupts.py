@@ -10,7 +10,10 @@ import jax
 import kills
 import pytest
 
+import jaxbelt as jb
 from jaxbelt.sweeps import store
+from jaxbelt.sweeps.datasets import Memory
+from jaxbelt.sweeps.question import Question
 
 #: A sweep that would take hours: many short runs, or a few long ones, each longer than a call of
 #: the kernel is to take. Before it, one of the same program that compiles it.
@@ -86,6 +89,27 @@ def test_an_interrupt_ends_the_command(tmp_path):
     assert code == 130 and "interrupted after " in errors and "Traceback" not in errors
     assert seconds < SOON
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "owner, method, kept, message",
+    [
+        (Question, "of", False, "before the first run"),
+        (Question, "identity", True, "before the first run"),
+        (Memory, "dataset", False, "after 3 of 3 runs, which are not kept; with a store"),
+        (store.Store, "finish", True, "3 of 3 runs are in .*; the same call goes on from there"),
+    ],
+)
+def test_an_interrupt_beside_the_runs_says_what_became_of_them(
+    tmp_path, monkeypatch, owner, method, kept, message
+):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(owner, method, interrupt)
+    options = dict(store=tmp_path / "a.zarr") if kept else {}
+    with pytest.raises(KeyboardInterrupt, match=message):
+        jb.sweep(jb.presets.class_b, {"nu0": [0.1, 0.2, 0.3], "nu1": [0.35]}, t1=5.0, **options)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")

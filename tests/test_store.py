@@ -2,7 +2,10 @@
 
 import errno
 import json
+import os
+import subprocess
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import kills
@@ -17,6 +20,7 @@ from jaxbelt.sweeps.grid import Blocks
 from jaxbelt.sweeps.locks import locked
 from jaxbelt.sweeps.store import CHECKSUM
 
+TESTS = Path(__file__).parent
 AXES = {"nu0": np.linspace(-0.6, 0.55, 5), "nu1": np.array([0.35, -0.2, 0.1])}
 OPTIONS = dict(observe="attractor", progress=False)
 
@@ -293,6 +297,63 @@ def test_a_full_disk_harms_nothing(tmp_path, whole, monkeypatch):
     found = jb.verify(path)
     assert not found.bad and 0 < len(found.to_do) < 5
     assert again(path).equals(whole)
+
+
+#: On a disk of two megabytes of its own, which something else fills but for so many kilobytes: the
+#: sweep has to say so, and go on from what it has when there is room again.
+FULL_DISK = """
+import os, sys
+from pathlib import Path
+import jax
+jax.config.update("jax_enable_x64", True)
+import jaxbelt as jb
+import test_store as tests
+tests.stores.BLOCK_RUNS = 4
+disk, told = Path(sys.argv[1]), []
+whole = jb.sweep(jb.presets.class_b, tests.AXES, **tests.OPTIONS)
+for room in map(int, sys.argv[2:]):
+    path, other = disk / f"{room}.zarr", disk / "other"
+    free = os.statvfs(disk)
+    other.write_bytes(bytes(free.f_bavail * free.f_frsize - 1024 * room))
+    try:
+        tests.again(path)
+        raise SystemExit(f"{room} KiB were enough")
+    except OSError as error:
+        assert "No space left on device" in str(error), error
+        assert "store cannot be written" in str(error) or " of 15 runs are in" in str(error), error
+    done = []
+    if path.exists():
+        found = jb.verify(path)
+        assert not found.bad and not found.finished, found
+        done = found.done
+    other.unlink()
+    assert tests.again(path).equals(whole) and jb.verify(path).finished
+    told.append(len(done))
+    tests.stores.shutil.rmtree(path)
+print(*told)
+"""
+
+
+def test_a_disk_that_is_full_harms_nothing(tmp_path):
+    """A real one, where this system lets a process have one of its own."""
+
+    def on_a_disk(size, *command):
+        mount = f'mount -t tmpfs -o size={size} none "$0" && exec "$@"'
+        own = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", mount, str(tmp_path)]
+        environment = dict(os.environ, PYTHONPATH=os.pathsep.join([str(TESTS), *sys.path]))
+        return subprocess.run([*own, *command], capture_output=True, text=True, env=environment)
+
+    try:
+        allowed = on_a_disk("64k", "true").returncode == 0
+    except OSError:
+        allowed = False
+    if not allowed:
+        pytest.skip("no file system of its own for a process")
+    rooms = map(str, (8, 100, 200, 300, 400))
+    ran = on_a_disk("2m", sys.executable, "-c", FULL_DISK, str(tmp_path), *rooms)
+    assert ran.returncode == 0, ran.stderr
+    done = [int(word) for word in ran.stdout.split()]
+    assert done[0] == 0 and max(done) > 0
 
 
 def test_an_interrupt_keeps_what_is_done(tmp_path, whole, monkeypatch):

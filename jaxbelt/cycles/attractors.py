@@ -13,7 +13,7 @@ with one sequence of events. Two things tell.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -135,8 +135,8 @@ class Runs:
         tolerance = max(dataset.attrs["rtol"], dataset.attrs["atol"])
         return cls(np.nan_to_num(np.stack(columns, axis=-1)), signatures, RUN * tolerance)
 
-    def at(self, index: tuple[int, ...]) -> "Runs":
-        """One of them."""
+    def at(self, index: Any) -> "Runs":
+        """Some of them, by an index of the arrays."""
         return Runs(self.places[index], np.asarray(self.signatures[index]), self.error)
 
     def same(self, others: "Runs") -> tuple[np.ndarray, np.ndarray]:

@@ -4,8 +4,12 @@ Steps are those of `step.take_step`. One that passes a section is made again, sh
 of it is so near to the crossing that a Taylor step leads there; the run itself goes on from the
 step's end. Stick phases are known in closed form. Integrals are summed by the stages of the steps,
 as the motion is, and over stick phases by Gauss's rule.
+
+Where a moment is carries no derivative as it is found. A Newton step from there, of size 0 but for
+rounding, gives it that of the implicit function, and so results have right derivatives.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -18,25 +22,26 @@ from jax import lax
 from jaxtyping import Array
 
 from ..kernel.events import event_kinds
-from ..kernel.lanes import Lanes, Observer, choose
+from ..kernel.lanes import Lanes, Observer, choose, materialise
 from ..kernel.step import LANDING
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator
 from .moments import (
+    PARTS_OF_STEP,
     AtEvents,
     AtTimes,
+    Course,
+    Cut,
     checked,
+    crossings_held,
     cut_of_step,
     per_lane,
-    root_between,
     section_of,
     side_of,
     value_and_rate,
 )
 from .observers import RunEnd, RunEvent
 
-#: Parts of a stick phase in which a crossing of a section is looked for.
-PARTS = 4
 #: Nodes and weights of Gauss's rule on [0, 1].
 NODES = [(0.5 * (1 + x), 0.5 * w) for x, w in zip(*np.polynomial.legendre.leggauss(8), strict=True)]
 
@@ -121,30 +126,37 @@ class Along(Observer):
             until = jnp.minimum(until, _next(times, passed))
         rates = self.rates if hasattr(self.reducer, "rates") else None
         new = take_step(osc, window, one, lanes, until, rtol, atol, rates)
-        h, reach = new.t - lanes.t, LANDING * jnp.sqrt(rtol)
-        theta, found = jnp.ones_like(h), []
+        h, reach = lax.stop_gradient(new.t - lanes.t), LANDING * jnp.sqrt(rtol)
+        starts, ends = (
+            tuple(materialise(x, one) for x in _state_and_rate(osc, end)) for end in (lanes, new)
+        )
+        course = Course.of_step(starts, ends, materialise(h, one))
+        cuts = []
         for (_, _, function), side in zip(self._sections(), seen.sides, strict=True):
-            starts = value_and_rate(function, osc, lanes.mode, lanes.x1, lanes.x2)
-            ends = value_and_rate(function, osc, lanes.mode, new.x1, new.x2)
-            theta = jnp.minimum(theta, cut_of_step(side, starts, ends, h, reach))
-            found.append((starts, ends))
+            looks = [
+                course.look(function, osc, lanes.mode, jnp.full_like(h, k / PARTS_OF_STEP))
+                for k in range(PARTS_OF_STEP + 1)
+            ]
+            looks = [(materialise(v, one), materialise(r, one)) for v, r in looks]
+            cuts.append(cut_of_step(side, looks, h, reach))
+        theta = functools.reduce(jnp.minimum, [cut.theta for cut in cuts], jnp.ones_like(h))
+        theta = lax.stop_gradient(materialise(theta, one))
         cut = (h > 0) & (theta < 1)
         new = choose(cut, replace(lanes, h=theta * h), new)
-        kept = (h > 0) & ~cut
-        return self._asked_in_step(osc, lanes, new, kept, found)
+        return self._asked_in_step(osc, one, lanes, new, (h > 0) & ~cut, cuts)
 
-    def _asked_in_step(self, osc, lanes: Lanes, new: Lanes, kept, found) -> Lanes:
+    def _asked_in_step(self, osc, one, lanes: Lanes, new: Lanes, kept, cuts: list[Cut]) -> Lanes:
         seen, sides = new.memory, []
-        parts = zip(self._sections(), seen.sides, found, strict=True)
-        for (number, direction, _), side, (starts, ends) in parts:
-            # The end that is nearer, and from there by a Taylor step.
-            (g0, r0), (g1, r1) = starts, ends
-            now = jnp.where(kept, side_of(g1, r1, side), side)
-            first = jnp.abs(g0 * r1) < jnp.abs(g1 * r0)
-            near = choose(first, lanes, new)
-            value, rate = jnp.where(first, g0, g1), jnp.where(first, r0, r1)
-            delta = -value / jnp.where(rate == 0, 1.0, rate)
-            delta = jnp.clip(delta, lanes.t - near.t, new.t - near.t)
+        parts = zip(self._sections(), seen.sides, cuts, strict=True)
+        for (number, direction, function), side, cut in parts:
+            now = value_and_rate(function, osc, new.mode, new.x1, new.x2)
+            now = jnp.where(kept, side_of(*now, side), side)
+            # The end that is nearer, and from there by Taylor steps.
+            near = choose(cut.at_start, lanes, new)
+            delta = jnp.zeros_like(near.t)
+            for _ in range(2):
+                delta = _to_section(function, osc, near, delta, lanes.t - near.t, new.t - near.t)
+                delta = materialise(delta, one)
             wanted = (now != side) & (now * direction >= 0)
             seen = self._ask(seen, osc, near, delta, wanted, number)
             sides.append(now)
@@ -156,11 +168,9 @@ class Along(Observer):
         memory = replace(seen, sides=tuple(sides), passed=tuple(passed))
         return replace(new, memory=memory)
 
-    def _ask(self, seen: _Watched, osc, lanes: Lanes, delta, wanted, number: int) -> _Watched:
+    def _ask(self, seen: _Watched, osc, lanes: Lanes, delta, wanted, number) -> _Watched:
         """The state after an update at a moment that is `delta` away from the lanes."""
-        a = jnp.where(lanes.mode.any_stuck, 0.0, lanes.a)
-        t, x1 = lanes.t + delta, lanes.x1 + delta * (lanes.x2 + 0.5 * delta * a)
-        x2 = lanes.x2 + delta * a
+        t, (x1, x2) = lanes.t + delta, _moved(osc, lanes, delta)
         ends = [
             self.rates(osc, lanes.mode, *state)
             for state in ((lanes.t, lanes.x1, lanes.x2), (t, x1, x2))
@@ -169,10 +179,11 @@ class Along(Observer):
         none = jnp.zeros(t.shape, int)
         return self._update(seen, (t, x1, x2, none, none - 1), number, totals, wanted)
 
-    def _update(self, seen: _Watched, place: Any, number: int, totals, wanted) -> _Watched:
+    def _update(self, seen: _Watched, place: Any, number, totals, wanted) -> _Watched:
         """The state after an update where it is wanted; place: t, x1, x2, kind and belt."""
         t, x1, x2, kind, belt = place
-        event = RunEvent(t, x1, x2, kind, belt, jnp.full(t.shape, number), totals)
+        number = jnp.broadcast_to(jnp.asarray(number, int), t.shape)
+        event = RunEvent(t, x1, x2, kind, belt, number, totals)
         state = jax.vmap(self.reducer.update)(seen.state, event)
         return replace(seen, state=choose(wanted, state, seen.state))
 
@@ -188,7 +199,7 @@ class Along(Observer):
             place = passage.t, passage.x1, passage.x2, *first
             seen = self._update(seen, place, number, lanes.integrals, fired & busy)
         holds = busy & (lanes.t > passage.t)
-        seen = self._held(seen, osc, before, lanes, holds)
+        seen = self._held(seen, osc, one, before, lanes, holds)
         totals = self._over_hold(osc, before, lanes, holds)
         for number in events:
             place = lanes.t, lanes.x1, lanes.x2, *second
@@ -216,68 +227,120 @@ class Along(Observer):
             )
         return totals
 
-    def _held(self, seen: _Watched, osc, before: Lanes, after: Lanes, holds) -> _Watched:
-        """Moments within a stick phase, or rest: x1 moves evenly."""
+    def _held(self, seen: _Watched, osc, one, before: Lanes, after: Lanes, holds) -> _Watched:
+        """Moments within a stick phase, or rest, in their order: x1 moves evenly."""
+        frozen, start, end = lax.stop_gradient((osc, before, after))
+        course = Course((start.x1, end.x1 - start.x1), start.x2, end.t - start.t)
+        tables, sides = [], []
+        for (_, direction, function), side in zip(self._sections(), seen.sides, strict=True):
 
-        def at(theta):
-            t = before.t + theta * (after.t - before.t)
-            x1 = before.x1 + theta * (after.x1 - before.x1)
-            part = replace(before, t=t, x1=x1)
-            return replace(part, integrals=self._over_hold(osc, before, part, holds))
+            def look(theta, function=function):
+                told = course.look(function, frozen, start.mode, theta)
+                return materialise(told[0], one), materialise(told[1], one)
 
-        sides = []
-        for (number, direction, function), side in zip(self._sections(), seen.sides, strict=True):
-
-            def look(i, carry, number=number, direction=direction, function=function):
-                seen, side = carry
-                i = i.astype(side.dtype)
-
-                def value(theta):
-                    place = at_x1((i + theta) / PARTS)
-                    return function(osc, before.mode, place, before.x2)
-
-                end = value(jnp.ones_like(side))
-                now = jnp.where(holds & (end != 0), jnp.sign(end), side)
-                moment = at((i + root_between(value, side)) / PARTS)
-                wanted = (now != side) & (now * direction >= 0)
-                seen = self._ask(seen, osc, moment, jnp.zeros_like(side), wanted, number)
-                return seen, now
-
-            def at_x1(theta):
-                return before.x1 + theta * (after.x1 - before.x1)
-
-            seen, side = lax.fori_loop(0, PARTS, look, (seen, side))
+            side, *table = crossings_held(look, side, direction, holds)
             sides.append(side)
+            tables.append(tuple(table))
         seen = replace(seen, sides=tuple(sides))
-        for k, (number, times) in enumerate(self._times()):
-            seen = self._times_held(seen, osc, at, before, after, k, number, times)
-        return seen
 
-    def _times_held(
-        self, seen: _Watched, osc, at, before, after, k: int, number: int, times
-    ) -> _Watched:
-        """The fixed times of a stick phase; and those at the start of a run."""
-        busy = after.run >= 0
+        def pending(state):
+            seen, tables = state
+            left = [jnp.any(self._due(seen, after))]
+            return jnp.any(jnp.stack(left + [jnp.any(jnp.isfinite(_first(t))) for t in tables]))
 
-        def due(seen):
-            return busy & (_next(times, seen.passed[k]) <= after.t)
+        def ask(state):
+            seen, tables = state
+            return self._ask_next_held(seen, tables, osc, before, after, holds)
 
-        def ask(seen):
-            wanted = due(seen)
-            t = jnp.where(wanted, _next(times, seen.passed[k]), after.t)
-            duration = after.t - before.t
-            moment = at((t - before.t) / jnp.where(duration > 0, duration, 1.0))
-            moment = replace(moment, t=t)
-            seen = self._ask(seen, osc, moment, jnp.zeros_like(t), wanted, number)
-            count = seen.passed[k] + jnp.where(wanted, 1, 0)
-            return eqx.tree_at(lambda s: s.passed[k], seen, count)
+        return lax.while_loop(pending, ask, (seen, tables))[0]
 
-        return lax.while_loop(lambda seen: jnp.any(due(seen)), ask, seen)
+    def _due(self, seen: _Watched, after: Lanes) -> Array:
+        """The lanes that have passed a fixed time; at the start of a run, too."""
+        late = [
+            _next(times, passed) <= after.t
+            for (_, times), passed in zip(self._times(), seen.passed, strict=True)
+        ]
+        return (after.run >= 0) & functools.reduce(jnp.logical_or, late, jnp.zeros_like(after.done))
+
+    def _ask_next_held(self, seen: _Watched, tables, osc, before, after, holds):
+        """The state after the next moment of each lane, and the tables without it."""
+        duration = after.t - before.t
+        safe = jnp.where(duration > 0, duration, 1.0)
+        theta, number = jnp.full_like(duration, jnp.inf), jnp.zeros(duration.shape, int)
+        for (one, _, _), table in zip(self._sections(), tables, strict=True):
+            first = _first(table)
+            number = jnp.where(first < theta, one, number)
+            theta = jnp.minimum(theta, first)
+        exact, passed = before.t + jnp.where(jnp.isfinite(theta), theta, 0.0) * duration, []
+        for (one, times), count in zip(self._times(), seen.passed, strict=True):
+            time = _next(times, count)
+            due = (after.run >= 0) & (time <= after.t)
+            time = jnp.where(due, time, after.t)
+            earlier = due & ((time - before.t) / safe <= lax.stop_gradient(theta))
+            theta = jnp.where(earlier, (time - before.t) / safe, theta)
+            exact, number = jnp.where(earlier, time, exact), jnp.where(earlier, one, number)
+            passed.append((due, one))
+        wanted = jnp.isfinite(theta)
+        theta = jnp.where(wanted, theta, 0.0)
+
+        part = replace(before, t=exact, x1=before.x1 + theta * (after.x1 - before.x1))
+        part = replace(part, integrals=self._over_hold(osc, before, part, holds))
+        delta = jnp.zeros_like(theta)
+        for one, _, function in self._sections():
+            way = _to_section(function, osc, part, delta, delta, delta)
+            delta = jnp.where(number == one, way, delta)
+        seen = self._ask(seen, osc, part, delta, wanted, number)
+        counts = tuple(
+            count + jnp.where(due & (number == one), 1, 0)
+            for count, (due, one) in zip(seen.passed, passed, strict=True)
+        )
+        tables = [
+            tuple(jnp.where((number == one)[None] & (t <= theta[None]), jnp.inf, t) for t in table)
+            for (one, _, _), table in zip(self._sections(), tables, strict=True)
+        ]
+        return replace(seen, passed=counts), tables
 
     def finish(self, osc, lanes):
         end = RunEnd(lanes.t, lanes.x1, lanes.x2, lanes.status, lanes.integrals)
         results = jax.vmap(self.reducer.finish)(lanes.memory.state, end)
         return {**results, "status": lanes.status}
+
+
+def _first(table: tuple[Array, ...]) -> Array:
+    """The earliest of the crossings in each lane."""
+    return functools.reduce(jnp.minimum, [jnp.min(part, axis=0) for part in table])
+
+
+def _state_and_rate(osc: Oscillator, lanes: Lanes) -> tuple[Array, Array, Array]:
+    """x1, x2 and x2' in the mode of the lanes, which slip; without derivatives."""
+    osc, lanes = lax.stop_gradient((osc, lanes))
+    return lanes.x1, lanes.x2, mode_acceleration(osc, lanes.mode, lanes.x1, lanes.x2)
+
+
+def _moved(osc: Oscillator, lanes: Lanes, delta: Array) -> tuple[Array, Array]:
+    """The state that is `delta` away, by Taylor's formula of order 3 in x1 and 2 in x2."""
+
+    def field(x1, x2):
+        a = mode_acceleration(osc, lanes.mode, x1, x2)
+        return jnp.where(lanes.mode.any_stuck, 0.0, a)
+
+    x1, x2 = lanes.x1, lanes.x2
+    a = field(x1, x2)
+    _, jerk, *_ = jax.jvp(field, (x1, x2), (x2, a))
+    x1 = x1 + delta * (x2 + delta / 2 * (a + delta / 3 * jerk))
+    return x1, x2 + delta * (a + delta / 2 * jerk)
+
+
+def _to_section(function, osc, lanes: Lanes, delta, low, high) -> Array:
+    """The way in time to a section, by a Newton step from `delta`, between two bounds.
+
+    Its derivatives are those of the implicit function, whatever the bounds.
+    """
+    delta = lax.stop_gradient(delta)
+    value, rate = value_and_rate(function, osc, lanes.mode, *_moved(osc, lanes, delta))
+    step = -value / lax.stop_gradient(jnp.where(rate == 0, 1.0, rate))
+    step = jnp.where(rate == 0, 0.0, step)
+    return lax.stop_gradient(jnp.clip(delta + step, low, high) - step) + step
 
 
 def _next(times: tuple[float, ...], passed: Array) -> Array:

@@ -5,12 +5,14 @@ moments are where the value passes 0; extrema are sections, too: x1 is extreme w
 where x2' = 0.
 """
 
+import functools
 import hashlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from types import CodeType, FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -140,37 +142,192 @@ def side_of(value: Array, rate: Array, before: Array) -> Array:
     return jnp.where(value != 0, jnp.sign(value), jnp.where(rate != 0, jnp.sign(rate), before))
 
 
-# --- within a step --------------------------------------------------------------------------------
+# --- where a section is crossed -------------------------------------------------------------------
 
+#: Equal parts of a step, and of a stick phase, in which crossings of a section are looked for. In a
+#: part with one extremum of its value, or none, all are found.
+PARTS_OF_STEP, PARTS_OF_HOLD = 4, 8
 #: A cut that would leave less of a step at one of its ends, over the step, is not made.
 LEAST_CUT = 1e-3
 
 
-def cut_of_step(side, starts, ends, h: Array, reach: Array) -> Array:
-    """Where a step of size h should be cut for a section, from 0 to 1; 1: it may stay as it is.
+class Course(NamedTuple):
+    """The state along a way from 0 to 1, arrays [lanes]: polynomials of x1 and, of a stick phase,
+    constant x2; duration: of the way."""
 
-    side: of the section, before the step; starts, ends: the section's value and rate at both ends;
-    reach: an end that is nearer to a crossing than this time tells the crossing by a Taylor step.
-    Between its ends the value is taken for the cubic that has these values and rates: the step is
-    made again, and its end then is nearer, until it is near enough.
+    x1: tuple[Array, ...]
+    x2: Array | None
+    duration: Array
+
+    @classmethod
+    def of_step(cls, starts, ends, h: Array) -> "Course":
+        """The quintic that has x1, x2 and x2' of both ends; starts, ends: these."""
+        (p0, v0, a0), (p1, v1, a1) = ((x1, h * x2, h * h * a) for x1, x2, a in (starts, ends))
+        d, e, f = p1 - p0 - v0 - 0.5 * a0, v1 - v0 - a0, a1 - a0
+        last = 10 * d - 4 * e + 0.5 * f, -15 * d + 7 * e - f, 6 * d - 3 * e + 0.5 * f
+        return cls((p0, v0, 0.5 * a0, *last), None, h)
+
+    def look(self, function, osc, mode, theta) -> tuple[Array, Array]:
+        """A section's value, and its derivative by theta."""
+        x1 = _polynomial(self.x1, theta)
+        slopes = [k * c for k, c in enumerate(self.x1)][1:]
+        bends = [k * c for k, c in enumerate(slopes)][1:]
+        if self.x2 is not None:
+            tangents = _polynomial(slopes, theta), jnp.zeros_like(x1)
+            state = x1, self.x2
+        else:
+            h = jnp.where(self.duration > 0, self.duration, 1.0)
+            state = x1, _polynomial(slopes, theta) / h
+            tangents = _polynomial(slopes, theta), _polynomial(bends, theta) / h
+        value, slope, *_ = jax.jvp(lambda x1, x2: function(osc, mode, x1, x2), state, tangents)
+        return value, slope
+
+
+class Parts(NamedTuple):
+    """What is known of a section at the ends of the parts of a way, lists of arrays [lanes].
+
+    values, slopes: by theta, one more than there are parts; sides: likewise, from that before on;
+    crosses: whether the side changes in a part; dips: whether the value comes nearer to 0 in it and
+    goes away again, so that it may pass twice.
     """
-    (g0, r0), (g1, r1) = starts, ends
-    d0, d1 = h * r0, h * r1
-    cubic = (g0, d0, 3 * (g1 - g0) - 2 * d0 - d1, d0 + d1 - 2 * (g1 - g0))
-    crosses = side_of(g1, r1, side) != side
-    near = (jnp.abs(g0) <= reach * jnp.abs(r0)) | (jnp.abs(g1) <= reach * jnp.abs(r1))
-    root = _bisected(lambda theta: _polynomial(cubic, theta), side)
-    # A value that comes near to 0 and goes away again may have crossed twice.
-    nears = ~crosses & (side * d0 < 0) & (side * d1 > 0)
-    derivative = (d0, 2 * cubic[2], 3 * cubic[3])
-    extremum = _bisected(lambda theta: -_polynomial(derivative, theta), side)
-    least = side * _polynomial(cubic, extremum)
-    doubt = 0.1 * jnp.maximum(side * g0 - least, side * g1 - least)
-    inside = (extremum > LEAST_CUT) & (extremum < 1 - LEAST_CUT)
-    theta = jnp.where(crosses & ~near, root, 1.0)
-    theta = jnp.where(nears & (least < doubt) & inside, extremum, theta)
+
+    values: list[Array]
+    slopes: list[Array]
+    sides: list[Array]
+    crosses: list[Array]
+    dips: list[Array]
+
+    @classmethod
+    def of(cls, looks: Sequence[tuple[Array, Array]], side: Array) -> "Parts":
+        values, slopes = (list(part) for part in zip(*looks, strict=True))
+        sides = [side]
+        for value, slope in zip(values[1:], slopes[1:], strict=True):
+            sides.append(side_of(value, slope, sides[-1]))
+        pairs = list(pairwise(range(len(values))))
+        crosses = [sides[i] != sides[j] for i, j in pairs]
+        dips = [
+            ~cross & (sides[i] * slopes[i] < 0) & (sides[i] * slopes[j] > 0)
+            for cross, (i, j) in zip(crosses, pairs, strict=True)
+        ]
+        return cls(values, slopes, sides, crosses, dips)
+
+
+class Cut(NamedTuple):
+    """Where a step should be cut for a section, from 0 to 1, 1: it may stay as it is; and whether
+    it then crosses the section near its start, and not near its end."""
+
+    theta: Array
+    at_start: Array
+
+
+def cut_of_step(side: Array, looks: Sequence[tuple[Array, Array]], h: Array, reach: Array) -> Cut:
+    """Where a step of size h should be cut, so that it crosses a section once at most, near an end.
+
+    side: of the section, before the step; looks: its value, and derivative by theta, at the ends of
+    the parts, those inside by the interpolant; reach: an end that is nearer to a crossing than this
+    time tells the crossing by a Taylor step. Within a part the value is taken for the cubic that
+    these give: the step is made again, and its end then is nearer, until it is near enough.
+    """
+    side, looks, h, reach = lax.stop_gradient((side, looks, h, reach))
+    parts = Parts.of(looks, side)
+    n = len(parts.crosses)
+    depth = functools.reduce(jnp.maximum, [side * value for value in parts.values])
+    found, picked = [], None
+    for k in reversed(range(n)):
+        cubic = _cubic(parts, k, 1 / n)
+        extremum = _extremum_of(cubic)
+        least = parts.sides[k] * _polynomial(cubic, extremum)
+        place = (k + extremum) / n
+        inside = (place > LEAST_CUT) & (place < 1 - LEAST_CUT)
+        # The interpolant is not exact: a value that comes near to 0 may pass it.
+        dips = parts.dips[k] & (least < 0.1 * (depth - least)) & inside
+        here = parts.crosses[k] | dips
+        one = (jnp.full_like(h, k), parts.sides[k], parts.crosses[k], place, *cubic)
+        picked = (
+            one if picked is None else tuple(map(functools.partial(jnp.where, here), one, picked))
+        )
+        found.append(here)
+    assert picked is not None
+    k, at_part, crosses, extremum, *cubic = picked
+    root = (k + _bisected(lambda theta: _polynomial(cubic, theta), at_part)) / n
+    count = sum(here.astype(jnp.int32) for here in found)
+
+    (g0, r0), (g1, r1) = looks[0], looks[-1]
+    near = reach / jnp.where(h > 0, h, 1.0)
+    at_start = parts.crosses[0] & (side * r0 < 0) & (jnp.abs(g0) <= near * jnp.abs(r0))
+    at_end = parts.crosses[-1] & (parts.sides[-1] * r1 > 0) & (jnp.abs(g1) <= near * jnp.abs(r1))
+    stays = (count == 0) | ((count == 1) & (at_start | at_end))
+    # What is near the start is met in a step of one part.
+    theta = jnp.where(crosses, jnp.where(at_start, 1 / n, root), extremum)
     # Where a section is only touched, no end is ever near; the step is then as short as `reach`.
-    return lax.stop_gradient(jnp.where(h > 0.1 * reach, theta, 1.0))
+    theta = jnp.where(stays | (h <= 0.1 * reach), 1.0, theta)
+    nearer = jnp.abs(g0 * r1) < jnp.abs(g1 * r0)
+    return Cut(theta, at_start | (~at_end & nearer))
+
+
+def crossings_held(
+    look: Callable[[Array], tuple[Array, Array]], side: Array, direction: int, holds: Array
+) -> tuple[Array, Array, Array]:
+    """Where a section is crossed in stick phases: two at most in each of `PARTS_OF_HOLD` parts.
+
+    look(theta): value and derivative by theta, for theta from 0 to 1; side: before; direction: that
+    is wanted, 0 for both; holds: lanes that stick. Returns the side at the end and theta of the
+    crossings, twice [parts, lanes], inf where there is none. x1 moves evenly, so all are found of a
+    value with one extremum in a part, or none; others may be missed in pairs.
+    """
+    n = PARTS_OF_HOLD
+    looks = [look(jnp.full_like(side, k / n)) for k in range(n + 1)]
+    parts = Parts.of(looks, side)
+    sides = jnp.stack(parts.sides[:-1])
+    dips = jnp.stack([dip & holds for dip in parts.dips])
+    some = jnp.stack([cross & holds for cross in parts.crosses]) | dips
+    numbers = jnp.arange(n)
+    none = jnp.full(sides.shape, jnp.inf)
+
+    def following(i):
+        later = jnp.any(some, axis=1) & (numbers >= i)
+        return jnp.where(jnp.any(later), jnp.argmax(later), n)
+
+    def search(state):
+        i, first, second = state
+        here = (numbers == i)[:, None]
+        start = jnp.sum(jnp.where(here, sides, 0.0), axis=0)
+        dip = jnp.any(here & dips, axis=0)
+
+        def at(theta):
+            return look((i.astype(theta.dtype) + theta) / n)
+
+        extremum = _bisected(lambda theta: -at(theta)[1], start)
+        twice = dip & (start * at(extremum)[0] < 0)
+        end = jnp.where(twice, extremum, 1.0)
+        root = end * _bisected(lambda theta: at(end * theta)[0], start)
+        back = end + (1 - end) * _bisected(lambda theta: at(end + (1 - end) * theta)[0], -start)
+        once = jnp.any(here & some, axis=0) & (~dip | twice)
+        once, twice = once & (start * direction <= 0), twice & (start * direction >= 0)
+        root, back = ((i.astype(theta.dtype) + theta) / n for theta in (root, back))
+        first = jnp.where(here & once[None], root[None], first)
+        second = jnp.where(here & twice[None], back[None], second)
+        return following(i + 1), first, second
+
+    start = following(jnp.zeros((), int)), none, none
+    _, first, second = lax.while_loop(lambda state: state[0] < n, search, start)
+    return jnp.where(holds, parts.sides[-1], side), first, second
+
+
+def _cubic(parts: Parts, k: int, length: float) -> tuple[Array, ...]:
+    """The value in a part, by its values and slopes at both ends."""
+    g0, g1 = parts.values[k], parts.values[k + 1]
+    d0, d1 = length * parts.slopes[k], length * parts.slopes[k + 1]
+    return g0, d0, 3 * (g1 - g0) - 2 * d0 - d1, d0 + d1 - 2 * (g1 - g0)
+
+
+def _extremum_of(cubic: Sequence[Array]) -> Array:
+    """Where a cubic is extreme whose slope changes its sign between 0 and 1; else 1."""
+    _, d0, c2, c3 = cubic
+    d1 = d0 + 2 * c2 + 3 * c3
+    divisor = jnp.sign(d0) * jnp.sqrt(jnp.maximum(c2 * c2 - 3 * c3 * d0, 0.0)) - c2
+    safe = (d0 * d1 < 0) & (divisor != 0)
+    return jnp.where(safe, jnp.clip(d0 / jnp.where(safe, divisor, 1.0), 0.0, 1.0), 1.0)
 
 
 def _polynomial(coefficients: Sequence[Array], theta: Array) -> Array:
@@ -191,8 +348,3 @@ def _bisected(function: Callable[[Array], Array], side: Array) -> Array:
 
     ends = jnp.zeros_like(side), jnp.ones_like(side)
     return lax.fori_loop(0, 50, halve, ends)[1]
-
-
-def root_between(function: Callable[[Array], Array], side: Array) -> Array:
-    """The same, for a function that is given and no interpolant."""
-    return lax.stop_gradient(_bisected(function, side))

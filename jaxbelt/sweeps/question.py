@@ -54,9 +54,6 @@ class Question:
         for name in wanted:
             known = ", ".join(grid.axes)
             require(name in grid.axes, "derivatives", f"names of axes, {known}", repr(name))
-        plain = not isinstance(_observer(observe), Along)
-        expected = "none, where observe has `at` or `rates`"
-        require(plain or not wanted, "derivatives", expected, wanted)
         return cls(grid, observe, numbers, tuple(wanted))
 
     def arguments(self) -> tuple[Any, ...]:

@@ -4,13 +4,19 @@
 the starts, an axis of attractors, each with the fraction of the starts that lead to it.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..checks import require
-from ..cycles.attractors import APART, Runs
-from .attractor import CYCLE, STUCK_FOR_EVER, UNDECIDED
+from ..cycles.attractors import Runs, is_same
+from ..cycles.cycle import find_cycle
+from ..model.oscillator import Oscillator
+from ..results import Status
+from .attractor import CYCLE, EQUILIBRIUM, UNDECIDED
 
 if TYPE_CHECKING:
     import xarray
@@ -19,27 +25,35 @@ if TYPE_CHECKING:
 AT_ONCE = 2**18
 #: Variables of a sweep that say nothing of an attractor.
 OF_RUNS = ("transient", "status")
+#: Coordinates that are no arguments of the function of the sweep.
+NO_PARAMETERS = ("x1", "x2", "belt")
 
 
-def attractors(dataset: "xarray.Dataset") -> "xarray.Dataset":
+def attractors(
+    dataset: "xarray.Dataset", make: Callable[..., Oscillator] | None = None
+) -> "xarray.Dataset":
     """The attractors at each point of a sweep, the one that most starts lead to first.
 
-    dataset: of `sweep(..., observe="attractor")` with `x1`, `x2` or both among its axes.
+    dataset: of `sweep(..., observe="attractor")` with `x1`, `x2` or both among its axes. make: the
+    function that the sweep was of; only cycles that are very near to one another need it.
     Returns a dataset over the other axes and `attractor`: fraction, of the starts that lead there,
     and kind, signature, sticks, period, stick_duration, n_events and the extrema, of one of its
     runs. Where there are fewer attractors than elsewhere fraction is 0 and kind is undecided. What
     fractions lack to 1 are runs that were undecided.
 
-    Two runs lead to one cycle if it has the same events and extent, to a hundredth of its size; to
-    one equilibrium if it is at the same place; what is stuck for ever is one attractor for each set
-    of belts.
+    Two runs lead to one cycle if it has the same events, extrema and period, to a thousand times
+    the tolerance of the sweep; to one equilibrium if it is at the same place; what is stuck for
+    ever is one attractor for each set of belts. Cycles that differ by more than that, but by less
+    than a hundredth of their size, may be one that attracts weakly, or several: shooting tells, and
+    what it does not find is undecided. `ValueError` where it is needed and `make` is not given.
     """
     require("kind" in dataset, "dataset", 'that of sweep(..., observe="attractor")', "one without")
     starts = [name for name in ("x1", "x2") if name in dataset.kind.dims]
     require(starts, "dataset", "one with an axis x1 or x2 of starts", f"{dataset.kind.dims}")
     others = [name for name in dataset.kind.dims if name not in starts]
-    labels = _labels_of_starts(dataset, others, starts)
     order = (*others, *starts)
+    labels = _labels_of_starts(dataset, others, starts)
+    labels = _without_doubt(dataset, make, others, starts, labels)
     sizes = [dataset.sizes[name] for name in others]
     count = int(labels.max(initial=0)) + 1
     numbers = np.arange(count)
@@ -72,24 +86,30 @@ def _nothing(dtype: np.dtype) -> np.ndarray:
     return np.asarray(np.nan if np.issubdtype(dtype, np.floating) else 0, dtype)
 
 
+def _runs_by_points(dataset: "xarray.Dataset", others: list[str], starts: list[str]) -> Runs:
+    """What the runs tell, [points, starts]."""
+    runs = Runs.of(dataset, (*others, *starts))
+    shape = -1, int(np.prod([dataset.sizes[name] for name in starts]))
+    return replace(
+        runs, places=runs.places.reshape(*shape, 5), signatures=runs.signatures.reshape(shape)
+    )
+
+
 def _labels_of_starts(
     dataset: "xarray.Dataset", others: list[str], starts: list[str]
 ) -> np.ndarray:
     """Numbers of the attractors, [.., starts], in the order in which they are met, or -1."""
-    order = (*others, *starts)
-    sizes = [dataset.sizes[name] for name in others]
-    runs = Runs.of(dataset, order)
-    kinds = dataset["kind"].transpose(*order).values.reshape(np.prod(sizes, dtype=int), -1)
-    sticks = dataset["sticks"].transpose(*order, "belt").values.astype(bool)
-    sticks = sticks.reshape(*kinds.shape, -1)
-    places, signatures = runs.places.reshape(*kinds.shape, -1), runs.signatures.reshape(kinds.shape)
-    labels = np.empty(kinds.shape, int)
-    step = max(1, AT_ONCE // kinds.shape[1])
+    runs = _runs_by_points(dataset, others, starts)
+    shape = runs.signatures.shape
+    kinds = dataset["kind"].transpose(*others, *starts).values.reshape(shape)
+    sticks = dataset["sticks"].transpose(*others, *starts, "belt").values.astype(bool)
+    sticks = sticks.reshape(*shape, -1)
+    labels = np.empty(shape, int)
+    step = max(1, AT_ONCE // shape[1])
     for i in range(0, len(kinds), step):
         part = slice(i, i + step)
-        of_part = Runs(places[part], signatures[part], runs.error)
-        labels[part] = _labels_of(kinds[part], sticks[part], of_part)
-    return labels.reshape(*sizes, -1)
+        labels[part] = _labels_of(kinds[part], sticks[part], runs.at((part,)))
+    return labels.reshape(*(dataset.sizes[name] for name in others), -1)
 
 
 def _labels_of(kinds: np.ndarray, sticks: np.ndarray, runs: Runs) -> np.ndarray:
@@ -100,19 +120,82 @@ def _labels_of(kinds: np.ndarray, sticks: np.ndarray, runs: Runs) -> np.ndarray:
     while np.any(left):
         one = np.argmax(left, axis=1)
         there = rows[:, None], one[:, None]
-        same = left & (kinds == kinds[there]) & np.all(sticks == sticks[there], axis=-1)
-        first = Runs(runs.places[there], runs.signatures[there], runs.error)
-        same &= _same_place(kinds, runs, first)
-        labels[same & left[there]] = number
+        same = kinds == kinds[there]
+        first = runs.at(there)
+        middle = np.abs(runs.places[..., 0] - first.places[..., 0])
+        rests = middle < runs.error * (1 + np.abs(first.places[..., 0]))
+        stuck = np.all(sticks == sticks[there], axis=-1)
+        rests = np.where(kinds == EQUILIBRIUM, rests, stuck)
+        same &= np.where(kinds == CYCLE, runs.same(first)[0], rests)
+        labels[same & left & left[there]] = number
         left &= ~same
         number += 1
     return labels
 
 
-def _same_place(kinds: np.ndarray, runs: Runs, one: Runs) -> np.ndarray:
-    gap = np.max(np.abs(runs.places - one.places), axis=-1)
-    size = np.ptp(one.places[..., :4], axis=-1)
-    cycles = (runs.signatures == one.signatures) & (gap < APART * size)
-    middle = np.abs(runs.places[..., 0] - one.places[..., 0])
-    rests = middle < runs.error * (1 + np.abs(one.places[..., 0]))
-    return np.where(kinds == CYCLE, cycles, rests | (kinds == STUCK_FOR_EVER))
+# --- cycles that the runs do not tell apart -------------------------------------------------------
+
+
+def _without_doubt(
+    dataset: "xarray.Dataset",
+    make: Callable[..., Oscillator] | None,
+    others: list[str],
+    starts: list[str],
+    labels: np.ndarray,
+) -> np.ndarray:
+    """The same numbers where shooting has told which of them are of one cycle."""
+    runs = _runs_by_points(dataset, others, starts)
+    flat = labels.reshape(runs.signatures.shape).copy()
+    kinds = dataset["kind"].transpose(*others, *starts).values.reshape(flat.shape)
+    doubts = _doubts(kinds, flat, runs)
+    if not doubts:
+        return labels
+    require(
+        make is not None,
+        "make",
+        "given, the function of the sweep, for cycles that only shooting tells apart",
+        f"None; there are such at {len(doubts)} points",
+    )
+    assert make is not None
+    sizes = [dataset.sizes[name] for name in others]
+    for point, pairs in doubts.items():
+        place = dict(zip(others, np.unravel_index(point, sizes), strict=True))
+        here = dataset.isel({name: int(i) for name, i in place.items()})
+        given = (str(name) for name in here.coords if name not in NO_PARAMETERS)
+        osc = make(**{name: float(here[name]) for name in given})
+        flat[point] = _settled(osc, flat[point], runs.places[point], pairs)
+    return flat.reshape(labels.shape)
+
+
+def _settled(
+    osc: Oscillator, labels: np.ndarray, places: np.ndarray, pairs: list[tuple[int, int]]
+) -> np.ndarray:
+    """The numbers at a point, where shooting tells which of the pairs are one."""
+    cycles, settled = {}, labels.copy()
+    for number in sorted({number for pair in pairs for number in pair}):
+        # From where the cycle turns back: there it is known best.
+        x1_max = places[np.argmax(labels == number), 1]
+        cycles[number] = find_cycle(osc, (float(x1_max), 0.0))
+        if int(cycles[number].status) != Status.OK or not bool(cycles[number].stable):
+            settled[labels == number] = -1
+    for one, other in pairs:
+        if is_same(cycles[one], cycles[other]):
+            first, second = (settled[np.argmax(labels == number)] for number in (one, other))
+            settled[settled == second] = first
+    known = settled >= 0
+    settled[known] = np.unique(settled[known], return_inverse=True)[1]
+    return settled
+
+
+def _doubts(kinds: np.ndarray, labels: np.ndarray, runs: Runs) -> dict[int, list[tuple[int, int]]]:
+    """The points at which runs leave open whether two numbers are of one cycle, and which."""
+    rows = np.arange(len(labels))
+    numbers = range(int(labels.max(initial=-1)) + 1)
+    there = [(rows, np.argmax(labels == number, axis=1)) for number in numbers]
+    cycle = [np.any((labels == k) & (kinds == CYCLE), axis=1) for k in numbers]
+    doubts: dict[int, list[tuple[int, int]]] = {}
+    for one, other in combinations(numbers, 2):
+        open_ = runs.at(there[one]).same(runs.at(there[other]))[1]
+        for point in np.flatnonzero(cycle[one] & cycle[other] & open_).tolist():
+            doubts.setdefault(point, []).append((one, other))
+    return doubts

@@ -80,7 +80,8 @@ class Store:
 
         def prepare():
             if not (path / "zarr.json").exists():
-                _create(path, question)
+                with _writes(path):
+                    _create(path, question)
             if part is None:
                 _sweep_out(path)
 
@@ -272,16 +273,23 @@ def _is_finished(path: Path) -> bool:
 
 def _check_folder(path: Path) -> None:
     """Raise unless a store can be written there."""
-    try:
+    with _writes(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and not (path / "zarr.json").exists():
             fits = path.is_dir() and not any(path.iterdir())
             require(fits, "store", "an empty folder or the store of this very sweep", f"{path}")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise PermissionError(13, "store cannot be written", str(path))
+
+
+@contextmanager
+def _writes(path: Path) -> Iterator[None]:
+    """Let an error of the system say that it was the store that could not be written."""
+    try:
+        yield
     except OSError as error:
         message = f"store cannot be written: {error.strerror}"
         raise OSError(error.errno, message, str(path)) from None
-    if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise PermissionError(13, "store cannot be written", str(path))
 
 
 def _sweep_out(path: Path) -> None:

@@ -7,7 +7,8 @@ is.
 
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -95,29 +96,61 @@ def sweep(
     the sweep within a second and says what became of its runs; so does `OSError` where a store
     cannot be written.
     """
-    question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives)
-    audit = float(as_array(audit, "audit"))
-    require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
-    require(
-        audit == 0 or not isinstance(question.program.observer, Reduce | Along),
-        "audit",
-        '0 but for observe="final" and "attractor"',
-        audit,
-    )
-    _check_where(question, store, executor, blocks, audit)
-    if store is None:
+    with _ends_told() as known:
+        question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives)
+        audit = float(as_array(audit, "audit"))
+        require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
+        require(
+            audit == 0 or not isinstance(question.program.observer, Reduce | Along),
+            "audit",
+            '0 but for observe="final" and "attractor"',
+            audit,
+        )
+        _check_where(question, store, executor, blocks, audit)
+        if store is not None:
+            return _kept(question, Path(store), executor, blocks, progress, audit, known)
         results = Memory(question.table)
+        known.append(results)
         _do_and_show(question, results, progress)
         told = _audited(question, results, audit) if audit else {}
         return results.dataset(question.attributes() | told)
-    return _kept(question, Path(store), executor, blocks, progress, audit)
+
+
+@contextmanager
+def _ends_told() -> "Iterator[list[Memory | Store]]":
+    """Let an interrupt, or a disk that is full, say what becomes of the runs, whenever it comes.
+
+    Yields a list for the results, once there is a place for them.
+    """
+    known: list[Memory | Store] = []
+    try:
+        yield known
+    except KeyboardInterrupt:
+        told = (
+            known[0].interrupted()
+            if known
+            else "interrupted before the first run; nothing is lost, the same call begins again"
+        )
+        raise KeyboardInterrupt(told) from None
+    except OSError as error:  # of a store on a full disk, say
+        if not known:
+            raise
+        told = f"{error.strerror or error}; {known[0].interrupted()}"
+        raise OSError(error.errno, told) from error
 
 
 def _kept(
-    question: Question, path: Path, executor: Any, part: tuple[int, int] | None, progress, audit
+    question: Question,
+    path: Path,
+    executor: Any,
+    part: tuple[int, int] | None,
+    progress: bool | None,
+    audit: float,
+    known: list[Memory | Store],
 ) -> "xarray.Dataset":
     """The sweep in a store, or as far as that part of its blocks goes."""
     with Store.opened(path, question, part) as results:
+        known.append(results)
         if results.to_do:
             _do_and_show(question, results, progress, executor)
         if part is None:
@@ -134,16 +167,10 @@ def _do_and_show(
 ) -> None:
     """Do the runs that the results lack, here or on a cluster."""
     with SweepProgress(results.runs, results.done(), progress) as bar:
-        try:
-            if executor is not None and isinstance(results, Store):
-                do_on_cluster(executor, question, results, bar.advance)
-            else:
-                do_runs(question, results, results.to_do, bar.advance)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(results.interrupted()) from None
-        except OSError as error:  # of a store on a full disk, say
-            told = error.strerror or str(error)
-            raise OSError(error.errno, f"{told}; {results.interrupted()}") from error
+        if executor is not None and isinstance(results, Store):
+            do_on_cluster(executor, question, results, bar.advance)
+        else:
+            do_runs(question, results, results.to_do, bar.advance)
 
 
 def _check_where(question: Question, store, executor, blocks, audit: float) -> None:
