@@ -13,7 +13,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     model/          friction oscillator parameters modes events equilibria
     presets         the published systems
     motion/         integrators arcs sensitivities runs sampling smoothing simulate
-    cycles/         settling shooting orbits cycle attractors functionals
+    cycles/         settling shooting orbits cycle attractors functionals returns separatrices
+    cycles/         portrait
     sweeps/         lanes step events marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
@@ -57,6 +58,8 @@ from .cycles.functionals import (
     stick_duration,
     stick_fraction,
 )
+from .cycles.portrait import Portrait, portrait
+from .cycles.separatrices import Separatrix
 from .inverse.design import Design, design, distance_to
 from .inverse.fit import Fit, fit
 from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
@@ -111,8 +114,10 @@ __all__ = [
     "Hopf",
     "NonsmoothFold",
     "Oscillator",
+    "Portrait",
     "PseudoHopf",
     "RegionMap",
+    "Separatrix",
     "SlidingExchange",
     "SpecialPoint",
     "Status",
@@ -145,6 +150,7 @@ __all__ = [
     "plot_phase_portrait",
     "plot_time_history",
     "plot_vector_field",
+    "portrait",
     "presets",
     "refine",
     "region_map",

@@ -34,6 +34,7 @@ class Status(enum.IntEnum):
     MISFIT = 17
     UNREACHABLE = 18
     NO_FOLD = 19
+    INCOMPLETE = 20
 
 
 ADVICE = {
@@ -89,6 +90,11 @@ ADVICE = {
     Status.NO_FOLD: (
         "No loop of the orbits around the equilibrium is extremal in its growth, or none that is "
         "closes nearby: no two cycles meet near here."
+    ),
+    Status.INCOMPLETE: (
+        "Between some tops it is not told whether there is a cycle: a continuum of closed orbits, "
+        "cycles about to merge, or orbits that settle too slowly. Look at the gaps, or move away "
+        "from the bifurcation point."
     ),
     Status.NO_FIXED_POINT: "There is no fixed point in a smooth field whose trace could vanish.",
     Status.UNEXPLAINED: (

@@ -1,4 +1,5 @@
-"""Campaigns: `python -m tests.campaign final|simulate|derivatives|attractors|grazing|paths`."""
+"""Campaigns: `python -m tests.campaign WHAT`, one of final, simulate, derivatives, attractors,
+grazing, paths, portraits."""
 
 import argparse
 import functools
@@ -18,10 +19,12 @@ def main(arguments=None):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from . import cases, compare, package, paths
+    from . import cases, compare, package, paths, portraits
 
     if options.what == "paths":
         return paths.run(options.seed, options.paths)
+    if options.what == "portraits":
+        return portraits.run(options.seed, options.runs)
     rng = np.random.default_rng(options.seed)
     began = time.monotonic()
     verdicts, disagreements, right, done = Counter(), [], [], 0
@@ -89,8 +92,11 @@ def main(arguments=None):
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=__doc__)
     parser.add_argument(
-        "what", choices=("final", "simulate", "derivatives", "attractors", "grazing", "paths")
-    )
+        "what",
+        choices=(
+            "final", "simulate", "derivatives", "attractors", "grazing", "paths", "portraits",
+        ),
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=int, default=2000)
     parser.add_argument("--paths", type=int, default=20)

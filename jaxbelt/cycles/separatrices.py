@@ -1,0 +1,194 @@
+"""Orbits that bound basins from points of contact edges: `Separatrix`.
+
+On an edge x1 = sigma the velocity is x1' = x2 on both sides, so at (sigma, 0) orbits turn: those of
+a side that pulls away from the edge touch it there. Where neither side draws the mass in, orbits
+that pass the edge just below that point, or above it, go on, and those that miss it turn. They part
+at the orbit that ends in the point, one from each side: the stable separatrices, reached in finite
+time. Where a side pushes away an orbit leaves from the point, an unstable separatrix. Where both do
+the point is a saddle; where a belt at rest holds the mass on one side, a segment ends in it.
+
+Stable separatrices are followed backwards: in reversed time, t -> -t and x2 -> -x2, an oscillator
+with the signs of its damping, loads and velocities changed. Backwards, too, an orbit goes on in one
+way as long as it slips, for it comes to a boundary only where orbits cross it: the mass leaves a
+stick phase in one place only, slip onset. With a law whose static limit exceeds mu(0), orbits leave
+upwards or downwards all along a piece of the boundary beyond slip; then the separatrix ends there,
+and that piece of the boundary itself parts the motions.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..checks import number
+from ..model.modes import (
+    STUCK,
+    Mode,
+    contact,
+    edges,
+    mode_acceleration,
+    mode_of_state,
+    select,
+)
+from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
+from ..numerics.compiling import each, jit
+from ..results import Status
+from .orbits import follow_finely, place_of_rest
+from .returns import side_pulls
+from .shooting import Loop, flow, meshed
+
+#: Arcs for which a separatrix is followed: some 40 loops.
+SEPARATRIX_ARCS = 256
+#: Samples of each arc.
+ARC_SAMPLES = 16
+
+
+class Separatrix(eqx.Module):
+    """An orbit that leaves, or ends in, a point (sigma, 0) of a contact edge.
+
+    - edge: sigma. side: "left" or "right", on which side of the edge the orbit is there. stable:
+      whether it ends in the point, and so bounds basins, or leaves it.
+    - ts: times, 0 at the edge, [samples]; ys: states (x1, x2), [samples, 2]; both in the order of
+      time, and good to 1e-9. Ends of arcs are among the samples.
+    - end: what its other end is, where an unstable one leads to and a stable one comes from:
+      "equilibrium", "cycle", "outside" (of |x1|, |x2| < reach, see `Portrait`), "boundary" (of a
+      belt whose static limit exceeds mu(0): it leaves this boundary beside a piece where the mass
+      sticks), or "unsettled" (it approaches what it comes from, or leads to, too slowly).
+    - to: the number of that equilibrium, or of that attracting or unstable cycle, in the portrait;
+      else -1.
+    """
+
+    edge: Array
+    side: str = eqx.field(static=True)
+    stable: bool = eqx.field(static=True)
+    ts: Array
+    ys: Array
+    end: str = eqx.field(static=True)
+    to: int = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        way = "from" if self.stable else "to"
+        number_of = f" {self.to}" if self.to >= 0 else ""
+        return (
+            f"Separatrix({'stable' if self.stable else 'unstable'}, {self.side} of x1 = "
+            f"{number(self.edge)}, {way} {self.end}{number_of})"
+        )
+
+
+class Branch(NamedTuple):
+    """A separatrix as it was followed: backwards, with x2 reversed, where it is stable.
+
+    tops: its maxima of x1 in the order in which it came to them; y: where it was left; rest: x1
+    where it came to rest, else NaN; status: of the orbit; cut: whether it came to a piece of a boundary where the mass sticks.
+    """
+
+    edge: float
+    side: str
+    stable: bool
+    ts: np.ndarray
+    ys: np.ndarray
+    tops: np.ndarray
+    y: np.ndarray
+    rest: float
+    status: Status
+    cut: bool
+
+
+def branches(osc: Oscillator, reach: float) -> list[Branch]:
+    """All separatrices of an oscillator, followed as long as |x1| and |x2| are < reach."""
+    positions = np.unique(np.asarray(jnp.stack(edges(osc))))
+    backwards = reversed_in_time(osc)
+    found: list[Branch] = []
+    for edge in positions[np.isfinite(positions)].tolist():
+        left, right = (float(pull[0]) for pull in side_pulls(osc, np.array([edge])))
+        if left > 0 or right < 0 or left == right == 0:
+            continue
+        for stable, moving in ((False, osc), (True, backwards)):
+            for side in ("left", "right"):
+                orbit = _orbit_and_samples(moving, edge, side == "right", reach)
+                if orbit is not None:
+                    found.append(_branch(osc, edge, side, stable, orbit))
+    return found
+
+
+def reversed_in_time(osc: Oscillator) -> Oscillator:
+    """The oscillator whose motion (x1, -x2) is the motion of `osc` backwards. It never sticks."""
+    return eqx.tree_at(
+        lambda o: [o.damping, *(b.velocity for b in o.belts), *(b.load for b in o.belts)],
+        osc,
+        replace_fn=lambda leaf: -leaf,
+    )
+
+
+def _orbit_and_samples(osc: Oscillator, edge: float, rightward: bool, reach: float):
+    """See `_leaving`; NumPy's. None where no orbit leaves the point to that side."""
+    numbers = (jnp.asarray(np.array(number)) for number in (edge, rightward, reach))
+    leaves, *found = jax.tree.map(np.asarray, _leaving(osc, *numbers))
+    return found if leaves else None
+
+
+@jit
+def _leaving(osc: Oscillator, edge: Array, rightward: Array, reach: Array):
+    """Whether an orbit leaves (edge, 0) to a side. Then it, where it comes to rest, and of each of its arcs
+    times since its entry, [arcs, samples], and states there."""
+    zero, one = jnp.zeros(()), jnp.ones(())
+    sides = (contact(osc, edge, zero, rightward=side) for side in (True, False))
+    mode = select(rightward, *sides)
+    # A belt at rest opposes the motion that sets in.
+    onward = jnp.where(rightward, one, -one)
+    mode = Mode(tuple(jnp.where(code == STUCK, -onward, code) for code in mode.codes))
+    leaves = onward * mode_acceleration(osc, mode, edge, zero) > 0
+    orbit = follow_finely(osc, mode, jnp.stack([edge, zero]), SEPARATRIX_ARCS, reach)
+    rest = place_of_rest(osc, orbit)
+    used = jnp.arange(SEPARATRIX_ARCS) < orbit.count
+    durations = jnp.where(used & jnp.isfinite(orbit.durations), orbit.durations, 0.0)
+    loop = Loop(orbit.codes, orbit.ends, orbit.entries, durations)
+    chain, _ = meshed(osc, loop, ARC_SAMPLES)
+
+    def along(codes, mesh, y, duration):
+        def beyond(duration):
+            return ~(jnp.max(jnp.abs(flow(osc, codes, mesh, y, duration))) < 2 * reach)
+
+        # Where nothing turns it an orbit may go far in one arc.
+        duration = lax.while_loop(beyond, lambda duration: 0.8 * duration, duration)
+
+        def advance(y, fraction):
+            y = flow(osc, codes, jnp.ones(1), y, duration * fraction)
+            return y, y
+
+        _, states = lax.scan(advance, y, mesh)
+        return duration * jnp.cumsum(mesh), states
+
+    return leaves, orbit, rest, *each(along)(chain.codes, chain.mesh, orbit.entries, durations)
+
+
+@jit
+def _is_held(osc: Oscillator, ys: Array) -> Array:
+    return mode_of_state(osc, ys[:, 0], ys[:, 1]).any_stuck
+
+
+def _branch(osc: Oscillator, edge: float, side: str, stable: bool, followed) -> Branch:
+    """The separatrix that an orbit, as `_leaving` gives it, is."""
+    orbit, rest, since, states = followed
+    count, was_cut, y = int(orbit.count), False, orbit.y
+    if stable:
+        following = np.concatenate([orbit.entries[1:], orbit.y[None]])
+        following[count - 1] = orbit.y
+        at_boundary = (np.arange(len(following)) < count) & (orbit.ends < len(osc.belts))
+        stuck = np.flatnonzero(at_boundary & np.asarray(_is_held(osc, following * [1.0, -1.0])))
+        if stuck.size:
+            count, was_cut = int(stuck[0]) + 1, True
+            y = following[count - 1]
+    begins = np.append(0.0, np.cumsum(since[:count, -1]))[:-1]
+    ts = np.concatenate([[0.0], (begins[:, None] + since[:count]).ravel()])
+    ys = np.concatenate([[[edge, 0.0]], states[:count].reshape(-1, 2)])
+    tops = orbit.tops[:count]
+    if stable:
+        ts, ys = -ts[::-1], ys[::-1] * [1.0, -1.0]
+    status, tops = Status(int(orbit.status)), tops[~np.isnan(tops)]
+    return Branch(edge, side, stable, ts, ys, tops, y, float(rest), status, was_cut)
