@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..checks import is_concrete, require
-from ..model.equilibria import Equilibria, EquilibriumKind, candidates, equilibria
+from ..checks import is_concrete, pick, require
+from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator, check_oscillator
 from ..results import Status, describe, draw
@@ -26,6 +26,8 @@ from .separatrices import Branch, Separatrix, branches
 
 #: A top is on a cycle that is no farther away than this, relative to the distance from the origin.
 ON_CYCLE = 1e-5
+#: An orbit without an end that gets so near to a point of rest tends to it.
+CREEPING = 1e-3
 
 
 class Portrait(eqx.Module):
@@ -35,7 +37,7 @@ class Portrait(eqx.Module):
     - equilibria: all of them, saddles included, see `Equilibria`.
     - cycles: the attracting ones; unstable: the unstable ones; tuples of `Cycle`, by their largest
       x1.
-    - separatrices: a tuple of `Separatrix`; the stable ones bound basins, as unstable cycles do.
+    - separatrices: a tuple of `Separatrix`, by the x1 of their points; the stable ones bound basins, as unstable cycles do.
     - escapes: whether starts far out go to infinity.
     - reach: the bounds of what was looked at, |x1| and |x2| < reach. No cycle is farther out, as
       far as a bound is known, which it is not where damping is 0, nor for damping < 0 with friction
@@ -139,12 +141,12 @@ def portrait(osc: Oscillator) -> Portrait:
     """
     check_oscillator(osc)
     require(is_concrete(osc), "osc", "known: portraits are not for jit or vmap", "a traced one")
-    rests, reach = candidates(osc), reach_of(osc)
-    found = branches(osc, reach)
+    points, reach = equilibria(osc), reach_of(osc)
+    rests = pick(points, np.asarray(points.kind) != EquilibriumKind.SADDLE)
+    found = branches(osc, rests, reach)
     map_ = Returns(osc, rests, reach, [top for branch in found for top in branch.tops[:2].tolist()])
     cycles = tuple(cycle for cycle in map_.cycles if abs(float(cycle.multiplier)) < 1)
     unstable = tuple(cycle for cycle in map_.cycles if float(cycle.multiplier) > 1)
-    points = equilibria(osc)
     gaps = np.array(sorted(map_.gaps)).reshape(-1, 2)
     status = Status.INCOMPLETE if len(gaps) else Status.OK
     return Portrait(
@@ -153,7 +155,7 @@ def portrait(osc: Oscillator) -> Portrait:
         cycles=cycles,
         unstable=unstable,
         separatrices=tuple(
-            _named(branch, map_, points, unstable if branch.stable else cycles) for branch in found
+            _named(branch, map_, points, unstable if branch.stable else cycles) for branch in sorted(found, key=lambda branch: branch.x1)
         ),
         escapes=map_.escapes,
         reach=reach,
@@ -168,8 +170,8 @@ def _named(
     """The separatrix, with where it leads to or comes from; cycles: those that may be that."""
     end, to = _end_of(branch, map_, points, cycles)
     ts, ys = jax.device_put((branch.ts, branch.ys))
-    edge = jnp.asarray(np.array(branch.edge))
-    return Separatrix(edge, branch.side, branch.stable, ts, ys, end, to)
+    x1 = jnp.asarray(np.array(branch.x1))
+    return Separatrix(x1, branch.side, branch.stable, ts, ys, end, to)
 
 
 def _end_of(branch: Branch, map_: Returns, points: Equilibria, cycles) -> tuple[str, int]:
@@ -187,6 +189,8 @@ def _end_of(branch: Branch, map_: Returns, points: Equilibria, cycles) -> tuple[
 def _approached(branch: Branch, map_: Returns, points: Equilibria, cycles) -> tuple[str, int]:
     """What the tops of an orbit tend to that was followed until they hardly moved: the next such
     cycle, or the end of their interval, in the direction in which they go."""
+    if branch.status != Status.OK and (to := _creeping_to(branch, points)) >= 0:
+        return "equilibrium", to
     if not len(branch.tops):
         return "unsettled", -1
     top = float(branch.tops[-1])
@@ -208,3 +212,12 @@ def _approached(branch: Branch, map_: Returns, points: Equilibria, cycles) -> tu
         return ("outside" if high == map_.intervals[-1][1] else "unsettled"), -1
     rests = np.flatnonzero(np.abs(np.asarray(points.x1_upper) - low) < 1e-9 * (1 + abs(low)))
     return ("equilibrium", int(rests[0])) if rests.size else ("unsettled", -1)
+
+
+def _creeping_to(branch: Branch, points: Equilibria) -> int:
+    """The number of the point of rest that an orbit has come so near to that it will not end: a
+    node on an edge, or on the boundary of a belt at rest, takes for ever; -1 if there is none."""
+    ends = np.stack([np.asarray(points.x1_lower), np.asarray(points.x1_upper)])
+    away = np.min(np.hypot(ends - branch.y[0], branch.y[1]), axis=0)
+    away[np.asarray(points.kind) == EquilibriumKind.SADDLE] = np.inf
+    return int(np.argmin(away)) if np.any(away < CREEPING) else -1

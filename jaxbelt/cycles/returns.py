@@ -55,6 +55,8 @@ RETURNED = 1e-8
 DIVISIONS, JUMP = 6, 1e-6
 #: Cycles with a multiplier as near to 1 are parts of a continuum of closed orbits.
 NEUTRAL = 1e-9
+#: Intervals of tops as short as this, relative to where they are, are rounding.
+ROUNDING = 1e-12
 #: The largest distance from the origin that is looked at, where no bound is known.
 FARTHEST = 1e4
 
@@ -161,7 +163,7 @@ class Returns:
         pulls = np.asarray(side_pulls(self.osc, 0.5 * (ends[1:] + ends[:-1]))[1])
         found: list[tuple[float, float]] = []
         for low, high, pull in zip(ends[:-1].tolist(), ends[1:].tolist(), pulls, strict=True):
-            if not pull < 0:
+            if not pull < 0 or high - low < ROUNDING * (1 + abs(low)):
                 continue
             goes_on = found and found[-1][1] == low and self._passes(low)
             found[-1:] = [(found[-1][0], high)] if goes_on else [*found[-1:], (low, high)]

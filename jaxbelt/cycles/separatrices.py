@@ -1,4 +1,4 @@
-"""Orbits that bound basins from points of contact edges: `Separatrix`.
+"""Orbits that bound basins from points of the axis x2 = 0: `Separatrix`.
 
 On an edge x1 = sigma the velocity is x1' = x2 on both sides, so at (sigma, 0) orbits turn: those of
 a side that pulls away from the edge touch it there. Where neither side draws the mass in, orbits
@@ -6,6 +6,11 @@ that pass the edge just below that point, or above it, go on, and those that mis
 at the orbit that ends in the point, one from each side: the stable separatrices, reached in finite
 time. Where a side pushes away an orbit leaves from the point, an unstable separatrix. Where both do
 the point is a saddle; where a belt at rest holds the mass on one side, a segment ends in it.
+
+Where a segment ends elsewhere, at the limit of what belts at rest hold, orbits that stop within it
+stay, and those that stop beyond turn back. These are caught, too, if only they stop near enough,
+unless friction falls so steeply that the end is an unstable node of the field in which they turn,
+or the static limit exceeds mu(0). Then the orbit that arrives in the end bounds the basin.
 
 Stable separatrices are followed backwards: in reversed time, t -> -t and x2 -> -x2, an oscillator
 with the signs of its damping, loads and velocities changed. Backwards, too, an orbit goes on in one
@@ -25,11 +30,13 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import number
+from ..model.equilibria import Equilibria, EquilibriumKind
 from ..model.modes import (
     STUCK,
     Mode,
     contact,
     edges,
+    force_rounding,
     mode_acceleration,
     mode_of_state,
     select,
@@ -40,7 +47,7 @@ from ..numerics.compiling import each, jit
 from ..results import Status
 from .orbits import follow_finely, place_of_rest
 from .returns import side_pulls
-from .shooting import Loop, flow, meshed
+from .shooting import Loop, flow, meshed, trace_of
 
 #: Arcs for which a separatrix is followed: some 40 loops.
 SEPARATRIX_ARCS = 256
@@ -49,21 +56,21 @@ ARC_SAMPLES = 16
 
 
 class Separatrix(eqx.Module):
-    """An orbit that leaves, or ends in, a point (sigma, 0) of a contact edge.
+    """An orbit that leaves, or ends in, a point (x1, 0): of a contact edge, or an end of a segment.
 
-    - edge: sigma. side: "left" or "right", on which side of the edge the orbit is there. stable:
+    - x1: of the point. side: "left" or "right", on which side of it the orbit is there. stable:
       whether it ends in the point, and so bounds basins, or leaves it.
-    - ts: times, 0 at the edge, [samples]; ys: states (x1, x2), [samples, 2]; both in the order of
+    - ts: times, 0 at the point, [samples]; ys: states (x1, x2), [samples, 2]; both in the order of
       time, and good to 1e-9. Ends of arcs are among the samples.
     - end: what its other end is, where an unstable one leads to and a stable one comes from:
-      "equilibrium", "cycle", "outside" (of |x1|, |x2| < reach, see `Portrait`), "boundary" (of a
+      "equilibrium" (or an end of a segment), "cycle", "outside" (of |x1|, |x2| < reach, see `Portrait`), "boundary" (of a
       belt whose static limit exceeds mu(0): it leaves this boundary beside a piece where the mass
       sticks), or "unsettled" (it approaches what it comes from, or leads to, too slowly).
     - to: the number of that equilibrium, or of that attracting or unstable cycle, in the portrait;
       else -1.
     """
 
-    edge: Array
+    x1: Array
     side: str = eqx.field(static=True)
     stable: bool = eqx.field(static=True)
     ts: Array
@@ -76,7 +83,7 @@ class Separatrix(eqx.Module):
         number_of = f" {self.to}" if self.to >= 0 else ""
         return (
             f"Separatrix({'stable' if self.stable else 'unstable'}, {self.side} of x1 = "
-            f"{number(self.edge)}, {way} {self.end}{number_of})"
+            f"{number(self.x1)}, {way} {self.end}{number_of})"
         )
 
 
@@ -87,7 +94,7 @@ class Branch(NamedTuple):
     where it came to rest, else NaN; status: of the orbit; cut: whether it came to a piece of a boundary where the mass sticks.
     """
 
-    edge: float
+    x1: float
     side: str
     stable: bool
     ts: np.ndarray
@@ -99,21 +106,51 @@ class Branch(NamedTuple):
     cut: bool
 
 
-def branches(osc: Oscillator, reach: float) -> list[Branch]:
-    """All separatrices of an oscillator, followed as long as |x1| and |x2| are < reach."""
+def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[Branch]:
+    """All separatrices of an oscillator, followed as long as |x1| and |x2| are < reach; rests:
+    where the mass can rest."""
     positions = np.unique(np.asarray(jnp.stack(edges(osc))))
     backwards = reversed_in_time(osc)
-    found: list[Branch] = []
-    for edge in positions[np.isfinite(positions)].tolist():
-        left, right = (float(pull[0]) for pull in side_pulls(osc, np.array([edge])))
+    found: list[Branch | None] = []
+    for x1 in positions[np.isfinite(positions)].tolist():
+        left, right = (float(pull[0]) for pull in side_pulls(osc, np.array([x1])))
         if left > 0 or right < 0 or left == right == 0:
             continue
         for stable, moving in ((False, osc), (True, backwards)):
             for side in ("left", "right"):
-                orbit = _orbit_and_samples(moving, edge, side == "right", reach)
-                if orbit is not None:
-                    found.append(_branch(osc, edge, side, stable, orbit))
-    return found
+                found.append(_branch(osc, moving, x1, side, stable, reach))
+    for rest in rests:
+        if int(rest.kind) != EquilibriumKind.SEGMENT:
+            continue
+        for x1, side in ((float(rest.x1_lower), "right"), (float(rest.x1_upper), "left")):
+            repels = _repels(osc, *_as_arrays(x1, side == "right"))
+            if x1 not in positions and repels:
+                found.append(_branch(osc, backwards, x1, side, True, reach))
+    return [branch for branch in found if branch is not None]
+
+
+def _as_arrays(*numbers: float) -> list[Array]:
+    """Numbers as arrays of one type, so that one program serves all."""
+    return [jnp.asarray(np.array(number)) for number in numbers]
+
+
+@jit
+def _repels(osc: Oscillator, x1: Array, rightward: Array) -> Array:
+    """Whether orbits that turn just beyond an end of a segment leave it, to the side given."""
+    zero = jnp.zeros(())
+    mode = _mode_onward(osc, x1, rightward)
+    (trace,) = trace_of(osc, mode, x1, zero)
+    pull = mode_acceleration(osc, mode, x1, zero)
+    pushes = jnp.where(rightward, pull, -pull) > force_rounding(x1)
+    return pushes | (trace >= 2)
+
+
+def _mode_onward(osc: Oscillator, x1: Array, rightward: Array) -> Mode:
+    """The slip mode beside (x1, 0) to one side; a belt at rest opposes the motion to there."""
+    sides = (contact(osc, x1, jnp.zeros(()), rightward=side) for side in (True, False))
+    mode = select(rightward, *sides)
+    backward = jnp.where(rightward, -1.0, 1.0)
+    return Mode(tuple(jnp.where(code == STUCK, backward, code) for code in mode.codes))
 
 
 def reversed_in_time(osc: Oscillator) -> Oscillator:
@@ -125,25 +162,15 @@ def reversed_in_time(osc: Oscillator) -> Oscillator:
     )
 
 
-def _orbit_and_samples(osc: Oscillator, edge: float, rightward: bool, reach: float):
-    """See `_leaving`; NumPy's. None where no orbit leaves the point to that side."""
-    numbers = (jnp.asarray(np.array(number)) for number in (edge, rightward, reach))
-    leaves, *found = jax.tree.map(np.asarray, _leaving(osc, *numbers))
-    return found if leaves else None
-
-
 @jit
-def _leaving(osc: Oscillator, edge: Array, rightward: Array, reach: Array):
-    """Whether an orbit leaves (edge, 0) to a side. Then it, where it comes to rest, and of each of its arcs
-    times since its entry, [arcs, samples], and states there."""
-    zero, one = jnp.zeros(()), jnp.ones(())
-    sides = (contact(osc, edge, zero, rightward=side) for side in (True, False))
-    mode = select(rightward, *sides)
-    # A belt at rest opposes the motion that sets in.
-    onward = jnp.where(rightward, one, -one)
-    mode = Mode(tuple(jnp.where(code == STUCK, -onward, code) for code in mode.codes))
-    leaves = onward * mode_acceleration(osc, mode, edge, zero) > 0
-    orbit = follow_finely(osc, mode, jnp.stack([edge, zero]), SEPARATRIX_ARCS, reach)
+def _leaving(osc: Oscillator, x1: Array, rightward: Array, reach: Array):
+    """Whether an orbit leaves (x1, 0) to a side. Then it, where it comes to rest, and of each of
+    its arcs times since its entry, [arcs, samples], and states there."""
+    zero = jnp.zeros(())
+    mode = _mode_onward(osc, x1, rightward)
+    pull = mode_acceleration(osc, mode, x1, zero)
+    leaves = jnp.where(rightward, pull, -pull) > 0
+    orbit = follow_finely(osc, mode, jnp.stack([x1, zero]), SEPARATRIX_ARCS, reach)
     rest = place_of_rest(osc, orbit)
     used = jnp.arange(SEPARATRIX_ARCS) < orbit.count
     durations = jnp.where(used & jnp.isfinite(orbit.durations), orbit.durations, 0.0)
@@ -172,9 +199,14 @@ def _is_held(osc: Oscillator, ys: Array) -> Array:
     return mode_of_state(osc, ys[:, 0], ys[:, 1]).any_stuck
 
 
-def _branch(osc: Oscillator, edge: float, side: str, stable: bool, followed) -> Branch:
-    """The separatrix that an orbit, as `_leaving` gives it, is."""
-    orbit, rest, since, states = followed
+def _branch(
+    osc: Oscillator, moving: Oscillator, x1: float, side: str, stable: bool, reach: float
+) -> Branch | None:
+    """The separatrix of a point on one side, if there is one; moving: `osc`, backwards if stable."""
+    found = _leaving(moving, *_as_arrays(x1, side == "right", reach))
+    leaves, orbit, rest, since, states = jax.tree.map(np.asarray, found)
+    if not leaves:
+        return None
     count, was_cut, y = int(orbit.count), False, orbit.y
     if stable:
         following = np.concatenate([orbit.entries[1:], orbit.y[None]])
@@ -186,9 +218,9 @@ def _branch(osc: Oscillator, edge: float, side: str, stable: bool, followed) -> 
             y = following[count - 1]
     begins = np.append(0.0, np.cumsum(since[:count, -1]))[:-1]
     ts = np.concatenate([[0.0], (begins[:, None] + since[:count]).ravel()])
-    ys = np.concatenate([[[edge, 0.0]], states[:count].reshape(-1, 2)])
+    ys = np.concatenate([[[x1, 0.0]], states[:count].reshape(-1, 2)])
     tops = orbit.tops[:count]
     if stable:
         ts, ys = -ts[::-1], ys[::-1] * [1.0, -1.0]
     status, tops = Status(int(orbit.status)), tops[~np.isnan(tops)]
-    return Branch(edge, side, stable, ts, ys, tops, y, float(rest), status, was_cut)
+    return Branch(x1, side, stable, ts, ys, tops, y, float(rest), status, was_cut)

@@ -34,7 +34,7 @@ MAX_ADAPTIVE_STEPS = 100_000
 #: A step of `Graded` times the wanted density. From there Newton's method takes two steps, mostly.
 STRIDE = 0.2
 #: Steps of `Graded`, times their stride, before an arc, a quarter of a loop at most, is given up.
-MAX_GRADED = 40.0
+MAX_GRADED = 200.0
 
 _ORDER_8 = scheme((2, 4, 6, 8))
 

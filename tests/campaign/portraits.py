@@ -154,7 +154,9 @@ def _invented(osc, told: jb.Portrait, seen: set[int], aside: Counter) -> list[st
         if number not in seen:
             arcs = cycle.arcs
             again = engine.attractor(osc, tuple(np.asarray(arcs.y)[0].tolist()), t_max=PATIENCE)
-            if _number_of(again, told) == number:
+            if again.kind == "undecided":
+                aside["undecided"] += 1
+            elif _number_of(again, told) == number:
                 aside["small basin"] += 1
             else:
                 wrong.append(f"invented: {cycle}, engine {again}")
