@@ -112,10 +112,12 @@ def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[Branch]:
     positions = np.unique(np.asarray(jnp.stack(edges(osc))))
     backwards = reversed_in_time(osc)
     found: list[Branch | None] = []
+    parting: list[float] = []
     for x1 in positions[np.isfinite(positions)].tolist():
         left, right = (float(pull[0]) for pull in side_pulls(osc, np.array([x1])))
         if left > 0 or right < 0 or left == right == 0:
             continue
+        parting.append(x1)
         for stable, moving in ((False, osc), (True, backwards)):
             for side in ("left", "right"):
                 found.append(_branch(osc, moving, x1, side, stable, reach))
@@ -123,8 +125,7 @@ def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[Branch]:
         if int(rest.kind) != EquilibriumKind.SEGMENT:
             continue
         for x1, side in ((float(rest.x1_lower), "right"), (float(rest.x1_upper), "left")):
-            repels = _repels(osc, *_as_arrays(x1, side == "right"))
-            if x1 not in positions and repels:
+            if x1 not in parting and _repels(osc, *_as_arrays(x1, side == "right")):
                 found.append(_branch(osc, backwards, x1, side, True, reach))
     return [branch for branch in found if branch is not None]
 
@@ -142,7 +143,7 @@ def _repels(osc: Oscillator, x1: Array, rightward: Array) -> Array:
     (trace,) = trace_of(osc, mode, x1, zero)
     pull = mode_acceleration(osc, mode, x1, zero)
     pushes = jnp.where(rightward, pull, -pull) > force_rounding(x1)
-    return pushes | (trace >= 2)
+    return pushes | (jnp.abs(pull) < force_rounding(x1)) & (trace >= 2)
 
 
 def _mode_onward(osc: Oscillator, x1: Array, rightward: Array) -> Mode:

@@ -187,8 +187,9 @@ def plot_portrait(portrait: Portrait, ax: Axes | None = None) -> Axes:
     """
     given, ax = ax, new_axes() if ax is None else ax
     osc, cycles = portrait.oscillator, [*portrait.cycles, *portrait.unstable]
-    loops = [np.asarray(cycle.sample(400)) for cycle in cycles]
-    x1, x2 = (_with_margin(ends) for ends in _window(osc, loops, portrait.equilibria, None, None))
+    paths = [np.asarray(one.ys) for one in portrait.separatrices if not one.stable]
+    paths += [np.asarray(cycle.sample(400)) for cycle in cycles]
+    x1, x2 = (_with_margin(ends) for ends in _window(osc, paths, portrait.equilibria, None, None))
     shown = {"equilibria": portrait.equilibria, "xlim": x1, "ylim": x2}
     plot_phase_portrait(osc, cycles=cycles, ax=ax, **shown)
     for one in portrait.separatrices:
@@ -199,7 +200,7 @@ def plot_portrait(portrait: Portrait, ax: Axes | None = None) -> Axes:
         away = path[::-1] if one.stable else path
         outside = (away < [x1[0], x2[0]]) | (away > [x1[1], x2[1]])
         leaves = np.append(np.flatnonzero(np.any(outside, axis=1)), len(away))[0]
-        index = _index_at_distance(ax, away[:leaves], ARROW_DISTANCE)
+        index = _index_at_distance(ax, away[: max(leaves - 1, 1)], ARROW_DISTANCE)
         index = len(path) - 1 - index if one.stable else index
         _draw_arrowheads(ax, path, style["color"], [index])
     if given is None:
