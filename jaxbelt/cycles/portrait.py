@@ -37,7 +37,7 @@ class Portrait(eqx.Module):
     - equilibria: all of them, saddles included, see `Equilibria`.
     - cycles: the attracting ones; unstable: the unstable ones; tuples of `Cycle`, by their largest
       x1.
-    - separatrices: a tuple of `Separatrix`, by the x1 of their points; the stable ones bound basins, as unstable cycles do.
+    - separatrices: a tuple of `Separatrix`, by their points; the stable ones bound basins, as unstable cycles do.
     - escapes: whether starts far out go to infinity.
     - reach: the bounds of what was looked at, |x1| and |x2| < reach. No cycle is farther out, as
       far as a bound is known, which it is not where damping is 0, nor for damping < 0 with friction
@@ -155,7 +155,7 @@ def portrait(osc: Oscillator) -> Portrait:
         cycles=cycles,
         unstable=unstable,
         separatrices=tuple(
-            _named(branch, map_, points, unstable if branch.stable else cycles) for branch in sorted(found, key=lambda branch: branch.x1)
+            _named(branch, map_, points, unstable if branch.stable else cycles) for branch in found
         ),
         escapes=map_.escapes,
         reach=reach,
@@ -170,8 +170,8 @@ def _named(
     """The separatrix, with where it leads to or comes from; cycles: those that may be that."""
     end, to = _end_of(branch, map_, points, cycles)
     ts, ys = jax.device_put((branch.ts, branch.ys))
-    x1 = jnp.asarray(np.array(branch.x1))
-    return Separatrix(x1, branch.side, branch.stable, ts, ys, end, to)
+    point = jax.device_put(np.array(branch.point))
+    return Separatrix(point, branch.side, branch.stable, ts, ys, end, to)
 
 
 def _end_of(branch: Branch, map_: Returns, points: Equilibria, cycles) -> tuple[str, int]:

@@ -26,13 +26,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from ..checks import pick
 from ..model.equilibria import Equilibria
 from ..model.modes import contact, edges, mode_acceleration, settle
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .attractors import distinct
-from .cycle import Cycle, exactly
+from .cycle import Cycle, exactly, polish
 from .orbits import before_stick_ends, follow_to_top, loop_of, place_of_rest
 from .settling import AT_REST
 from .shooting import SIZES, Loop, cut
@@ -53,6 +54,11 @@ RETURNED = 1e-8
 #: A bracket is divided into 64, at most so often; if it then is one of a jump, the map changes
 #: by more than this there.
 DIVISIONS, JUMP = 6, 1e-6
+#: In brackets as narrow as this, relative to where they are, a cycle that was not solved for is
+#: tried with so many steps for each arc: large ones pass boundaries fast.
+NARROW, MANY_STEPS = 1e-6, 128
+#: The error of the map, relative to the top; by so much over 1 - multiplier is a fixed point off.
+MAP_ERROR = 3e-7
 #: Cycles with a multiplier as near to 1 are parts of a continuum of closed orbits.
 NEUTRAL = 1e-9
 #: Intervals of tops as short as this, relative to where they are, are rounding.
@@ -81,9 +87,9 @@ def side_pulls(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
 
 
 @jit
-def _next_tops(osc: Oscillator, starts: Array) -> Array:
+def _next_tops(osc: Oscillator, starts: Array) -> tuple[Array, Loop]:
     """The top that follows each start, [starts, 2]; or x1 where the orbit comes to rest; inf where
-    it does not come back; NaN where that is not told."""
+    it does not come back; NaN where that is not told. And the way there, as if it were closed."""
 
     def one(start):
         orbit, top = follow_to_top(osc, start, LOOP_ROOM)
@@ -91,17 +97,10 @@ def _next_tops(osc: Oscillator, starts: Array) -> Array:
         far = jnp.max(jnp.abs(orbit.y)) > 10 * (1 + jnp.max(jnp.abs(start)))
         lost = (orbit.status != Status.OK) & (far | ~jnp.all(jnp.isfinite(orbit.y)))
         rest = jnp.where(lost & jnp.isnan(rest), jnp.inf, rest)
-        return jnp.where(jnp.isnan(top), rest, top)
+        orbit = eqx.tree_at(lambda orbit: orbit.repeats, orbit, jnp.asarray(-1))
+        return jnp.where(jnp.isnan(top), rest, top), loop_of(orbit, LOOP_ROOM, len(osc.belts))
 
     return each(one)(lax.stop_gradient(starts))
-
-
-@jit
-def _loop_from(osc: Oscillator, x1: Array) -> tuple[Loop, Array]:
-    """The loop from a top to the next, as if it were closed, and whether there is one."""
-    orbit, top = follow_to_top(osc, jnp.stack([x1, jnp.zeros(())]), LOOP_ROOM)
-    orbit = eqx.tree_at(lambda orbit: orbit.repeats, orbit, jnp.asarray(-1))
-    return loop_of(orbit, LOOP_ROOM, len(osc.belts)), ~jnp.isnan(top)
 
 
 @jit
@@ -141,18 +140,20 @@ class Returns:
     def __call__(self, tops: np.ndarray) -> np.ndarray:
         """The tops that follow these: see `_next_tops`."""
         new = np.array([top for top in tops.tolist() if top not in self._known])
-        starts = np.column_stack([new, np.zeros_like(new)])
-        self._known |= dict(zip(new.tolist(), self._after(starts).tolist(), strict=True))
+        after, _ = self._after(np.column_stack([new, np.zeros_like(new)]))
+        self._known |= dict(zip(new.tolist(), after.tolist(), strict=True))
         return np.array([self._known[top] for top in tops.tolist()])
 
-    def _after(self, starts: np.ndarray) -> np.ndarray:
-        """The tops that follow these states, [starts, 2], in batches of one size."""
-        found = []
+    def _after(self, starts: np.ndarray) -> tuple[np.ndarray, list[Loop]]:
+        """The tops that follow these states, [starts, 2], and the loops, in batches of one size."""
+        tops, loops = [np.zeros(0)], []
         for first in range(0, len(starts), TOPS_AT_ONCE):
             batch = starts[first : first + TOPS_AT_ONCE]
             filled = np.concatenate([batch, batch[-1:].repeat(TOPS_AT_ONCE - len(batch), axis=0)])
-            found.append(np.asarray(_next_tops(self.osc, filled))[: len(batch)])
-        return np.concatenate(found) if found else np.zeros(0)
+            after, ways = _next_tops(self.osc, filled)
+            tops.append(np.asarray(after)[: len(batch)])
+            loops.append(ways)
+        return np.concatenate(tops), loops
 
     def _intervals_of_tops(self, rests: Equilibria) -> list[tuple[float, float]]:
         """The intervals of the axis in which a mass at rest is pulled to the left."""
@@ -177,7 +178,7 @@ class Returns:
     def _tops_after_sticking(self) -> list[float]:
         """The tops after each place where a stick phase ends, and the ones after those."""
         starts = np.asarray(_stick_ends(self.osc))
-        first = self._after(starts[np.isfinite(starts[:, 0])])
+        first, _ = self._after(starts[np.isfinite(starts[:, 0])])
         tops = first[np.isfinite(first)]
         return [*tops.tolist(), *(top for top in self(tops).tolist() if np.isfinite(top))]
 
@@ -275,16 +276,18 @@ class Returns:
 
     def _cycle_at(self, top: float, low: float, high: float) -> Cycle | None:
         """The cycle with its top between two tops, from the loop of one between them, or None."""
-        loop, closes = _loop_from(self.osc, jnp.asarray(np.array(top)))
-        if not closes:
-            return None
-        cycle = exactly(self.osc, cut([loop])[0], jnp.asarray(np.array(Status.OK.value)))
+        _, (loops,) = self._after(np.array([[top, 0.0]]))
+        loop = pick(loops, 0)
+        loop, ok = cut([loop])[0], jnp.asarray(np.array(Status.OK.value))
+        cycle = exactly(self.osc, loop, ok)
+        if int(cycle.status) == Status.NO_CONVERGENCE and high - low < NARROW * (1 + abs(top)):
+            cycle = polish(self.osc, loop, ok, steps=MANY_STEPS)
         if int(cycle.status) != Status.OK or np.ptp(np.asarray(cycle.unknowns)[:, 0]) < AT_REST:
             return None
-        margin = 0.5 * (high - low) + 1e-7 * (1 + abs(top))
+        growth = min(abs(float(cycle.multiplier) - 1), 1.0)
+        margin = 0.5 * (high - low) + MAP_ERROR * (1 + abs(top)) / max(growth, NEUTRAL)
         at_home = low - margin <= float(cycle.x1_max) <= high + margin
-        neutral = abs(float(cycle.multiplier) - 1) < NEUTRAL
-        return cycle if at_home and not neutral else None
+        return cycle if at_home and growth > NEUTRAL else None
 
 
 def _positions(osc: Oscillator, rests: Equilibria) -> list[Array]:
