@@ -13,8 +13,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     model/          friction oscillator parameters modes events equilibria
     presets         the published systems
     motion/         integrators arcs sensitivities runs sampling smoothing simulate
-    cycles/         settling shooting orbits cycle attractors functionals returns separatrices
-    cycles/         portrait
+    cycles/         settling shooting orbits cycle attractors functionals
+    cycles/         backwards returns separatrices portrait
     sweeps/         lanes step events marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds

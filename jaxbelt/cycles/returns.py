@@ -33,10 +33,11 @@ from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .attractors import distinct
-from .cycle import Cycle, exactly, polish
+from .backwards import forwards, reversed_in_time, solved
+from .cycle import Cycle
 from .orbits import before_stick_ends, follow_to_top, loop_of, place_of_rest
 from .settling import AT_REST
-from .shooting import SIZES, Loop, cut
+from .shooting import SIZES, Loop
 
 #: Tops that are evaluated in one batch.
 TOPS_AT_ONCE = 64
@@ -54,9 +55,6 @@ RETURNED = 1e-8
 #: A bracket is divided into 64, at most so often; if it then is one of a jump, the map changes
 #: by more than this there.
 DIVISIONS, JUMP = 6, 1e-6
-#: In brackets as narrow as this, relative to where they are, a cycle that was not solved for is
-#: tried with so many steps for each arc: large ones pass boundaries fast.
-NARROW, MANY_STEPS = 1e-6, 128
 #: The error of the map, relative to the top; by so much over 1 - multiplier is a fixed point off.
 MAP_ERROR = 3e-7
 #: Cycles with a multiplier as near to 1 are parts of a continuum of closed orbits.
@@ -140,17 +138,17 @@ class Returns:
     def __call__(self, tops: np.ndarray) -> np.ndarray:
         """The tops that follow these: see `_next_tops`."""
         new = np.array([top for top in tops.tolist() if top not in self._known])
-        after, _ = self._after(np.column_stack([new, np.zeros_like(new)]))
+        after, _ = self._after(self.osc, np.column_stack([new, np.zeros_like(new)]))
         self._known |= dict(zip(new.tolist(), after.tolist(), strict=True))
         return np.array([self._known[top] for top in tops.tolist()])
 
-    def _after(self, starts: np.ndarray) -> tuple[np.ndarray, list[Loop]]:
+    def _after(self, osc: Oscillator, starts: np.ndarray) -> tuple[np.ndarray, list[Loop]]:
         """The tops that follow these states, [starts, 2], and the loops, in batches of one size."""
         tops, loops = [np.zeros(0)], []
         for first in range(0, len(starts), TOPS_AT_ONCE):
             batch = starts[first : first + TOPS_AT_ONCE]
             filled = np.concatenate([batch, batch[-1:].repeat(TOPS_AT_ONCE - len(batch), axis=0)])
-            after, ways = _next_tops(self.osc, filled)
+            after, ways = _next_tops(osc, filled)
             tops.append(np.asarray(after)[: len(batch)])
             loops.append(ways)
         return np.concatenate(tops), loops
@@ -178,7 +176,7 @@ class Returns:
     def _tops_after_sticking(self) -> list[float]:
         """The tops after each place where a stick phase ends, and the ones after those."""
         starts = np.asarray(_stick_ends(self.osc))
-        first, _ = self._after(starts[np.isfinite(starts[:, 0])])
+        first, _ = self._after(self.osc, starts[np.isfinite(starts[:, 0])])
         tops = first[np.isfinite(first)]
         return [*tops.tolist(), *(top for top in self(tops).tolist() if np.isfinite(top))]
 
@@ -270,24 +268,34 @@ class Returns:
                 found.append(cycle)
             elif divisions > 1 and tops.size > 2:
                 found += self._solved_between(Bracket(float(a), float(b)), divisions - 1)
+            elif after > before and (behind := self._cycle_behind(float(b))) is not None:
+                found.append(behind)
             elif not abs(after - before) > JUMP:
                 self.gaps.append((float(a), float(b)))
         return found
 
     def _cycle_at(self, top: float, low: float, high: float) -> Cycle | None:
         """The cycle with its top between two tops, from the loop of one between them, or None."""
-        _, (loops,) = self._after(np.array([[top, 0.0]]))
-        loop = pick(loops, 0)
-        loop, ok = cut([loop])[0], jnp.asarray(np.array(Status.OK.value))
-        cycle = exactly(self.osc, loop, ok)
-        if int(cycle.status) == Status.NO_CONVERGENCE and high - low < NARROW * (1 + abs(top)):
-            cycle = polish(self.osc, loop, ok, steps=MANY_STEPS)
-        if int(cycle.status) != Status.OK or np.ptp(np.asarray(cycle.unknowns)[:, 0]) < AT_REST:
+        _, (loops,) = self._after(self.osc, np.array([[top, 0.0]]))
+        return _if_at_home(solved(self.osc, pick(loops, 0)), top, high - low)
+
+    def _cycle_behind(self, top: float) -> Cycle | None:
+        """The cycle with its top there, as it is backwards, or None: then the map jumps there."""
+        behind = reversed_in_time(self.osc)
+        (before,), (loops,) = self._after(behind, np.array([[top, 0.0]]))
+        if not abs(before - top) < MAP_ERROR * (1 + abs(top)):
             return None
-        growth = min(abs(float(cycle.multiplier) - 1), 1.0)
-        margin = 0.5 * (high - low) + MAP_ERROR * (1 + abs(top)) / max(growth, NEUTRAL)
-        at_home = low - margin <= float(cycle.x1_max) <= high + margin
-        return cycle if at_home and growth > NEUTRAL else None
+        cycle = _if_at_home(solved(behind, pick(loops, 0)), top, 0.0)
+        return None if cycle is None else forwards(self.osc, cycle)
+
+
+def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
+    """A cycle that was solved for from a top, if it is one, and where it was looked for."""
+    if int(cycle.status) != Status.OK or np.ptp(np.asarray(cycle.unknowns)[:, 0]) < AT_REST:
+        return None
+    growth = min(abs(float(cycle.multiplier) - 1), 1.0)
+    margin = width + MAP_ERROR * (1 + abs(top)) / max(growth, NEUTRAL)
+    return cycle if abs(float(cycle.x1_max) - top) < margin and growth > NEUTRAL else None
 
 
 def _positions(osc: Oscillator, rests: Equilibria) -> list[Array]:

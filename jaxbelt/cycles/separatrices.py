@@ -51,6 +51,7 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
 from ..results import Status
+from .backwards import reversed_in_time
 from .orbits import follow_finely, place_of_rest
 from .returns import side_pulls
 from .shooting import Loop, flow, meshed, trace_of
@@ -207,15 +208,6 @@ def _at_rest(
     # Backwards the signs of all relative velocities are the other ones.
     mode = np.where(np.abs(mode) == 1, -mode, mode) if stable else mode
     return _branch(osc, (x1, 0.0), mode, side, stable, reach) if leaves else None
-
-
-def reversed_in_time(osc: Oscillator) -> Oscillator:
-    """The oscillator whose motion (x1, -x2) is the motion of `osc` backwards. It never sticks."""
-    return eqx.tree_at(
-        lambda o: [o.damping, *(b.velocity for b in o.belts), *(b.load for b in o.belts)],
-        osc,
-        replace_fn=lambda leaf: -leaf,
-    )
 
 
 @jit
