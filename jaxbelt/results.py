@@ -92,9 +92,9 @@ ADVICE = {
         "closes nearby: no two cycles meet near here."
     ),
     Status.INCOMPLETE: (
-        "Between some tops it is not told whether there is a cycle: a continuum of closed orbits, "
-        "cycles about to merge, or orbits that settle too slowly. Look at the gaps, or move away "
-        "from the bifurcation point."
+        "Not everything is told: in the gaps there may be cycles (a continuum of closed orbits, "
+        "cycles about to merge, orbits that settle too slowly), or a separatrix of a node that lies "
+        "on a contact edge is missing. Move away from the bifurcation point."
     ),
     Status.NO_FIXED_POINT: "There is no fixed point in a smooth field whose trace could vanish.",
     Status.UNEXPLAINED: (

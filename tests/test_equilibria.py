@@ -20,7 +20,7 @@ from jaxbelt import EquilibriumKind
 
 EXACT = dict(rel=1e-12, abs=1e-12)
 SETTLED = 1e-4
-FIXED_POINT, SEGMENT, PSEUDO_FOCUS = EquilibriumKind
+FIXED_POINT, SEGMENT, PSEUDO_FOCUS, SADDLE = EquilibriumKind
 
 HOPF_A = (sqrt(8) - 1) / 10
 

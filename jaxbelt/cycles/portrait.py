@@ -18,6 +18,7 @@ from jaxtyping import Array
 from ..checks import is_concrete, pick, require
 from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.events import signature_name
+from ..model.modes import edges
 from ..model.oscillator import Oscillator, check_oscillator
 from ..results import Status, describe, draw
 from .cycle import Cycle
@@ -26,6 +27,10 @@ from .separatrices import Branch, Separatrix, branches
 
 #: A top is on a cycle that is no farther away than this, relative to the distance from the origin.
 ON_CYCLE = 1e-5
+#: An equilibrium as near to an edge is on it.
+ON_EDGE = 1e-9
+#: Separatrices are followed beyond the reach, from where they may come back into it.
+TRACED = 3.0
 #: An orbit without an end that gets so near to a point of rest tends to it.
 CREEPING = 1e-3
 
@@ -44,7 +49,9 @@ class Portrait(eqx.Module):
       that grows with the speed.
     - gaps: intervals (from, to) of x1 at rest in which it is not told whether cycles pass, [gaps,
       2]; those of a continuum of closed orbits, which are neither attracting nor unstable, too.
-    - status: OK, or INCOMPLETE where there is a gap.
+    - status: OK, or INCOMPLETE where there is a gap, or where an equilibrium on a contact edge is a
+      stable node: the orbit that comes to it in its fast direction is a separatrix, too, and is not
+      given.
 
     Starts tell which basin they are in by where they lie: see `table` for all numbers, `plot` for
     the picture.
@@ -143,12 +150,13 @@ def portrait(osc: Oscillator) -> Portrait:
     require(is_concrete(osc), "osc", "known: portraits are not for jit or vmap", "a traced one")
     points, reach = equilibria(osc), reach_of(osc)
     rests = pick(points, np.asarray(points.kind) != EquilibriumKind.SADDLE)
-    found = branches(osc, rests, reach)
+    found = branches(osc, rests, TRACED * reach)
     map_ = Returns(osc, rests, reach, [top for branch in found for top in branch.tops[:2].tolist()])
     cycles = tuple(cycle for cycle in map_.cycles if abs(float(cycle.multiplier)) < 1)
     unstable = tuple(cycle for cycle in map_.cycles if float(cycle.multiplier) > 1)
     gaps = np.array(sorted(map_.gaps)).reshape(-1, 2)
-    status = Status.INCOMPLETE if len(gaps) else Status.OK
+    told = not len(gaps) and not _has_node_on_edge(osc, points)
+    status = Status.OK if told else Status.INCOMPLETE
     return Portrait(
         oscillator=osc,
         equilibria=points,
@@ -162,6 +170,15 @@ def portrait(osc: Oscillator) -> Portrait:
         gaps=jax.device_put(gaps),
         status=jnp.asarray(np.array(status.value)),
     )
+
+
+def _has_node_on_edge(osc: Oscillator, points: Equilibria) -> bool:
+    """Whether a stable node lies on a contact edge, up to rounding."""
+    x1, at = np.asarray(points.x1), np.asarray(jnp.stack(edges(osc)))
+    on_edge = np.min(np.abs(x1[:, None] - at), axis=1, initial=np.inf) < ON_EDGE
+    fixed = np.asarray(points.kind) == EquilibriumKind.FIXED_POINT
+    is_node = np.asarray(points.eigenvalues)[:, 0].imag == 0
+    return bool(np.any(on_edge & fixed & is_node & np.asarray(points.stable)))
 
 
 def _named(

@@ -48,6 +48,10 @@ PER_DECADE = 16
 #: Intervals shorter than this fraction of the distance from where they begin are divided only where
 #: the growth of loops changes by more than the second number, and none below the third.
 SHORT, UNEVEN, SHORTEST = 1e-2, 0.05, 1e-5
+#: Distances from the tops that follow stick phases, and jumps, begin with this one.
+BESIDE = 1e-10
+#: Cycles around a pseudo-focus are looked for down to this width; their height is larger.
+AT_FOCUS = 1e-7
 #: Tops at most, in search of all cycles.
 MOST_TOPS = 20_000
 #: Tops that return to themselves to this fraction do so up to the errors of orbits.
@@ -127,6 +131,7 @@ class Returns:
         self._hits: list[float] = []
         self._known: dict[float, float] = {}
         self.reach = reach
+        self._edges = {float(edge) for edge in edges(osc)}
         self.intervals = self._intervals_of_tops(rests)
         self._special = np.array([*special, *self._tops_after_sticking()])
         for low, high in self.intervals:
@@ -198,14 +203,15 @@ class Returns:
 
     def _first_tops(self, low: float, high: float) -> np.ndarray:
         length = high - low
-        least = min(AT_REST, 1e-4 * length)
+        # Cycles around a pseudo-focus are as wide as the square of their height.
+        least = min(0.1 * AT_FOCUS if low in self._edges else AT_REST, 1e-4 * length)
         decades = np.log10(0.5 * length / least)
         away = np.geomspace(least, 0.5 * length, max(8, int(PER_DECADE * decades)))
         near = self._special[(low < self._special) & (self._special < high)]
-        beside = np.concatenate([-away[away < 0.1], [0.0], away[away < 0.1]])
-        tops = np.concatenate(
-            [low + away, high - away, [high], (near[:, None] + beside[::2]).ravel(), near]
-        )
+        # An unstable cycle may be as near to one that sticks as that is to its fold.
+        steps = np.geomspace(BESIDE, 0.1, int(-0.25 * PER_DECADE * np.log10(BESIDE)))
+        beside = (near[:, None] + np.concatenate([-steps, steps])).ravel()
+        tops = np.concatenate([low + away, high - away, [high], beside, near])
         return np.unique(tops[(low + least <= tops) & (tops <= high)])
 
     def _divided(self, tops: np.ndarray, returns: np.ndarray, low: float) -> np.ndarray:
@@ -223,7 +229,7 @@ class Returns:
     def _collect(self, tops: np.ndarray, returns: np.ndarray, low: float) -> None:
         """Take the changes of sign, the tops that return to themselves, and what is not known."""
         rise = returns - tops
-        zero = np.abs(rise) <= RETURNED * np.minimum(1.0, np.maximum(tops - low, 1e-3))
+        zero = np.abs(rise) <= np.maximum(RETURNED * np.minimum(1.0, tops - low), RETURNED**2)
         many = zero[:-2] & zero[1:-1] & zero[2:] if tops.size > 2 else np.zeros(0, bool)
         closed = np.zeros(tops.size, bool)
         for i in np.flatnonzero(many):
@@ -291,7 +297,10 @@ class Returns:
 
 def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
     """A cycle that was solved for from a top, if it is one, and where it was looked for."""
-    if int(cycle.status) != Status.OK or np.ptp(np.asarray(cycle.unknowns)[:, 0]) < AT_REST:
+    if int(cycle.status) != Status.OK:
+        return None
+    x1, x2, _ = np.ptp(np.asarray(cycle.unknowns), axis=0)
+    if x1 < AT_FOCUS or x2 < AT_REST:
         return None
     growth = min(abs(float(cycle.multiplier) - 1), 1.0)
     margin = width + MAP_ERROR * (1 + abs(top)) / max(growth, NEUTRAL)
