@@ -93,8 +93,8 @@ ADVICE = {
     ),
     Status.INCOMPLETE: (
         "Not everything is told: in the gaps there may be cycles (a continuum of closed orbits, "
-        "cycles about to merge, orbits that settle too slowly), or a separatrix of a node that lies "
-        "on a contact edge is missing. Move away from the bifurcation point."
+        "cycles about to merge, orbits that settle too slowly), or a separatrix is missing, of a "
+        "node on a contact edge. Move away from the bifurcation point."
     ),
     Status.NO_FIXED_POINT: "There is no fixed point in a smooth field whose trace could vanish.",
     Status.UNEXPLAINED: (

@@ -3,8 +3,9 @@
 In reversed time, t -> -t and x2 -> -x2, an oscillator is one with the signs of its damping, loads
 and velocities changed. It never sticks: orbits that do not stick go on backwards in one way.
 
-Slow belts with steep friction laws make cycles whose multiplier is 1e20. They pass along a boundary,
-just off it, for a long time; forwards no number leads to such a cycle, backwards all of them do.
+Slow belts with steep friction laws make cycles whose multiplier is 1e20. They pass along a
+boundary, just off it, for a long time; forwards no number leads to such a cycle, backwards all of
+them do.
 """
 
 import equinox as eqx

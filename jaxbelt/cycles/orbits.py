@@ -180,11 +180,9 @@ def follow_to_top(osc: Oscillator, y0: Array, budget: int) -> tuple[Orbit, Array
     return orbit, jnp.where(orbit.count > 0, _last_top(orbit), jnp.nan)
 
 
-def follow_finely(
-    osc: Oscillator, mode: Mode, y0: Array, budget: int, reach: Array
-) -> Orbit:
-    """The orbit that leaves y0 in a mode, like `follow`, but every arc to 1e-12, as long as |x1| and
-    |x2| are < reach."""
+def follow_finely(osc: Oscillator, mode: Mode, y0: Array, budget: int, reach: Array) -> Orbit:
+    """The orbit that leaves y0 in a mode, like `follow`, but every arc to 1e-12, and to rest nearly,
+    as long as |x1| and |x2| are < reach."""
     osc, mode, y0 = lax.stop_gradient((osc, mode, y0))
     start = _standing(osc, mode, y0, jnp.asarray(Status.OK.value), budget)
     return _settled_or_not(_finely_from(osc, start, reach))

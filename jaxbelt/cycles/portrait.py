@@ -1,9 +1,10 @@
 """Everything that there is at one oscillator: `portrait` and what it returns, `Portrait`.
 
-The plane of a planar system is told by a few sets: where orbits end, and what parts those that end
-in different places. With dry friction they are (see `returns` and `separatrices` for why there are
-no others): equilibria, attracting cycles, unstable cycles, and the separatrices of points on contact
-edges. Nothing here knows bifurcations, so it stands among the cycles.
+The plane is told by a few sets: where orbits end, and what parts those that end in different
+places. With dry friction they are (see `returns` and `separatrices` for why there are no others)
+equilibria, attracting cycles, unstable cycles, and separatrices of points on contact edges, of ends
+of segments and of boundaries with a jump. Nothing here needs bifurcations, so it stands among the
+cycles.
 """
 
 from collections.abc import Sequence
@@ -42,7 +43,8 @@ class Portrait(eqx.Module):
     - equilibria: all of them, saddles included, see `Equilibria`.
     - cycles: the attracting ones; unstable: the unstable ones; tuples of `Cycle`, by their largest
       x1.
-    - separatrices: a tuple of `Separatrix`, by their points; the stable ones bound basins, as unstable cycles do.
+    - separatrices: a tuple of `Separatrix`, by their points; the stable ones bound basins, as
+      unstable cycles do.
     - escapes: whether starts far out go to infinity.
     - reach: the bounds of what was looked at, |x1| and |x2| < reach. No cycle is farther out, as
       far as a bound is known, which it is not where damping is 0, nor for damping < 0 with friction
@@ -177,7 +179,7 @@ def _has_node_on_edge(osc: Oscillator, points: Equilibria) -> bool:
     x1, at = np.asarray(points.x1), np.asarray(jnp.stack(edges(osc)))
     on_edge = np.min(np.abs(x1[:, None] - at), axis=1, initial=np.inf) < ON_EDGE
     fixed = np.asarray(points.kind) == EquilibriumKind.FIXED_POINT
-    is_node = np.asarray(points.eigenvalues)[:, 0].imag == 0
+    is_node = np.isreal(np.asarray(points.eigenvalues)[:, 0])
     return bool(np.any(on_edge & fixed & is_node & np.asarray(points.stable)))
 
 

@@ -153,7 +153,7 @@ class Returns:
         for first in range(0, len(starts), TOPS_AT_ONCE):
             batch = starts[first : first + TOPS_AT_ONCE]
             filled = np.concatenate([batch, batch[-1:].repeat(TOPS_AT_ONCE - len(batch), axis=0)])
-            after, ways = _next_tops(osc, filled)
+            after, ways = _next_tops(osc, jax.device_put(filled))
             tops.append(np.asarray(after)[: len(batch)])
             loops.append(ways)
         return np.concatenate(tops), loops
@@ -164,7 +164,7 @@ class Returns:
         cuts = np.unique(cuts[np.isfinite(cuts)])
         cuts = cuts if cuts.size else np.zeros(1)
         ends = np.append(cuts, self.reach)
-        pulls = np.asarray(side_pulls(self.osc, 0.5 * (ends[1:] + ends[:-1]))[1])
+        pulls = np.asarray(side_pulls(self.osc, jax.device_put(0.5 * (ends[1:] + ends[:-1])))[1])
         found: list[tuple[float, float]] = []
         for low, high, pull in zip(ends[:-1].tolist(), ends[1:].tolist(), pulls, strict=True):
             if not pull < 0 or high - low < ROUNDING * (1 + abs(low)):
@@ -175,7 +175,7 @@ class Returns:
 
     def _passes(self, x1: float) -> bool:
         """Whether both sides of an edge pull to the left."""
-        left, right = side_pulls(self.osc, np.array([x1]))
+        left, right = side_pulls(self.osc, jax.device_put(np.array([x1])))
         return bool(left[0] < 0 and right[0] < 0)
 
     def _tops_after_sticking(self) -> list[float]:
@@ -237,7 +237,9 @@ class Returns:
         for first, last in _runs_of(closed):
             self.gaps.append((float(tops[first]), float(tops[last])))
         for first, last in _runs_of(np.isnan(returns)):
-            self.gaps.append((float(tops[max(first - 1, 0)]), float(tops[min(last + 1, tops.size - 1)])))
+            self.gaps.append(
+                (float(tops[max(first - 1, 0)]), float(tops[min(last + 1, tops.size - 1)]))
+            )
         self._hits += tops[zero & ~closed].tolist()
         told = ~zero & ~np.isnan(returns)
         signs, where = np.sign(rise[told]), tops[told]

@@ -63,8 +63,8 @@ ARC_SAMPLES = 16
 
 
 class Separatrix(eqx.Module):
-    """An orbit that leaves, or ends in, a point: (sigma, 0) of a contact edge, an end of a segment, or
-    where it touches the boundary of a belt whose static limit exceeds mu(0).
+    """An orbit that leaves, or ends in, a point: (sigma, 0) of a contact edge, an end of a segment,
+    or where it touches the boundary of a belt whose static limit exceeds mu(0).
 
     - point: (x1, x2). side: "left" or "right", on which side of it the orbit is there. stable:
       whether it ends in the point, and so may bound basins, or leaves it.
@@ -123,7 +123,7 @@ def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[Branch]:
     found: list[Branch | None] = []
     parting: list[float] = []
     for x1 in positions[np.isfinite(positions)].tolist():
-        left, right = (float(pull[0]) for pull in side_pulls(osc, np.array([x1])))
+        left, right = (float(pull[0]) for pull in side_pulls(osc, jax.device_put(np.array([x1]))))
         if left > 0 or right < 0 or left == right == 0:
             continue
         parting.append(x1)
@@ -145,7 +145,7 @@ def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[Branch]:
     return sorted(unique.values(), key=lambda branch: branch.point)
 
 
-def _as_arrays(*numbers: float) -> list[Array]:
+def _as_arrays(*numbers: float | int | bool) -> list[Array]:
     """Numbers as arrays of one type, so that one program serves all."""
     return [jnp.asarray(np.array(number)) for number in numbers]
 
@@ -199,9 +199,7 @@ def _tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     return jnp.stack([x1, x2], axis=-1), jnp.stack(slips.codes, axis=-1)
 
 
-def _at_rest(
-    osc: Oscillator, x1: float, side: str, stable: bool, reach: float
-) -> Branch | None:
+def _at_rest(osc: Oscillator, x1: float, side: str, stable: bool, reach: float) -> Branch | None:
     """The separatrix of a point (x1, 0) on one side, if there is one."""
     moving = reversed_in_time(osc) if stable else osc
     leaves, mode = map(np.asarray, _leaves(moving, *_as_arrays(x1, side == "right")))
@@ -258,14 +256,16 @@ def _branch(
     way = np.array([1.0, -1.0 if stable else 1.0])
     start = np.array(point) * way, np.where(np.abs(codes) == 1, codes * way[1], codes)
     moving = reversed_in_time(osc) if stable else osc
-    found = _orbit_from(moving, *start, *_as_arrays(reach))
+    found = _orbit_from(moving, *jax.device_put(start), *_as_arrays(reach))
     orbit, rest, since, states = jax.tree.map(np.asarray, found)
     count, was_cut, y = int(orbit.count), False, orbit.y
     if stable:
         following = np.concatenate([orbit.entries[1:], orbit.y[None]])
         following[count - 1] = orbit.y
         at_boundary = (np.arange(len(following)) < count) & (orbit.ends < len(osc.belts))
-        stuck = np.flatnonzero(at_boundary & np.asarray(_is_held(osc, following * way)))
+        stuck = np.flatnonzero(
+            at_boundary & np.asarray(_is_held(osc, jax.device_put(following * way)))
+        )
         if stuck.size:
             count, was_cut = int(stuck[0]) + 1, True
             y = following[count - 1]
