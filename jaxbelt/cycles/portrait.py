@@ -24,7 +24,7 @@ from ..model.oscillator import Oscillator, check_oscillator
 from ..results import Status, describe, draw
 from .cycle import Cycle
 from .returns import Returns, reach_of
-from .separatrices import Branch, Separatrix, branches
+from .separatrices import Separatrix, TracedSeparatrix, branches
 
 #: A top is on a cycle that is no farther away than this, relative to the distance from the origin.
 ON_CYCLE = 1e-5
@@ -184,7 +184,7 @@ def _has_node_on_edge(osc: Oscillator, points: Equilibria) -> bool:
 
 
 def _named(
-    branch: Branch, map_: Returns, points: Equilibria, cycles: Sequence[Cycle]
+    branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles: Sequence[Cycle]
 ) -> Separatrix:
     """The separatrix, with where it leads to or comes from; cycles: those that may be that."""
     end, to = _end_of(branch, map_, points, cycles)
@@ -193,7 +193,7 @@ def _named(
     return Separatrix(point, branch.side, branch.stable, ts, ys, end, to)
 
 
-def _end_of(branch: Branch, map_: Returns, points: Equilibria, cycles) -> tuple[str, int]:
+def _end_of(branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles) -> tuple[str, int]:
     if branch.cut:
         return "boundary", -1
     if max(abs(branch.y)) >= map_.reach or branch.status == Status.NOT_FINITE:
@@ -205,7 +205,9 @@ def _end_of(branch: Branch, map_: Returns, points: Equilibria, cycles) -> tuple[
     return _approached(branch, map_, points, cycles)
 
 
-def _approached(branch: Branch, map_: Returns, points: Equilibria, cycles) -> tuple[str, int]:
+def _approached(
+    branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles
+) -> tuple[str, int]:
     """What the tops of an orbit tend to that was followed until they hardly moved: the next such
     cycle, or the end of their interval, in the direction in which they go."""
     if branch.status != Status.OK and (to := _creeping_to(branch, points)) >= 0:
@@ -233,7 +235,7 @@ def _approached(branch: Branch, map_: Returns, points: Equilibria, cycles) -> tu
     return ("equilibrium", int(rests[0])) if rests.size else ("unsettled", -1)
 
 
-def _creeping_to(branch: Branch, points: Equilibria) -> int:
+def _creeping_to(branch: TracedSeparatrix, points: Equilibria) -> int:
     """The number of the point of rest that an orbit has come so near to that it will not end: a
     node on an edge, or on the boundary of a belt at rest, takes for ever; -1 if there is none."""
     ends = np.stack([np.asarray(points.x1_lower), np.asarray(points.x1_upper)])

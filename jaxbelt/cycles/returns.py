@@ -49,7 +49,7 @@ PER_DECADE = 16
 #: the growth of loops changes by more than the second number, and none below the third.
 SHORT, UNEVEN, SHORTEST = 1e-2, 0.05, 1e-5
 #: Distances from the tops that follow stick phases, and jumps, begin with this one.
-BESIDE = 1e-10
+CLOSEST = 1e-10
 #: Cycles around a pseudo-focus are looked for down to this width; their height is larger.
 AT_FOCUS = 1e-7
 #: Tops at most, in search of all cycles.
@@ -209,7 +209,7 @@ class Returns:
         away = np.geomspace(least, 0.5 * length, max(8, int(PER_DECADE * decades)))
         near = self._special[(low < self._special) & (self._special < high)]
         # An unstable cycle may be as near to one that sticks as that is to its fold.
-        steps = np.geomspace(BESIDE, 0.1, int(-0.25 * PER_DECADE * np.log10(BESIDE)))
+        steps = np.geomspace(CLOSEST, 0.1, int(-0.25 * PER_DECADE * np.log10(CLOSEST)))
         beside = (near[:, None] + np.concatenate([-steps, steps])).ravel()
         tops = np.concatenate([low + away, high - away, [high], beside, near])
         return np.unique(tops[(low + least <= tops) & (tops <= high)])

@@ -96,7 +96,7 @@ class Separatrix(eqx.Module):
         )
 
 
-class Branch(NamedTuple):
+class TracedSeparatrix(NamedTuple):
     """A separatrix as it was followed: backwards, with x2 reversed, where it is stable.
 
     tops: its maxima of x1 in the order in which it came to them; y: where it was left; rest: x1
@@ -116,11 +116,11 @@ class Branch(NamedTuple):
     cut: bool
 
 
-def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[Branch]:
+def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[TracedSeparatrix]:
     """All separatrices of an oscillator, followed as long as |x1| and |x2| are < reach; rests:
     where the mass can rest."""
     positions = np.unique(np.asarray(jnp.stack(edges(osc))))
-    found: list[Branch | None] = []
+    found: list[TracedSeparatrix | None] = []
     parting: list[float] = []
     for x1 in positions[np.isfinite(positions)].tolist():
         left, right = (float(pull[0]) for pull in side_pulls(osc, jax.device_put(np.array([x1]))))
@@ -199,7 +199,9 @@ def _tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     return jnp.stack([x1, x2], axis=-1), jnp.stack(slips.codes, axis=-1)
 
 
-def _at_rest(osc: Oscillator, x1: float, side: str, stable: bool, reach: float) -> Branch | None:
+def _at_rest(
+    osc: Oscillator, x1: float, side: str, stable: bool, reach: float
+) -> TracedSeparatrix | None:
     """The separatrix of a point (x1, 0) on one side, if there is one."""
     moving = reversed_in_time(osc) if stable else osc
     leaves, mode = map(np.asarray, _leaves(moving, *_as_arrays(x1, side == "right")))
@@ -251,7 +253,7 @@ def _branch(
     side: str,
     stable: bool,
     reach: float,
-) -> Branch:
+) -> TracedSeparatrix:
     """The separatrix that leaves, or comes to, a point in a mode."""
     way = np.array([1.0, -1.0 if stable else 1.0])
     start = np.array(point) * way, np.where(np.abs(codes) == 1, codes * way[1], codes)
@@ -276,4 +278,4 @@ def _branch(
     if stable:
         ts, ys = -ts[::-1], ys[::-1]
     status, tops = Status(int(orbit.status)), tops[~np.isnan(tops)]
-    return Branch(point, side, stable, ts, ys, tops, y, float(rest), status, was_cut)
+    return TracedSeparatrix(point, side, stable, ts, ys, tops, y, float(rest), status, was_cut)

@@ -141,16 +141,16 @@ def _existing(rows, found: Equilibria):
 def candidates(osc: Oscillator) -> Equilibria:
     """Where the mass can rest, all but saddles: one row a zone and one an edge, sorted; those
     without an equilibrium come last as NaN."""
-    return _rows(osc, with_saddles=False)
+    return _rows_of(osc, with_saddles=False)
 
 
 @jit
 def _all_candidates(osc: Oscillator) -> Equilibria:
     """The same with saddles."""
-    return _rows(osc, with_saddles=True)
+    return _rows_of(osc, with_saddles=True)
 
 
-def _rows(osc: Oscillator, *, with_saddles: bool) -> Equilibria:
+def _rows_of(osc: Oscillator, *, with_saddles: bool) -> Equilibria:
     positions = jnp.sort(jnp.stack(edges(osc)))
     zones, points = _in_zones(osc, positions), _at_edges(osc, positions, with_saddles=with_saddles)
     rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), zones, points)

@@ -194,7 +194,9 @@ def _not_parted(told: jb.Portrait, ids, x1s, x2s) -> list[str]:
             at = np.concatenate([_crossings(curve, axis, level) for curve in curves] or [[]])
             for i in np.flatnonzero((row[1:] != row[:-1]) & (row[1:] >= 0) & (row[:-1] >= 0)):
                 low, high = along[i] - room, along[i + 1] + room
-                if axis == 1 and any(along[i] <= v <= along[i + 1] for v in _jumps(told)):
+                if axis == 1 and any(
+                    along[i] - 1e-9 <= v <= along[i + 1] + 1e-9 for v in _jumps(told)
+                ):
                     continue
                 if not np.any((low <= at) & (at <= high)):
                     ends = [(a, level) if axis == 0 else (level, a) for a in along[i : i + 2]]
