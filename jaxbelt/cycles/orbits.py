@@ -181,8 +181,8 @@ def follow_to_top(osc: Oscillator, y0: Array, budget: int) -> tuple[Orbit, Array
 
 
 def follow_finely(osc: Oscillator, mode: Mode, y0: Array, budget: int, reach: Array) -> Orbit:
-    """The orbit that leaves y0 in a mode, as in `follow`, but every arc to 1e-12, nearly to where it
-    rests, as long as |x1| and |x2| are < reach."""
+    """The orbit that leaves y0 in a mode, as in `follow`, but every arc to 1e-12, and nearly to
+    where it rests, as long as |x1| and |x2| are < reach."""
     osc, mode, y0 = lax.stop_gradient((osc, mode, y0))
     start = _standing(osc, mode, y0, jnp.asarray(Status.OK.value), budget)
     return _settled_or_not(_finely_from(osc, start, reach))
