@@ -133,7 +133,7 @@ def differences(osc: engine.Oscillator, told: jb.Portrait) -> tuple[list[str], C
         aside["node on an edge"] += 1
     else:
         wrong += _not_parted(told, ids, x1s, x2s)
-    wrong += [f"not unstable: {one}" for one in told.unstable if not _repels(osc, one)]
+    wrong += [f"not unstable: {one}" for one in told.unstable if not _repels(osc, one, told)]
     return wrong, aside
 
 
@@ -223,10 +223,12 @@ def _crossings(curve: np.ndarray, axis: int, level: float) -> np.ndarray:
     return curve[i, axis] + share * (curve[i + 1, axis] - curve[i, axis])
 
 
-def _repels(osc: engine.Oscillator, cycle: jb.Cycle) -> bool:
+def _repels(osc: engine.Oscillator, cycle: jb.Cycle, told: jb.Portrait) -> bool:
     """Whether starts on both sides of its top leave a cycle, in one loop."""
     top = float(cycle.x1_max)
-    step = 1e-4 * min(1.0, float(cycle.x1_max - cycle.x1_min))
+    tops = [float(one.x1_max) for one in (*told.cycles, *told.unstable) if one is not cycle]
+    nearest = min([1.0, *(abs(other - top) for other in tops)])
+    step = 1e-4 * min(nearest, float(cycle.x1_max - cycle.x1_min))
     for side in (-step, step):
         run = engine.simulate(osc, (top + side, 0.0), 5 * float(cycle.period) + 50, turns=True)
         tops = run.y[(run.kind == engine.TURN) & (run.belt == 0), 0]
