@@ -15,6 +15,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     kernel/         lanes step events rounds
     motion/         integrators arcs sensitivities sampling batches runs smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
+    cycles/         backwards returns separatrices portrait
     sweeps/         marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
@@ -58,6 +59,8 @@ from .cycles.functionals import (
     stick_duration,
     stick_fraction,
 )
+from .cycles.portrait import Portrait, portrait
+from .cycles.separatrices import Separatrix
 from .inverse.design import Design, design, distance_to
 from .inverse.fit import Fit, fit
 from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
@@ -112,8 +115,10 @@ __all__ = [
     "Hopf",
     "NonsmoothFold",
     "Oscillator",
+    "Portrait",
     "PseudoHopf",
     "RegionMap",
+    "Separatrix",
     "SlidingExchange",
     "SpecialPoint",
     "Status",
@@ -146,6 +151,7 @@ __all__ = [
     "plot_phase_portrait",
     "plot_time_history",
     "plot_vector_field",
+    "portrait",
     "presets",
     "refine",
     "region_map",

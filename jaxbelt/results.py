@@ -34,6 +34,7 @@ class Status(enum.IntEnum):
     MISFIT = 17
     UNREACHABLE = 18
     NO_FOLD = 19
+    INCOMPLETE = 20
 
 
 ADVICE = {
@@ -95,6 +96,11 @@ ADVICE = {
     Status.NO_FIXED_POINT: (
         "There is no fixed point in a smooth field whose trace could vanish. Where there is one "
         "elsewhere, jb.scan with a span finds its points."
+    ),
+    Status.INCOMPLETE: (
+        "Not everything is told: in the gaps there may be cycles (a continuum of closed orbits, "
+        "cycles about to merge, orbits that settle too slowly), or a separatrix is missing, of a "
+        "node on a contact edge. Move away from the bifurcation point."
     ),
     Status.UNEXPLAINED: (
         "What the oscillator does changes here, and no condition known to the search explains how. "

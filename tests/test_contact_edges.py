@@ -255,7 +255,8 @@ def test_a_belt_at_rest_that_no_cycle_sticks_to():
     assert points[1].value == pytest.approx(exact, abs=1e-14)
     for nu, rests in ((-1e-3, [pull]), (1e-3, [pull, pull + 0.6 + 0.4 / 1.01])):
         found = jb.equilibria(jb.presets.class_d(-0.47, nu, 0.14, 1.18))
-        np.testing.assert_allclose(found.x1, rests, rtol=0, atol=1e-14)
+        places = found.x1[found.kind != jb.EquilibriumKind.SADDLE]
+        np.testing.assert_allclose(places, rests, rtol=0, atol=1e-14)
     point = jb.refine(jb.BeltAtRest(1), jb.presets.class_c(0.3, 0.2, 9.0), where=nu1)
     assert point.status == Status.NOT_TOUCHED and jnp.isnan(point.value)
 

@@ -13,18 +13,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..cycles.orbits import Orbit, follow, last_loop, loop_of
+from ..cycles.orbits import Orbit, before_stick_ends, follow, last_loop, loop_of
 from ..cycles.shooting import Loop, following_codes
 from ..model.equilibria import Equilibria
 from ..model.modes import (
-    STUCK,
-    capacity,
-    contact,
-    edges,
     mode_acceleration,
     mode_of,
-    onset_position,
-    select,
 )
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
@@ -40,28 +34,6 @@ FOLLOWED = 96
 ATTEMPTS = 6
 #: Where some of them start to the right of an equilibrium, so far from it.
 DISTANCES = (0.02, 0.3, 3.0)
-
-
-def before_stick_ends(osc: Oscillator, belt: int | Array) -> Array:
-    """States stuck to a belt where stick phases end, one for each zone between contact edges.
-
-    Shortly before slip onset; or, where the zone ends first, on the edge. NaN where neither is, or
-    the belt does not touch. [zones, 2].
-    """
-    v = velocity_of(osc, belt) / osc.omega
-    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
-    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
-    mode = contact(osc, lower, v, rightward=True)
-    onset, held = onset_position(osc, mode), capacity(osc, mode)
-    before, ahead = select(v > 0, (lower, upper), (upper, lower))
-    slips = (lower < onset) & (onset < upper)
-    # It holds between onset - 2 sgn(v) held and onset.
-    meets = jnp.isfinite(ahead) & ~slips & (jnp.abs(onset - held * jnp.sign(v) - ahead) <= held)
-    near = jnp.minimum(0.01 * held, 0.5 * jnp.abs(onset - before))
-    exists = (jnp.stack(mode.codes)[belt] == STUCK) & (lower < upper)
-    x1 = jnp.where(slips, onset - near * jnp.sign(v), jnp.where(meets, ahead, jnp.nan))
-    states = jnp.stack([x1, jnp.full_like(x1, v)], axis=1)
-    return jnp.where(exists[:, None], states, jnp.nan)
 
 
 def starts(osc: Oscillator, rests: Equilibria) -> Array:

@@ -33,7 +33,7 @@ from ..cycles.attractors import (
 from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
 from ..cycles.settling import AT_REST
 from ..cycles.shooting import SIZES, Loop, cut
-from ..model.equilibria import equilibria
+from ..model.equilibria import candidates
 from ..model.oscillator import Oscillator
 from ..model.variations import varied
 from ..numerics.compiling import each, jit
@@ -306,6 +306,6 @@ def _motions(oscs: Oscillator) -> _Motions:
 
 
 def _motions_at(osc: Oscillator) -> _Motions:
-    rests = equilibria(osc)
+    rests = candidates(osc)
     loop, status = settled_loops(osc, rests, ROOM)
     return _Motions(rests.kind, rests.stable, rests.modes, status, loop)

@@ -11,16 +11,25 @@ from jax import lax
 from jaxtyping import Array
 
 from ..model.modes import (
+    STUCK,
+    Mode,
     at_focus,
     begins_at_rest,
+    capacity,
+    contact,
+    edges,
+    first_of,
     force_rounding,
+    mode_acceleration,
     mode_of,
     mode_of_state,
+    onset_position,
+    select,
     settles,
 )
 from ..model.oscillator import Oscillator
 from ..motion.arcs import ArcEnd, Ends, Signs, after_slip, signs_after, slip_arc, stick_arc
-from ..motion.integrators import Graded
+from ..motion.integrators import STRIDE, Graded
 from ..numerics.compiling import one_kernel
 from ..results import Status
 from .settling import AT_REST, has_repeated
@@ -28,6 +37,10 @@ from .shooting import Loop
 
 #: Arcs that an orbit is followed for before it is given up: some 100 loops.
 MOST_ARCS = 1024
+#: The stride of `Graded` with which every arc is good to 1e-12.
+FINE_STRIDE = 0.05
+#: So near to an equilibrium such an orbit ends, or nearer.
+SEEN_AT_REST = 1e-2
 
 
 class Orbit(eqx.Module):
@@ -54,21 +67,22 @@ class Orbit(eqx.Module):
     done: Array
 
 
-def _arc(osc: Oscillator, orbit: Orbit) -> ArcEnd:
+def _arc(osc: Oscillator, orbit: Orbit, stride: float) -> ArcEnd:
     """The next arc of an orbit, to an extremum at most."""
     mode, y = mode_of(orbit.code), (orbit.y[0], orbit.y[1])
 
     def slip():
-        arc = slip_arc(osc, mode, orbit.signs, y, Graded(osc, mode), every_extremum=True)
+        integrator = Graded(osc, mode, stride)
+        arc = slip_arc(osc, mode, orbit.signs, y, integrator, every_extremum=True)
         return after_slip(osc, mode, orbit.signs, arc)
 
     return lax.cond(mode.any_stuck, lambda: stick_arc(osc, mode, y, jnp.asarray(jnp.inf)), slip)
 
 
-def _next_arc(osc: Oscillator, orbit: Orbit) -> Orbit:
+def _next_arc(osc: Oscillator, orbit: Orbit, stride: float = STRIDE) -> Orbit:
     codes = orbit.code
     stuck = mode_of(codes).any_stuck
-    end = _arc(osc, orbit)
+    end = _arc(osc, orbit, stride)
     y_end = jnp.stack(end.y)
     code = jnp.stack([jnp.asarray(c, dtype=orbit.y.dtype) for c in end.mode.codes])
 
@@ -125,16 +139,82 @@ def _follow_from(osc: Oscillator, start: Orbit) -> Orbit:
     return lax.while_loop(going, functools.partial(_next_arc, osc), start)
 
 
+@one_kernel
+def _to_top_from(osc: Oscillator, start: Orbit) -> Orbit:
+    def going(orbit):
+        arrived = (orbit.count > 0) & ~jnp.isnan(_last_top(orbit))
+        return ~orbit.done & ~arrived & (orbit.count < orbit.tops.size)
+
+    return lax.while_loop(going, functools.partial(_next_arc, osc), start)
+
+
+@one_kernel
+def _finely_from(osc: Oscillator, start: Orbit, reach: Array) -> Orbit:
+    def going(orbit):
+        near = jnp.max(jnp.abs(orbit.y)) < reach
+        # Where it comes to rest is known before it is there.
+        away = jnp.hypot(orbit.y[0] - place_of_rest(osc, orbit), orbit.y[1])
+        on_the_way = (orbit.status == Status.EQUILIBRIUM) & (away > SEEN_AT_REST)
+        return (~orbit.done | on_the_way) & near & (orbit.count < orbit.tops.size)
+
+    return lax.while_loop(going, lambda orbit: _next_arc(osc, orbit, FINE_STRIDE), start)
+
+
+def _last_top(orbit: Orbit) -> Array:
+    """x1 at the end of the last arc if that is a top, else NaN."""
+    last = jnp.arange(orbit.tops.size) == orbit.count - 1
+    return jnp.max(jnp.where(last, orbit.tops, -jnp.inf))
+
+
 def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
     """The orbit from y0 until a loop repeats, it comes to rest, or the budget is used up."""
     osc, y0 = lax.stop_gradient((osc, y0))
-    n = len(osc.belts)
-    mode = mode_of_state(osc, y0[0], y0[1])
+    return _settled_or_not(_follow_from(osc, _beginning(osc, y0, budget)))
+
+
+def follow_to_top(osc: Oscillator, y0: Array, budget: int) -> tuple[Orbit, Array]:
+    """The orbit from y0 until a top, or it comes to rest; and x1 at the top, NaN where it has come
+    to none."""
+    osc, y0 = lax.stop_gradient((osc, y0))
+    orbit = _to_top_from(osc, _beginning(osc, y0, budget))
+    return orbit, jnp.where(orbit.count > 0, _last_top(orbit), jnp.nan)
+
+
+def follow_finely(osc: Oscillator, mode: Mode, y0: Array, budget: int, reach: Array) -> Orbit:
+    """The orbit that leaves y0 in a mode, as in `follow`, but every arc to 1e-12, and nearly to
+    where it rests, as long as |x1| and |x2| are < reach."""
+    osc, mode, y0 = lax.stop_gradient((osc, mode, y0))
+    start = _standing(osc, mode, y0, jnp.asarray(Status.OK.value), budget)
+    return _settled_or_not(_finely_from(osc, start, reach))
+
+
+def place_of_rest(osc: Oscillator, orbit: Orbit) -> Array:
+    """x1 where an orbit has come to rest, to the last digit; NaN where it has not."""
+    last = jnp.arange(orbit.tops.size) == orbit.count - 1
+    held = jnp.sum(jnp.where(last, orbit.entries[:, 0], 0.0))
+    fixed = mode_acceleration(osc, mode_of(orbit.code), jnp.zeros(()), jnp.zeros(()))
+    ways = (Status.STUCK_FOREVER, Status.PSEUDO_FOCUS, Status.EQUILIBRIUM)
+    places = (held, orbit.y[0], fixed)
+    return first_of([orbit.status == way for way in ways], places, jnp.asarray(jnp.nan))
+
+
+def _settled_or_not(orbit: Orbit) -> Orbit:
+    status = jnp.where(orbit.done, orbit.status, Status.NOT_SETTLED.value)
+    return eqx.tree_at(lambda orbit: orbit.status, orbit, status)
+
+
+def _beginning(osc: Oscillator, y0: Array, budget: int) -> Orbit:
+    """An orbit that stands at y0, with room for as many arcs as the budget."""
     rests = begins_at_rest(osc, y0[0], y0[1])
     focus = at_focus(osc, y0[0], y0[1])
     status = jnp.where(rests, Status.EQUILIBRIUM.value, Status.OK.value)
     status = jnp.where(focus, Status.PSEUDO_FOCUS.value, status)
-    start = Orbit(
+    return _standing(osc, mode_of_state(osc, y0[0], y0[1]), y0, status, budget)
+
+
+def _standing(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: int) -> Orbit:
+    n = len(osc.belts)
+    return Orbit(
         entries=jnp.zeros((budget, 2)),
         durations=jnp.zeros(budget),
         codes=jnp.ones((budget, n)),
@@ -150,9 +230,6 @@ def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
         status=status,
         done=status != Status.OK,
     )
-    orbit = _follow_from(osc, start)
-    status = jnp.where(orbit.done, orbit.status, Status.NOT_SETTLED.value)
-    return eqx.tree_at(lambda orbit: orbit.status, orbit, status)
 
 
 def last_loop(orbit: Orbit) -> tuple[Array, Array]:
@@ -193,3 +270,25 @@ def first_loop(osc: Oscillator, x1: Array, distance: Array, size: int):
     top = jnp.where(row < size, orbit.tops[jnp.minimum(row, size - 1)], jnp.nan)
     closed = (jnp.asarray(-1), row + 1)
     return eqx.tree_at(lambda o: (o.repeats, o.count), orbit, closed), meets, top
+
+
+def before_stick_ends(osc: Oscillator, belt: int | Array) -> Array:
+    """States stuck to a belt where stick phases end, one for each zone between contact edges.
+
+    Shortly before slip onset; or, where the zone ends first, on the edge. NaN where neither is, or
+    the belt does not touch. [zones, 2].
+    """
+    v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
+    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
+    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    mode = contact(osc, lower, v, rightward=True)
+    onset, held = onset_position(osc, mode), capacity(osc, mode)
+    before, ahead = select(v > 0, (lower, upper), (upper, lower))
+    slips = (lower < onset) & (onset < upper)
+    # It holds between onset - 2 sgn(v) held and onset.
+    meets = jnp.isfinite(ahead) & ~slips & (jnp.abs(onset - held * jnp.sign(v) - ahead) <= held)
+    near = jnp.minimum(0.01 * held, 0.5 * jnp.abs(onset - before))
+    exists = (jnp.stack(mode.codes)[belt] == STUCK) & (lower < upper)
+    x1 = jnp.where(slips, onset - near * jnp.sign(v), jnp.where(meets, ahead, jnp.nan))
+    states = jnp.stack([x1, jnp.full_like(x1, v)], axis=1)
+    return jnp.where(exists[:, None], states, jnp.nan)

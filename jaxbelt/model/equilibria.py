@@ -1,4 +1,4 @@
-"""Where the mass can rest: fixed points, segments of pseudo-equilibria, pseudo-foci; all at x2 = 0.
+"""Fixed points, segments of pseudo-equilibria, pseudo-foci, two-fold saddles; all at x2 = 0.
 
 The contact edges cut the x1 axis into zones. At rest within a zone every touching belt that moves
 pulls with u0_i mu_i(|nu_i|) sgn(nu_i), and the spring balances their sum, the pull, at x1 = pull.
@@ -7,8 +7,13 @@ whatever is up to their capacity, the sum of u0_k mus_k: then all x1 within the 
 pull are pseudo-equilibria, a segment. At an edge between two zones whose accelerations both point
 to the edge, a_L > 0 > a_R, there is a pseudo-focus (see `modes.edge_focus`).
 
-Everything is in closed form, so derivatives with respect to any parameter go through. An edge that
-pushes away to both sides, a_L < 0 < a_R, is not listed: nothing that is disturbed stays near it.
+At an edge that pushes away to both sides, a_L < 0 < a_R, there is a saddle: x1' = x2 on both sides,
+so nothing slides along an edge, and (sigma, 0) is a visible-visible two-fold (see M. Guardia, T. M.
+Seara and M. A. Teixeira, Generic bifurcations of low codimension of planar Filippov systems, J.
+Differential Equations 250 (2011) 1967-2023). Four orbits reach and leave it in a finite time. No
+mass rests there: what asks where it can rest takes `candidates`, which leaves saddles out.
+
+Everything is in closed form, so derivatives with respect to any parameter go through.
 """
 
 import enum
@@ -38,11 +43,13 @@ from .oscillator import Oscillator, check_oscillator
 
 
 class EquilibriumKind(enum.IntEnum):
-    """What sort of rest: in a smooth field, held by belts at rest, between the sides of an edge."""
+    """What sort: rest in a smooth field, held by belts at rest, between the sides of an edge; and a
+    point of an edge that both its sides push away from, where nothing rests."""
 
     FIXED_POINT = 1
     SEGMENT = 2
     PSEUDO_FOCUS = 3
+    SADDLE = 4
 
 
 class Equilibria(eqx.Module):
@@ -55,14 +62,15 @@ class Equilibria(eqx.Module):
     - x1: position, of a segment its middle, [equilibria] (NaN where padded, like all below).
     - x1_lower, x1_upper: ends of a segment, else both x1.
     - modes: contact codes, [equilibria, belts] (+1/-1 slip with that sign of r_i, 0 stuck, -2/+2
-      mass below/above the belt's interval; all 0 where padded). At a pseudo-focus those of the
-      left-hand side of the edge.
+      mass below/above the belt's interval; all 0 where padded). At a pseudo-focus and a saddle
+      those of the left-hand side of the edge.
     - jacobian: of the field of the mode at a fixed point, [equilibria, 2, 2], else NaN.
     - eigenvalues: its eigenvalues, eqs. (25) and (26) of the paper, the one with the larger real
       or imaginary part first, complex [equilibria, 2], else NaN.
     - rate: small disturbances behave like exp(rate t): the largest real part of the eigenvalues at
       a fixed point; at a pseudo-focus (tr_L/a_L + tr_R/|a_R|) / (3 (1/a_L + 1/|a_R|)), or -inf
-      where a belt at rest touches, which ends them in a finite time; NaN for a segment.
+      where a belt at rest touches, which ends them in a finite time; inf at a saddle, which is
+      left in a finite time; NaN for a segment.
     - stable: rate < 0. A segment is stable if disturbances of some part of it end in it again.
       That is where the needed force is less than the sum of u0_k mu_k(0); the rest of a segment,
       if mu(0) is less than the static limit, holds but does not attract.
@@ -106,7 +114,8 @@ def _row_text(row: Equilibria) -> str:
 
 
 def equilibria(osc: Oscillator) -> Equilibria:
-    """All equilibria of the oscillator, sorted by x1: see `Equilibria` for what is known of each.
+    """All equilibria of the oscillator, saddles among them, sorted by x1: see `Equilibria` for what
+    is known of each.
 
     osc: `Oscillator` with any friction laws, any number of belts and any contact intervals. Works
     under `jax.jit`, `jax.vmap` and derivatives; nothing raises there. `ValueError` names a
@@ -117,7 +126,7 @@ def equilibria(osc: Oscillator) -> Equilibria:
     its eigenvalues and stability are those of that side alone.
     """
     check_oscillator(osc)
-    found = candidates(osc)
+    found = _all_candidates(osc)
     return _existing(found, found)
 
 
@@ -130,9 +139,20 @@ def _existing(rows, found: Equilibria):
 
 @jit
 def candidates(osc: Oscillator) -> Equilibria:
-    """One row a zone and one an edge, sorted; those without an equilibrium come last as NaN."""
+    """Where the mass can rest, all but saddles: one row a zone and one an edge, sorted; those
+    without an equilibrium come last as NaN."""
+    return _rows_of(osc, with_saddles=False)
+
+
+@jit
+def _all_candidates(osc: Oscillator) -> Equilibria:
+    """The same with saddles."""
+    return _rows_of(osc, with_saddles=True)
+
+
+def _rows_of(osc: Oscillator, *, with_saddles: bool) -> Equilibria:
     positions = jnp.sort(jnp.stack(edges(osc)))
-    zones, points = _in_zones(osc, positions), _at_edges(osc, positions)
+    zones, points = _in_zones(osc, positions), _at_edges(osc, positions, with_saddles=with_saddles)
     rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), zones, points)
     return rows[jnp.argsort(rows.x1)]
 
@@ -215,10 +235,10 @@ def _eigenvalues(matrix: Array) -> Array:
     return jnp.stack(pair, axis=-1)
 
 
-# --- at the edges: pseudo-foci ------------------------------------------------------------------
+# --- at the edges: pseudo-foci and saddles --------------------------------------------------------
 
 
-def _at_edges(osc: Oscillator, positions: Array) -> Equilibria:
+def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equilibria:
     before = jnp.concatenate([jnp.full(1, -jnp.inf), positions[:-1]])
     # Edges at one place count once; finite numbers stand in for the infinite ones.
     is_edge = jnp.isfinite(positions) & (positions > before)
@@ -228,22 +248,28 @@ def _at_edges(osc: Oscillator, positions: Array) -> Equilibria:
     left, right = (settle(osc, contacts, x1, rest) for contacts in (on_left, on_right))
     focus = edge_focus(osc, left, right, x1)
     # Where a belt at rest holds the mass, the segment on that side ends here.
-    exists = is_edge & focus.exists & ~left.any_stuck & ~right.any_stuck
+    slips = is_edge & ~left.any_stuck & ~right.any_stuck
+    is_focus, is_saddle = slips & focus.exists, jnp.zeros_like(slips)
+    if with_saddles:
+        pulls = [mode_acceleration(osc, mode, x1, rest) for mode in (left, right)]
+        is_saddle = slips & (pulls[0] < 0) & (pulls[1] > 0)
+    exists = is_focus | is_saddle
     # A belt at rest brakes on the way out and on the way back: each loop takes off a fraction of
     # the velocity that does not go to 0 with it, so infinitely many loops take a finite time.
     rubs = capacity(osc, on_left) + capacity(osc, on_right) > 0
-    rate = jnp.where(exists, jnp.where(rubs, -jnp.inf, focus.rate), jnp.nan)
+    rate = jnp.where(is_focus, jnp.where(rubs, -jnp.inf, focus.rate), jnp.nan)
     x1 = jnp.where(exists, x1, jnp.nan)
     none = jnp.full_like(x1, jnp.nan)
+    kind = jnp.where(is_saddle, EquilibriumKind.SADDLE.value, EquilibriumKind.PSEUDO_FOCUS.value)
     return Equilibria(
-        kind=jnp.where(exists, EquilibriumKind.PSEUDO_FOCUS.value, 0),
+        kind=jnp.where(exists, kind, 0),
         x1=x1,
         x1_lower=x1,
         x1_upper=x1,
         modes=_codes(left, exists),
         jacobian=jnp.broadcast_to(none[:, None, None], (*x1.shape, 2, 2)),
         eigenvalues=jnp.broadcast_to(lax.complex(none, none)[:, None], (*x1.shape, 2)),
-        rate=rate,
+        rate=jnp.where(is_saddle, jnp.inf, rate),
         stable=rate < 0,
     )
 
@@ -276,7 +302,7 @@ def lyapunov_coefficient(osc: Oscillator) -> Array:
 
 @jit
 def _lyapunov_coefficients(osc: Oscillator) -> tuple[Equilibria, Array]:
-    found = candidates(osc)
+    found = _all_candidates(osc)
     mode = Mode(tuple(codes.astype(found.x1.dtype) for codes in jnp.moveaxis(found.modes, -1, 0)))
     is_fixed = found.kind == EquilibriumKind.FIXED_POINT
     rest = jnp.zeros_like(found.x1)

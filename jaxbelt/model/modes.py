@@ -502,7 +502,7 @@ def disc_margin(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> A
     for fraction in DISC:
         v = fraction * radius
         margins.append(-v * mode_acceleration(osc, mode, x1_rest, v))
-    pulls = [belt.load > 0 for belt in osc.belts]  # no other belt is an obstacle
+    pulls = [belt.load != 0 for belt in osc.belts]  # no other belt is an obstacle
     for v in (radius, -radius):
         bounds = boundary_guards(osc, mode, v) + edge_guards(osc, mode, x1_rest + v)
         margins += [
@@ -577,7 +577,7 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     size = jnp.abs(x2)
     nearest = jnp.inf
     for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
-        rubs = (is_left | is_right) & (belt.load > 0)
+        rubs = (is_left | is_right) & (belt.load != 0)
         nearest = jnp.minimum(nearest, jnp.where(rubs, jnp.abs(belt.velocity), jnp.inf))
     captured = (
         focus.exists

@@ -33,8 +33,8 @@ MAX_FRACTION, FIRST_FRACTION = 0.5, 0.2
 MAX_ADAPTIVE_STEPS = 100_000
 #: A step of `Graded` times the wanted density. From there Newton's method takes two steps, mostly.
 STRIDE = 0.2
-#: Steps of `Graded` before an arc, a quarter of a loop at most, is given up.
-MAX_GRADED_STEPS = 200
+#: Steps of `Graded`, times their stride, before an arc, a quarter of a loop at most, is given up.
+MAX_GRADED = 200.0
 
 _ORDER_8 = scheme((2, 4, 6, 8))
 
@@ -194,10 +194,11 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 
 
 class Graded(AbstractIntegrator):
-    """Steps of STRIDE over the `density` that the slip mode wants."""
+    """Steps of a stride over the `density` that the slip mode wants."""
 
     osc: Oscillator
     mode: Mode
+    stride: float = STRIDE
 
     def march(self, field, y, left):
         # A stuck lane of a batch has no slip arc to follow; it must not keep the others waiting.
@@ -206,12 +207,12 @@ class Graded(AbstractIntegrator):
         def unfinished(state):
             _, _, _, y, steps = state
             finite = jnp.isfinite(y[0]) & jnp.isfinite(y[1])
-            going = (steps < MAX_GRADED_STEPS) & active & finite
+            going = (steps * self.stride < MAX_GRADED) & active & finite
             return ((steps == 0) | ~left(y)) & going
 
         def advance(state):
             t, _, h, y, steps = state
-            h_new = STRIDE / density(self.osc, self.mode, *y)
+            h_new = self.stride / density(self.osc, self.mode, *y)
             return t + h, y, h_new, self.step(field, y, h_new), steps + 1
 
         zero = jnp.zeros(())

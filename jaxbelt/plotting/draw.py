@@ -6,7 +6,9 @@ from matplotlib.axes import Axes
 
 from ..bifurcations.curves import BifurcationCurve
 from ..bifurcations.diagrams import BifurcationDiagram, RegionMap
+from ..cycles.portrait import Portrait
 from .diagrams import plot_curves, plot_diagram, plot_region_map
+from .phase import plot_portrait
 
 
 def draw_result(result: Any, ax: Axes | None, **options: Any) -> Axes:
@@ -18,4 +20,6 @@ def draw_result(result: Any, ax: Axes | None, **options: Any) -> Axes:
             return plot_diagram(result, ax, **options)
         case RegionMap():
             return plot_region_map(result, ax, **options)
+        case Portrait():
+            return plot_portrait(result, ax, **options)
     raise TypeError(f"result must be one that has a picture, got {type(result).__name__}")

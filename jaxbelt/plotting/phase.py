@@ -8,7 +8,8 @@ returns the axes. What is drawn is shown in the manner of the paper:
   band behind it. Finite contact edges sigma are dotted vertical lines.
 - stable cycles as thick solid, unstable ones as dashed lines, other orbits thin and grey;
 - stable fixed points filled, unstable ones open, pseudo-foci as diamonds in the same way, a segment
-  of pseudo-equilibria as a thick bar.
+  of pseudo-equilibria as a thick bar, saddles as crosses.
+- stable separatrices, which bound basins, purple, unstable ones grey and dash-dotted.
 """
 
 from collections.abc import Sequence
@@ -22,17 +23,28 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from ..cycles.portrait import Portrait
 from ..model.equilibria import Equilibria, EquilibriumKind
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.modes import mode_acceleration, mode_of_state
 from ..model.oscillator import Oscillator
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
-from .style import belt_colour, figure_of, journal_figure, new_axes, new_figure, spread
+from .style import belt_colour, draw_key, figure_of, journal_figure, new_axes, new_figure, spread
 
 #: A second mark of the belts, for print without colour.
 BELT_HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\")
 ORBIT_COLOUR = "0.55"
+#: How far from its point a separatrix has its arrow, as a fraction of the axes.
+ARROW_DISTANCE = 0.3
+#: Separatrices: reddish purple of Okabe and Ito, and grey.
+STABLE_SEPARATRIX = {"color": "#CC79A7", "linewidth": 1.3, "label": "stable separatrix"}
+UNSTABLE_SEPARATRIX = {
+    "color": "0.45",
+    "linewidth": 0.8,
+    "linestyle": (0, (5, 1.6, 1, 1.6)),
+    "label": "unstable separatrix",
+}
 
 
 @runtime_checkable
@@ -167,6 +179,35 @@ def plot_phase_portrait(
     return ax
 
 
+def plot_portrait(portrait: Portrait, ax: Axes | None = None) -> Axes:
+    """All that there is at one oscillator, see `Portrait`: its cycles and equilibria as in
+    `plot_phase_portrait`, and its separatrices, with an arrow in the direction of time.
+
+    ax: None makes new ones, with a key below. Returns the axes.
+    """
+    given, ax = ax, new_axes() if ax is None else ax
+    osc, cycles = portrait.oscillator, [*portrait.cycles, *portrait.unstable]
+    paths = [np.asarray(one.ys) for one in portrait.separatrices if not one.stable]
+    paths += [np.asarray(cycle.sample(400)) for cycle in cycles]
+    x1, x2 = (_with_margin(ends) for ends in _window(osc, paths, portrait.equilibria, None, None))
+    shown = {"equilibria": portrait.equilibria, "xlim": x1, "ylim": x2}
+    plot_phase_portrait(osc, cycles=cycles, ax=ax, **shown)
+    for one in portrait.separatrices:
+        path = np.asarray(one.ys)
+        style = STABLE_SEPARATRIX if one.stable else UNSTABLE_SEPARATRIX
+        ax.plot(*path.T, zorder=3, **style)
+        # From the point, whichever way it is passed.
+        away = path[::-1] if one.stable else path
+        outside = (away < [x1[0], x2[0]]) | (away > [x1[1], x2[1]])
+        leaves = np.append(np.flatnonzero(np.any(outside, axis=1)), len(away))[0]
+        index = _index_at_distance(ax, away[: max(leaves - 1, 1)], ARROW_DISTANCE)
+        index = len(path) - 1 - index if one.stable else index
+        _draw_arrowheads(ax, path, style["color"], [index])
+    if given is None:
+        draw_key(figure_of(ax), ncols=3)
+    return ax
+
+
 def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
     """The discontinuity boundaries and contact edges of `osc`, in the present window of the axes.
 
@@ -278,13 +319,17 @@ def _with_margin(values: Sequence[float]) -> tuple[float, float]:
 
 
 def draw_equilibrium(ax: Axes, row: Equilibria) -> None:
-    """One row of equilibria: a fixed point, a pseudo-focus, or a segment; filled where stable."""
+    """One row of equilibria, see the module's text; filled where stable."""
     face = "black" if row.stable else "white"
     ends = [float(row.x1_lower), float(row.x1_upper)]
     if row.kind == EquilibriumKind.SEGMENT:
         bar = {"solid_capstyle": "butt", "zorder": 5}
         ax.plot(ends, [0, 0], color="black", linewidth=3.5, label="pseudo-equilibria", **bar)
         ax.plot(ends, [0, 0], color=face, linewidth=1.9, **bar)
+        return
+    if row.kind == EquilibriumKind.SADDLE:
+        cross = {"marker": "x", "markersize": 5.5, "markeredgewidth": 1.6, "linestyle": "none"}
+        ax.plot(ends[:1], [0.0], color="black", label="saddle", zorder=6, **cross)
         return
     is_focus = row.kind == EquilibriumKind.PSEUDO_FOCUS
     stability = "stable" if row.stable else "unstable"

@@ -19,12 +19,15 @@ KEY_ORDER = (
     "orbit",
     "stable cycle",
     "unstable cycle",
+    "stable separatrix",
+    "unstable separatrix",
     "sliding set",
     "stable fixed point",
     "unstable fixed point",
     "stable pseudo-focus",
     "unstable pseudo-focus",
     "pseudo-equilibria",
+    "saddle",
 )
 
 #: Settings for a journal's page, see `journal_style`.

@@ -1,5 +1,5 @@
 """Campaigns: `python -m tests.campaign WHAT`, WHAT being final, simulate, derivatives, attractors,
-grazing, paths or refine."""
+grazing, paths, refine or portraits."""
 
 import argparse
 import functools
@@ -19,12 +19,14 @@ def main(arguments=None):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from . import cases, compare, package, paths, refine
+    from . import cases, compare, package, paths, portraits, refine
 
     if options.what == "paths":
         return paths.run(options.seed, options.paths)
     if options.what == "refine":
         return refine.run(options.seed, options.runs)
+    if options.what == "portraits":
+        return portraits.run(options.seed, options.runs)
     rng = np.random.default_rng(options.seed)
     began = time.monotonic()
     verdicts, disagreements, right, done = Counter(), [], [], 0
@@ -93,7 +95,10 @@ def _parser():
     parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=__doc__)
     parser.add_argument(
         "what",
-        choices=("final", "simulate", "derivatives", "attractors", "grazing", "paths", "refine"),
+        choices=(
+            *("final", "simulate", "derivatives", "attractors", "grazing", "paths", "refine"),
+            "portraits",
+        ),
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=int, default=2000)

@@ -1,0 +1,86 @@
+"""Motion backwards in time, and unstable cycles that are solved for there.
+
+In reversed time, t -> -t and x2 -> -x2, an oscillator is one with the signs of its damping, loads
+and velocities changed. It never sticks: orbits that do not stick go on backwards in one way.
+
+Slow belts with steep friction laws make cycles whose multiplier is 1e20. They pass along a
+boundary, just off it, for a long time; forwards no number leads to such a cycle, backwards all of
+them do.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..model.oscillator import Oscillator
+from ..results import Status
+from .cycle import Cycle, exactly, integration_error, polish
+from .shooting import Chain, Loop, cut
+
+#: Steps of an arc that is too long for those of `exactly`, which then leave a larger error.
+MANY_STEPS, TOO_COARSE = 128, 1e-10
+
+
+class BackwardCycle(Cycle):
+    """An unstable cycle that was solved for backwards; a `Cycle`, and as what it was solved for.
+
+    Its derivatives are not known.
+    """
+
+    backwards: Cycle
+
+    def sample(self, n: int) -> Array:
+        """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
+        return jnp.flip(self.backwards.sample(n), axis=0) * jnp.array([[1.0, -1.0]])
+
+    def __repr__(self) -> str:
+        return Cycle.__repr__(self)
+
+
+def reversed_in_time(osc: Oscillator) -> Oscillator:
+    """The oscillator whose motion (x1, -x2) is the motion of `osc` backwards."""
+    return eqx.tree_at(
+        lambda o: [o.damping, *(b.velocity for b in o.belts), *(b.load for b in o.belts)],
+        osc,
+        replace_fn=lambda leaf: -leaf,
+    )
+
+
+def solved(osc: Oscillator, loop: Loop) -> Cycle:
+    """The cycle that a known loop nearly is, with as many steps as it takes."""
+    loop, ok = cut([loop])[0], jnp.asarray(np.array(Status.OK.value))
+    cycle = exactly(osc, loop, ok)
+    inexact = int(cycle.status) == Status.NO_CONVERGENCE
+    if int(cycle.status) == Status.OK:
+        inexact = float(integration_error(cycle)) > TOO_COARSE
+    return polish(osc, loop, ok, steps=MANY_STEPS) if inexact else cycle
+
+
+def forwards(osc: Oscillator, cycle: Cycle) -> BackwardCycle:
+    """The unstable cycle of an oscillator, from the attracting one of that reversed in time.
+
+    Each arc begins where it ended, and ends by what the arc before it, now after it, ended by.
+    """
+    chain, z = cycle.chain, np.asarray(cycle.unknowns)
+    n = int(np.sum(np.asarray(chain.used)))
+    rows = np.arange(len(z))
+    own = rows < n
+    arc = np.where(own, n - 1 - rows, rows)
+    codes = np.asarray(chain.codes)[arc]
+    ends = np.asarray(chain.ends)[np.where(own, (arc - 1) % n, rows)]
+    entries = z[np.where(own, (arc + 1) % n, 0), :2] * [1.0, -1.0]
+    return BackwardCycle(
+        oscillator=osc,
+        chain=Chain(
+            jnp.asarray(np.where(np.abs(codes) == 1, -codes, codes)),
+            jnp.asarray(ends),
+            jnp.asarray(np.asarray(chain.mesh)[arc, ::-1]),
+        ),
+        unknowns=jnp.asarray(np.column_stack([entries, z[arc, 2]])),
+        multiplier=1 / cycle.multiplier,
+        residual=cycle.residual,
+        iterations=cycle.iterations,
+        status=cycle.status,
+        backwards=cycle,
+    )

@@ -1,0 +1,244 @@
+"""Everything that there is at one oscillator: `portrait` and what it returns, `Portrait`.
+
+The plane is told by a few sets: where orbits end, and what parts those that end in different
+places. With dry friction they are (see `returns` and `separatrices` for why there are no others)
+equilibria, attracting cycles, unstable cycles, and separatrices of points on contact edges, of ends
+of segments and of boundaries with a jump. Nothing here needs bifurcations, so it stands among the
+cycles.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..checks import is_concrete, pick, require
+from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
+from ..model.events import signature_name
+from ..model.modes import edges
+from ..model.oscillator import Oscillator, check_oscillator
+from ..results import Status, describe, draw
+from .cycle import Cycle
+from .returns import Returns, reach_of
+from .separatrices import Separatrix, TracedSeparatrix, branches
+
+#: A top is on a cycle that is no farther away than this, relative to the distance from the origin.
+ON_CYCLE = 1e-5
+#: An equilibrium as near to an edge is on it.
+ON_EDGE = 1e-9
+#: Separatrices are followed beyond the reach, from where they may come back into it.
+TRACED = 3.0
+#: An orbit without an end that gets so near to a point of rest tends to it.
+CREEPING = 1e-3
+
+
+class Portrait(eqx.Module):
+    """Everything that there is at one oscillator; what `portrait` returns.
+
+    - oscillator: whose portrait it is.
+    - equilibria: all of them, saddles included, see `Equilibria`.
+    - cycles: the attracting ones; unstable: the unstable ones; tuples of `Cycle`, by their largest
+      x1.
+    - separatrices: a tuple of `Separatrix`, by their points; the stable ones bound basins, as
+      unstable cycles do.
+    - escapes: whether starts far out go to infinity.
+    - reach: the bounds of what was looked at, |x1| and |x2| < reach. No cycle is farther out, as
+      far as a bound is known, which it is not where damping is 0, nor for damping < 0 with friction
+      that grows with the speed.
+    - gaps: intervals (from, to) of x1 at rest in which it is not told whether cycles pass, [gaps,
+      2]; those of a continuum of closed orbits, which are neither attracting nor unstable, too.
+    - status: OK, or INCOMPLETE where there is a gap, or where an equilibrium on a contact edge is a
+      stable node: the orbit that comes to it in its fast direction is a separatrix, too, and is not
+      given.
+
+    Starts tell which basin they are in by where they lie: see `table` for all numbers, `plot` for
+    the picture.
+    """
+
+    oscillator: Oscillator
+    equilibria: Equilibria
+    cycles: tuple[Cycle, ...]
+    unstable: tuple[Cycle, ...]
+    separatrices: tuple[Separatrix, ...]
+    escapes: bool = eqx.field(static=True)
+    reach: float = eqx.field(static=True)
+    gaps: Array
+    status: Array
+
+    def table(self) -> list[dict[str, Any]]:
+        """A row for each equilibrium, cycle and separatrix: what it is, stable or not, where.
+
+        Keys: what, number (among its sort), kind (an `EquilibriumKind`, the events of a cycle, or
+        where a separatrix leads to or comes from), stable, x1_min, x1_max, x2_min, x2_max, period
+        and multiplier of a cycle, rate of an equilibrium; None where it has none.
+        """
+        rows = [
+            _row(
+                "equilibrium",
+                number,
+                EquilibriumKind(int(rest.kind)).name,
+                rest.stable,
+                np.array([[rest.x1_lower, 0.0], [rest.x1_upper, 0.0]]),
+                rate=float(rest.rate),
+            )
+            for number, rest in enumerate(self.equilibria)
+        ]
+        for cycles in (self.cycles, self.unstable):
+            rows += [
+                _row(
+                    "cycle",
+                    number,
+                    signature_name(cycle.signature),
+                    cycle.stable,
+                    np.array([[cycle.x1_min, cycle.x2_min], [cycle.x1_max, cycle.x2_max]]),
+                    period=float(cycle.period),
+                    multiplier=float(cycle.multiplier),
+                )
+                for number, cycle in enumerate(cycles)
+            ]
+        rows += [
+            _row("separatrix", number, f"{one.end} {one.to}", one.stable, np.asarray(one.ys))
+            for number, one in enumerate(self.separatrices)
+        ]
+        return rows
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw it into the axes `ax`, which are returned; None: new ones, with a key below."""
+        return draw(self, ax)
+
+    def __repr__(self) -> str:
+        lines = [f"Portrait({len(self.equilibria)} equilibria, {len(self.cycles)} attracting and "]
+        lines[0] += f"{len(self.unstable)} unstable cycles, {len(self.separatrices)} separatrices"
+        lines[0] += ", starts far out go to infinity" if self.escapes else ""
+        lines += [repr(self.equilibria), *map(repr, [*self.cycles, *self.unstable])]
+        lines += map(repr, self.separatrices)
+        if int(self.status) != Status.OK:
+            lines.append(f"{Status(int(self.status)).name}: {describe(self.status)}")
+        return "\n  ".join(lines) + ")"
+
+
+def _row(what: str, number: int, kind: str, stable: Any, ys: np.ndarray, **more: float):
+    x1, x2 = np.asarray(ys).T
+    return {
+        "what": what,
+        "number": number,
+        "kind": kind,
+        "stable": bool(stable),
+        "x1_min": float(x1.min()),
+        "x1_max": float(x1.max()),
+        "x2_min": float(x2.min()),
+        "x2_max": float(x2.max()),
+        "period": None,
+        "multiplier": None,
+        "rate": None,
+        **more,
+    }
+
+
+def portrait(osc: Oscillator) -> Portrait:
+    """All equilibria, attracting and unstable cycles, and separatrices of an oscillator.
+
+    osc: `Oscillator` with any friction laws, belts and contact intervals, of any damping. See
+    `Portrait` for what comes back. Cycles smaller than 1e-5 are not told from equilibria.
+
+    For one known oscillator, outside of `jax.jit`, `jax.vmap` and derivatives: how much there is
+    decides what is computed. `ValueError` names an argument that is impossible, or traced.
+    """
+    check_oscillator(osc)
+    require(is_concrete(osc), "osc", "known: portraits are not for jit or vmap", "a traced one")
+    points, reach = equilibria(osc), reach_of(osc)
+    rests = pick(points, np.asarray(points.kind) != EquilibriumKind.SADDLE)
+    found = branches(osc, rests, TRACED * reach)
+    map_ = Returns(osc, rests, reach, [top for branch in found for top in branch.tops[:2].tolist()])
+    cycles = tuple(cycle for cycle in map_.cycles if abs(float(cycle.multiplier)) < 1)
+    unstable = tuple(cycle for cycle in map_.cycles if float(cycle.multiplier) > 1)
+    gaps = np.array(sorted(map_.gaps)).reshape(-1, 2)
+    told = not len(gaps) and not _has_node_on_edge(osc, points)
+    status = Status.OK if told else Status.INCOMPLETE
+    return Portrait(
+        oscillator=osc,
+        equilibria=points,
+        cycles=cycles,
+        unstable=unstable,
+        separatrices=tuple(
+            _named(branch, map_, points, unstable if branch.stable else cycles) for branch in found
+        ),
+        escapes=map_.escapes,
+        reach=reach,
+        gaps=jax.device_put(gaps),
+        status=jnp.asarray(np.array(status.value)),
+    )
+
+
+def _has_node_on_edge(osc: Oscillator, points: Equilibria) -> bool:
+    """Whether a stable node lies on a contact edge, up to rounding."""
+    x1, at = np.asarray(points.x1), np.asarray(jnp.stack(edges(osc)))
+    on_edge = np.min(np.abs(x1[:, None] - at), axis=1, initial=np.inf) < ON_EDGE
+    fixed = np.asarray(points.kind) == EquilibriumKind.FIXED_POINT
+    is_node = np.isreal(np.asarray(points.eigenvalues)[:, 0])
+    return bool(np.any(on_edge & fixed & is_node & np.asarray(points.stable)))
+
+
+def _named(
+    branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles: Sequence[Cycle]
+) -> Separatrix:
+    """The separatrix, with where it leads to or comes from; cycles: those that may be that."""
+    end, to = _end_of(branch, map_, points, cycles)
+    ts, ys = jax.device_put((branch.ts, branch.ys))
+    point = jax.device_put(np.array(branch.point))
+    return Separatrix(point, branch.side, branch.stable, ts, ys, end, to)
+
+
+def _end_of(branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles) -> tuple[str, int]:
+    if branch.cut:
+        return "boundary", -1
+    if max(abs(branch.y)) >= map_.reach or branch.status == Status.NOT_FINITE:
+        return "outside", -1
+    if not np.isnan(branch.rest):
+        lower, upper = np.asarray(points.x1_lower), np.asarray(points.x1_upper)
+        away = np.maximum(np.maximum(lower - branch.rest, branch.rest - upper), 0.0)
+        return "equilibrium", int(np.argmin(away))
+    return _approached(branch, map_, points, cycles)
+
+
+def _approached(
+    branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles
+) -> tuple[str, int]:
+    """What the tops of an orbit tend to that was followed until they hardly moved: the next such
+    cycle, or the end of their interval, in the direction in which they go."""
+    if branch.status != Status.OK and (to := _creeping_to(branch, points)) >= 0:
+        return "equilibrium", to
+    if not len(branch.tops):
+        return "unsettled", -1
+    top = float(branch.tops[-1])
+    step = float(map_(np.array([top]))[0]) - top
+    step = -step if branch.stable else step
+    (low, high), *_ = [*(i for i in map_.intervals if i[0] < top <= i[1]), (top, top)]
+    inside = [
+        (number, float(cycle.x1_max))
+        for number, cycle in enumerate(cycles)
+        if low < float(cycle.x1_max) <= high
+    ]
+    near = [(abs(at - top), number) for number, at in inside]
+    if near and min(near)[0] < ON_CYCLE * (1 + abs(top)):
+        return "cycle", min(near)[1]
+    ahead = [(abs(at - top), number) for number, at in inside if (at - top) * step > 0]
+    if ahead:
+        return "cycle", min(ahead)[1]
+    if step > 0:
+        return ("outside" if high == map_.intervals[-1][1] else "unsettled"), -1
+    rests = np.flatnonzero(np.abs(np.asarray(points.x1_upper) - low) < 1e-9 * (1 + abs(low)))
+    return ("equilibrium", int(rests[0])) if rests.size else ("unsettled", -1)
+
+
+def _creeping_to(branch: TracedSeparatrix, points: Equilibria) -> int:
+    """The number of the point of rest that an orbit has come so near to that it will not end: a
+    node on an edge, or on the boundary of a belt at rest, takes for ever; -1 if there is none."""
+    ends = np.stack([np.asarray(points.x1_lower), np.asarray(points.x1_upper)])
+    away = np.min(np.hypot(ends - branch.y[0], branch.y[1]), axis=0)
+    away[np.asarray(points.kind) == EquilibriumKind.SADDLE] = np.inf
+    return int(np.argmin(away)) if np.any(away < CREEPING) else -1

@@ -1,0 +1,347 @@
+"""The return map of the tops, and all cycles of an oscillator from it: `Returns`.
+
+x1' = x2, so an orbit moves right above the axis x2 = 0 and left below it. A top is a maximum of x1,
+a state (x1, 0) at which the mass is pulled to the left; the map leads from a top to the next one.
+
+- A closed orbit has one top. Between a top and the next minimum of x1 an orbit is a graph over the
+  x1 axis, and two orbits do not cross: were there two tops and two minima, two of the four arcs
+  would. So the fixed points of the map are the cycles.
+- For the same reason the map does not decrease where both tops lie between the same neighbours of
+  the rests, edges and segments on the axis. So P(a) > b, or P(b) < a, shows that no cycle has its
+  top between a and b. The tops are divided until each interval is free in this sense, brackets a
+  change of sign of P(x1) - x1, or is short.
+- The map is flat where orbits stick, and steep beside. A cycle that sticks comes by a place where a
+  stick phase ends; the tops that follow those are divided at, too.
+- It jumps at tops whose orbits end in a point of an edge that nothing draws in from one side, see
+  `separatrices`. A jump over the diagonal is no cycle.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..checks import pick
+from ..model.equilibria import Equilibria
+from ..model.modes import contact, edges, mode_acceleration, settle
+from ..model.oscillator import Oscillator
+from ..numerics.compiling import each, jit
+from ..results import Status
+from .attractors import distinct
+from .backwards import forwards, reversed_in_time, solved
+from .cycle import Cycle
+from .orbits import before_stick_ends, follow_to_top, loop_of, place_of_rest
+from .settling import AT_REST
+from .shooting import SIZES, Loop
+
+#: Tops that are evaluated in one batch.
+TOPS_AT_ONCE = 64
+#: Room for the arcs of one loop.
+LOOP_ROOM = SIZES[-1]
+#: Tops for each factor of ten of the distance from where an interval begins, and from its end.
+PER_DECADE = 16
+#: Intervals shorter than this fraction of the distance from where they begin are divided only where
+#: the growth of loops changes by more than the second number, and none below the third.
+SHORT, UNEVEN, SHORTEST = 1e-2, 0.05, 1e-5
+#: Distances from the tops that follow stick phases, and jumps, begin with this one.
+CLOSEST = 1e-10
+#: Cycles around a pseudo-focus are looked for down to this width; their height is larger.
+AT_FOCUS = 1e-7
+#: Tops at most, in search of all cycles.
+MOST_TOPS = 20_000
+#: Tops that return to themselves to this fraction do so up to the errors of orbits.
+RETURNED = 1e-8
+#: A bracket is divided into 64, at most so often; if it then is one of a jump, the map changes
+#: by more than this there.
+DIVISIONS, JUMP = 6, 1e-6
+#: The error of the map, relative to the top; by so much over 1 - multiplier is a fixed point off.
+MAP_ERROR = 3e-7
+#: Cycles with a multiplier as near to 1 are parts of a continuum of closed orbits.
+NEUTRAL = 1e-9
+#: Intervals of tops as short as this, relative to where they are, are rounding.
+ROUNDING = 1e-12
+#: The largest distance from the origin that is looked at, where no bound is known.
+FARTHEST = 1e4
+
+
+class Bracket(NamedTuple):
+    """Tops between which P(x1) - x1 changes its sign."""
+
+    low: float
+    high: float
+
+
+@jit
+def side_pulls(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
+    """x2' of a mass at rest just left and just right of each x1, [places]; 0 where a belt holds
+    it."""
+    rest = jnp.zeros_like(x1)
+    modes = [settle(osc, contact(osc, x1, rest, rightward=s), x1, rest) for s in (False, True)]
+    left, right = (
+        jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, rest)) for mode in modes
+    )
+    return left, right
+
+
+@jit
+def _next_tops(osc: Oscillator, starts: Array) -> tuple[Array, Loop]:
+    """The top that follows each start, [starts, 2]; or x1 where the orbit comes to rest; inf where
+    it does not come back; NaN where that is not told. And the way there, as if it were closed."""
+
+    def one(start):
+        orbit, top = follow_to_top(osc, start, LOOP_ROOM)
+        rest = place_of_rest(osc, orbit)
+        far = jnp.max(jnp.abs(orbit.y)) > 10 * (1 + jnp.max(jnp.abs(start)))
+        lost = (orbit.status != Status.OK) & (far | ~jnp.all(jnp.isfinite(orbit.y)))
+        rest = jnp.where(lost & jnp.isnan(rest), jnp.inf, rest)
+        orbit = eqx.tree_at(lambda orbit: orbit.repeats, orbit, jnp.asarray(-1))
+        return jnp.where(jnp.isnan(top), rest, top), loop_of(orbit, LOOP_ROOM, len(osc.belts))
+
+    return each(one)(lax.stop_gradient(starts))
+
+
+@jit
+def _stick_ends(osc: Oscillator) -> Array:
+    """States shortly before stick phases end, [places, 2]; NaN where there is none."""
+    return jnp.concatenate([before_stick_ends(osc, belt) for belt in range(len(osc.belts))])
+
+
+class Returns:
+    """The return map of one oscillator, evaluated, and its fixed points.
+
+    reach: no cycle, and no orbit that comes to rest, has a top beyond it, or such are not known.
+    intervals: of tops, (from, to) each, from left to right. cycles: all cycles found, each once, in
+    order of their tops. gaps: intervals of tops, (from, to) each, of which it is not told whether
+    there are cycles in them, such as a continuum of closed orbits. escapes: whether orbits from the
+    outermost tops go on outwards.
+    """
+
+    def __init__(
+        self, osc: Oscillator, rests: Equilibria, reach: float, special: Sequence[float]
+    ) -> None:
+        """rests: where the mass can rest; special: tops near which the map may be steep."""
+        self.osc = osc
+        self.gaps: list[tuple[float, float]] = []
+        self._brackets: list[Bracket] = []
+        self._hits: list[float] = []
+        self._known: dict[float, float] = {}
+        self.reach = reach
+        self._edges = {float(edge) for edge in edges(osc)}
+        self.intervals = self._intervals_of_tops(rests)
+        self._special = np.array([*special, *self._tops_after_sticking()])
+        for low, high in self.intervals:
+            self._search(low, high)
+        self.cycles = self._solved()
+        outermost = self.intervals[-1][1]
+        self.escapes = bool(self(np.array([outermost]))[0] > outermost)
+
+    def __call__(self, tops: np.ndarray) -> np.ndarray:
+        """The tops that follow these: see `_next_tops`."""
+        new = np.array([top for top in tops.tolist() if top not in self._known])
+        after, _ = self._after(self.osc, np.column_stack([new, np.zeros_like(new)]))
+        self._known |= dict(zip(new.tolist(), after.tolist(), strict=True))
+        return np.array([self._known[top] for top in tops.tolist()])
+
+    def _after(self, osc: Oscillator, starts: np.ndarray) -> tuple[np.ndarray, list[Loop]]:
+        """The tops that follow these states, [starts, 2], and the loops, in batches of one size."""
+        tops, loops = [np.zeros(0)], []
+        for first in range(0, len(starts), TOPS_AT_ONCE):
+            batch = starts[first : first + TOPS_AT_ONCE]
+            filled = np.concatenate([batch, batch[-1:].repeat(TOPS_AT_ONCE - len(batch), axis=0)])
+            after, ways = _next_tops(osc, jax.device_put(filled))
+            tops.append(np.asarray(after)[: len(batch)])
+            loops.append(ways)
+        return np.concatenate(tops), loops
+
+    def _intervals_of_tops(self, rests: Equilibria) -> list[tuple[float, float]]:
+        """The intervals of the axis in which a mass at rest is pulled to the left."""
+        cuts = np.concatenate([*map(np.ravel, map(np.asarray, _positions(self.osc, rests)))])
+        cuts = np.unique(cuts[np.isfinite(cuts)])
+        cuts = cuts if cuts.size else np.zeros(1)
+        ends = np.append(cuts, self.reach)
+        pulls = np.asarray(side_pulls(self.osc, jax.device_put(0.5 * (ends[1:] + ends[:-1])))[1])
+        found: list[tuple[float, float]] = []
+        for low, high, pull in zip(ends[:-1].tolist(), ends[1:].tolist(), pulls, strict=True):
+            if not pull < 0 or high - low < ROUNDING * (1 + abs(low)):
+                continue
+            goes_on = found and found[-1][1] == low and self._passes(low)
+            found[-1:] = [(found[-1][0], high)] if goes_on else [*found[-1:], (low, high)]
+        return found
+
+    def _passes(self, x1: float) -> bool:
+        """Whether both sides of an edge pull to the left."""
+        left, right = side_pulls(self.osc, jax.device_put(np.array([x1])))
+        return bool(left[0] < 0 and right[0] < 0)
+
+    def _tops_after_sticking(self) -> list[float]:
+        """The tops after each place where a stick phase ends, and the ones after those."""
+        starts = np.asarray(_stick_ends(self.osc))
+        first, _ = self._after(self.osc, starts[np.isfinite(starts[:, 0])])
+        tops = first[np.isfinite(first)]
+        return [*tops.tolist(), *(top for top in self(tops).tolist() if np.isfinite(top))]
+
+    # --- dividing -------------------------------------------------------------------------------
+
+    def _search(self, low: float, high: float) -> None:
+        """Find the brackets of cycles with their tops in an interval."""
+        tops = self._first_tops(low, high)
+        returns = self(tops)
+        while tops.size < MOST_TOPS:
+            divided = self._divided(tops, returns, low)
+            if not divided.size:
+                break
+            tops = np.concatenate([tops, divided])
+            returns = np.concatenate([returns, self(divided)])
+            order = np.argsort(tops)
+            tops, returns = tops[order], returns[order]
+        self._collect(tops, returns, low)
+
+    def _first_tops(self, low: float, high: float) -> np.ndarray:
+        length = high - low
+        # Cycles around a pseudo-focus are as wide as the square of their height.
+        least = min(0.1 * AT_FOCUS if low in self._edges else AT_REST, 1e-4 * length)
+        decades = np.log10(0.5 * length / least)
+        away = np.geomspace(least, 0.5 * length, max(8, int(PER_DECADE * decades)))
+        near = self._special[(low < self._special) & (self._special < high)]
+        # An unstable cycle may be as near to one that sticks as that is to its fold.
+        steps = np.geomspace(CLOSEST, 0.1, int(-0.25 * PER_DECADE * np.log10(CLOSEST)))
+        beside = (near[:, None] + np.concatenate([-steps, steps])).ravel()
+        tops = np.concatenate([low + away, high - away, [high], beside, near])
+        return np.unique(tops[(low + least <= tops) & (tops <= high)])
+
+    def _divided(self, tops: np.ndarray, returns: np.ndarray, low: float) -> np.ndarray:
+        """New tops, one in each interval that is not known to be free of cycles."""
+        (a, b), (after_a, after_b) = (tops[:-1], tops[1:]), (returns[:-1], returns[1:])
+        with np.errstate(invalid="ignore"):
+            free = (after_a > b) | (after_b < a)
+            changes = np.sign(after_a - a) * np.sign(after_b - b) <= 0
+            growth = (after_a - a) / (a - low), (after_b - b) / (b - low)
+            uneven = np.abs(growth[1] - growth[0]) > UNEVEN * np.abs(growth[0])
+        width = (b - a) / (b - low)
+        wide = (width > SHORT) | (width > SHORTEST) & uneven
+        return (0.5 * (a + b))[~free & ~changes & wide & np.isfinite(width)]
+
+    def _collect(self, tops: np.ndarray, returns: np.ndarray, low: float) -> None:
+        """Take the changes of sign, the tops that return to themselves, and what is not known."""
+        rise = returns - tops
+        zero = np.abs(rise) <= np.maximum(RETURNED * np.minimum(1.0, tops - low), RETURNED**2)
+        many = zero[:-2] & zero[1:-1] & zero[2:] if tops.size > 2 else np.zeros(0, bool)
+        closed = np.zeros(tops.size, bool)
+        for i in np.flatnonzero(many):
+            closed[i : i + 3] = tops[i + 2] - tops[i] > 1e-4 * (tops[i] - low) or closed[i]
+        for first, last in _runs_of(closed):
+            self.gaps.append((float(tops[first]), float(tops[last])))
+        for first, last in _runs_of(np.isnan(returns)):
+            self.gaps.append(
+                (float(tops[max(first - 1, 0)]), float(tops[min(last + 1, tops.size - 1)]))
+            )
+        self._hits += tops[zero & ~closed].tolist()
+        told = ~zero & ~np.isnan(returns)
+        signs, where = np.sign(rise[told]), tops[told]
+        for i in np.flatnonzero(np.diff(signs)):
+            if not np.any(closed & (where[i] < tops) & (tops < where[i + 1])):
+                self._brackets.append(Bracket(float(where[i]), float(where[i + 1])))
+
+    # --- solving --------------------------------------------------------------------------------
+
+    def _solved(self) -> list[Cycle]:
+        """The cycles in all brackets and at all tops that return to themselves, each once."""
+        found = [self._cycle_at(top, top, top) for top in self._hits]
+        for bracket in self._brackets:
+            found += self._solved_between(bracket, DIVISIONS)
+        cycles = distinct([cycle for cycle in found if cycle is not None])
+        return sorted(cycles, key=lambda cycle: float(cycle.x1_max))
+
+    def _solved_between(self, bracket: Bracket, divisions: int) -> list[Cycle]:
+        low, high = bracket
+        tops = np.unique(np.linspace(low, high, TOPS_AT_ONCE + 2)[1:-1])
+        tops = np.concatenate([[low], tops[(low < tops) & (tops < high)], [high]])
+        rise = self(tops) - tops
+        told = ~np.isnan(rise)
+        tops, rise = tops[told], rise[told]
+        changes = np.flatnonzero(np.sign(rise[:-1]) * np.sign(rise[1:]) <= 0)
+        found: list[Cycle] = []
+        for a, b, before, after in zip(
+            tops[changes], tops[changes + 1], rise[changes], rise[changes + 1], strict=True
+        ):
+            # Where the map is flat, the cycle is where it leads.
+            at = a + (b - a) * np.clip(before / (before - after), 0.01, 0.99)
+            cycle = self._cycle_at(float(at), float(a), float(b))
+            if cycle is not None and (float(cycle.multiplier) > 1) == (after > before):
+                found.append(cycle)
+            elif divisions > 1 and tops.size > 2:
+                found += self._solved_between(Bracket(float(a), float(b)), divisions - 1)
+            elif after > before and (behind := self._cycle_behind(float(b))) is not None:
+                found.append(behind)
+            elif not abs(after - before) > JUMP:
+                self.gaps.append((float(a), float(b)))
+        return found
+
+    def _cycle_at(self, top: float, low: float, high: float) -> Cycle | None:
+        """The cycle with its top between two tops, from the loop of one between them, or None."""
+        _, (loops,) = self._after(self.osc, np.array([[top, 0.0]]))
+        return _if_at_home(solved(self.osc, pick(loops, 0)), top, high - low)
+
+    def _cycle_behind(self, top: float) -> Cycle | None:
+        """The cycle with its top there, as it is backwards, or None: then the map jumps there."""
+        behind = reversed_in_time(self.osc)
+        (before,), (loops,) = self._after(behind, np.array([[top, 0.0]]))
+        if not abs(before - top) < MAP_ERROR * (1 + abs(top)):
+            return None
+        cycle = _if_at_home(solved(behind, pick(loops, 0)), top, 0.0)
+        return None if cycle is None else forwards(self.osc, cycle)
+
+
+def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
+    """A cycle that was solved for from a top, if it is one, and where it was looked for."""
+    if int(cycle.status) != Status.OK:
+        return None
+    x1, x2, _ = np.ptp(np.asarray(cycle.unknowns), axis=0)
+    if x1 < AT_FOCUS or x2 < AT_REST:
+        return None
+    growth = min(abs(float(cycle.multiplier) - 1), 1.0)
+    margin = width + MAP_ERROR * (1 + abs(top)) / max(growth, NEUTRAL)
+    return cycle if abs(float(cycle.x1_max) - top) < margin and growth > NEUTRAL else None
+
+
+def _positions(osc: Oscillator, rests: Equilibria) -> list[Array]:
+    return [*edges(osc), rests.x1_lower, rests.x1_upper]
+
+
+def _runs_of(flags: np.ndarray) -> np.ndarray:
+    """First and last number of each run of True, [runs, 2]."""
+    switches = np.flatnonzero(np.diff(flags, prepend=False, append=False))
+    return switches.reshape(-1, 2) - [0, 1]
+
+
+def reach_of(osc: Oscillator) -> float:
+    """How far out a top can be that returns to itself; FARTHEST where that is farther, or not
+    known.
+
+    Let friction be at most F. Half a loop of the linear oscillator with a constant force F takes
+    an extremum x to -(q x + F (1 + q)) at most, q = exp(-pi zeta/(2 w)), w^2 = 1 - zeta^2/4, and no
+    force between -F and F takes it farther; q = 0 from zeta = 2 on. So with q < 1 no top beyond
+    F (1 + q)/(1 - q) comes back as far out. With q > 1, F (1 + q)/(q - 1) is where the least that
+    half a loop leads to, q x - F (1 + q), is x, and from farther out orbits go to infinity.
+    Friction that opposes the motion and grows with the speed brings orbits further in.
+    """
+    zeta = float(osc.damping)
+    frequency = np.sqrt(max(1 - zeta**2 / 4, 0.0))
+    decay = np.exp(-np.pi * abs(zeta) / (2 * frequency)) if frequency > 0 else 0.0
+    friction = sum(_largest_pull(belt) for belt in osc.belts)
+    bound = friction * (1 + decay) / max(1 - decay, 1e-12)
+    # Equilibria and all that may be an end of an interval lie within.
+    inner = [friction, *(abs(edge) for edge in map(float, edges(osc)) if np.isfinite(edge))]
+    inner += [abs(float(belt.velocity / osc.omega)) for belt in osc.belts]
+    return float(max(min(1.01 * bound + 1.0, FARTHEST), max(inner) + 1.0))
+
+
+def _largest_pull(belt) -> float:
+    speeds = np.linspace(0.0, 1.0 + abs(float(belt.velocity)), 65)
+    largest = max(float(belt.friction.static), float(np.max(belt.friction.mu(jnp.asarray(speeds)))))
+    return float(belt.load) * largest

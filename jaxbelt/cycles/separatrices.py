@@ -1,0 +1,281 @@
+"""Orbits that bound basins, from the points in which they end: `Separatrix`.
+
+On an edge x1 = sigma the velocity is x1' = x2 on both sides, so at (sigma, 0) orbits turn: those of
+a side that pulls away from the edge touch it there. Where neither side draws the mass in, orbits
+that pass the edge just below that point, or above it, go on, and those that miss it turn. They part
+at the orbit that ends in the point, one from each side: the stable separatrices, reached in finite
+time. Where a side pushes away an orbit leaves from the point, an unstable separatrix. Where both do
+the point is a saddle; where a belt at rest holds the mass on one side, a segment ends in it.
+
+Where a segment ends elsewhere, at the limit of what belts at rest hold, orbits that stop within it
+stay, and those that stop beyond turn back. These are caught, too, if only they stop near enough,
+unless friction falls so steeply that the end is an unstable node of the field in which they turn,
+or the static limit exceeds mu(0). Then the orbit that arrives in the end bounds the basin.
+
+Where the static limit of a belt exceeds mu(0) an orbit that touches its boundary parts those that
+pass by from those that stick, for these do so until the static limit. It ends in the point where
+it touches, and goes on as both.
+
+Stable separatrices are followed backwards: in reversed time, t -> -t and x2 -> -x2, an oscillator
+with the signs of its damping, loads and velocities changed. Backwards, too, an orbit goes on in one
+way as long as it slips, for it comes to a boundary only where orbits cross it: the mass leaves a
+stick phase in one place only, slip onset. With a law whose static limit exceeds mu(0), orbits leave
+upwards or downwards all along a piece of the boundary beyond slip; then the separatrix ends there,
+and that piece of the boundary itself parts the motions.
+"""
+
+from itertools import product
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..checks import number
+from ..model.equilibria import Equilibria, EquilibriumKind
+from ..model.modes import (
+    STUCK,
+    Mode,
+    capacity,
+    contact,
+    edges,
+    force_rounding,
+    mode_acceleration,
+    mode_of,
+    mode_of_state,
+    select,
+)
+from ..model.oscillator import Oscillator
+from ..numerics.compiling import each, jit
+from ..results import Status
+from .backwards import reversed_in_time
+from .orbits import follow_finely, place_of_rest
+from .returns import side_pulls
+from .shooting import Loop, flow, meshed, trace_of
+
+#: Arcs for which a separatrix is followed: some 40 loops.
+SEPARATRIX_ARCS = 256
+#: Samples of each arc at even times, and as many where the friction law bends.
+ARC_SAMPLES = 16
+
+
+class Separatrix(eqx.Module):
+    """An orbit that leaves, or ends in, a point: (sigma, 0) of a contact edge, an end of a segment,
+    or where it touches the boundary of a belt whose static limit exceeds mu(0).
+
+    - point: (x1, x2). side: "left" or "right", on which side of it the orbit is there. stable:
+      whether it ends in the point, and so may bound basins, or leaves it.
+    - ts: times, 0 at the point, [samples]; ys: states (x1, x2), [samples, 2]; both in the order of
+      time, and good to 1e-9. Ends of arcs are among the samples.
+    - end: what its other end is, where an unstable one leads to and a stable one comes from:
+      "equilibrium" (or an end of a segment), "cycle", "outside" (of |x1|, |x2| < reach, see
+      `Portrait`), "boundary" (of a belt whose static limit exceeds mu(0): it leaves this boundary
+      beside a piece where the mass sticks), or "unsettled" (it approaches what it comes from, or
+      leads to, too slowly).
+    - to: the number of that equilibrium, or of that attracting or unstable cycle, in the portrait;
+      else -1.
+    """
+
+    point: Array
+    side: str = eqx.field(static=True)
+    stable: bool = eqx.field(static=True)
+    ts: Array
+    ys: Array
+    end: str = eqx.field(static=True)
+    to: int = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        way = "from" if self.stable else "to"
+        number_of = f" {self.to}" if self.to >= 0 else ""
+        return (
+            f"Separatrix({'stable' if self.stable else 'unstable'}, {self.side} of ("
+            f"{number(self.point[0])}, {number(self.point[1])}), {way} {self.end}{number_of})"
+        )
+
+
+class TracedSeparatrix(NamedTuple):
+    """A separatrix as it was followed: backwards, with x2 reversed, where it is stable.
+
+    tops: its maxima of x1 in the order in which it came to them; y: where it was left; rest: x1
+    where it came to rest, else NaN; status: of the orbit; cut: whether it came to a piece of a
+    boundary where the mass sticks.
+    """
+
+    point: tuple[float, float]
+    side: str
+    stable: bool
+    ts: np.ndarray
+    ys: np.ndarray
+    tops: np.ndarray
+    y: np.ndarray
+    rest: float
+    status: Status
+    cut: bool
+
+
+def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[TracedSeparatrix]:
+    """All separatrices of an oscillator, followed as long as |x1| and |x2| are < reach; rests:
+    where the mass can rest."""
+    positions = np.unique(np.asarray(jnp.stack(edges(osc))))
+    found: list[TracedSeparatrix | None] = []
+    parting: list[float] = []
+    for x1 in positions[np.isfinite(positions)].tolist():
+        left, right = (float(pull[0]) for pull in side_pulls(osc, jax.device_put(np.array([x1]))))
+        if left > 0 or right < 0 or left == right == 0:
+            continue
+        parting.append(x1)
+        for stable, side in product((False, True), ("left", "right")):
+            found.append(_at_rest(osc, x1, side, stable, reach))
+    for rest in rests:
+        if int(rest.kind) != EquilibriumKind.SEGMENT:
+            continue
+        for x1, side in ((float(rest.x1_lower), "right"), (float(rest.x1_upper), "left")):
+            if x1 not in parting and _repels(osc, *_as_arrays(x1, side == "right")):
+                found.append(_at_rest(osc, x1, side, True, reach))
+    for belt in range(len(osc.belts)):
+        points, codes = map(np.asarray, _tangencies(osc, *_as_arrays(belt)))
+        for (x1, x2), mode in zip(points.tolist(), codes, strict=True):
+            if np.isfinite(x1):
+                side = "left" if x2 > 0 else "right"
+                found.append(_branch(osc, (x1, x2), mode, side, True, reach))
+    unique = {(b.point, b.side, b.stable): b for b in found if b is not None}
+    return sorted(unique.values(), key=lambda branch: branch.point)
+
+
+def _as_arrays(*numbers: float | int | bool) -> list[Array]:
+    """Numbers as arrays of one type, so that one program serves all."""
+    return [jnp.asarray(np.array(number)) for number in numbers]
+
+
+@jit
+def _repels(osc: Oscillator, x1: Array, rightward: Array) -> Array:
+    """Whether orbits that turn just beyond an end of a segment leave it, to the side given."""
+    zero = jnp.zeros(())
+    mode = _mode_onward(osc, x1, rightward)
+    (trace,) = trace_of(osc, mode, x1, zero)
+    pull = mode_acceleration(osc, mode, x1, zero)
+    pushes = jnp.where(rightward, pull, -pull) > force_rounding(x1)
+    return pushes | (jnp.abs(pull) < force_rounding(x1)) & (trace >= 2)
+
+
+def _mode_onward(osc: Oscillator, x1: Array, rightward: Array) -> Mode:
+    """The slip mode beside (x1, 0) to one side; a belt at rest opposes the motion to there."""
+    sides = (contact(osc, x1, jnp.zeros(()), rightward=side) for side in (True, False))
+    mode = select(rightward, *sides)
+    backward = jnp.where(rightward, -1.0, 1.0)
+    return Mode(tuple(jnp.where(code == STUCK, backward, code) for code in mode.codes))
+
+
+@jit
+def _leaves(osc: Oscillator, x1: Array, rightward: Array) -> tuple[Array, Array]:
+    """Whether an orbit leaves (x1, 0) to a side, and the mode in which it would, [belts]."""
+    mode = _mode_onward(osc, x1, rightward)
+    pull = mode_acceleration(osc, mode, x1, jnp.zeros(()))
+    return jnp.where(rightward, pull, -pull) > 0, jnp.stack(mode.codes)
+
+
+@jit
+def _tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
+    """Where orbits touch the boundary of a belt whose static limit exceeds mu(0), one point for
+    each zone between contact edges, [zones, 2], NaN where there is none; and the modes of these
+    orbits, [zones, belts].
+
+    x2'' = -x2 there, so they are orbits that slip with the sign of the belt's velocity.
+    """
+    v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
+    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
+    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    stuck = contact(osc, lower, v, rightward=True)
+    slips = Mode(tuple(jnp.where(code == STUCK, jnp.sign(v), code) for code in stuck.codes))
+    zero = jnp.zeros_like(lower)
+    x1 = mode_acceleration(osc, slips, zero, v)
+    kinetic = jnp.abs(x1 - mode_acceleration(osc, stuck, zero, v))
+    exists = (jnp.stack(stuck.codes)[belt] == STUCK) & (lower < x1) & (x1 < upper) & (v != 0)
+    exists = exists & (capacity(osc, stuck) - kinetic > force_rounding(x1))
+    x1, x2 = jnp.where(exists, x1, jnp.nan), jnp.full_like(x1, v)
+    return jnp.stack([x1, x2], axis=-1), jnp.stack(slips.codes, axis=-1)
+
+
+def _at_rest(
+    osc: Oscillator, x1: float, side: str, stable: bool, reach: float
+) -> TracedSeparatrix | None:
+    """The separatrix of a point (x1, 0) on one side, if there is one."""
+    moving = reversed_in_time(osc) if stable else osc
+    leaves, mode = map(np.asarray, _leaves(moving, *_as_arrays(x1, side == "right")))
+    # Backwards the signs of all relative velocities are the other ones.
+    mode = np.where(np.abs(mode) == 1, -mode, mode) if stable else mode
+    return _branch(osc, (x1, 0.0), mode, side, stable, reach) if leaves else None
+
+
+@jit
+def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array):
+    """The orbit from a state in a mode, where it comes to rest, and of each of its arcs times since
+    its entry, [arcs, samples], and states there."""
+    orbit = follow_finely(osc, mode_of(codes), y, SEPARATRIX_ARCS, reach)
+    rest = place_of_rest(osc, orbit)
+    used = jnp.arange(SEPARATRIX_ARCS) < orbit.count
+    durations = jnp.where(used & jnp.isfinite(orbit.durations), orbit.durations, 0.0)
+    loop = Loop(orbit.codes, orbit.ends, orbit.entries, durations)
+    chain, _ = meshed(osc, loop, ARC_SAMPLES)
+    even = jnp.linspace(1.0, 0.0, ARC_SAMPLES, endpoint=False)
+
+    def along(codes, mesh, y, duration):
+        def beyond(duration):
+            return ~(jnp.max(jnp.abs(flow(osc, codes, mesh, y, duration))) < 2 * reach)
+
+        # Where nothing turns it an orbit may go far in one arc.
+        duration = lax.while_loop(beyond, lambda duration: 0.8 * duration, duration)
+
+        def advance(y, fraction):
+            y = flow(osc, codes, jnp.ones(1), y, duration * fraction)
+            return y, y
+
+        # As near to each other as the law's bends, and the picture, ask.
+        at = jnp.sort(jnp.concatenate([jnp.cumsum(mesh), even])).at[-1].set(1.0)
+        _, states = lax.scan(advance, y, jnp.diff(at, prepend=0.0))
+        return duration * at, states
+
+    return orbit, rest, *each(along)(chain.codes, chain.mesh, orbit.entries, durations)
+
+
+@jit
+def _is_held(osc: Oscillator, ys: Array) -> Array:
+    return mode_of_state(osc, ys[:, 0], ys[:, 1]).any_stuck
+
+
+def _branch(
+    osc: Oscillator,
+    point: tuple[float, float],
+    codes: np.ndarray,
+    side: str,
+    stable: bool,
+    reach: float,
+) -> TracedSeparatrix:
+    """The separatrix that leaves, or comes to, a point in a mode."""
+    way = np.array([1.0, -1.0 if stable else 1.0])
+    start = np.array(point) * way, np.where(np.abs(codes) == 1, codes * way[1], codes)
+    moving = reversed_in_time(osc) if stable else osc
+    found = _orbit_from(moving, *jax.device_put(start), *_as_arrays(reach))
+    orbit, rest, since, states = jax.tree.map(np.asarray, found)
+    count, was_cut, y = int(orbit.count), False, orbit.y
+    if stable:
+        following = np.concatenate([orbit.entries[1:], orbit.y[None]])
+        following[count - 1] = orbit.y
+        at_boundary = (np.arange(len(following)) < count) & (orbit.ends < len(osc.belts))
+        stuck = np.flatnonzero(
+            at_boundary & np.asarray(_is_held(osc, jax.device_put(following * way)))
+        )
+        if stuck.size:
+            count, was_cut = int(stuck[0]) + 1, True
+            y = following[count - 1]
+    begins = np.append(0.0, np.cumsum(since[:count, -1]))[:-1]
+    ts = np.concatenate([[0.0], (begins[:, None] + since[:count]).ravel()])
+    ys = np.concatenate([[point], states[:count].reshape(-1, 2) * way])
+    tops = orbit.tops[:count]
+    if stable:
+        ts, ys = -ts[::-1], ys[::-1]
+    status, tops = Status(int(orbit.status)), tops[~np.isnan(tops)]
+    return TracedSeparatrix(point, side, stable, ts, ys, tops, y, float(rest), status, was_cut)

@@ -1,0 +1,267 @@
+"""Portraits: all that `portrait` tells of an oscillator against what the engine sees.
+
+The engine runs from 121 starts on a grid. Three things must hold.
+
+- Where each run leads is an attractor of the portrait. One of the portrait that no start leads to
+  is one for the engine that starts on it; it is set aside and counted, for its basin is small.
+- Two neighbours on the grid that lead to different attractors are parted by an unstable cycle or a
+  stable separatrix, which passes between them; or by a boundary, where the static limit of its belt
+  exceeds mu(0).
+- Starts beside an unstable cycle, within it and without, leave it.
+"""
+
+import time
+from collections import Counter
+from dataclasses import replace
+from math import inf
+
+import jax.numpy as jnp
+import numpy as np
+
+import jaxbelt as jb
+
+from . import engine, package
+from .cases import PAPER, random_case, rational_case, special_positions, structures
+
+#: Starts: so many displacements and velocities, in this window.
+SIDE, WINDOW = 11, ((-3.0, 3.0), (-2.0, 2.0))
+#: Extrema and periods of one cycle, and places at rest, differ by less.
+SAME, AT_REST = 1e-6, 1e-4
+#: Samples are connected by chords: these are no farther from the curve, as a part of the distance
+#: between starts.
+CHORD = 0.02
+#: Smaller cycles than the first, at a pseudo-focus than the second, are not told from rest.
+TINY, TINY_AT_FOCUS = 1e-5, 1e-7
+#: Round numbers meet Hopf points: there loops neither grow nor shrink, to any order that shows.
+CENTRE = 1e-12
+#: Time until the engine gives a run up.
+PATIENCE = 20_000.0
+
+
+def random_oscillator(rng: np.random.Generator) -> tuple[str, engine.Oscillator]:
+    """A kind, and an oscillator of it."""
+    kind = str(rng.choice(KINDS, p=SHARES))
+    if kind == "paper":
+        return kind, _of_the_paper(rng)
+    if kind in ("random", "rational"):
+        make = random_case if kind == "random" else rational_case
+        number = int(rng.choice([0, 4, 5], p=[0.8, 0.1, 0.1]))
+        return kind, make(rng, structures(rng, 6)[number]).oscillator
+    osc = (_of_the_paper if rng.random() < 0.5 else _random)(rng)
+    first, *rest = osc.belts
+    if kind == "negative damping":
+        return kind, replace(osc, damping=-float(rng.uniform(0.01, 0.4)))
+    if kind == "equal belts":
+        rest = [replace(b, velocity=first.velocity, law=first.law, load=first.load) for b in rest]
+    elif kind == "belt at rest":
+        first = replace(first, velocity=0.0)
+    elif kind == "no load":
+        first = replace(first, load=0.0)
+    else:
+        return kind, _with_edge_on_equilibrium(rng, osc)
+    return kind, replace(osc, belts=(first, *rest))
+
+
+KINDS = (
+    "paper", "random", "rational", "negative damping", "equal belts", "belt at rest", "no load",
+    "edge on equilibrium",
+)  # fmt: skip
+SHARES = (0.35, 0.25, 0.15, 0.05, 0.05, 0.05, 0.05, 0.05)
+
+
+def _random(rng):
+    return random_case(rng, structures(rng, 1)[0]).oscillator
+
+
+def _of_the_paper(rng) -> engine.Oscillator:
+    """The paper's belts at random velocities, in contact as in one of its classes."""
+    nu0, nu1 = rng.uniform(-0.8, 0.8, 2)
+    s0, s1 = np.sort(rng.uniform(-1.2, 1.2, 2))
+    style = rng.choice(["a", "b", "c", "d", "d"])
+    if style == "a":
+        return engine.Oscillator(0.5, (engine.Belt(nu0, PAPER),))
+    bounds = {"b": (inf, -inf), "c": (s0, s0), "d": (s1, s0)}[str(style)]
+    belts = (
+        engine.Belt(nu0, PAPER, 1.0, -inf, float(bounds[0])),
+        engine.Belt(nu1, PAPER, 1.0, float(bounds[1]), inf),
+    )
+    return engine.Oscillator(0.5, belts)
+
+
+def _with_edge_on_equilibrium(rng, osc: engine.Oscillator) -> engine.Oscillator:
+    places = [x for x in special_positions(osc) if abs(x) < 3]
+    edge = float(rng.choice(places))
+    first, *rest = osc.belts
+    first = replace(first, lower=-inf, upper=edge)
+    return replace(osc, belts=(first, *(replace(b, lower=edge, upper=inf) for b in rest)))
+
+
+# --- what is compared -----------------------------------------------------------------------------
+
+
+def differences(osc: engine.Oscillator, told: jb.Portrait) -> tuple[list[str], Counter]:
+    """What is wrong with the portrait of an oscillator, and how often what was set aside.
+
+    Starts are compared as far as the portrait goes, |x1| and |x2| < reach.
+    """
+    aside: Counter = Counter()
+    centres = [float(r.x1) for r in told.equilibria if abs(float(r.rate)) < CENTRE]
+    gaps = np.asarray(told.gaps).tolist()
+    of_centres = [gap for gap in gaps if any(abs(gap[0] - x1) < 1e-4 for x1 in centres)]
+    aside["gap at a Hopf point"] += len(of_centres)
+    wrong = [f"gap {gap}" for gap in gaps if gap not in of_centres]
+    wrong += [f"{one}" for one in told.separatrices if one.end == "unsettled" and one.stable]
+    ids = np.full((SIDE, SIDE), -1)
+    x1s, x2s = (np.linspace(*ends, SIDE) for ends in WINDOW)
+    for i, x1 in enumerate(x1s):
+        for j, x2 in enumerate(x2s):
+            if max(abs(x1), abs(x2)) > told.reach:
+                aside["beyond reach"] += 1
+                continue
+            seen = engine.attractor(osc, (x1, x2), t_max=PATIENCE)
+            if seen.kind == "undecided":
+                aside["goes to infinity" if seen.status == engine.NOT_FINITE else "undecided"] += 1
+                ids[i, j] = 1000 if seen.status == engine.NOT_FINITE and told.escapes else -1
+                continue
+            ids[i, j] = _number_of(seen, told)
+            if ids[i, j] < 0 and _is_tiny(seen, told):
+                aside["tiny"] += 1
+            elif ids[i, j] < 0:
+                wrong.append(f"from {(x1, x2)} missing: {seen}")
+    wrong += _invented(osc, told, set(ids.ravel().tolist()), aside)
+    if int(told.status) == jb.Status.INCOMPLETE and not len(told.gaps):
+        aside["node on an edge"] += 1
+    else:
+        wrong += _not_parted(told, ids, x1s, x2s)
+    wrong += [f"not unstable: {one}" for one in told.unstable if not _repels(osc, one, told)]
+    return wrong, aside
+
+
+def _number_of(seen: engine.Attractor, told: jb.Portrait) -> int:
+    """The number of an attractor in the portrait: cycles first, then equilibria; -1: none."""
+    if seen.kind == "cycle":
+        for number, cycle in enumerate(told.cycles):
+            mine = float(cycle.x1_min), float(cycle.x1_max), float(cycle.period)
+            if np.max(np.abs(np.array(mine) - [*seen.x1, seen.period])) < SAME:
+                return number
+        return -1
+    x1, number = seen.x1[0], -1
+    end = -inf
+    for row, rest in enumerate(told.equilibria):
+        holds = int(rest.kind) == jb.EquilibriumKind.SEGMENT
+        # Pieces of one segment are one.
+        if not (holds and abs(float(rest.x1_lower) - end) < 1e-12):
+            number = len(told.cycles) + row
+        end = float(rest.x1_upper) if holds else inf
+        inside = float(rest.x1_lower) - AT_REST <= x1 <= float(rest.x1_upper) + AT_REST
+        if inside and (holds or bool(rest.stable)):
+            return number
+    return -1
+
+
+def _is_tiny(seen: engine.Attractor, told: jb.Portrait) -> bool:
+    foci = np.asarray(told.equilibria.kind) == jb.EquilibriumKind.PSEUDO_FOCUS
+    at_focus = np.any(np.abs(np.asarray(told.equilibria.x1)[foci] - seen.x1[0]) < 1e-3)
+    return seen.x1[1] - seen.x1[0] < (TINY_AT_FOCUS if at_focus else TINY)
+
+
+def _invented(osc, told: jb.Portrait, seen: set[int], aside: Counter) -> list[str]:
+    wrong = []
+    for number, cycle in enumerate(told.cycles):
+        if number not in seen:
+            arcs = cycle.arcs
+            again = engine.attractor(osc, tuple(np.asarray(arcs.y)[0].tolist()), t_max=PATIENCE)
+            if again.kind == "undecided":
+                aside["undecided"] += 1
+            elif _number_of(again, told) == number:
+                aside["small basin"] += 1
+            else:
+                wrong.append(f"invented: {cycle}, engine {again}")
+    return wrong
+
+
+def _not_parted(told: jb.Portrait, ids, x1s, x2s) -> list[str]:
+    """Neighbours that lead to different attractors without a curve between them."""
+    curves = [np.asarray(one.ys) for one in told.separatrices if one.stable]
+    for cycle in told.unstable:
+        ys = np.asarray(cycle.sample(2000))
+        curves.append(np.concatenate([ys, ys[1:2]]))
+    wrong = []
+    for axis, along, across in ((0, x1s, x2s), (1, x2s, x1s)):
+        room = CHORD * (along[1] - along[0])
+        for k, level in enumerate(across):
+            row = ids[:, k] if axis == 0 else ids[k]
+            at = np.concatenate([_crossings(curve, axis, level) for curve in curves] or [[]])
+            for i in np.flatnonzero((row[1:] != row[:-1]) & (row[1:] >= 0) & (row[:-1] >= 0)):
+                low, high = along[i] - room, along[i + 1] + room
+                if axis == 1 and any(
+                    along[i] - 1e-9 <= v <= along[i + 1] + 1e-9 for v in _jumps(told)
+                ):
+                    continue
+                if not np.any((low <= at) & (at <= high)):
+                    ends = [(a, level) if axis == 0 else (level, a) for a in along[i : i + 2]]
+                    wrong.append(f"not parted: {ends}, {row[i]} and {row[i + 1]}")
+    return wrong
+
+
+def _jumps(told: jb.Portrait) -> list[float]:
+    """The boundaries of belts whose static limit exceeds mu(0), from which orbits leave upwards or
+    downwards: they part motions themselves."""
+    belts, omega = told.oscillator.belts, float(told.oscillator.omega)
+    return [
+        float(b.velocity) / omega
+        for b in belts
+        if float(b.friction.static) > float(b.friction.mu(jnp.zeros(()))) + 1e-12
+    ]
+
+
+def _crossings(curve: np.ndarray, axis: int, level: float) -> np.ndarray:
+    """Where a curve crosses a line of the grid; ends of it on the line count."""
+    other = curve[:, 1 - axis] - level
+    i = np.flatnonzero(other[1:] * other[:-1] <= 0)
+    share = other[i] / np.where(other[i] == other[i + 1], 1.0, other[i] - other[i + 1])
+    return curve[i, axis] + share * (curve[i + 1, axis] - curve[i, axis])
+
+
+def _repels(osc: engine.Oscillator, cycle: jb.Cycle, told: jb.Portrait) -> bool:
+    """Whether starts on both sides of its top leave a cycle, in one loop."""
+    top = float(cycle.x1_max)
+    tops = [float(one.x1_max) for one in (*told.cycles, *told.unstable) if one is not cycle]
+    nearest = min([1.0, *(abs(other - top) for other in tops)])
+    step = 1e-4 * min(nearest, float(cycle.x1_max - cycle.x1_min))
+    for side in (-step, step):
+        run = engine.simulate(osc, (top + side, 0.0), 5 * float(cycle.period) + 50, turns=True)
+        tops = run.y[(run.kind == engine.TURN) & (run.belt == 0), 0]
+        if not tops.size:
+            return run.status != engine.OK or side < 0
+        moved = (tops[0] - top) / side
+        if not moved > 1 + 0.3 * min(float(cycle.multiplier) - 1, 1.0):
+            return False
+    return True
+
+
+def run(seed: int, runs: int, show: int = 20) -> int:
+    """Compare so many random portraits, and print what differs."""
+    rng = np.random.default_rng(seed)
+    began, spent, shown = time.monotonic(), 0.0, 0
+    counts, aside, bad = Counter(), Counter(), Counter()
+    for _ in range(runs):
+        kind, osc = random_oscillator(rng)
+        before = time.monotonic()
+        told = jb.portrait(package.oscillator(osc))
+        spent += time.monotonic() - before
+        wrong, left = differences(osc, told)
+        counts[kind] += 1
+        counts["attracting"] += len(told.cycles)
+        counts["unstable"] += len(told.unstable)
+        counts["separatrices"] += len(told.separatrices)
+        aside += left
+        if wrong:
+            bad[kind] += 1
+            if shown < show:
+                shown += 1
+                print(f"\n{kind}: {package.oscillator(osc)!r}")
+                print("\n".join(wrong[:6]), told, sep="\n", flush=True)
+    print(f"seed {seed}, {time.monotonic() - began:.0f} s, {spent / runs:.3f} s a portrait")
+    print(f"{dict(counts)}, set aside: {dict(aside)}, wrong: {dict(bad)}")
+    return int(bool(bad))

@@ -1,0 +1,222 @@
+"""Portraits: closed forms, published values, SciPy backwards in time, and the independent engine.
+
+The campaign is `python -m tests.campaign portraits`; what it found is in docs/checked.md.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import oracle
+import pytest
+from scipy.integrate import solve_ivp
+
+import jaxbelt as jb
+from tests.campaign import engine, package, portraits
+from tests.campaign.cases import PAPER
+
+#: Two attracting cycles with one sequence of events, around two of three foci.
+TWO_CYCLES = (-0.06341, 0.5073, -0.49694, 0.61855)
+
+
+def engine_class_d(nu0, nu1, sigma0, sigma1, damping=0.5) -> engine.Oscillator:
+    belts = (
+        engine.Belt(nu0, PAPER, 1.0, -np.inf, sigma1),
+        engine.Belt(nu1, PAPER, 1.0, sigma0, np.inf),
+    )
+    return engine.Oscillator(damping, belts)
+
+
+@pytest.fixture(scope="module")
+def class_d() -> jb.Portrait:
+    return jb.portrait(jb.presets.class_d(*TWO_CYCLES))
+
+
+def test_attractors_are_told_apart_by_where_they_are(class_d):
+    assert int(class_d.status) == jb.Status.OK and not len(class_d.gaps)
+    left, right = class_d.cycles
+    assert left.signature == right.signature
+    # The periods are those of another program's cycles, to all the digits that it gave.
+    assert float(left.period) == pytest.approx(9.9148027860, abs=1e-9)
+    assert float(right.period) == pytest.approx(10.9019400715, abs=1e-9)
+    assert class_d.unstable == () and not class_d.escapes
+
+
+def test_saddles_and_their_separatrices(class_d):
+    kinds = [jb.EquilibriumKind(int(kind)).name for kind in class_d.equilibria.kind]
+    assert kinds == ["FIXED_POINT", "SADDLE", "FIXED_POINT", "SADDLE", "FIXED_POINT"]
+    points = [tuple(np.asarray(one.point)) for one in class_d.separatrices]
+    assert points == [(-0.49694, 0.0)] * 4 + [(0.61855, 0.0)] * 4
+    ends = {(one.point[0].item(), one.side, one.end, one.to) for one in class_d.separatrices}
+    assert (-0.49694, "left", "cycle", 0) in ends and (-0.49694, "right", "cycle", 1) in ends
+    for one in class_d.separatrices:
+        place = -1 if one.stable else 0
+        assert one.ts[place] == 0 and tuple(np.asarray(one.ys)[place]) == tuple(one.point)
+        assert np.all(np.diff(one.ts) >= 0)
+
+
+def test_separatrices_are_orbits_to_1e_9(class_d):
+    """The engine, from samples some loops before the saddle, comes to it; forwards it follows."""
+    osc = engine_class_d(*TWO_CYCLES)
+    for one in class_d.separatrices:
+        ts, ys = np.asarray(one.ts), np.asarray(one.ys)
+        if one.stable:
+            # Errors grow backwards like exp(damping/2 time) or less, and shrink as much forwards.
+            start = np.searchsorted(ts, -6.0)
+            run = engine.simulate(osc, ys[start], -ts[start], capture=False)
+            assert np.abs(np.array(run.y_end) - ys[-1]).max() < 1e-9
+        else:
+            i = np.searchsorted(ts, 3.0)
+            start = (np.nextafter(ys[0, 0], -9 if one.side == "left" else 9), 0.0)
+            run = engine.simulate(osc, start, ts[i], capture=False)
+            assert np.abs(np.array(run.y_end) - ys[i]).max() < 1e-9
+
+
+def test_table_and_text_tell_everything(class_d):
+    rows = class_d.table()
+    assert [row["what"] for row in rows] == ["equilibrium"] * 5 + ["cycle"] * 2 + ["separatrix"] * 8
+    assert rows[1]["kind"] == "SADDLE" and not rows[1]["stable"] and rows[1]["rate"] == np.inf
+    assert rows[5]["period"] == float(class_d.cycles[0].period)
+    text = repr(class_d)
+    assert "2 attracting and 0 unstable cycles, 8 separatrices" in text and "SADDLE" in text
+
+
+def test_picture_shows_everything(class_d):
+    ax = class_d.plot()
+    labels = [line.get_label() for line in ax.get_lines()]
+    assert labels.count("stable cycle") == 2 and labels.count("saddle") == 2
+    assert labels.count("stable separatrix") == labels.count("unstable separatrix") == 4
+    plt.close("all")
+
+
+def test_bad_arguments_are_refused_by_name():
+    with pytest.raises(ValueError, match="damping must be finite"):
+        jb.portrait(eqx.tree_at(lambda o: o.damping, jb.presets.class_a(0.3), jnp.array(jnp.nan)))
+    with pytest.raises(ValueError, match="osc must be known"):
+        jax.jit(lambda nu: jb.portrait(jb.presets.class_b(nu, 0.35)).reach)(0.2)
+
+
+def test_saddle_is_an_equilibrium_where_nothing_rests():
+    """Class (c): a_L = 0.7 nu-pull - sigma and so on, with mu(0.3) = 0.7."""
+    osc = jb.presets.class_c(-0.3, 0.3, -0.2)
+    points = jb.equilibria(osc)
+    assert [int(kind) for kind in points.kind] == [1, jb.EquilibriumKind.SADDLE, 1]
+    assert np.asarray(points.x1) == pytest.approx([-0.7, -0.2, 0.7], abs=1e-15)
+    assert points.stable.tolist() == [True, False, True] and points.rate[1] == np.inf
+    # Only where the edge pushes away to both sides.
+    assert not np.any(jb.equilibria(jb.presets.class_c(-0.3, 0.3, 0.8)).kind == 4)
+
+
+# --- slow: other programs, the engine ---------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("zeta", "amplitude"), [(-0.1, 7.739495458), (-0.2, 3.917652434)])
+def test_unstable_cycle_that_bounds_what_goes_to_infinity(zeta, amplitude):
+    osc = jb.Oscillator(zeta, jb.presets.class_a(0.3).belts)
+    found = jb.portrait(osc)
+    (cycle,) = found.unstable
+    assert found.escapes and float(jb.amplitude(cycle)) == pytest.approx(amplitude, abs=1e-9)
+    # Backwards it attracts: SciPy, from a tenth farther in, and out.
+    for start in (0.9, 1.1):
+        top = _top_backwards(zeta, start * float(cycle.x1_max), loops=90)
+        assert top == pytest.approx(float(cycle.x1_max), abs=1e-9)
+
+
+def _top_backwards(zeta: float, x1: float, loops: int) -> float:
+    """x1 of the top after so many loops of class (a) at nu0 = 0.3 in reversed time, none of which
+    meets the boundary where it sticks; v = -x2."""
+    mu = oracle.conti(1.0, 0.6, 10.0)[0]
+
+    def turns(t, y):
+        return y[1]
+
+    def meets(t, y):
+        return y[1] + 0.3
+
+    y, tops = [x1, 0.0], 0
+    while tops < loops:
+        # r = 0.3 + v; what is beyond a zero of v or r is the next piece.
+        v_sign = np.sign(y[1]) or -np.sign(y[0])
+        sign = 1.0 if y[1] > -0.3 or (y[1] == -0.3 and y[0] < 0) else -1.0
+        turns.terminal = meets.terminal = True
+        turns.direction, meets.direction = -v_sign, -sign
+
+        def field(t, y, sign=sign):
+            return y[1], -y[0] + zeta * y[1] + sign * mu(sign * (0.3 + y[1]))
+
+        run = solve_ivp(field, (0, 50), y, "DOP853", rtol=1e-13, atol=1e-13, events=(turns, meets))
+        y = run.y[:, -1].tolist()
+        if run.t_events[0].size:
+            y[1] = 0.0
+            tops += v_sign > 0
+        else:
+            y[1] = -0.3
+    return y[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", portraits.KINDS)
+def test_portraits_are_the_engines(kind):
+    """Attractors from 121 starts; curves between neighbours that lead to different ones."""
+    rng = np.random.default_rng(portraits.KINDS.index(kind))
+    done = 0
+    while done < 4:
+        what, osc = portraits.random_oscillator(rng)
+        if what == kind:
+            done += 1
+            wrong, _ = portraits.differences(osc, jb.portrait(package.oscillator(osc)))
+            assert wrong == []
+
+
+@pytest.mark.slow
+def test_orbits_that_touch_a_boundary_with_a_jump_bound_basins():
+    """Coulomb's law with a static limit above the kinetic one."""
+    law = ("coulomb", 1.2, 0.6)
+    osc = engine.Oscillator(
+        0.25,
+        (
+            engine.Belt(0.2, law, 1.5, -np.inf, -1.4),
+            engine.Belt(-0.2, ("coulomb", 1.0, 0.5), 1.5, -1.4, np.inf),
+        ),
+        0.5,
+    )
+    told = jb.portrait(package.oscillator(osc))
+    (one,) = told.separatrices
+    # needed = -x1 - zeta x2 balances the kinetic friction, -u0 0.5, at x2 = nu/omega.
+    assert np.asarray(one.point) == pytest.approx([-0.75 + 0.1, -0.4], abs=1e-14)
+    assert portraits.differences(osc, told)[0] == []
+
+
+@pytest.mark.slow
+def test_cycle_whose_multiplier_is_1e20_is_solved_for_backwards():
+    """It passes along the boundary of a slow belt. Starts on its two sides go to two cycles."""
+    belts = (
+        engine.Belt(
+            -0.0359699775761,
+            ("conti", 1.23834266023, 0.543764190981, 11.4523662569, 0.0985743864923),
+            1.52923444492,
+            0.68989911476,
+            np.inf,
+        ),
+    )
+    osc = engine.Oscillator(-0.368460830234, belts, 0.861998498696)
+    told = jb.portrait(package.oscillator(osc))
+    (cycle,) = told.unstable
+    assert float(cycle.multiplier) > 1e19
+    top = float(cycle.x1_max)
+    inside, outside = (engine.attractor(osc, (top + d, 0.0)) for d in (-1e-7, 1e-7))
+    assert inside.x1[1] < top < outside.x1[1]
+    ys = np.asarray(cycle.sample(400))
+    assert ys[0] == pytest.approx([top, 0.0], abs=1e-9) and ys[-1] == pytest.approx(ys[0], abs=1e-9)
+
+
+@pytest.mark.slow
+def test_continuum_of_closed_orbits_is_a_gap():
+    """Without damping, and with Coulomb's law, all orbits that do not reach the belt are closed."""
+    told = jb.portrait(jb.Oscillator(0.0, (jb.Belt(0.4, jb.Coulomb(1.0, 0.6)),)))
+    assert int(told.status) == jb.Status.INCOMPLETE
+    ((low, high),) = np.asarray(told.gaps)
+    # Circles around (0.6, 0) with radii up to 0.4; the one that sticks is from 1.0 onwards.
+    assert low == pytest.approx(0.6, abs=1e-3) and high == pytest.approx(1.0, abs=1e-2)
