@@ -16,10 +16,7 @@ from jaxtyping import Array
 from ..cycles.orbits import Orbit, before_stick_ends, follow, last_loop, loop_of
 from ..cycles.shooting import Loop, following_codes
 from ..model.equilibria import Equilibria
-from ..model.modes import (
-    mode_acceleration,
-    mode_of,
-)
+from ..model.modes import STUCK, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit

@@ -64,7 +64,7 @@ MAP_ERROR = 3e-7
 #: Cycles with a multiplier as near to 1 are parts of a continuum of closed orbits.
 NEUTRAL = 1e-9
 #: Intervals of tops as short as this, relative to where they are, are rounding.
-ROUNDING = 1e-12
+NARROWEST = 1e-12
 #: The largest distance from the origin that is looked at, where no bound is known.
 FARTHEST = 1e4
 
@@ -167,7 +167,7 @@ class Returns:
         pulls = np.asarray(side_pulls(self.osc, jax.device_put(0.5 * (ends[1:] + ends[:-1])))[1])
         found: list[tuple[float, float]] = []
         for low, high, pull in zip(ends[:-1].tolist(), ends[1:].tolist(), pulls, strict=True):
-            if not pull < 0 or high - low < ROUNDING * (1 + abs(low)):
+            if not pull < 0 or high - low < NARROWEST * (1 + abs(low)):
                 continue
             goes_on = found and found[-1][1] == low and self._passes(low)
             found[-1:] = [(found[-1][0], high)] if goes_on else [*found[-1:], (low, high)]

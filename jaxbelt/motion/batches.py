@@ -66,16 +66,16 @@ def blank_book(osc, batch: Batch) -> Round:
     one = jnp.ones(batch.width)
 
     def kept(osc):
-        lanes = _begun(osc, (one, one), one[0], batch)
+        lanes = _first_lanes(osc, (one, one), one[0], batch)
         return one_round(osc, lanes, one, one, one[0], one[0], edges=batch.edges)[1]
 
     shapes = jax.eval_shape(kept, osc)
     return jax.tree.map(lambda s: jnp.zeros((batch.rounds, *s.shape), s.dtype), shapes)
 
 
-def _begun(osc, y0, rtol, batch: Batch) -> Lanes:
-    run = jnp.zeros(batch.width, jnp.int32)
-    return lanes_at_start(osc, run, *y0, jnp.zeros((), jnp.int32), rtol, edges=batch.edges)
+def _first_lanes(osc, y0, rtol, batch: Batch) -> Lanes:
+    run, (x1, x2) = jnp.zeros(batch.width, jnp.int32), y0
+    return lanes_at_start(osc, run, x1, x2, jnp.zeros((), jnp.int32), rtol, edges=batch.edges)
 
 
 def followed_together(
@@ -88,7 +88,7 @@ def followed_together(
     """
     one = jnp.ones(batch.width)
     tolerances = [jnp.maximum(SHARE * tol, LEAST_TOLERANCE) for tol in (rtol, atol)]
-    lanes = _begun(osc, y0, tolerances[0], batch)
+    lanes = _first_lanes(osc, y0, tolerances[0], batch)
     lanes, book, used = _written(osc, lanes, one, span, tolerances, batch, book)
     inside = (jnp.arange(batch.rounds) < used)[:, None]
     arcs, fits = _arcs(book, inside, batch)
