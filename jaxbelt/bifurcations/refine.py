@@ -21,6 +21,8 @@ from .conditions import AbstractCondition, BifurcationPoint
 from .path import ParameterPath
 from .scan import search
 
+#: Points found in two ways are one if they are no further apart.
+SAME_POINT = 1e-9
 #: Where Newton's method ends so near to the guess, there is no look for a nearer point; nor where
 #: it ends so near, if its first step was no longer than that. Of two thousand guesses three led
 #: beyond the next point, to others 0.018 and 0.029 away, after first steps of 0.4 and 0.5, and to a
@@ -83,7 +85,8 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         found = search(path, INTERVALS, near=1.0)
         of_kind = [one for one in found if one.condition == condition and one.status == Status.OK]
         if of_kind:
-            return min([*of_kind, point], key=lambda one: _away(one, guess))
+            nearest = min(of_kind, key=lambda one: _away(one, guess))
+            return nearest if _away(nearest, guess) < away - SAME_POINT else point
         if away <= reach:
             break
     return point
