@@ -274,7 +274,8 @@ def test_transformations_compose_in_any_order(name):
 
     rows = jnp.array([[-0.3, 2.5], [-0.2, 2.0], [0.4, -1.0]])
     alone = jnp.stack([jax.jit(jax.jacfwd(loss))(row) for row in rows])
-    np.testing.assert_allclose(COMPOSITIONS[name](loss)(rows), alone, rtol=1e-10, atol=1e-11)
+    # In a batch the arcs are cut at other places; derivatives along an arc are right to 1e-8.
+    np.testing.assert_allclose(COMPOSITIONS[name](loss)(rows), alone, rtol=1e-8, atol=1e-9)
 
 
 def test_a_stick_phase_forgets_the_start():
