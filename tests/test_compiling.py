@@ -7,6 +7,7 @@ import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
 from jax import lax
 
 import jaxbelt as jb
@@ -51,17 +52,8 @@ def test_each_is_vmap():
 def test_runs_with_other_numbers_of_events_compile_nothing():
     osc = jb.presets.class_b(0.45, 0.35)
     first = jb.simulate(osc, (3.0, 0.0), 40.0, max_segments=4096)  # as in tests/test_simulate.py
-    compiled = []
-
-    def listen(name, *_, **__):
-        if name.endswith("backend_compile_duration"):
-            compiled.append(name)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with compilations() as compiled:
         second = jb.simulate(osc, (3.0, 0.0), 30.0, max_segments=4096)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     assert second.events.t.size < first.events.t.size
     assert compiled == []
 
@@ -71,23 +63,14 @@ class Constant(jb.Coulomb):
 
 
 def test_a_sweep_compiles_its_kernel_once():
-    compiled = []
-
-    def listen(name, *_, fun_name="", **__):
-        if name.endswith("backend_compile_duration"):
-            compiled.append(fun_name)
-
     law = Constant(1.0, 0.8)
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with compilations() as compiled:
         jb.sweep(
             lambda nu: jb.Oscillator(0.1, (jb.Belt(nu, law, load=1.0),)),
             {"nu": np.linspace(0.1, 0.5, 5)},
             y0=(1.0, 0.0),
             t1=20.0,
         )
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     assert sum("advance" in name for name in compiled) == 1
 
 

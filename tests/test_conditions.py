@@ -9,6 +9,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from compilations import compilations
 from scipy.optimize import brentq
 
 import jaxbelt as jb
@@ -117,23 +118,15 @@ def test_numbers_in_conditions_are_data():
         jb.refine(PeriodIs(8.0), osc, where=nu0)
         jb.refine(jb.NonsmoothFold(1), osc, where=nu0)
         jb.refine(jb.SuddenSliding(0), osc, where=nu0)
+        jb.refine(jb.Hopf(), osc, where=zeta)  # what the second look meets there
 
     osc = jb.presets.class_b(0.5, 0.35)
     look(osc)
-    compiled = []
-
-    def listen(event: str, duration_secs: float, **_):
-        if event.endswith("backend_compile_duration"):
-            compiled.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with compilations() as compiled:
         jb.refine(PeriodIs(7.0), osc, where=zeta)
         jb.refine(jb.NonsmoothFold(0), osc, where=zeta)
         jb.refine(jb.GrazingSliding(1), osc, where=nu0)
         jb.refine(jb.SuddenSliding(1), osc, where=nu0)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     assert compiled == []
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from compilations import compilations
 
 import jaxbelt as jb
 from jaxbelt import Status
@@ -274,26 +275,20 @@ def test_another_function_compiles_nothing():
         point = jb.refine(jb.Hopf(), lambda s: make(1.01 * s), at=at)
         span = ((at - 0.1, at + 0.1), (0.3, 0.4))
         jb.bifurcation_curve(
-            point, lambda p, q: vary(make(1.01 * p), q9, jnp.asarray(q)[None]), span, max_points=3
+            point,
+            lambda p, q: vary(make(1.01 * p), velocity, jnp.asarray(q)[None]),
+            span,
+            max_points=3,
         )
 
     def looks(factor):
         look(lambda s: jb.presets.class_b(factor * s, 0.35), 0.27 / factor)
         look(lambda s: jb.presets.class_b(factor * s**2, 0.35), 0.52 / math.sqrt(factor))
 
-    q9 = leaf_index(jb.presets.class_b(0.1, 0.2), lambda osc: osc.belts[1].velocity)
+    velocity = leaf_index(jb.presets.class_b(0.1, 0.2), lambda osc: osc.belts[1].velocity)
     looks(1.0)
-    compiled = []
-
-    def listen(event: str, duration_secs: float, **_):
-        if event.endswith("backend_compile_duration"):
-            compiled.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with compilations() as compiled:
         looks(1.2)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     assert compiled == []
 
 

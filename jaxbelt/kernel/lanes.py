@@ -82,6 +82,11 @@ def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
     return jax.tree.map(pick, on_true, on_false)
 
 
+def are_finite(lanes: Lanes) -> Array:
+    """The lanes whose state and x2' are numbers."""
+    return jnp.isfinite(lanes.x1) & jnp.isfinite(lanes.x2) & jnp.isfinite(lanes.a)
+
+
 def code_of(mode: Mode) -> Array:
     """A mode as one number, whose digits to the base 5 are its contact codes."""
     total = jnp.zeros(())

@@ -13,8 +13,9 @@ from .events import pass_events
 from .lanes import Lanes, code_of
 from .step import STEP_SAFETY, attempt, first_step, take_step, window_of
 
-#: Steps of a round that is written down.
-LOGGED_STEPS = 4
+#: Steps between two looks at the events: these cost about as much as a step, and a lane that waits
+#: for them is idle.
+STEPS_PER_ROUND = 4
 
 
 def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, *, edges: bool) -> Lanes:
@@ -72,7 +73,7 @@ class Round(eqx.Module):
 
 
 def one_round(osc: Oscillator, lanes: Lanes, one, t1, rtol, atol, *, edges: bool):
-    """The lanes past the events and LOGGED_STEPS steps further, and the `Round`."""
+    """The lanes past the events and STEPS_PER_ROUND steps further, and the `Round`."""
     lanes, passage = pass_events(osc, lanes, t1, rtol, edges=edges, captures=True)
     window = window_of(osc, lanes, edges=edges, extrema=None)
 
@@ -81,8 +82,8 @@ def one_round(osc: Oscillator, lanes: Lanes, one, t1, rtol, atol, *, edges: bool
         return lanes, (lanes.t, lanes.x1, lanes.x2)
 
     first = lanes.t, lanes.x1, lanes.x2
-    after, rest = lax.scan(step, lanes, length=LOGGED_STEPS)
-    ts, x1s, x2s = ((a, *(b[i] for i in range(LOGGED_STEPS))) for a, b in zip(first, rest))
+    after, rest = lax.scan(step, lanes, length=STEPS_PER_ROUND)
+    ts, x1s, x2s = ((a, *(b[i] for i in range(STEPS_PER_ROUND))) for a, b in zip(first, rest))
     kept = Round(
         t=passage.t,
         x1=passage.x1,

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..kernel.lanes import Lanes, codes_in
-from ..kernel.rounds import LOGGED_STEPS, Round, flown_on, lanes_at_start, one_round
+from ..kernel.lanes import Lanes, are_finite, codes_in
+from ..kernel.rounds import STEPS_PER_ROUND, Round, flown_on, lanes_at_start, one_round
 from ..model.events import event_between
 from ..model.modes import Mode
 from ..model.oscillator import Oscillator
@@ -26,6 +26,9 @@ from ..results import Status
 
 #: Lanes of a group, at most, and rounds that one piece of machine code makes.
 LANES_AT_ONCE, PAGE = 128, 8
+#: Rounds of all lanes for which a book has room, of 180 bytes each; a group of fewer lanes where it
+#: has to have more for each.
+BOOK = 2**20
 #: The tolerance of a lane's steps over that of the run. A run by itself is far more accurate than
 #: its tolerance, and is to be the same in a batch; at order eight a hundred times the accuracy
 #: takes 1.8 times the steps.
@@ -51,12 +54,13 @@ class Batch(NamedTuple):
 class Group(NamedTuple):
     """The runs of a group, arrays [.., lanes].
 
-    lanes: at the end; arcs: columns of `runs.ArcRecord` by name, [rows, lanes]; samples: [samples,
-    2, lanes]; alone: runs that have to be followed by themselves.
+    lanes: at the end; arcs: columns of `runs.ArcRecord` by name, [rows, lanes]; used: which of the
+    rows are; samples: [samples, 2, lanes]; alone: runs that have to be followed by themselves.
     """
 
     lanes: Lanes
     arcs: dict[str, Any]
+    used: Array
     samples: Array
     alone: Array
 
@@ -89,17 +93,13 @@ def followed_together(
     one = jnp.ones(batch.width)
     tolerances = [jnp.maximum(SHARE * tol, LEAST_TOLERANCE) for tol in (rtol, atol)]
     lanes = _first_lanes(osc, y0, tolerances[0], batch)
-    lanes, book, used = _written(osc, lanes, one, span, tolerances, batch, book)
-    inside = (jnp.arange(batch.rounds) < used)[:, None]
-    arcs, fits = _arcs(book, inside, batch)
+    lanes, book, rounds = _written(osc, lanes, one, span, tolerances, batch, book)
+    inside = (jnp.arange(batch.rounds) < rounds)[:, None]
+    arcs, used, fits = _arcs(book, inside, batch)
     samples = _samples(osc, book, inside, one, ts, batch)
     begins_nowhere = lanes.status == Status.NOT_FINITE.value
-    known = lanes.done & fits & ~jnp.any(book.rests & inside, axis=0) & ~_is_lost(lanes)
-    return Group(lanes, arcs, samples, ~known & ~begins_nowhere), book
-
-
-def _is_lost(lanes: Lanes) -> Array:
-    return ~(jnp.isfinite(lanes.x1) & jnp.isfinite(lanes.x2) & jnp.isfinite(lanes.a))
+    known = lanes.done & fits & ~jnp.any(book.rests & inside, axis=0) & are_finite(lanes)
+    return Group(lanes, arcs, used, samples, ~known & ~begins_nowhere), book
 
 
 def _written(osc, lanes, one, span, tolerances, batch: Batch, book) -> tuple[Lanes, Round, Array]:
@@ -115,7 +115,7 @@ def _written(osc, lanes, one, span, tolerances, batch: Batch, book) -> tuple[Lan
 
     def unfinished(state):
         lanes, _, number = state
-        return jnp.any(~lanes.done & ~_is_lost(lanes)) & (number < batch.rounds)
+        return jnp.any(~lanes.done & are_finite(lanes)) & (number < batch.rounds)
 
     def turn(state):
         lanes, book, number = state
@@ -126,8 +126,8 @@ def _written(osc, lanes, one, span, tolerances, batch: Batch, book) -> tuple[Lan
     return lax.while_loop(unfinished, turn, (lanes, book, jnp.asarray(0)))
 
 
-def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Array]:
-    """The arcs of the lanes, and whether there was room for them.
+def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Array, Array]:
+    """The arcs of the lanes, which rows are used, and whether there was room for all.
 
     In each round there may be two: the phase in which a lane sticks, and its steps.
     """
@@ -172,9 +172,8 @@ def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Arr
         fired=jnp.where(fires, at(book.number, after), -1),
         in_time=(wanted[:, None] == total[None]) & ~happens,
         captured=fires & at(book.captured, after),
-        used=there,
     )
-    return arcs, (total > 0) & (total <= batch.rows)
+    return arcs, there, (total > 0) & (total <= batch.rows)
 
 
 def _searched(columns: Array, values: Array, side: str) -> Array:
@@ -191,9 +190,9 @@ def _samples(osc, book: Round, inside: Array, one, ts, batch: Batch) -> Array:
         return jnp.stack(columns, axis=1).reshape(-1, batch.width)
 
     begins, ends = rows(book.t, *book.ts[:-1]), rows(*book.ts)
-    known = jnp.repeat(inside, LOGGED_STEPS + 1, axis=0)
+    known = jnp.repeat(inside, STEPS_PER_ROUND + 1, axis=0)
     places = jnp.maximum(_searched(jnp.where(known, begins, jnp.inf), ts, "right") - 1, 0)
-    row, is_first = places // (LOGGED_STEPS + 1), places % (LOGGED_STEPS + 1) == 0
+    row, is_first = places // (STEPS_PER_ROUND + 1), places % (STEPS_PER_ROUND + 1) == 0
 
     def at(column, places=places):
         return jnp.take_along_axis(column, places, axis=0)

@@ -33,7 +33,7 @@ from ..model.oscillator import Oscillator
 from ..numerics.compiling import any_lane, in_turn, of_lane, one_kernel, with_batches
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
-from .batches import LANES_AT_ONCE, PAGE, Batch, Group, blank_book, followed_together
+from .batches import BOOK, LANES_AT_ONCE, PAGE, Batch, Group, blank_book, followed_together
 from .integrators import Adaptive, State
 from .sampling import arcs_at, sampled
 from .sensitivities import Arc, in_one_row, sensitivities, split, with_derivatives
@@ -221,9 +221,10 @@ def _together(lane, axis_size, batched, osc, y0, t0, t1, ts, rtol, atol, *, rule
     args = osc, y0, t0, t1, ts, rtol, atol
     one, rows = of_lane(lane, batched, args)
     shapes = jax.eval_shape(one, [leaf[0] for leaf in rows])
-    width = min(LANES_AT_ONCE, -(-axis_size // 8) * 8)
     room = shapes[1].t.shape[0]
-    batch = Batch(width, -(-room // PAGE) * PAGE, room, len(osc.belts), rules.edges)
+    rounds = -(-room // PAGE) * PAGE
+    width = min(LANES_AT_ONCE, -(-axis_size // 8) * 8, max(8, BOOK // rounds))
+    batch = Batch(width, rounds, room, len(osc.belts), rules.edges)
     groups = -(-axis_size // width)
 
     def by_group(leaf):
@@ -234,11 +235,12 @@ def _together(lane, axis_size, batched, osc, y0, t0, t1, ts, rtol, atol, *, rule
     def spread(leaf, flag):
         return leaf if flag else jnp.broadcast_to(leaf, (axis_size, *jnp.shape(leaf)))
 
-    flags = batched
-    y0, t0, t1, ts = (spread(leaf, flag) for leaf, flag in zip(args[1:5], flags[1:5], strict=True))
+    y0, t0, t1, ts = (
+        spread(leaf, flag) for leaf, flag in zip(args[1:5], batched[1:5], strict=True)
+    )
     # One tolerance for all: the smallest.
     rtol, atol = jnp.min(rtol), jnp.min(atol)
-    of_group, leaves = of_lane(lambda osc: osc, (flags[0],), (osc,))
+    of_group, leaves = of_lane(lambda osc: osc, (batched[0],), (osc,))
 
     def group(book, rows):
         leaves, y0, t0, t1, ts = rows
@@ -262,14 +264,13 @@ def _together(lane, axis_size, batched, osc, y0, t0, t1, ts, rtol, atol, *, rule
 
         return lax.map(turn, (alone, found, rows))
 
-    return lax.cond(jnp.any(alone), again, lambda: found)
+    # A true branch in a batch of batches, too.
+    return lax.cond(any_lane(jnp.any(alone)), again, lambda: found)
 
 
 def _as_runs(group: Group, t0: Array, t1: Array, shapes) -> tuple[Any, Array]:
     """The runs of a group as `arcs_of_run` gives them, [lanes, ..], and which to follow alone."""
-    lanes, arcs = group.lanes, group.arcs
-    used = arcs.pop("used")
-    t0_row = t0[None]
+    lanes, arcs, used = group.lanes, group.arcs, group.used
 
     def column(name, blank):
         value = (
@@ -282,7 +283,7 @@ def _as_runs(group: Group, t0: Array, t1: Array, shapes) -> tuple[Any, Array]:
     blank = _unused(shapes[1].mode.shape[1])
     records = {name: column(name, getattr(blank, name)) for name in arcs}
     for name in ("t", "event_t"):
-        records[name] = records[name] + t0_row
+        records[name] = records[name] + t0[None]
     # As in a run by itself: at t1 itself.
     is_end = used & arcs["in_time"]
     records["event_t"] = jnp.where(is_end, t1[None], records["event_t"])

@@ -22,16 +22,16 @@ from jax import lax
 from jaxtyping import Array
 
 from ..kernel.events import pass_events
-from ..kernel.lanes import Lanes, Program, choose
-from ..kernel.rounds import lanes_at_start
+from ..kernel.lanes import Lanes, Program, are_finite, choose
+from ..kernel.rounds import STEPS_PER_ROUND, lanes_at_start
 from ..kernel.step import take_step, window_of
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import one_kernel
 from ..results import Status
 
-#: Steps between two looks at the events, and looks between two refills: events and refills cost
-#: about as much as a step, and a lane that waits for them is idle.
-STEPS_PER_ROUND, ROUNDS_PER_PASS = 4, 4
+#: Looks at the events between two refills: a refill costs about as much as a step, and a lane that
+#: waits for one is idle.
+ROUNDS_PER_PASS = 4
 
 
 def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator:
@@ -352,7 +352,7 @@ def _rank(flags: Array) -> Array:
 
 def _give_up(lanes: Lanes, passes, limit) -> Lanes:
     """End runs that took too many steps, or whose state is not finite."""
-    finite = jnp.isfinite(lanes.x1) & jnp.isfinite(lanes.x2) & jnp.isfinite(lanes.a)
+    finite = are_finite(lanes)
     lost = ~lanes.done & (~finite | (passes - lanes.begun > limit))
     reason = jnp.where(finite, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
     status = jnp.where(lost, reason.astype(lanes.status.dtype), lanes.status)

@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Array
 
 from ..kernel.lanes import Program
+from ..kernel.rounds import STEPS_PER_ROUND
 from ..numerics.compiling import wide
 from .queue import (
     ROUNDS_PER_PASS,
-    STEPS_PER_ROUND,
     Call,
     advance,
     advance_with_derivatives,
