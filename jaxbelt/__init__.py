@@ -19,7 +19,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
-    bifurcations/   path scan refine curves diagrams switch_folds
+    bifurcations/   path scan refine curves regions diagrams switch_folds
     inverse/        selection record fit design
     plotting/       style phase diagrams sweeps model draw
     paper           the paper's table and figures
@@ -35,15 +35,11 @@ from . import presets
 from .bifurcations.conditions import BifurcationPoint, SpecialPoint
 from .bifurcations.crossings import CrossingSliding, SlidingExchange
 from .bifurcations.curves import BifurcationCurve, bifurcation_curve
-from .bifurcations.diagrams import (
-    BifurcationDiagram,
-    RegionMap,
-    bifurcation_diagram,
-    region_map,
-)
+from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
 from .bifurcations.edges import CornerCollision, GrazingEdge
 from .bifurcations.folds import FoldOfCycles
 from .bifurcations.refine import refine
+from .bifurcations.regions import RegionMap, region_map
 from .bifurcations.rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
 from .bifurcations.scan import scan
 from .bifurcations.tangencies import GrazingSliding, NonsmoothFold

@@ -19,7 +19,8 @@ import numpy as np
 
 from .bifurcations.conditions import AbstractCondition
 from .bifurcations.crossings import SlidingExchange
-from .bifurcations.diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
+from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
+from .bifurcations.regions import RegionMap, region_map
 from .bifurcations.rests import Hopf, SuddenSliding
 from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, unstable_cycle

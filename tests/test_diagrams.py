@@ -7,8 +7,8 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import EventKind
-from jaxbelt.bifurcations.diagrams import region_name
 from jaxbelt.bifurcations.labels import Label
+from jaxbelt.bifurcations.regions import region_name
 
 
 def nu0(osc):

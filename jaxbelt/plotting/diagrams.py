@@ -17,7 +17,8 @@ from matplotlib.patheffects import withStroke
 from scipy import ndimage
 
 from ..bifurcations.curves import BifurcationCurve
-from ..bifurcations.diagrams import BifurcationDiagram, Branch, RegionMap, interior
+from ..bifurcations.diagrams import BifurcationDiagram, Branch
+from ..bifurcations.regions import RegionMap, interior
 from ..cycles.cycle import Cycle
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.oscillator import Oscillator

@@ -5,7 +5,8 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from ..bifurcations.curves import BifurcationCurve
-from ..bifurcations.diagrams import BifurcationDiagram, RegionMap
+from ..bifurcations.diagrams import BifurcationDiagram
+from ..bifurcations.regions import RegionMap
 from ..cycles.portrait import Portrait
 from .diagrams import plot_curves, plot_diagram, plot_region_map
 from .phase import plot_portrait
