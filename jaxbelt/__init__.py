@@ -9,6 +9,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     results         status codes and what to do about them
     numerics/       compiling
     checks          arguments, checked at the public edge
+    tables          results as tables
     numerics/       derivatives extrapolation newton continuation roots
     model/          friction oscillator parameters variations modes events equilibria
     presets         the published systems
@@ -18,7 +19,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     cycles/         backwards returns separatrices portrait
     sweeps/         marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
-    bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
+    bifurcations/   special labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   path scan refine curves regions diagrams switch_folds
     inverse/        selection record fit design
     plotting/       style phase diagrams sweeps model draw
@@ -32,7 +33,7 @@ import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 from . import presets
-from .bifurcations.conditions import BifurcationPoint, SpecialPoint
+from .bifurcations.conditions import BifurcationPoint
 from .bifurcations.crossings import CrossingSliding, SlidingExchange
 from .bifurcations.curves import BifurcationCurve, bifurcation_curve
 from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
@@ -42,6 +43,7 @@ from .bifurcations.refine import refine
 from .bifurcations.regions import RegionMap, region_map
 from .bifurcations.rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
 from .bifurcations.scan import scan
+from .bifurcations.special import SpecialPoint
 from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, find_cycle, unstable_cycle
 from .cycles.functionals import (

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -27,11 +27,15 @@ from ..numerics.compiling import jit
 from ..results import Status, draw
 from ..sweeps.datasets import decoded
 from ..sweeps.sweep import sweep
+from ..tables import table_of
 from .conditions import BifurcationPoint
 from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
 from .labels import Label
 from .path import ParameterPath
 from .scan import search
+
+if TYPE_CHECKING:
+    import pandas
 
 
 def region_name(osc: Oscillator, label: Label) -> str:
@@ -92,13 +96,15 @@ class RegionMap(eqx.Module):
         """The oscillator in that cell."""
         return self.make(**dict(zip(self.names, self.example(name), strict=True)))
 
-    def table(self) -> list[dict[str, Any]]:
+    def table(self) -> "pandas.DataFrame":
         """All curves in rows, with their number: see `BifurcationCurve.table`."""
-        return [
-            {"curve": number, **row}
-            for number, curve in enumerate(self.curves)
-            for row in curve.table(self.names)
-        ]
+        return table_of(
+            [
+                {"curve": number, **row}
+                for number, curve in enumerate(self.curves)
+                for row in curve.table(self.names).to_dict("records")
+            ]
+        )
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the map into the axes `ax`, which are returned.
