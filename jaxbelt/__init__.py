@@ -20,9 +20,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     bifurcations/   special labels systems guesses conditions tangencies crossings rests edges folds
-    bifurcations/   path scan refine curves regions diagrams switch_folds
+    bifurcations/   path scan refine curves faces regions diagrams switch_folds
     inverse/        selection record fit design
-    plotting/       style phase diagrams sweeps model draw
+    plotting/       style phase histories points diagrams regions sweeps inverse model draw
     paper           the paper's table and figures
     __init__        the public names
     commands/       options reproduce simulate diagram map sweep basins verify

@@ -11,8 +11,9 @@ back on the same side, from stable to unstable.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import combinations, pairwise
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,14 +24,19 @@ from ..checks import require
 from ..cycles.cycle import Cycle, polish
 from ..cycles.shooting import Loop, cut
 from ..model.equilibria import candidates
+from ..model.events import signature_name
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
 from ..results import Status, draw
+from ..tables import per_belt, table_of
 from .conditions import BifurcationPoint
 from .labels import Label
 from .path import ParameterPath
-from .regions import region_name
+from .regions import in_plane_of_paper, region_name
 from .scan import by_value, edges_touched, search
+
+if TYPE_CHECKING:
+    import pandas
 
 #: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
 SAME = 1e-2
@@ -43,7 +49,7 @@ class Branch(eqx.Module):
     stable: [rows]. x1_min, x1_max, x2_min, x2_max: the range of the motion, [rows]; of a segment of
     pseudo-equilibria its ends. period, multiplier (the nontrivial one): of a cycle, else NaN.
     stick_durations, stick_velocities: per loop, and of the belt over omega, [rows, belts]; NaN
-    where a cycle does not stick to that belt.
+    where a cycle does not stick to that belt. cycles: a `Cycle` a row, of equilibria none.
     """
 
     kind: str = eqx.field(static=True)
@@ -57,6 +63,38 @@ class Branch(eqx.Module):
     multiplier: np.ndarray
     stick_durations: np.ndarray
     stick_velocities: np.ndarray
+    cycles: tuple[Cycle, ...]
+
+    @property
+    def amplitude(self) -> np.ndarray:
+        """Half the range of x1 of a cycle, 0 of what rests, [rows]."""
+        moves = self.kind == "cycle"
+        return 0.5 * (self.x1_max - self.x1_min) if moves else np.zeros(len(self))
+
+    def evaluated(self, functional: Callable[[Cycle], Any]) -> np.ndarray:
+        """A functional of the cycles, [rows]: NaN where there is none. It is given one known
+        `Cycle` after another, so it need not be of what JAX can trace."""
+        if not self.cycles:
+            return np.full(len(self), np.nan)
+        values = [np.asarray(functional(cycle)) for cycle in self.cycles]
+        for value in values:
+            fits = value.ndim == 0 and np.issubdtype(value.dtype, np.number)
+            told = f"one that returns {value.dtype}{list(value.shape)}"
+            require(fits, "quantity", "a function of a cycle that returns one number", told)
+        return np.array(values, float)
+
+    def columns(self) -> dict[str, Any]:
+        """What the table of a diagram tells of its rows."""
+        names = ("stable", "x1_min", "x1_max", "x2_min", "x2_max", "period", "amplitude")
+        events = [signature_name(cycle.signature) for cycle in self.cycles]
+        return {
+            "kind": [self.kind] * len(self),
+            "belts": [""] * len(self),
+            "value": self.values,
+            **{name: getattr(self, name) for name in (*names, "multiplier")},
+            **per_belt("stick_duration", self.stick_durations),
+            "signature": events or [""] * len(self),
+        }
 
     def __len__(self) -> int:
         return len(self.values)
@@ -75,7 +113,8 @@ class BifurcationDiagram(eqx.Module):
     touches a contact edge; branches: of equilibria, then of cycles; regions: (first, last, name) of
     every stretch between points of `scan`, see `region_name`; oscillator: the one that was given,
     of a function that at the first value; name: of the parameter, as the path to it, or that of the
-    function's argument. `plot()` draws it.
+    function's argument; as_paper: whether the path lies in the plane of the paper's Fig. 6, so that
+    pictures show the names of the regions. `table()` has all rows and points, `plot()` draws it.
     """
 
     points: tuple[BifurcationPoint, ...]
@@ -83,12 +122,41 @@ class BifurcationDiagram(eqx.Module):
     regions: tuple[tuple[float, float, str], ...] = eqx.field(static=True)
     oscillator: Oscillator
     name: str = eqx.field(static=True)
+    as_paper: bool = eqx.field(static=True, default=False)
 
-    def plot(self, ax: Any = None, *, quantity: str = "x2") -> Any:
+    def table(self) -> "pandas.DataFrame":
+        """A row for each row of each branch, in order, and then for each special point.
+
+        Columns: branch (its number; missing for a point), kind ("equilibrium", "cycle", or the
+        condition of a point), belts (of a point), value (of the parameter), stable (missing for a
+        point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests), amplitude (half the
+        range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each belt (NaN where it
+        does not stick to that), signature (the events of a cycle, as in `Cycle.table`).
+        """
+        parts = [
+            table_of({"branch": np.full(len(branch), number), **branch.columns()})
+            for number, branch in enumerate(self.branches)
+        ]
+        parts.append(table_of([_row_of_point(point) for point in self.points]))
+        import pandas
+
+        table = pandas.concat([part for part in parts if len(part)], ignore_index=True)
+        return table.astype({"branch": "Int64", "stable": "boolean"})
+
+    def plot(self, ax: Any = None, *, quantity: str | Callable[[Cycle], Any] | None = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned.
 
-        quantity: "x2", the paper's Figs. 3 and 7: equilibria at x2 = 0, sticking cycles by the
-        velocity of the belt, others by their largest x2; or "x1" (smallest and largest), "period".
+        quantity: what is drawn over the parameter.
+
+        - "amplitude": half the range of x1; 0 of equilibria.
+        - "x1": the smallest and the largest.
+        - "x2": as in the paper's Figs. 3 and 7. Equilibria at x2 = 0, cycles that stick by the
+          velocity of each belt that they stick to, others by their largest x2.
+        - "period": of cycles.
+        - a functional of cycles, such as `jb.stick_fraction`, or a function of your own that takes
+          a `Cycle` and returns a number: of cycles, stable and unstable.
+        - None: "amplitude" where a cycle sticks, for x2 would draw but the velocity of its belt;
+          else "x2", and "x1" where there is no cycle.
         """
         return draw(self, ax, quantity=quantity)
 
@@ -138,7 +206,23 @@ def bifurcation_diagram(
         regions=tuple((a, b, name) for (a, b), name in zip(stretches, names, strict=True)),
         oscillator=path.osc,
         name=path.name,
+        as_paper=in_plane_of_paper([path.at(v) for v in (path.first, *middles, path.last)]),
     )
+
+
+def _row_of_point(point: BifurcationPoint) -> dict[str, Any]:
+    row, none = point.row(), [np.nan] * len(point.oscillator.belts)
+    known = int(point.cycle.status) == Status.OK
+    names = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
+    return {
+        "kind": row["kind"],
+        "belts": row["belts"],
+        "value": row["value"],
+        **{name: row[name] for name in names},
+        "amplitude": 0.5 * (row["x1_max"] - row["x1_min"]) if known else np.nan,
+        **per_belt("stick_duration", point.cycle.stick_durations if known else none),
+        "signature": signature_name(point.cycle.signature) if known else "",
+    }
 
 
 def _nodes(path: ParameterPath, a: float, b: float, rows: int) -> np.ndarray:
@@ -177,7 +261,7 @@ def _equilibrium_pieces(path: ParameterPath, nodes: Sequence[np.ndarray]) -> lis
     for stretch, rows in enumerate(_consecutive(nodes)):
         values, here = nodes[stretch], jax.tree.map(lambda x, rows=rows: x[rows], found)
         none = np.full(len(values), np.nan)
-        per_belt = np.full((len(values), len(path.osc.belts)), np.nan)
+        none_stick = np.full((len(values), len(path.osc.belts)), np.nan)
         for row in range(int(np.max(np.sum(here.kind > 0, axis=1)))):
             branch = Branch(
                 kind="equilibrium",
@@ -189,8 +273,9 @@ def _equilibrium_pieces(path: ParameterPath, nodes: Sequence[np.ndarray]) -> lis
                 x2_max=np.zeros(len(values)),
                 period=none,
                 multiplier=none,
-                stick_durations=per_belt,
-                stick_velocities=per_belt,
+                stick_durations=none_stick,
+                stick_velocities=none_stick,
+                cycles=(),
             )
             pieces.append(_Piece(branch, stretch))
     return pieces
@@ -208,24 +293,26 @@ def _cycle_pieces(
         groups = [values for _, values, _ in wanted]
         loops = [loop for _, _, group in wanted for loop in group]
         cycles = _attracting(path, np.concatenate(groups), loops)
-        pieces += _as_pieces(path, cycles, groups, [stretch for stretch, _, _ in wanted])
+        pieces += _as_pieces(cycles, groups, [stretch for stretch, _, _ in wanted])
     both = _separated(labels)
     if both:
         groups = [nodes[stretch] for stretch, _ in both]
         arounds = np.repeat([around for _, around in both], [len(group) for group in groups])
         cycles = _repelling(path, np.concatenate(groups), arounds)
-        pieces += _as_pieces(path, cycles, groups, [stretch for stretch, _ in both])
+        pieces += _as_pieces(cycles, groups, [stretch for stretch, _ in both])
     return pieces
 
 
-def _as_pieces(path: ParameterPath, found: "_Rows", groups, stretches) -> list[_Piece]:
-    pieces = []
+def _as_pieces(cycles: Sequence[Cycle], groups, stretches) -> list[_Piece]:
+    pieces, found = [], _stacked(_row_of_branch, cycles)
     for stretch, values, rows in zip(stretches, groups, _consecutive(groups), strict=True):
         fine = found.status[rows] == Status.OK
         if np.any(fine):
             here = jax.tree.map(lambda x, rows=rows[fine]: x[rows], found)
             fields = {name: value for name, value in here._asdict().items() if name != "status"}
-            pieces.append(_Piece(Branch(kind="cycle", values=values[fine], **fields), stretch))
+            own = tuple(cycles[row] for row in rows[fine].tolist())
+            branch = Branch(kind="cycle", values=values[fine], cycles=own, **fields)
+            pieces.append(_Piece(branch, stretch))
     return pieces
 
 
@@ -278,15 +365,15 @@ def _stacked(program, items: Iterable[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
 
-def _attracting(path: ParameterPath, values: np.ndarray, loops: Sequence[Loop]) -> _Rows:
+def _attracting(path: ParameterPath, values: np.ndarray, loops: Sequence[Loop]) -> list[Cycle]:
     ok = jnp.asarray(Status.OK.value)
     pairs = zip(values, cut(loops), strict=True)
-    return _stacked(_row_of_branch, (polish(path.at(value), loop, ok) for value, loop in pairs))
+    return [polish(path.at(value), loop, ok) for value, loop in pairs]
 
 
-def _repelling(path: ParameterPath, values: np.ndarray, arounds: np.ndarray) -> _Rows:
+def _repelling(path: ParameterPath, values: np.ndarray, arounds: np.ndarray) -> list[Cycle]:
     pairs = zip(values.tolist(), arounds.tolist(), strict=True)
-    return _stacked(_row_of_branch, (path.unstable(value, around) for value, around in pairs))
+    return [path.unstable(value, around) for value, around in pairs]
 
 
 # --- from pieces to branches ----------------------------------------------------------------------
@@ -331,7 +418,7 @@ def _joined(pieces: Sequence[_Piece], points: Sequence[BifurcationPoint]) -> lis
             branch = pieces[at[0]].branch
             chain.append(_reversed(branch) if at[1] else branch)
             at = partner.get((at[0], not at[1]))
-        branches.append(jax.tree.map(lambda *leaves: np.concatenate(leaves), *chain))
+        branches.append(_chained(chain))
     return branches
 
 
@@ -348,4 +435,11 @@ def _distance(a: _End, b: _End) -> float:
 
 
 def _reversed(branch: Branch) -> Branch:
-    return jax.tree.map(lambda leaf: leaf[::-1], branch)
+    arrays = jax.tree.map(lambda leaf: leaf[::-1], replace(branch, cycles=()))
+    return replace(arrays, cycles=branch.cycles[::-1])
+
+
+def _chained(parts: Sequence[Branch]) -> Branch:
+    bare = [replace(part, cycles=()) for part in parts]
+    arrays = jax.tree.map(lambda *leaves: np.concatenate(leaves), *bare)
+    return replace(arrays, cycles=tuple(cycle for part in parts for cycle in part.cycles))

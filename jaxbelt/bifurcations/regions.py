@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, require
-from ..cycles.attractors import Runs, distinct, lead_to_one_cycle, stuck_belts
+from ..cycles.attractors import Runs, distinct, itinerary, lead_to_one_cycle, stuck_belts
 from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator
@@ -30,12 +30,16 @@ from ..sweeps.sweep import sweep
 from ..tables import table_of
 from .conditions import BifurcationPoint
 from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
+from .faces import Faces
 from .labels import Label
 from .path import ParameterPath
 from .scan import search
 
 if TYPE_CHECKING:
     import pandas
+
+#: Velocities that differ by less are one, but for rounding.
+SAME_VELOCITY = 1e-12
 
 
 def region_name(osc: Oscillator, label: Label) -> str:
@@ -64,15 +68,33 @@ def region_of(opposite: bool, belts: int, rests: bool, cycles: Sequence[Collecti
     return f"{7 - number if opposite else number}{tail}"
 
 
+def in_plane_of_paper(oscillators: Sequence[Oscillator]) -> bool:
+    """Whether oscillators differ in the velocities of two belts only that both always touch, class
+    (b): those of the plane of the paper's Fig. 6, where the regions have their names."""
+    still = [
+        tuple(replace(belt, velocity=jnp.zeros(())) for belt in osc.belts) for osc in oscillators
+    ]
+    leaves = [jax.tree.leaves(replace(o, belts=b)) for o, b in zip(oscillators, still, strict=True)]
+    same = all(
+        len(one) == len(leaves[0])
+        and all(np.array_equal(x, y) for x, y in zip(one, leaves[0], strict=True))
+        for one in leaves
+    )
+    edges = [float(edge) for belt in oscillators[0].belts for edge in (belt.lower, belt.upper)]
+    return same and len(oscillators[0].belts) == 2 and edges == [-np.inf, np.inf] * 2
+
+
 class RegionMap(eqx.Module):
     """What `region_map` returns.
 
     names: of the two parameters, as arguments of `make`; values: of each, [n] and [m]; label: name
     of the region, [n, m], as from `region_name`, "" where the runs were undecided; curves: what
     bounds the regions, see `BifurcationCurve`; cycles: by the name of a region, the cycles in its
-    example, attracting ones and the unstable one; make: as given. `example(name)` is a cell well
-    inside a region; `table()` has the curves as rows; `plot()` draws the map, with a portrait of
-    each region.
+    example, attracting ones and the unstable one; on_line: cells where a belt is at rest, or two
+    run at one velocity, [n, m]: what is so on that line only is the name of these; between: (p, q,
+    name) in each part of the plane between curves in which there is no other cell; make: as given.
+    `example(name)` is a cell well inside a region; `table()` has the curves as rows; `plot()` draws
+    the map, with a portrait of each region.
     """
 
     names: tuple[str, str] = eqx.field(static=True)
@@ -80,6 +102,8 @@ class RegionMap(eqx.Module):
     label: np.ndarray
     curves: tuple[BifurcationCurve, ...]
     cycles: dict[str, tuple[Cycle, ...]]
+    on_line: np.ndarray
+    between: tuple[tuple[float, float, str], ...] = eqx.field(static=True)
     make: Callable[..., Oscillator] = eqx.field(static=True)
 
     @property
@@ -94,7 +118,22 @@ class RegionMap(eqx.Module):
 
     def oscillator(self, name: str) -> Oscillator:
         """The oscillator in that cell."""
-        return self.make(**dict(zip(self.names, self.example(name), strict=True)))
+        return _at(self.make, self.names, self.example(name))
+
+    @property
+    def as_paper(self) -> bool:
+        """Whether the plane is that of the paper's Fig. 6, the velocities of class (b): pictures
+        show the names of the regions there only."""
+        corners = [(p, q) for p in self.values[0][[0, -1]] for q in self.values[1][[0, -1]]]
+        return in_plane_of_paper([_at(self.make, self.names, corner) for corner in corners])
+
+    def raster(self) -> np.ndarray:
+        """The name at every point of an even raster over the plane, on the side of each exact curve
+        that the point is on, [pixels, pixels], the first parameter along the rows."""
+        faces, points, names = _faces_of(self.values, self.label, self.on_line, self.curves)
+        extra = [(p, q) for p, q, _ in self.between]
+        points = np.concatenate([points, np.array(extra).reshape(-1, 2)])
+        return faces.named(points, [*names, *(name for *_, name in self.between)])
 
     def table(self) -> "pandas.DataFrame":
         """All curves in rows, with their number: see `BifurcationCurve.table`."""
@@ -160,19 +199,51 @@ def region_map(
     with ThreadPoolExecutor(1) as beside:
         cells = beside.submit(_cells, make, names, values, dict(axes), starts)
         curves = _bounds(make, names, values, step, lines) if lines else ()
-        label, cycles = cells.result()
+        label, cycles, on_line = cells.result()
     pair = (names[0], names[1]), (values[0], values[1])
-    return RegionMap(*pair, label, tuple(curves), cycles, make)
+    between = _between(make, names, pair[1], label, on_line, curves, starts)
+    return RegionMap(*pair, label, tuple(curves), cycles, on_line, between, make)
+
+
+def _at(make, names, pair) -> Oscillator:
+    return make(**dict(zip(names, map(float, pair), strict=True)))
+
+
+def _faces_of(values, label, on_line, curves) -> tuple[Faces, np.ndarray, list[str]]:
+    """The faces of a map, and the cells that tell what is in an area, with their names."""
+    (p, q), told = values, (label != "") & ~on_line
+    faces = Faces(((p[0], p[-1]), (q[0], q[-1])), [curve.path for curve in curves])
+    rows, columns = np.nonzero(told)
+    return faces, np.column_stack([p[rows], q[columns]]), label[told].tolist()
+
+
+def _between(make, names, values, label, on_line, curves, starts):
+    """What there is in each part of the plane between curves in which there is no cell."""
+    if not curves:
+        return ()
+    faces, points, _ = _faces_of(values, label, on_line, curves)
+    found = []
+    for p, q in faces.unnamed(points):
+        osc = _at(make, names, (p, q))
+        cycles = [cycle for cycle in _cycles(osc, starts) if bool(cycle.stable)]
+        rests, velocities = _at_cells(make, names, jnp.asarray([[p, q]]))
+        opposite = bool(jnp.min(velocities) < 0 < jnp.max(velocities))
+        stuck = [stuck_belts(itinerary(osc, cycle.chain)) for cycle in cycles]
+        if bool(rests[0]) or stuck:
+            name = region_of(opposite, len(osc.belts), bool(rests[0]), stuck)
+            found.append((p, q, name))
+    return tuple(found)
 
 
 def _cells(make, names, values, axes, starts):
-    """The names of all cells, and the cycles in the example of each region."""
-    label = _cell_names(make, names, values, axes, starts)
+    """The names of all cells, the cycles in the example of each region, and which cells lie on a
+    line where velocities meet."""
+    label, on_line = _cell_names(make, names, values, axes, starts)
     cycles = {}
     for name in sorted(set(np.unique(label).tolist()) - {""}):
-        osc = make(**dict(zip(names, _example(values, label == name), strict=True)))
+        osc = _at(make, names, _example(values, label == name))
         cycles[name] = _cycles(osc, starts)
-    return label, cycles
+    return label, cycles, on_line
 
 
 def _example(values, inside: np.ndarray) -> tuple[float, float]:
@@ -188,7 +259,7 @@ def _cycles(osc: Oscillator, starts) -> tuple[Cycle, ...]:
     return tuple(distinct([*(find_cycle(osc, start) for start in starts), *repelling]))
 
 
-def _cell_names(make, names, values, axes, starts) -> np.ndarray:
+def _cell_names(make, names, values, axes, starts) -> tuple[np.ndarray, np.ndarray]:
     runs = [sweep(make, axes, y0=start, observe="attractor") for start in starts]
     grid = np.meshgrid(*values, indexing="ij")
     rests, velocities = _at_cells(make, names, jnp.asarray(np.stack([g.ravel() for g in grid], 1)))
@@ -209,7 +280,7 @@ def _cell_names(make, names, values, axes, starts) -> np.ndarray:
         both = (seen[..., i] > 0) & (seen[..., j] > 0)
         same, doubtful = tell[i].same(tell[j])
         for row, column in np.argwhere(both & doubtful):
-            osc = make(**{names[0]: values[0][row], names[1]: values[1][column]})
+            osc = _at(make, names, (values[0][row], values[1][column]))
             same[row, column] = lead_to_one_cycle(osc, starts[i], starts[j])
         seen[..., j] = np.where(both & same, 0, seen[..., j])
     opposite = (velocities.min(-1) < 0) & (velocities.max(-1) > 0)
@@ -220,7 +291,12 @@ def _cell_names(make, names, values, axes, starts) -> np.ndarray:
         cycles = [[b for b in range(n) if (code - 1) >> b & 1] for code in codes if code]
         name = region_of(bool(against), n, bool(rest), cycles)
         found.append(name if known and (rest or cycles) else "")
-    return np.array(found)[which.reshape(shape)]
+    # A belt is at rest where it runs at the velocity of one that does not.
+    others = np.append(velocities, np.zeros((*shape, 1)), axis=-1)
+    apart = velocities[..., :, None] - others[..., None, :]
+    meet = np.abs(apart) < SAME_VELOCITY
+    on_line = np.any(meet & ~np.eye(n, n + 1, dtype=bool), axis=(-2, -1))
+    return np.array(found)[which.reshape(shape)], on_line
 
 
 @jit

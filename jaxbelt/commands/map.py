@@ -42,7 +42,7 @@ def region_map(
 
     Example: jaxbelt map --class b --cells 400
     """
-    from ..plotting.diagrams import draw_region_map
+    from ..plotting.regions import draw_region_map
     from ..plotting.style import journal_figure, journal_style, save
 
     console = make_console()

@@ -150,7 +150,7 @@ class Cycle(eqx.Module):
         }
         return {
             "stable": bool(self.stable),
-            **{name: float(value) for name, value in numbers.items()},
+            **{name: float(value) if known else np.nan for name, value in numbers.items()},
             "iterations": int(self.iterations),
             "signature": signature_name(self.signature) if known else "",
             "status": Status(int(self.status)).name,

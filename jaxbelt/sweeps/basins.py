@@ -169,7 +169,7 @@ def basins(
     dataset["label"] = (
         ("x1", "x2"),
         labels,
-        {"long_name": "number of the attractor", "units": "1"}
+        {"long_name": "number of the attractor"}
         | flags({-1: "undecided", **dict(enumerate(attractors))}, "int32"),
     )
     return Basins(oscillator, dataset, attractors, cycles, unstable_cycle(oscillator))
