@@ -76,7 +76,7 @@ from .sweeps.sweep import Explanation, explain, sweep
 if TYPE_CHECKING:
     from .plotting.model import plot_friction_law
     from .plotting.phase import plot_phase_portrait, plot_time_history, plot_vector_field
-    from .plotting.sweeps import plot_basins
+    from .plotting.sweeps import plot_basins, plot_sweep
 
 __version__ = importlib.metadata.version("jaxbelt")
 
@@ -147,6 +147,7 @@ __all__ = [
     "plot_basins",
     "plot_friction_law",
     "plot_phase_portrait",
+    "plot_sweep",
     "plot_time_history",
     "plot_vector_field",
     "portrait",

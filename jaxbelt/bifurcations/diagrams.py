@@ -133,15 +133,14 @@ class BifurcationDiagram(eqx.Module):
         range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each belt (NaN where it
         does not stick to that), signature (the events of a cycle, as in `Cycle.table`).
         """
-        parts = [
-            table_of({"branch": np.full(len(branch), number), **branch.columns()})
+        rows = [
+            {"branch": number, **row}
             for number, branch in enumerate(self.branches)
+            for row in table_of(branch.columns()).to_dict("records")
         ]
-        parts.append(table_of([_row_of_point(point) for point in self.points]))
-        import pandas
-
-        table = pandas.concat([part for part in parts if len(part)], ignore_index=True)
-        return table.astype({"branch": "Int64", "stable": "boolean"})
+        table = table_of([*rows, *map(_row_of_point, self.points)])
+        # A point is of no branch, and neither stable nor unstable.
+        return table.astype({"branch": "Int64", "stable": "boolean"}) if len(table) else table
 
     def plot(self, ax: Any = None, *, quantity: str | Callable[[Cycle], Any] | None = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned.
@@ -215,11 +214,11 @@ def _row_of_point(point: BifurcationPoint) -> dict[str, Any]:
     known = int(point.cycle.status) == Status.OK
     names = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
     return {
-        "kind": row["kind"],
-        "belts": row["belts"],
-        "value": row["value"],
+        "branch": None,
+        **{name: row[name] for name in ("kind", "belts", "value")},
+        "stable": None,
         **{name: row[name] for name in names},
-        "amplitude": 0.5 * (row["x1_max"] - row["x1_min"]) if known else np.nan,
+        "amplitude": 0.5 * (row["x1_max"] - row["x1_min"]),
         **per_belt("stick_duration", point.cycle.stick_durations if known else none),
         "signature": signature_name(point.cycle.signature) if known else "",
     }
