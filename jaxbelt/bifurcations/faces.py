@@ -16,7 +16,7 @@ import numpy as np
 PIXELS = 900
 #: Pixels beside a wall: a chord of a bent curve may be off by so many, so cells and faces this near
 #: to one tell nothing.
-BESIDE = 3.0
+LEFT_OUT = 3.0
 
 #: The first and the last value of each of the two parameters.
 Span = tuple[tuple[float, float], tuple[float, float]]
@@ -61,10 +61,10 @@ class Faces:
         known = np.zeros(self.count + 1, bool)
         for point in points:
             at = self._pixel(point)
-            known[self.number[at]] |= bool(self.depth[at] > BESIDE)
+            known[self.number[at]] |= bool(self.depth[at] > LEFT_OUT)
         left = np.flatnonzero(~known[1:]) + 1
         deepest = np.atleast_1d(maximum(self.depth, self.number, left))
-        left = left[deepest > BESIDE]
+        left = left[deepest > LEFT_OUT]
         places = maximum_position(self.depth, self.number, left) if left.size else []
         step = (self.high - self.low) / (PIXELS - 1)
         return [(float(p), float(q)) for p, q in (self.low + np.array(at) * step for at in places)]
@@ -77,7 +77,7 @@ class Faces:
         seeds = np.full(self.number.shape, -1)
         for point, name in zip(points, names, strict=True):
             at = self._pixel(point)
-            if self.depth[at] > BESIDE:
+            if self.depth[at] > LEFT_OUT:
                 seeds[at] = known.index(name)
         codes = np.full(self.number.shape, -1)
         for face, box in enumerate(find_objects(self.number), start=1):
@@ -87,8 +87,8 @@ class Faces:
             if present.size == 1:
                 codes[box][inside] = present[0]
             elif present.size:
-                codes[box][inside] = _nearest(own)[inside]
-        return np.array(known)[_nearest(codes)]
+                codes[box][inside] = _filled(own)[inside]
+        return np.array(known)[_filled(codes)]
 
 
 def _densely(path: np.ndarray) -> np.ndarray:
@@ -100,7 +100,7 @@ def _densely(path: np.ndarray) -> np.ndarray:
     return np.column_stack([np.interp(along, gone, column) for column in path.T])
 
 
-def _nearest(codes: np.ndarray) -> np.ndarray:
+def _filled(codes: np.ndarray) -> np.ndarray:
     """Where a code is negative that of the nearest pixel with another one; 0 where none has."""
     from scipy.ndimage import distance_transform_edt
 

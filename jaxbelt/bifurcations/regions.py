@@ -201,7 +201,7 @@ def region_map(
         curves = _bounds(make, names, values, step, lines) if lines else ()
         label, cycles, on_line = cells.result()
     pair = (names[0], names[1]), (values[0], values[1])
-    between = _between(make, names, pair[1], label, on_line, curves, starts)
+    between = _names_between(make, names, pair[1], label, on_line, curves, starts)
     return RegionMap(*pair, label, tuple(curves), cycles, on_line, between, make)
 
 
@@ -217,7 +217,7 @@ def _faces_of(values, label, on_line, curves) -> tuple[Faces, np.ndarray, list[s
     return faces, np.column_stack([p[rows], q[columns]]), label[told].tolist()
 
 
-def _between(make, names, values, label, on_line, curves, starts):
+def _names_between(make, names, values, label, on_line, curves, starts):
     """What there is in each part of the plane between curves in which there is no cell."""
     if not curves:
         return ()

@@ -11,14 +11,14 @@ from .phase import belt_shading, path_of, stick_phases
 from .style import belt_colour, new_axes
 
 #: The marks of events, and what they are called.
-EVENTS = {
+EVENT_MARKS = {
     EventKind.STICK: ("v", "sticks to belt {}"),
     EventKind.SLIP: ("^", "slips from belt {}"),
     EventKind.CROSS: ("x", "crosses boundary {}"),
     EventKind.EDGE: ("s", "edge of belt {}"),
 }
 #: How contacts are drawn (Okabe and Ito), by their code, and what they are called.
-CONTACTS = {
+CONTACT_STYLES = {
     0: ("#222222", "", "sticks"),
     1: ("#56B4E9", "", "slips, belt faster"),
     -1: ("#E69F00", "", "slips, mass faster"),
@@ -48,10 +48,10 @@ def plot_events(events: Events, ax: Axes | None = None) -> Axes:
     lines = sorted({(int(belt), EventKind[kind]) for kind, belt in zip(table.kind, table.belt)})
     for height, (belt, kind) in enumerate(lines):
         t = table.t[(table.kind == kind.name) & (table.belt == belt)]
-        marker, _ = EVENTS[kind]
+        marker, _ = EVENT_MARKS[kind]
         style = {"color": belt_colour(belt), "markersize": 5, "linestyle": "none"}
         ax.plot(t, np.full(len(t), height), marker=marker, **style)
-    names = [EVENTS[kind][1].format(belt) for belt, kind in lines]
+    names = [EVENT_MARKS[kind][1].format(belt) for belt, kind in lines]
     ax.set_yticks(range(len(lines)), names)
     ax.set(xlabel=r"time $\tau$", ylabel="event", ylim=(-0.6, len(lines) - 0.4))
     return ax
@@ -68,7 +68,7 @@ def plot_arcs(arcs: Arcs, ax: Axes | None = None) -> Axes:
     spans[:, 1] = np.minimum(spans[:, 1], 1.05 * last + 1.0 - spans[:, 0])
     belts = [name for name in table if str(name).startswith("contact_")]
     for belt, name in enumerate(belts):
-        for code, (colour, hatch, words) in CONTACTS.items():
+        for code, (colour, hatch, words) in CONTACT_STYLES.items():
             wanted = table[name].abs() == 2 if code == 2 else table[name] == code
             bars = spans[wanted.to_numpy()]
             if len(bars):

@@ -50,7 +50,7 @@ def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
     ax.imshow(np.swapaxes(image, 0, 1), extent=extent, zorder=0, **style)
     plot_curves(regions.curves, ax)
     if regions.as_paper:
-        _name_regions(ax, regions, raster)
+        _name_areas(ax, regions, raster)
     else:
         words = _words_of_regions(regions)
         for name in filter(None, known):
@@ -62,7 +62,7 @@ def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _name_regions(ax: Axes, regions: RegionMap, raster: np.ndarray) -> None:
+def _name_areas(ax: Axes, regions: RegionMap, raster: np.ndarray) -> None:
     """The name of each region in each of its parts that has room for it."""
     # A part is told well enough by every fourth pixel.
     coarse = raster[::4, ::4]

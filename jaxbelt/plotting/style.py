@@ -97,7 +97,7 @@ def draw_key(
         [by_label[label] for label in labels],
         labels,
         loc="outside lower center",
-        ncols=ncols or _columns(72 * figure.get_size_inches()[0], labels),
+        ncols=ncols or _key_columns(72 * figure.get_size_inches()[0], labels),
         frameon=False,
         handlelength=1.8,
         columnspacing=1.4,
@@ -126,21 +126,22 @@ def add_key(ax: Axes) -> None:
         bbox_to_anchor=(0.5, 0.0),
         bbox_transform=ax.transAxes + below,
         borderaxespad=0.0,
-        ncols=_columns(width, labels),
+        ncols=_key_columns(width, labels),
         frameon=False,
         handlelength=2.2,
         columnspacing=1.4,
     )
 
 
-def _columns(width: float, labels: Sequence[str]) -> int:
-    """How many columns of a key there is room for in a width, in points."""
+def _key_columns(width: float, labels: Sequence[str]) -> int:
+    """How many columns of a key there is room for in a width, in points; rows of one length."""
     size = matplotlib.rcParams["font.size"]
     letters = 0.48 * size * np.array([len(label.replace("$", "")) for label in labels])
     count = len(labels)
     while count > 1 and np.sum(np.sort(letters)[-count:]) + 4.0 * size * count > width:
         count -= 1
-    return count
+    rows = -(-len(labels) // count)
+    return -(-len(labels) // rows)
 
 
 def parameter_label(name: str) -> str:

@@ -46,6 +46,7 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
         x, lines = dataset[values.dims[0]], values.values.reshape(values.shape[0], -1).T
         for i, line in enumerate(lines):
             style: dict[str, Any] = {"color": "black", "linewidth": 1.1}
+            style["drawstyle"] = "steps-mid" if variable == "kind" else "default"
             if len(lines) > 1:
                 style |= {"color": belt_colour(i), "label": f"{last} {i}"}
             ax.plot(x, line, linestyle=("-", "--", ":", "-.")[i % 4], **style)
