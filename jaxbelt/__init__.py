@@ -9,6 +9,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     results         status codes and what to do about them
     numerics/       compiling
     checks          arguments, checked at the public edge
+    tables          results as tables
     numerics/       derivatives extrapolation newton continuation roots
     model/          friction oscillator parameters variations modes events equilibria
     presets         the published systems
@@ -18,10 +19,10 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     cycles/         backwards returns separatrices portrait
     sweeps/         marks observers moments along attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
-    bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
-    bifurcations/   path scan refine curves diagrams switch_folds
+    bifurcations/   special labels systems guesses conditions tangencies crossings rests edges folds
+    bifurcations/   path scan refine curves faces regions diagrams switch_folds
     inverse/        selection record fit design
-    plotting/       style phase diagrams sweeps model draw
+    plotting/       style phase histories points diagrams regions sweeps inverse model draw
     paper           the paper's table and figures
     __init__        the public names
     commands/       options reproduce simulate diagram map sweep basins verify
@@ -32,20 +33,17 @@ import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 from . import presets
-from .bifurcations.conditions import BifurcationPoint, SpecialPoint
+from .bifurcations.conditions import BifurcationPoint
 from .bifurcations.crossings import CrossingSliding, SlidingExchange
 from .bifurcations.curves import BifurcationCurve, bifurcation_curve
-from .bifurcations.diagrams import (
-    BifurcationDiagram,
-    RegionMap,
-    bifurcation_diagram,
-    region_map,
-)
+from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
 from .bifurcations.edges import CornerCollision, GrazingEdge
 from .bifurcations.folds import FoldOfCycles
 from .bifurcations.refine import refine
+from .bifurcations.regions import RegionMap, region_map
 from .bifurcations.rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
 from .bifurcations.scan import scan
+from .bifurcations.special import SpecialPoint
 from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, find_cycle, unstable_cycle
 from .cycles.functionals import (
@@ -78,7 +76,7 @@ from .sweeps.sweep import Explanation, explain, sweep
 if TYPE_CHECKING:
     from .plotting.model import plot_friction_law
     from .plotting.phase import plot_phase_portrait, plot_time_history, plot_vector_field
-    from .plotting.sweeps import plot_basins
+    from .plotting.sweeps import plot_basins, plot_sweep
 
 __version__ = importlib.metadata.version("jaxbelt")
 
@@ -149,6 +147,7 @@ __all__ = [
     "plot_basins",
     "plot_friction_law",
     "plot_phase_portrait",
+    "plot_sweep",
     "plot_time_history",
     "plot_vector_field",
     "portrait",

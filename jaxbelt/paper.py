@@ -19,7 +19,8 @@ import numpy as np
 
 from .bifurcations.conditions import AbstractCondition
 from .bifurcations.crossings import SlidingExchange
-from .bifurcations.diagrams import BifurcationDiagram, RegionMap, bifurcation_diagram, region_map
+from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
+from .bifurcations.regions import RegionMap, region_map
 from .bifurcations.rests import Hopf, SuddenSliding
 from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, unstable_cycle
@@ -27,9 +28,10 @@ from .model.equilibria import Equilibria, equilibria
 from .model.oscillator import Belt, Oscillator
 from .model.variations import varied
 from .motion.simulate import Trajectory, simulate
-from .plotting.diagrams import draw_region_map, plot_diagram
+from .plotting.diagrams import plot_diagram
 from .plotting.model import draw_mechanical_model, plot_convergence, plot_friction_law
 from .plotting.phase import ClosedOrbit, plot_phase_portrait, plot_vector_field
+from .plotting.regions import draw_region_map
 from .plotting.style import Figure, draw_key, journal_figure, journal_style, save
 from .presets import (
     PUBLISHED,
@@ -450,7 +452,7 @@ def draw_map(regions: RegionMap) -> Figure:
 def draw_diagram(diagram: BifurcationDiagram, note: str) -> Figure:
     """Fig. 3 or 7."""
     figure = journal_figure(7.2, 4.2)
-    plot_diagram(diagram, figure.subplots())
+    plot_diagram(diagram, figure.subplots(), quantity="x2")
     draw_key(figure, note=_with_symbols(note))
     return figure
 

@@ -15,8 +15,9 @@ from typer.testing import CliRunner
 import jaxbelt as jb
 from jaxbelt import paper as reproduce
 from jaxbelt.cli import app
-from jaxbelt.commands.map import write_rows
+from jaxbelt.commands.map import write_table
 from jaxbelt.commands.options import belts_of_class, parse_belt
+from jaxbelt.tables import table_of
 
 runner = CliRunner()
 
@@ -167,7 +168,7 @@ def test_rows_read_back_to_the_last_digit(tmp_path):
         {"curve": 0, "nu0": 0.1 + 0.2, "multiplier": np.nan, "special": ""},
         {"curve": 1, "nu0": -1 / 3, "multiplier": 1.5, "special": "BeltAtRest 0 1"},
     ]
-    write_rows(rows, tmp_path / "curves.csv")
+    write_table(table_of(rows), tmp_path / "curves.csv")
     found = read(tmp_path / "curves.csv")
     assert list(found[0]) == list(rows[0]) and found[1]["special"] == "BeltAtRest 0 1"
     assert column(found, "nu0").tolist() == [0.1 + 0.2, -1 / 3]

@@ -100,7 +100,7 @@ def test_its_curve_is_followed_and_drawn(points):
 
     (line, *_) = curve.plot().lines
     assert line.get_label() == "period" and line.get_color() == "#0072B2"
-    assert curve.table(("nu0", "zeta"))[0]["condition"] == "PeriodIs"
+    assert curve.table(("nu0", "zeta")).condition[0] == "PeriodIs"
     plt.close("all")
 
 

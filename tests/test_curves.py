@@ -231,8 +231,9 @@ def test_a_limit_at_a_belt_at_rest_whose_law_jumps():
 
 
 def test_a_table_has_rows_and_special_points_in_order(fold):
-    table = fold.table(("nu0", "nu1"))
-    assert " ".join(table[0]) == "condition belts nu0 nu1 multiplier residual special"
+    columns = fold.table(("nu0", "nu1"))
+    table = columns.to_dict("records")
+    assert " ".join(columns) == "condition belts nu0 nu1 multiplier residual special"
     values = np.array([(row["nu0"], row["nu1"]) for row in table])
     assert np.array_equal(values, fold.path) and len(table) == len(fold) + 2
     named = [row["special"] for row in table if row["special"]]
@@ -243,7 +244,7 @@ def test_a_table_has_rows_and_special_points_in_order(fold):
     assert np.max(steps[:-6]) < 0.0201 and np.all(np.diff(steps[-6:-1]) < 0) and steps[-6] < 0.03
     assert {row["belts"] for row in table} == {"1"}
     assert [row["condition"] for row in table if not row["special"]] == list(fold.kinds)
-    assert "belts[0].velocity" in fold.table()[0]
+    assert "belts[0].velocity" in fold.table()
 
 
 def test_curves_have_the_symmetries_of_the_plane(points, fold):

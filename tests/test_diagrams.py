@@ -1,5 +1,9 @@
 """Bifurcation diagrams against closed forms and the oracle, and their pictures."""
 
+import dataclasses
+import functools
+
+import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import oracle_cycles
@@ -7,8 +11,9 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import EventKind
-from jaxbelt.bifurcations.diagrams import region_name
+from jaxbelt.bifurcations.faces import Faces
 from jaxbelt.bifurcations.labels import Label
+from jaxbelt.bifurcations.regions import RegionMap, in_plane_of_paper, region_name
 
 
 def nu0(osc):
@@ -104,17 +109,107 @@ def test_names_of_regions(velocities, stable, cycles, name):
 
 
 def test_picture(diagram):
-    for quantity in ("x2", "x1", "period"):
+    for quantity in ("x2", "x1", "period", "amplitude", jb.stick_fraction):
         ax = diagram.plot(quantity=quantity)
         texts = {text.get_text() for text in ax.texts}
         assert {"6", "4a", "2b", "fold, belt 1", "grazing, belt 0", "belt 0 at rest"} <= texts
         assert ax.get_xlabel() == r"belt velocity $\nu_0$"
-    with pytest.raises(ValueError, match="quantity must be one of x2, x1, period, got 'x3'"):
+    expected = "quantity must be one of amplitude, x1, x2, period, or a function of a cycle, got"
+    with pytest.raises(ValueError, match=f"{expected} 'x3'"):
         diagram.plot(quantity="x3")
+    with pytest.raises(ValueError, match=r"one number, got one that returns float64\[2\]"):
+        diagram.plot(quantity=lambda cycle: cycle.stick_durations)
+    plt.close("all")
+
+
+def heights(ax, label):
+    """What is drawn under a label, line after line."""
+    lines = [line for line in ax.get_lines() if line.get_label() == label]
+    return np.concatenate([line.get_ydata() for line in lines])
+
+
+def test_picture_of_any_functional(diagram):
+    """Of stable and unstable cycles, those that stick and those that do not."""
+    cycles = [branch for branch in diagram.branches if branch.kind == "cycle"]
+    for branch in cycles:
+        assert np.array_equal(branch.evaluated(jb.period), branch.period)
+        assert np.array_equal(branch.evaluated(jb.amplitude), branch.amplitude)
+        sticks = np.nansum(branch.stick_durations, axis=1)
+        assert np.allclose(branch.evaluated(jb.stick_duration), sticks, rtol=0, atol=1e-14)
+        # No more is given than taken: an independent way through whole cycles.
+        balance = branch.evaluated(lambda c: jb.energy_fed(c) / jb.energy_dissipated(c))
+        assert np.allclose(balance, 1, rtol=0, atol=1e-9)
+        # A function that JAX cannot trace.
+        events = branch.evaluated(lambda cycle: len(cycle.signature))
+        assert np.all((events == 0) == ~branch.stable) and np.all(events % 2 == 0)
+    own, named = diagram.plot(quantity=lambda c: c.period + 0.0), diagram.plot(quantity="period")
+    for label in ("stable cycle", "unstable cycle"):
+        assert np.array_equal(heights(own, label), heights(named, label))
+    # What rests has no such quantity, and no period.
+    assert not [line for line in own.get_lines() if "fixed point" in line.get_label()]
+    assert own.get_ylabel() == "quantity" and named.get_ylabel() == "period $T$"
+    sticks = diagram.plot(quantity=functools.partial(jb.stick_duration, belt=1))
+    assert sticks.get_ylabel() == "stick duration (belt 1)"
+    plt.close("all")
+
+
+def test_amplitude_is_drawn_where_x2_would_be_the_velocity_of_the_belt(diagram):
+    ax, named, functional = (
+        diagram.plot(**q) for q in ({}, {"quantity": "amplitude"}, {"quantity": jb.amplitude})
+    )
+    for label in ("stable cycle", "unstable cycle", "stable fixed point", "unstable fixed point"):
+        assert np.array_equal(heights(ax, label), heights(named, label))
+        assert np.array_equal(heights(ax, label), heights(functional, label))
+    assert np.all(heights(ax, "stable fixed point") == 0)
+    assert {text.get_text() for text in ax.get_legend().get_texts()} == {
+        "stable cycle",
+        "unstable cycle",
+        "stable fixed point",
+        "unstable fixed point",
+    }
+    rests = [branch for branch in diagram.branches if branch.kind == "equilibrium"]
+    only = dataclasses.replace(diagram, branches=tuple(rests))
+    assert only.plot().get_ylabel() == "displacement $x_1$"
+    plt.close("all")
+
+
+def test_table_has_every_row_and_point(diagram):
+    table = diagram.table()
+    rows = [len(branch) for branch in diagram.branches]
+    assert table.branch.value_counts(sort=False).tolist() == rows
+    assert len(table) == sum(rows) + len(diagram.points)
+    for number, branch in enumerate(diagram.branches):
+        own = table[table.branch == number]
+        assert set(own.kind) == {branch.kind}
+        for name in ("x1_min", "x2_max", "period", "amplitude", "multiplier"):
+            assert np.array_equal(own[name], getattr(branch, name), equal_nan=True)
+        assert (
+            np.array_equal(own.value, branch.values)
+            and own.stable.tolist() == branch.stable.tolist()
+        )
+    points = table[table.branch.isna()]
+    assert points.kind.tolist() == [point.kind for point in diagram.points]
+    assert points.value.tolist() == [float(point.value) for point in diagram.points]
+    stable = table[table.stable & (table.kind == "cycle")]
+    assert set(stable.signature) == {"stick0-slip0", "stick1-slip1", "stick0-slip0-stick1-slip1"}
+    assert set(table[~table.stable & (table.kind == "cycle")].signature) == {"smooth"}
+
+
+def test_names_of_regions_stand_in_the_plane_of_the_paper_only(diagram):
+    b, c = jb.presets.class_b, jb.presets.class_c
+    assert diagram.as_paper
+    assert in_plane_of_paper([b(0.1, 0.35), b(0.2, 0.35), b(-0.3, 0.1)])
+    assert not in_plane_of_paper([jb.presets.class_a(0.1), jb.presets.class_a(0.2)])
+    assert not in_plane_of_paper([c(0.1, 0.2, sigma=0.5), c(0.2, 0.2, sigma=0.5)])
+    damped = dataclasses.replace(b(0.1, 0.35), damping=0.4)
+    assert not in_plane_of_paper([b(0.1, 0.35), damped])
+    elsewhere = dataclasses.replace(diagram, as_paper=False)
+    assert not {"6", "4a", "2b"} & {text.get_text() for text in elsewhere.plot().texts}
+    plt.close("all")
 
 
 def test_picture_shows_stick_velocities_and_dashes_what_is_unstable(diagram):
-    lines = diagram.plot().get_lines()
+    lines = diagram.plot(quantity="x2").get_lines()
     dashed = [line for line in lines if line.get_label() == "unstable cycle"]
     assert len(dashed) == 2 and all(line.is_dashed() for line in dashed)
     stable = [line for line in lines if line.get_label() == "stable cycle"]
@@ -181,6 +276,51 @@ def test_cycles_in_the_examples_are_those_of_the_names(cells):
             assert belts == {"a": {0}, "b": {1}, "c": {0, 1}}[name[1]]
 
 
+CIRCLE = np.column_stack(
+    [np.cos(np.linspace(0, 2 * np.pi, 181)), np.sin(np.linspace(0, 2 * np.pi, 181))]
+)
+
+
+def test_every_pixel_is_on_its_side_of_the_curves():
+    """A circle on 3 x 3 cells, and one beside it that hardly leaves room between them."""
+    span = (-2.0, 2.0), (-2.0, 2.0)
+    faces = Faces(span, [CIRCLE, 1.1 * CIRCLE])
+    assert faces.count == 3
+    points = np.array([(0.0, 0.0), (1.9, 1.9), (-1.9, 0.0)])
+    (between,) = faces.unnamed(points)
+    assert 1.0 < np.hypot(*between) < 1.1
+    image = faces.named(np.array([*points, between]), ["in", "out", "out", "between"])
+    at = np.linspace(-2.0, 2.0, len(image))
+    radius = np.hypot(*np.meshgrid(at, at, indexing="ij"))
+    beside = np.minimum(abs(radius - 1), abs(radius - 1.1)) < 0.01  # two pixels, under a line
+    expected = np.where(radius < 1, "in", np.where(radius < 1.1, "between", "out"))
+    assert np.all((image == expected) | beside)
+    # Without the point between them the room there has the name of a neighbour, no other.
+    assert set(np.unique(faces.named(points, ["in", "out", "out"]))) == {"in", "out"}
+
+
+def test_a_gap_in_the_curves_leaves_it_to_the_nearest_cell():
+    faces = Faces(((-2.0, 2.0), (-2.0, 2.0)), [CIRCLE[:150]])
+    assert faces.count == 1 and faces.unnamed(np.zeros((1, 2))) == []
+    image = faces.named(np.array([(0.0, 0.0), (1.5, 0.0)]), ["in", "out"])
+    assert image[225, 450] == "in" and image[-1, 450] == "out"
+    assert set(np.unique(Faces(((0.0, 1.0), (0.0, 1.0)), []).named(np.zeros((1, 2)), ["1"]))) == {
+        "1"
+    }
+
+
+def test_a_cell_on_the_line_of_a_belt_at_rest_is_not_an_area(cells):
+    """There the mass stays: the cell's name is right on that line, and wrong on both its sides."""
+    nus = np.array([-0.2, 0.0, 0.2])
+    label = np.array([["3b", "1", "4c"], ["1", "1", "1"], ["4c", "1", "3a"]])
+    on_line = label == "1"
+    axes = (nus, nus)
+    made = RegionMap(("nu0", "nu1"), axes, label, (), {}, on_line, (), jb.presets.class_b)
+    assert set(np.unique(made.raster())) == {"3b", "4c", "3a"} and made.as_paper
+    # No cell of the others lies on such a line.
+    assert not np.any(cells.on_line) and cells.between == ()
+
+
 def test_impossible_axes_are_named():
     with pytest.raises(ValueError, match="axes must be two arguments of make"):
         jb.region_map(jb.presets.class_b, {"nu0": NU0S})
@@ -229,6 +369,20 @@ def test_curves_bound_the_regions(bounded):
             near = min(nearest(path, end) for path in paths for end in ends) < 2e-3
             fits = crossings > 0 if differ else crossings % 2 == 0  # through a tip and out again
             assert near or fits, (ends, differ, crossings)
+
+
+@pytest.mark.slow
+def test_pictures_are_right_beside_the_curves(bounded):
+    """At random points farther from the curves than their chords are off, by the oracle."""
+    image, rng = bounded.raster(), np.random.default_rng(3)
+    x, y = (np.linspace(v[0], v[-1], n) for v, n in zip(bounded.values, image.shape, strict=True))
+    checked = 0
+    for row, column in rng.integers(0, len(x), (60, 2)):
+        at = np.array([x[row], y[column]])
+        if min(nearest(curve.path, at) for curve in bounded.curves) > 6e-3:
+            assert image[row, column] == expected_name(*at.tolist())
+            checked += 1
+    assert checked > 40
 
 
 def crosses(path, a, b):

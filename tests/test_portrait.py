@@ -74,7 +74,7 @@ def test_separatrices_are_orbits_to_1e_9(class_d):
 
 
 def test_table_and_text_tell_everything(class_d):
-    rows = class_d.table()
+    rows = class_d.table().to_dict("records")
     assert [row["what"] for row in rows] == ["equilibrium"] * 5 + ["cycle"] * 2 + ["separatrix"] * 8
     assert rows[1]["kind"] == "SADDLE" and not rows[1]["stable"] and rows[1]["rate"] == np.inf
     assert rows[5]["period"] == float(class_d.cycles[0].period)

@@ -38,7 +38,7 @@ def test_the_dataset_is_labelled(dataset):
     assert list(dataset) == ["x1_end", "x2_end", "mode_end", "n_events", "status"]
     assert dataset.x1_end.dims == ("nu0", "nu1") and dataset.mode_end.dims == ("nu0", "nu1", "belt")
     assert np.array_equal(dataset.nu0, NU0)
-    assert dataset.nu0.attrs == {"long_name": "velocity of belt 0", "units": "1"}
+    assert dataset.nu0.attrs == {"long_name": "velocity of belt 0"}
     assert all(variable.attrs["long_name"] for variable in dataset.variables.values())
     told = dataset.attrs
     assert (told["t1"], told["rtol"], told["start"]) == (SPAN, 1e-8, "x1 = 3.0, x2 = 0.0")

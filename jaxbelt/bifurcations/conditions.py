@@ -22,7 +22,7 @@ import abc
 import functools
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -42,9 +42,11 @@ from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.continuation import Stop
 from ..numerics.newton import HOLDS, NEWTON_STEPS, STEP_ROUNDING
-from ..results import Status, describe
+from ..results import Status, describe, draw
+from ..tables import require_single, table_of
 from .guesses import nearest, settled_loops
 from .labels import AttractingCycle, Label
+from .special import SpecialPoint
 from .systems import (
     NOWHERE,
     AbstractSystem,
@@ -56,6 +58,9 @@ from .systems import (
     solve_system,
 )
 
+if TYPE_CHECKING:
+    import pandas
+
 
 class Line(NamedTuple):
     """How the curves of a kind are drawn: its name in legends, a colour, a line style (plain data,
@@ -64,24 +69,6 @@ class Line(NamedTuple):
     name: str
     colour: str
     style: str | tuple[float, tuple[float, ...]] = "-"
-
-
-class SpecialPoint(NamedTuple):
-    """A point of codimension two on a curve.
-
-    kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
-    "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
-    point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too),
-    "BoundaryHopf" (a Hopf point on a contact edge: there the curves of boundary equilibria and of
-    pseudo-Hopf points meet its own), "BeltAtRest", "EqualVelocities", or what a condition of your
-    own watches; belts: concerned; values: of the two parameters; residual: the largest error in all
-    equations.
-    """
-
-    kind: str
-    belts: tuple[int, ...]
-    values: tuple[float, float]
-    residual: float
 
 
 class Trail(NamedTuple):
@@ -338,6 +325,32 @@ class BifurcationPoint(eqx.Module):
     def place(self) -> np.ndarray:
         """Where the motion is, see `place_of`; NaN where there is none."""
         return self.condition.place(self)
+
+    def row(self) -> dict[str, Any]:
+        """What `table` tells of it."""
+        require_single(self, self.value, 0)
+        place = self.place if int(self.status) == Status.OK else NOWHERE
+        *extent, period = np.where(place == 0, [0, 0, 0, 0, np.nan], place)  # none at equilibria
+        return {
+            "kind": self.kind,
+            "belts": " ".join(map(str, self.condition.belts_concerned)),
+            **{name: float(getattr(self, name)) for name in ("value", "error", "residual")},
+            "iterations": int(self.iterations),
+            **dict(zip(("x1_min", "x1_max", "x2_min", "x2_max"), extent, strict=True)),
+            "period": period,
+            "multiplier": float(self.multiplier),
+            "status": Status(int(self.status)).name,
+        }
+
+    def table(self) -> "pandas.DataFrame":
+        """One row: kind, belts, value, error, residual, iterations, x1_min, x1_max, x2_min, x2_max
+        and period of the motion there, multiplier, status. Points of a scan: `pandas.concat`."""
+        return table_of([self.row()])
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the phase plane at the point, with the cycle where there is one, into the axes `ax`
+        (None: new ones), which are returned. `ValueError` where no point was found."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         if not is_concrete(self.value) or self.value.ndim:

@@ -22,8 +22,9 @@ from ..model.modes import mode_of, stick_limit
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..results import EventKind, Status
-from .conditions import AbstractCycleCondition, Line, SpecialPoint
+from .conditions import AbstractCycleCondition, Line
 from .guesses import nearest, orbit_after_stick, repeated_loop, settled_loops, without_arcs
+from .special import SpecialPoint
 from .systems import CycleSystem, contact_tests, nearest_contacts, stick_phase_from
 from .tangencies import Encounter
 

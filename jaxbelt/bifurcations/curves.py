@@ -10,7 +10,7 @@ beyond, and the curve goes on from there with the signature that is found.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,8 +24,13 @@ from ..model.variations import Family, Variation
 from ..numerics.compiling import jit
 from ..numerics.continuation import Corrected, CurvePoint, Stop, continue_curve, corrected
 from ..results import Status, draw
-from .conditions import AbstractCondition, BifurcationPoint, SpecialPoint, Trail
+from ..tables import table_of
+from .conditions import AbstractCondition, BifurcationPoint, Trail
+from .special import SpecialPoint
 from .systems import AbstractSystem, Seen
+
+if TYPE_CHECKING:
+    import pandas
 
 #: After so many points the steps of integration are spread anew.
 REMESH = 10
@@ -72,8 +77,8 @@ class BifurcationCurve(eqx.Module):
         at = (i.values if isinstance(i, SpecialPoint) else self.values[i] for i in self._order())
         return np.array(list(at))
 
-    def table(self, names: tuple[str, str] | None = None) -> list[dict[str, Any]]:
-        """The rows and special points in order, as dictionaries.
+    def table(self, names: tuple[str, str] | None = None) -> "pandas.DataFrame":
+        """The rows and special points in order.
 
         condition, belts: what holds there; the two parameters, under `names` (None: those of the
         curve); multiplier, residual: as above; special: kind and belts of a special point, else "".
@@ -97,7 +102,7 @@ class BifurcationCurve(eqx.Module):
                     "special": special,
                 }
             )
-        return rows
+        return table_of(rows)
 
     def _order(self) -> list[int | SpecialPoint]:
         """The numbers of the rows, and the special points at their places among them."""

@@ -1,4 +1,4 @@
-"""Pictures of a whole parameter space as data: `bifurcation_diagram` and `region_map`.
+"""Equilibria and cycles along a path in one parameter: `bifurcation_diagram`.
 
 A bifurcation diagram is what `scan` leaves between its points, filled in. In the stretch between
 two neighbouring points nothing changes in kind, so every equilibrium and every cycle in it can be
@@ -8,40 +8,35 @@ values are denser towards the points, where branches go like square roots. At a 
 one side goes on as what begins there at the same place: through a Hopf point with the other
 stability, through a grazing point or an exchange with another signature, and at a nonsmooth fold
 back on the same side, from stable to unstable.
-
-A region map is a sweep over two parameters from several starts, each cell named by what its runs
-lead to and by the stability of its equilibria. What bounds the regions is not read off the cells:
-points are found by `scan` along a few lines across the map, and their curves are followed.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, require
-from ..cycles.attractors import Runs, distinct, lead_to_one_cycle, stuck_belts
-from ..cycles.cycle import Cycle, find_cycle, polish, unstable_cycle
+from ..checks import require
+from ..cycles.cycle import Cycle, polish
 from ..cycles.shooting import Loop, cut
-from ..model.equilibria import EquilibriumKind, candidates, equilibria
+from ..model.equilibria import candidates
+from ..model.events import signature_name
 from ..model.oscillator import Oscillator
-from ..model.variations import Variation
 from ..numerics.compiling import jit
 from ..results import Status, draw
-from ..sweeps.datasets import decoded
-from ..sweeps.sweep import sweep
+from ..tables import per_belt, table_of
 from .conditions import BifurcationPoint
-from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
 from .labels import Label
 from .path import ParameterPath
+from .regions import in_plane_of_paper, region_name
 from .scan import by_value, edges_touched, search
+
+if TYPE_CHECKING:
+    import pandas
 
 #: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
 SAME = 1e-2
@@ -54,7 +49,7 @@ class Branch(eqx.Module):
     stable: [rows]. x1_min, x1_max, x2_min, x2_max: the range of the motion, [rows]; of a segment of
     pseudo-equilibria its ends. period, multiplier (the nontrivial one): of a cycle, else NaN.
     stick_durations, stick_velocities: per loop, and of the belt over omega, [rows, belts]; NaN
-    where a cycle does not stick to that belt.
+    where a cycle does not stick to that belt. cycles: a `Cycle` a row, of equilibria none.
     """
 
     kind: str = eqx.field(static=True)
@@ -68,6 +63,38 @@ class Branch(eqx.Module):
     multiplier: np.ndarray
     stick_durations: np.ndarray
     stick_velocities: np.ndarray
+    cycles: tuple[Cycle, ...]
+
+    @property
+    def amplitude(self) -> np.ndarray:
+        """Half the range of x1 of a cycle, 0 of what rests, [rows]."""
+        moves = self.kind == "cycle"
+        return 0.5 * (self.x1_max - self.x1_min) if moves else np.zeros(len(self))
+
+    def evaluated(self, functional: Callable[[Cycle], Any]) -> np.ndarray:
+        """A functional of the cycles, [rows]: NaN where there is none. It is given one known
+        `Cycle` after another, so it need not be of what JAX can trace."""
+        if not self.cycles:
+            return np.full(len(self), np.nan)
+        values = [np.asarray(functional(cycle)) for cycle in self.cycles]
+        for value in values:
+            fits = value.ndim == 0 and np.issubdtype(value.dtype, np.number)
+            told = f"one that returns {value.dtype}{list(value.shape)}"
+            require(fits, "quantity", "a function of a cycle that returns one number", told)
+        return np.array(values, float)
+
+    def columns(self) -> dict[str, Any]:
+        """What the table of a diagram tells of its rows."""
+        names = ("stable", "x1_min", "x1_max", "x2_min", "x2_max", "period", "amplitude")
+        events = [signature_name(cycle.signature) for cycle in self.cycles]
+        return {
+            "kind": [self.kind] * len(self),
+            "belts": [""] * len(self),
+            "value": self.values,
+            **{name: getattr(self, name) for name in (*names, "multiplier")},
+            **per_belt("stick_duration", self.stick_durations),
+            "signature": events or [""] * len(self),
+        }
 
     def __len__(self) -> int:
         return len(self.values)
@@ -86,7 +113,8 @@ class BifurcationDiagram(eqx.Module):
     touches a contact edge; branches: of equilibria, then of cycles; regions: (first, last, name) of
     every stretch between points of `scan`, see `region_name`; oscillator: the one that was given,
     of a function that at the first value; name: of the parameter, as the path to it, or that of the
-    function's argument. `plot()` draws it.
+    function's argument; as_paper: whether the path lies in the plane of the paper's Fig. 6, so that
+    pictures show the names of the regions. `table()` has all rows and points, `plot()` draws it.
     """
 
     points: tuple[BifurcationPoint, ...]
@@ -94,12 +122,40 @@ class BifurcationDiagram(eqx.Module):
     regions: tuple[tuple[float, float, str], ...] = eqx.field(static=True)
     oscillator: Oscillator
     name: str = eqx.field(static=True)
+    as_paper: bool = eqx.field(static=True, default=False)
 
-    def plot(self, ax: Any = None, *, quantity: str = "x2") -> Any:
+    def table(self) -> "pandas.DataFrame":
+        """A row for each row of each branch, in order, and then for each special point.
+
+        Columns: branch (its number; missing for a point), kind ("equilibrium", "cycle", or the
+        condition of a point), belts (of a point), value (of the parameter), stable (missing for a
+        point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests), amplitude (half the
+        range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each belt (NaN where it
+        does not stick to that), signature (the events of a cycle, as in `Cycle.table`).
+        """
+        rows = [
+            {"branch": number, **row}
+            for number, branch in enumerate(self.branches)
+            for row in table_of(branch.columns()).to_dict("records")
+        ]
+        table = table_of([*rows, *map(_row_of_point, self.points)])
+        # A point is of no branch, and neither stable nor unstable.
+        return table.astype({"branch": "Int64", "stable": "boolean"}) if len(table) else table
+
+    def plot(self, ax: Any = None, *, quantity: str | Callable[[Cycle], Any] | None = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned.
 
-        quantity: "x2", the paper's Figs. 3 and 7: equilibria at x2 = 0, sticking cycles by the
-        velocity of the belt, others by their largest x2; or "x1" (smallest and largest), "period".
+        quantity: what is drawn over the parameter.
+
+        - "amplitude": half the range of x1; 0 of equilibria.
+        - "x1": the smallest and the largest.
+        - "x2": as in the paper's Figs. 3 and 7. Equilibria at x2 = 0, cycles that stick by the
+          velocity of each belt that they stick to, others by their largest x2.
+        - "period": of cycles.
+        - a functional of cycles, such as `jb.stick_fraction`, or a function of your own that takes
+          a `Cycle` and returns a number: of cycles, stable and unstable.
+        - None: "amplitude" where a cycle sticks, for x2 would draw but the velocity of its belt;
+          else "x2", and "x1" where there is no cycle.
         """
         return draw(self, ax, quantity=quantity)
 
@@ -149,7 +205,23 @@ def bifurcation_diagram(
         regions=tuple((a, b, name) for (a, b), name in zip(stretches, names, strict=True)),
         oscillator=path.osc,
         name=path.name,
+        as_paper=in_plane_of_paper([path.at(v) for v in (path.first, *middles, path.last)]),
     )
+
+
+def _row_of_point(point: BifurcationPoint) -> dict[str, Any]:
+    row, none = point.row(), [np.nan] * len(point.oscillator.belts)
+    known = int(point.cycle.status) == Status.OK
+    names = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
+    return {
+        "branch": None,
+        **{name: row[name] for name in ("kind", "belts", "value")},
+        "stable": None,
+        **{name: row[name] for name in names},
+        "amplitude": 0.5 * (row["x1_max"] - row["x1_min"]),
+        **per_belt("stick_duration", point.cycle.stick_durations if known else none),
+        "signature": signature_name(point.cycle.signature) if known else "",
+    }
 
 
 def _nodes(path: ParameterPath, a: float, b: float, rows: int) -> np.ndarray:
@@ -172,251 +244,6 @@ def _separated(labels: Sequence[Label]) -> list[tuple[int, int]]:
     ]
 
 
-def region_name(osc: Oscillator, label: Label) -> str:
-    """The name of what a label tells, in the manner of the paper's Fig. 6.
-
-    A digit: 1 there is a stable equilibrium only; 2 a stable cycle, too; 3 a stable cycle only.
-    Where belts run in opposite directions these are 6, 5 and 4. With several belts a letter tells
-    what the cycle sticks to: a belt 0, b belt 1, c both (belts as binary digits, for more of them),
-    s none. Of several cycles each has its letter.
-    """
-    velocities = [float(belt.velocity) for belt in osc.belts]
-    opposite = min(velocities) < 0 < max(velocities)
-    rests = any(stable for _, stable, _ in label.equilibria)
-    return region_of(opposite, len(velocities), rests, [stuck_belts(path) for path in label.cycles])
-
-
-def region_of(opposite: bool, belts: int, rests: bool, cycles: Sequence[Collection[int]]) -> str:
-    """The same, where it is known whether belts run in opposite directions, how many there are,
-    whether an equilibrium is stable, and to which belts each of the cycles sticks."""
-    number = 2 if rests and cycles else 3 if cycles else 1
-    letters = []
-    for stuck in cycles:
-        code = sum(2**belt for belt in set(stuck))
-        letters.append(chr(ord("a") + code - 1) if code else "s")
-    tail = "".join(sorted(letters)) if belts > 1 else "s" * letters.count("s")
-    return f"{7 - number if opposite else number}{tail}"
-
-
-class RegionMap(eqx.Module):
-    """What `region_map` returns.
-
-    names: of the two parameters, as arguments of `make`; values: of each, [n] and [m]; label: name
-    of the region, [n, m], as from `region_name`, "" where the runs were undecided; curves: what
-    bounds the regions, see `BifurcationCurve`; cycles: by the name of a region, the cycles in its
-    example, attracting ones and the unstable one; make: as given. `example(name)` is a cell well
-    inside a region; `table()` has the curves as rows; `plot()` draws the map, with a portrait of
-    each region.
-    """
-
-    names: tuple[str, str] = eqx.field(static=True)
-    values: tuple[np.ndarray, np.ndarray]
-    label: np.ndarray
-    curves: tuple[BifurcationCurve, ...]
-    cycles: dict[str, tuple[Cycle, ...]]
-    make: Callable[..., Oscillator] = eqx.field(static=True)
-
-    @property
-    def regions(self) -> tuple[str, ...]:
-        """The names that occur, in order."""
-        return tuple(sorted(set(np.unique(self.label).tolist()) - {""}))
-
-    def example(self, name: str) -> tuple[float, float]:
-        """The values of the parameters in the cell of a region that is farthest from its bounds."""
-        require(name in self.regions, "name", f"one of {', '.join(self.regions)}", repr(name))
-        return _example(self.values, self.label == name)
-
-    def oscillator(self, name: str) -> Oscillator:
-        """The oscillator in that cell."""
-        return self.make(**dict(zip(self.names, self.example(name), strict=True)))
-
-    def table(self) -> list[dict[str, Any]]:
-        """All curves in rows, with their number: see `BifurcationCurve.table`."""
-        return [
-            {"curve": number, **row}
-            for number, curve in enumerate(self.curves)
-            for row in curve.table(self.names)
-        ]
-
-    def plot(self, ax: Any = None) -> Any:
-        """Draw the map into the axes `ax`, which are returned.
-
-        None: new ones, and a sketch of the phase portrait of each region in its example beside
-        them, as in the paper's Fig. 6.
-        """
-        return draw(self, ax)
-
-    def __repr__(self) -> str:
-        sizes = " x ".join(str(len(values)) for values in self.values)
-        return (
-            f"RegionMap({self.names[0]}, {self.names[1]}: {sizes} cells, "
-            f"regions {' '.join(self.regions)}, {len(self.curves)} curves)"
-        )
-
-
-def interior(inside: np.ndarray) -> tuple[int, int]:
-    """Row and column of the cell that is farthest from where a region ends, and from the rim.
-
-    Of several the last one: where the plane is symmetric, that with the larger parameters.
-    """
-    from scipy.ndimage import distance_transform_edt  # a quarter of a second that only maps need
-
-    depth = np.asarray(distance_transform_edt(np.pad(inside, 1)))[1:-1, 1:-1]
-    row, column = np.argwhere(depth > np.max(depth) - 1e-9)[-1]
-    return int(row), int(column)
-
-
-def region_map(
-    make: Callable[..., Oscillator],
-    axes: Mapping[str, ArrayLike],
-    *,
-    starts: Sequence[tuple[float, float]] = ((3.0, 0.0), (0.0, 0.0), (-2.0, -0.5)),
-    step: float = 0.01,
-    lines: int = 4,
-) -> RegionMap:
-    """Which motions there are in each cell of a plane of two parameters, and what bounds them.
-
-    make: gives an `Oscillator`, such as `jb.presets.class_b`; axes: two of its arguments and their
-    values, increasing. starts: where each cell is run from; what attracts none of them is not seen.
-    step: between the points of the curves, in units of the larger side of the map / 1.4; lines: on
-    how many lines parallel to each axis curves are looked for, 0 for none. `ValueError` names an
-    impossible argument.
-    """
-    require(len(axes) == 2, "axes", "two arguments of make and their values", list(axes))
-    names = tuple(axes)
-    values = [np.asarray(as_array(axes[name], name, (None,))) for name in names]
-    for name, along in zip(names, values, strict=True):
-        increases = along.size > 1 and np.all(np.diff(along) > 0)
-        require(increases, name, "two values or more that increase", along)
-    # Two things that know nothing of each other, most of the first time compiling.
-    with ThreadPoolExecutor(1) as beside:
-        cells = beside.submit(_cells, make, names, values, dict(axes), starts)
-        curves = _bounds(make, names, values, step, lines) if lines else ()
-        label, cycles = cells.result()
-    pair = (names[0], names[1]), (values[0], values[1])
-    return RegionMap(*pair, label, tuple(curves), cycles, make)
-
-
-def _cells(make, names, values, axes, starts):
-    """The names of all cells, and the cycles in the example of each region."""
-    label = _cell_names(make, names, values, axes, starts)
-    cycles = {}
-    for name in sorted(set(np.unique(label).tolist()) - {""}):
-        osc = make(**dict(zip(names, _example(values, label == name), strict=True)))
-        cycles[name] = _cycles(osc, starts)
-    return label, cycles
-
-
-def _example(values, inside: np.ndarray) -> tuple[float, float]:
-    row, column = interior(inside)
-    return float(values[0][row]), float(values[1][column])
-
-
-def _cycles(osc: Oscillator, starts) -> tuple[Cycle, ...]:
-    """The cycles that the starts lead to, and the unstable ones, each once."""
-    rests = equilibria(osc)
-    foci = int(np.sum(rests.stable & (rests.kind != EquilibriumKind.SEGMENT)))
-    repelling = (unstable_cycle(osc, around=number) for number in range(foci))
-    return tuple(distinct([*(find_cycle(osc, start) for start in starts), *repelling]))
-
-
-def _cell_names(make, names, values, axes, starts) -> np.ndarray:
-    runs = [sweep(make, axes, y0=start, observe="attractor") for start in starts]
-    grid = np.meshgrid(*values, indexing="ij")
-    rests, velocities = _at_cells(make, names, jnp.asarray(np.stack([g.ravel() for g in grid], 1)))
-    shape = grid[0].shape
-    stable = np.asarray(rests).reshape(shape)
-    velocities = np.asarray(velocities).reshape(*shape, -1)
-    n = velocities.shape[-1]
-    seen = np.zeros((*shape, len(runs)), dtype=int)  # 0 no cycle, else 1 + the belts stuck to
-    decided = np.ones(shape, dtype=bool)
-    for i, run in enumerate(runs):
-        kind = decoded(run[["kind"]]).kind.transpose(*names).values
-        sticks = run.sticks.transpose(*names, "belt").values
-        seen[..., i] = np.where(kind == "cycle", 1 + sticks @ 2 ** np.arange(n), 0)
-        decided &= kind != "undecided"
-    # Each cycle once.
-    tell = [Runs.of(run, names) for run in runs]
-    for i, j in combinations(range(len(runs)), 2):
-        both = (seen[..., i] > 0) & (seen[..., j] > 0)
-        same, doubtful = tell[i].same(tell[j])
-        for row, column in np.argwhere(both & doubtful):
-            osc = make(**{names[0]: values[0][row], names[1]: values[1][column]})
-            same[row, column] = lead_to_one_cycle(osc, starts[i], starts[j])
-        seen[..., j] = np.where(both & same, 0, seen[..., j])
-    opposite = (velocities.min(-1) < 0) & (velocities.max(-1) > 0)
-    facts = np.concatenate([stable[..., None], opposite[..., None], decided[..., None], seen], -1)
-    kinds, which = np.unique(facts.reshape(-1, facts.shape[-1]), axis=0, return_inverse=True)
-    found = []
-    for rest, against, known, *codes in kinds.tolist():
-        cycles = [[b for b in range(n) if (code - 1) >> b & 1] for code in codes if code]
-        name = region_of(bool(against), n, bool(rest), cycles)
-        found.append(name if known and (rest or cycles) else "")
-    return np.array(found)[which.reshape(shape)]
-
-
-@jit
-def _at_cells(make, names, cells: Array) -> tuple[Array, Array]:
-    def one(pair):
-        osc = make(**dict(zip(names, pair, strict=True)))
-        rests = equilibria(osc)
-        stable = jnp.any((rests.kind > 0) & rests.stable)
-        return stable, jnp.stack([belt.velocity for belt in osc.belts])
-
-    return jax.vmap(one)(cells)
-
-
-def _bounds(make, names, values, step, lines) -> list[BifurcationCurve]:
-    """The curve of every point on a few lines, each curve once."""
-
-    def at(p, q):
-        return make(**dict(zip(names, (p, q), strict=True)))
-
-    span = tuple((float(along[0]), float(along[-1])) for along in values)
-    step = step * max(b - a for a, b in span) / 1.4
-    across = [
-        (along, float(fixed))
-        for along in (0, 1)
-        for a, b in [span[1 - along]]
-        for fixed in a + (b - a) * (np.arange(lines) + 0.37) / lines
-    ]
-
-    def points_on(along: int, fixed: float) -> tuple[BifurcationPoint, ...]:
-        return search(ParameterPath(variation.held(1 - along, fixed), None, span[along]))
-
-    limits, corner = np.array(span), [ends[0] for ends in span]
-    variation = replace(Variation.of_function(at, corner, "make"), names=names)
-    curves: list[BifurcationCurve] = []
-    # The next lines are searched while curves are followed from those before.
-    with ThreadPoolExecutor(1) as ahead:
-        searches = [(line, ahead.submit(points_on, *line)) for line in across]
-        for (along, fixed), found in searches:
-            for point in found.result():
-                pair = np.empty(2)
-                pair[along], pair[1 - along] = float(point.value), fixed
-                if point.status == Status.OK and not any(
-                    _lies_on(point, pair, curve, step) for curve in curves
-                ):
-                    curves.append(follow_point(variation, point, pair, limits, step=step))
-    return curves
-
-
-def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, step: float) -> bool:
-    """Whether a point is on a curve that is known."""
-    if point.condition.lineage != curve.condition.lineage:
-        return False
-    a, b = curve.values[:-1], curve.values[1:]
-    chord = b - a
-    along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
-    along = np.clip(along, 0, 1)[:, None]
-    away = np.hypot(*(at - a - along * chord).T)
-    places = curve.places[:-1] + along * (curve.places[1:] - curve.places[:-1])
-    own = point.place
-    return any(
-        not is_elsewhere(own, places[i], FAR) for i in np.flatnonzero(away < 0.3 * step).tolist()
-    )
-
-
 # --- pieces of branches ---------------------------------------------------------------------------
 
 
@@ -433,7 +260,7 @@ def _equilibrium_pieces(path: ParameterPath, nodes: Sequence[np.ndarray]) -> lis
     for stretch, rows in enumerate(_consecutive(nodes)):
         values, here = nodes[stretch], jax.tree.map(lambda x, rows=rows: x[rows], found)
         none = np.full(len(values), np.nan)
-        per_belt = np.full((len(values), len(path.osc.belts)), np.nan)
+        none_stick = np.full((len(values), len(path.osc.belts)), np.nan)
         for row in range(int(np.max(np.sum(here.kind > 0, axis=1)))):
             branch = Branch(
                 kind="equilibrium",
@@ -445,8 +272,9 @@ def _equilibrium_pieces(path: ParameterPath, nodes: Sequence[np.ndarray]) -> lis
                 x2_max=np.zeros(len(values)),
                 period=none,
                 multiplier=none,
-                stick_durations=per_belt,
-                stick_velocities=per_belt,
+                stick_durations=none_stick,
+                stick_velocities=none_stick,
+                cycles=(),
             )
             pieces.append(_Piece(branch, stretch))
     return pieces
@@ -464,24 +292,26 @@ def _cycle_pieces(
         groups = [values for _, values, _ in wanted]
         loops = [loop for _, _, group in wanted for loop in group]
         cycles = _attracting(path, np.concatenate(groups), loops)
-        pieces += _as_pieces(path, cycles, groups, [stretch for stretch, _, _ in wanted])
+        pieces += _as_pieces(cycles, groups, [stretch for stretch, _, _ in wanted])
     both = _separated(labels)
     if both:
         groups = [nodes[stretch] for stretch, _ in both]
         arounds = np.repeat([around for _, around in both], [len(group) for group in groups])
         cycles = _repelling(path, np.concatenate(groups), arounds)
-        pieces += _as_pieces(path, cycles, groups, [stretch for stretch, _ in both])
+        pieces += _as_pieces(cycles, groups, [stretch for stretch, _ in both])
     return pieces
 
 
-def _as_pieces(path: ParameterPath, found: "_Rows", groups, stretches) -> list[_Piece]:
-    pieces = []
+def _as_pieces(cycles: Sequence[Cycle], groups, stretches) -> list[_Piece]:
+    pieces, found = [], _stacked(_row_of_branch, cycles)
     for stretch, values, rows in zip(stretches, groups, _consecutive(groups), strict=True):
         fine = found.status[rows] == Status.OK
         if np.any(fine):
             here = jax.tree.map(lambda x, rows=rows[fine]: x[rows], found)
             fields = {name: value for name, value in here._asdict().items() if name != "status"}
-            pieces.append(_Piece(Branch(kind="cycle", values=values[fine], **fields), stretch))
+            own = tuple(cycles[row] for row in rows[fine].tolist())
+            branch = Branch(kind="cycle", values=values[fine], cycles=own, **fields)
+            pieces.append(_Piece(branch, stretch))
     return pieces
 
 
@@ -534,15 +364,15 @@ def _stacked(program, items: Iterable[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
 
-def _attracting(path: ParameterPath, values: np.ndarray, loops: Sequence[Loop]) -> _Rows:
+def _attracting(path: ParameterPath, values: np.ndarray, loops: Sequence[Loop]) -> list[Cycle]:
     ok = jnp.asarray(Status.OK.value)
     pairs = zip(values, cut(loops), strict=True)
-    return _stacked(_row_of_branch, (polish(path.at(value), loop, ok) for value, loop in pairs))
+    return [polish(path.at(value), loop, ok) for value, loop in pairs]
 
 
-def _repelling(path: ParameterPath, values: np.ndarray, arounds: np.ndarray) -> _Rows:
+def _repelling(path: ParameterPath, values: np.ndarray, arounds: np.ndarray) -> list[Cycle]:
     pairs = zip(values.tolist(), arounds.tolist(), strict=True)
-    return _stacked(_row_of_branch, (path.unstable(value, around) for value, around in pairs))
+    return [path.unstable(value, around) for value, around in pairs]
 
 
 # --- from pieces to branches ----------------------------------------------------------------------
@@ -587,7 +417,7 @@ def _joined(pieces: Sequence[_Piece], points: Sequence[BifurcationPoint]) -> lis
             branch = pieces[at[0]].branch
             chain.append(_reversed(branch) if at[1] else branch)
             at = partner.get((at[0], not at[1]))
-        branches.append(jax.tree.map(lambda *leaves: np.concatenate(leaves), *chain))
+        branches.append(_chained(chain))
     return branches
 
 
@@ -604,4 +434,11 @@ def _distance(a: _End, b: _End) -> float:
 
 
 def _reversed(branch: Branch) -> Branch:
-    return jax.tree.map(lambda leaf: leaf[::-1], branch)
+    arrays = jax.tree.map(lambda leaf: leaf[::-1], replace(branch, cycles=()))
+    return replace(arrays, cycles=branch.cycles[::-1])
+
+
+def _chained(parts: Sequence[Branch]) -> Branch:
+    bare = [replace(part, cycles=()) for part in parts]
+    arrays = jax.tree.map(lambda *leaves: np.concatenate(leaves), *bare)
+    return replace(arrays, cycles=tuple(cycle for part in parts for cycle in part.cycles))

@@ -51,10 +51,10 @@ from ..results import Status
 from .conditions import (
     AbstractRestCondition,
     Line,
-    SpecialPoint,
     Trail,
 )
 from .guesses import HINT_BUDGET, orbit_after_stick
+from .special import SpecialPoint
 from .systems import RestSystem, small_newton, velocity_of
 
 #: The unknowns of a state of rest of which all is known.

@@ -42,7 +42,7 @@ def region_map(
 
     Example: jaxbelt map --class b --cells 400
     """
-    from ..plotting.diagrams import draw_region_map
+    from ..plotting.regions import draw_region_map
     from ..plotting.style import journal_figure, journal_style, save
 
     console = make_console()
@@ -62,7 +62,7 @@ def region_map(
             written = [out.with_name(out.name + end) for end in ends]
             save(figure, written[0])
         write_cells(found, written[1])
-        write_rows(found.table(), written[2])
+        write_table(found.table(), written[2])
     say(console, [repr(found)], written)
 
 
@@ -76,9 +76,6 @@ def write_cells(found: jb.RegionMap, path: Path) -> None:
             writer.writerow([first[i], second[j], name])
 
 
-def write_rows(rows: list[dict[str, Any]], path: Path) -> None:
-    """Dictionaries that have the same keys, a row each."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]) if rows else [])
-        writer.writeheader()
-        writer.writerows(rows)
+def write_table(table: Any, path: Path) -> None:
+    """A table of a result, every number to the last digit."""
+    table.to_csv(path, index=False, na_rep="nan")

@@ -6,6 +6,7 @@ guess from which `shooting` solves for the cycle.
 
 import functools
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -16,13 +17,14 @@ from jaxtyping import Array, ArrayLike
 
 from ..checks import as_array, check_finite, is_concrete, number, pick, require
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
-from ..model.events import Signature
+from ..model.events import Signature, signature_name
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import Arcs
 from ..numerics.compiling import any_lane, each, jit
 from ..numerics.newton import HOLDS, solve
-from ..results import Status, describe
+from ..results import Status, describe, draw
+from ..tables import per_belt, require_single, table_of
 from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
 from .shooting import (
     ARC_STEPS,
@@ -38,6 +40,9 @@ from .shooting import (
     meshed,
     room_of,
 )
+
+if TYPE_CHECKING:
+    import pandas
 
 #: Integration steps per slip arc where ARC_STEPS leave a larger error in the equations than EXACT,
 #: as halved steps tell it.
@@ -126,6 +131,42 @@ class Cycle(eqx.Module):
     def sample(self, n: int) -> Array:
         """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
         return _sample_cycle(self, n)
+
+    def row(self) -> dict[str, Any]:
+        """What `table` tells of it."""
+        require_single(self, self.multiplier, 0)
+        known = int(self.status) == Status.OK
+        x1, x2 = (self.x1_min, self.x1_max), (self.x2_min, self.x2_max)
+        numbers = {
+            "x1_min": x1[0],
+            "x1_max": x1[1],
+            "x2_min": x2[0],
+            "x2_max": x2[1],
+            "period": self.period,
+            "amplitude": 0.5 * (x1[1] - x1[0]),
+            "multiplier": self.multiplier,
+            **per_belt("stick_duration", self.stick_durations),
+            "residual": self.residual,
+        }
+        return {
+            "stable": bool(self.stable),
+            **{name: float(value) if known else np.nan for name, value in numbers.items()},
+            "iterations": int(self.iterations),
+            "signature": signature_name(self.signature) if known else "",
+            "status": Status(int(self.status)).name,
+        }
+
+    def table(self) -> "pandas.DataFrame":
+        """One row: stable, x1_min, x1_max, x2_min, x2_max, period, amplitude (half the range of
+        x1), multiplier, stick_duration_0, ... of each belt, residual, iterations, signature (its
+        events in order, such as stick1-slip1), status. `cycle.arcs.table()` has its arcs."""
+        return table_of([self.row()])
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw it in the phase plane of its oscillator, with the boundaries and equilibria there,
+        into the axes `ax` (None: new ones), which are returned. `ValueError` where there is no
+        cycle."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         if not is_concrete(self.unknowns) or self.unknowns.ndim != 2:

@@ -8,7 +8,7 @@ cycles.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -22,9 +22,13 @@ from ..model.events import signature_name
 from ..model.modes import edges
 from ..model.oscillator import Oscillator, check_oscillator
 from ..results import Status, describe, draw
+from ..tables import table_of
 from .cycle import Cycle
 from .returns import Returns, reach_of
 from .separatrices import Separatrix, TracedSeparatrix, branches
+
+if TYPE_CHECKING:
+    import pandas
 
 #: A top is on a cycle that is no farther away than this, relative to the distance from the origin.
 ON_CYCLE = 1e-5
@@ -69,12 +73,12 @@ class Portrait(eqx.Module):
     gaps: Array
     status: Array
 
-    def table(self) -> list[dict[str, Any]]:
+    def table(self) -> "pandas.DataFrame":
         """A row for each equilibrium, cycle and separatrix: what it is, stable or not, where.
 
-        Keys: what, number (among its sort), kind (an `EquilibriumKind`, the events of a cycle, or
-        where a separatrix leads to or comes from), stable, x1_min, x1_max, x2_min, x2_max, period
-        and multiplier of a cycle, rate of an equilibrium; None where it has none.
+        Columns: what, number (among its sort), kind (an `EquilibriumKind`, the events of a cycle,
+        or where a separatrix leads to or comes from), stable, x1_min, x1_max, x2_min, x2_max,
+        period and multiplier of a cycle, rate of an equilibrium; NaN where it has none.
         """
         rows = [
             _row(
@@ -104,10 +108,10 @@ class Portrait(eqx.Module):
             _row("separatrix", number, f"{one.end} {one.to}", one.stable, np.asarray(one.ys))
             for number, one in enumerate(self.separatrices)
         ]
-        return rows
+        return table_of(rows)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw it into the axes `ax`, which are returned; None: new ones, with a key below."""
+        """Draw it into the axes `ax`, which are returned; None: new ones."""
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -132,9 +136,9 @@ def _row(what: str, number: int, kind: str, stable: Any, ys: np.ndarray, **more:
         "x1_max": float(x1.max()),
         "x2_min": float(x2.min()),
         "x2_max": float(x2.max()),
-        "period": None,
-        "multiplier": None,
-        "rate": None,
+        "period": np.nan,
+        "multiplier": np.nan,
+        "rate": np.nan,
         **more,
     }
 

@@ -25,7 +25,7 @@ and that piece of the boundary itself parts the motions.
 """
 
 from itertools import product
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -50,11 +50,15 @@ from ..model.modes import (
 )
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
-from ..results import Status
+from ..results import Status, draw
+from ..tables import table_of
 from .backwards import reversed_in_time
 from .orbits import follow_finely, place_of_rest
 from .returns import side_pulls
 from .shooting import Loop, flow, meshed, trace_of
+
+if TYPE_CHECKING:
+    import pandas
 
 #: Arcs for which a separatrix is followed: some 40 loops.
 SEPARATRIX_ARCS = 256
@@ -86,6 +90,16 @@ class Separatrix(eqx.Module):
     ys: Array
     end: str = eqx.field(static=True)
     to: int = eqx.field(static=True)
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each sample, in the order of time: t, x1, x2."""
+        x1, x2 = np.asarray(self.ys).T
+        return table_of({"t": self.ts, "x1": x1, "x2": x2})
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw it in the phase plane, with its point, into the axes `ax` (None: new ones), which
+        are returned."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         way = "from" if self.stable else "to"

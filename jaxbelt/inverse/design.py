@@ -5,7 +5,7 @@ Newton's method on functionals of the cycle, damped, within bounds.
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -20,8 +20,12 @@ from ..cycles.cycle import Cycle, find_cycle
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
-from ..results import Status, describe
+from ..results import Status, describe, draw
+from ..tables import table_of
 from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of
+
+if TYPE_CHECKING:
+    import pandas
 
 #: Targets are met to this fraction of their size (or of one, where they are smaller).
 MET = 1e-9
@@ -44,6 +48,24 @@ class Design(eqx.Module):
     targets: Array
     iterations: int
     status: Array
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each parameter, then for each target in order: what ("parameter" or "target"),
+        name, value (of a target what was achieved), wanted (of a parameter NaN)."""
+        count = len(self.targets)
+        return table_of(
+            {
+                "what": ["parameter"] * len(self.names) + ["target"] * count,
+                "name": [*self.names, *(f"target {i}" for i in range(count))],
+                "value": np.concatenate([self.values, self.achieved]),
+                "wanted": np.concatenate([np.full(len(self.names), np.nan), self.targets]),
+            }
+        )
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the designed cycle, see `Cycle.plot`, into the axes `ax` (None: new ones), which are
+        returned."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         status = Status(int(self.status))

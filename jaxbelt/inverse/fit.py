@@ -22,7 +22,7 @@ All derivatives of 2 and 3 are those of `simulate`, through every stick, slip an
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -36,9 +36,13 @@ from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import simulate
 from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
-from ..results import Status, describe
+from ..results import Status, describe, draw
+from ..tables import table_of
 from .record import WINDOW, Record, record_of
 from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of
+
+if TYPE_CHECKING:
+    import pandas
 
 #: Each stage joins so many neighbouring windows.
 JOIN = 3
@@ -247,9 +251,9 @@ class Fit(eqx.Module):
 
     oscillator: with the estimates in it; names, estimates, standard_errors, [p]: of the parameters,
     in the order of `where`; covariance, [p, p]; y0, y0_standard_errors, [2]: the start, the state
-    at the first time; ys: the fitted motion at the times of the record, [samples, 2]; residuals:
-    datum minus motion, [samples, 2], NaN where there is no datum; noise: standard deviation of the
-    data in x1 and in x2, as given or estimated, [2].
+    at the first time; ts: the times of the record, [samples]; ys: the fitted motion there,
+    [samples, 2]; residuals: datum minus motion, [samples, 2], NaN where there is no datum; noise:
+    standard deviation of the data in x1 and in x2, as given or estimated, [2].
 
     Diagnostics of the residuals: reduced_chi_squared, about 1 +- sqrt(2/data) where model and noise
     are right; plausibility, the chance that noise alone makes it this large; autocorrelation, at
@@ -268,6 +272,7 @@ class Fit(eqx.Module):
     covariance: Array
     y0: Array
     y0_standard_errors: Array
+    ts: Array
     ys: Array
     residuals: Array
     noise: Array
@@ -280,8 +285,30 @@ class Fit(eqx.Module):
 
     def intervals(self, level: float = 0.95) -> Array:
         """Confidence intervals of the parameters, (lower, upper) each, [p, 2]."""
-        reach = jax.scipy.stats.norm.ppf(0.5 + 0.5 * level) * self.standard_errors
+        reach = _standard_errors_in(level) * self.standard_errors
         return jnp.stack([self.estimates - reach, self.estimates + reach], axis=1)
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each parameter, and for x1 and x2 at the first time: name, estimate,
+        standard_error, lower, upper (the confidence interval of 95 per cent)."""
+        names = (*self.names, "x1 at the start", "x2 at the start")
+        estimates = np.concatenate([self.estimates, self.y0])
+        errors = np.concatenate([self.standard_errors, self.y0_standard_errors])
+        reach = _standard_errors_in(0.95) * errors
+        return table_of(
+            {
+                "name": names,
+                "estimate": estimates,
+                "standard_error": errors,
+                "lower": estimates - reach,
+                "upper": estimates + reach,
+            }
+        )
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the record and the fitted motion over time into the axes `ax` (None: new ones),
+        which are returned."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         status = Status(int(self.status))
@@ -295,6 +322,11 @@ class Fit(eqx.Module):
         )
         advice = [] if status == Status.OK else [f"  {describe(status)}"]
         return "\n".join([head, *rows, *advice])
+
+
+def _standard_errors_in(level: float) -> float:
+    """How many standard errors a confidence interval of that level reaches to either side."""
+    return float(jax.scipy.stats.norm.ppf(0.5 + 0.5 * level))
 
 
 def fit(
@@ -360,7 +392,9 @@ def fit(
         whole = np.arange(len(record.starts)) == 0
         best = _fit_windows(linearized, np.asarray(u), np.asarray(record.starts), whole, 0.0)
         evaluations += best.evaluations
-    result = _result(oscillator, selection, record, values, best, freedom, count, evaluations)
+    result = _result(
+        oscillator, selection, record, times, values, best, freedom, count, evaluations
+    )
     tell(repr(result).splitlines()[0])
     return result
 
@@ -413,7 +447,7 @@ def _plausibility(chi2, freedom: int) -> float:
     return float(jax.scipy.special.gammaincc(0.5 * freedom, 0.5 * chi2))
 
 
-def _result(oscillator, selection, record, values, point: _Point, freedom, count, evaluations):
+def _result(oscillator, selection, record, ts, values, point: _Point, freedom, count, evaluations):
     p = point.u.size
     u = jnp.asarray(point.u)
     estimates = selection.values(u)
@@ -437,6 +471,7 @@ def _result(oscillator, selection, record, values, point: _Point, freedom, count
         covariance=jnp.asarray(covariance[:p, :p]),
         y0=jnp.asarray(point.starts[0]),
         y0_standard_errors=jnp.asarray(errors[p:]),
+        ts=jnp.asarray(ts),
         ys=jnp.asarray(ys),
         residuals=jnp.asarray(off),
         noise=jnp.asarray(np.where(np.isfinite(noise), noise, np.nan)),

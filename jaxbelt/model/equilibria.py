@@ -18,6 +18,7 @@ Everything is in closed form, so derivatives with respect to any parameter go th
 
 import enum
 from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -28,6 +29,8 @@ from jaxtyping import Array
 
 from ..checks import is_concrete, number, pick
 from ..numerics.compiling import jit
+from ..results import draw
+from ..tables import per_belt, require_single, table_of
 from .modes import (
     ABOVE,
     BELOW,
@@ -40,6 +43,9 @@ from .modes import (
     settle,
 )
 from .oscillator import Oscillator, check_oscillator
+
+if TYPE_CHECKING:
+    import pandas
 
 
 class EquilibriumKind(enum.IntEnum):
@@ -94,6 +100,32 @@ class Equilibria(eqx.Module):
 
     def __iter__(self) -> Iterator["Equilibria"]:
         return (self[i] for i in range(len(self)))
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each, from left to right: kind (the name of an `EquilibriumKind`), stable, x1,
+        x1_lower, x1_upper, rate, frequency (the imaginary part of the first eigenvalue: small
+        disturbances turn with it), and contact_0, contact_1, ..., the contact code of each belt."""
+        require_single(self, self.kind, 0, 1)
+        rows = jax.tree.map(np.asarray, self)
+        if self.kind.ndim == 0:
+            rows = jax.tree.map(lambda leaf: leaf[None], rows)
+        here = np.asarray(rows.kind) > 0
+        names = {
+            "kind": [EquilibriumKind(int(kind)).name for kind in np.asarray(rows.kind)[here]],
+            "stable": rows.stable,
+            "x1": rows.x1,
+            "x1_lower": rows.x1_lower,
+            "x1_upper": rows.x1_upper,
+            "rate": rows.rate,
+            "frequency": np.abs(np.imag(rows.eigenvalues))[:, 0],
+            **per_belt("contact", rows.modes),
+        }
+        return table_of({n: x if n == "kind" else np.asarray(x)[here] for n, x in names.items()})
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw them in the phase plane, on its line x2 = 0, into the axes `ax` (None: new ones),
+        which are returned."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         if not is_concrete(self) or self.kind.ndim > 1:

@@ -4,6 +4,7 @@ A trajectory is a chain of arcs, see `runs`; samples at given times are taken fr
 """
 
 import math
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -15,9 +16,13 @@ from ..checks import as_numbers, check_finite, check_positive, is_concrete, requ
 from ..model.modes import contact, has_edges
 from ..model.oscillator import Oscillator, check_oscillator
 from ..numerics.compiling import jit
-from ..results import EventKind, Status, describe
+from ..results import EventKind, Status, describe, draw
+from ..tables import per_belt, require_single, table_of
 from .runs import Rules, arcs_of_run, stacked_codes, states_at
 from .smoothing import integrate, smooth_field, switch_field, switch_mode
+
+if TYPE_CHECKING:
+    import pandas
 
 
 class Events(eqx.Module):
@@ -32,6 +37,19 @@ class Events(eqx.Module):
     y: Array
     kind: Array
     belt: Array
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each event, in order: t, x1, x2, kind (the name of an `EventKind`), belt."""
+        require_single(self, self.t, 1)
+        happened = np.asarray(self.kind) > 0
+        t, y, kind, belt = (np.asarray(x)[happened] for x in (self.t, self.y, self.kind, self.belt))
+        names = [EventKind(int(one)).name for one in kind]
+        return table_of({"t": t, "x1": y[:, 0], "x2": y[:, 1], "kind": names, "belt": belt})
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw which event happens when, a line for each kind and belt, into the axes `ax` (None:
+        new ones), which are returned."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         if not is_concrete(self.t) or self.t.ndim != 1:
@@ -53,6 +71,22 @@ class Arcs(eqx.Module):
     mode: Array
     duration: Array
 
+    def table(self) -> "pandas.DataFrame":
+        """A row for each arc, in order: t, x1, x2 at its entry, duration, and contact_0, contact_1,
+        ..., the contact code of each belt."""
+        require_single(self, self.t, 1)
+        used = ~np.isnan(np.asarray(self.t))
+        t, y, mode, duration = (
+            np.asarray(x)[used] for x in (self.t, self.y, self.mode, self.duration)
+        )
+        columns = {"t": t, "x1": y[:, 0], "x2": y[:, 1], "duration": duration}
+        return table_of(columns | per_belt("contact", mode))
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the contact of each belt over time, as a bar, into the axes `ax` (None: new ones),
+        which are returned."""
+        return draw(self, ax)
+
 
 class Trajectory(eqx.Module):
     """What `simulate` returns.
@@ -69,6 +103,20 @@ class Trajectory(eqx.Module):
     events: Events
     arcs: Arcs
     status: Array
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each sample: t, x1, x2, and contact_0, contact_1, ..., the contact code of each
+        belt. Of events and arcs there are tables, too: `trajectory.events.table()`."""
+        require_single(self, self.ts, 1)
+        x1, x2 = np.asarray(self.ys).T
+        columns = {"t": self.ts, "x1": x1, "x2": x2}
+        return table_of(columns | per_belt("contact", self.modes))
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw displacement and velocity over time, stick phases shaded, into the axes `ax` (None:
+        new ones), which are returned. `plot_time_history` has axes for each of the two,
+        `plot_phase_portrait` the plane of both."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         if not is_concrete(self.ts) or self.ts.ndim != 1:

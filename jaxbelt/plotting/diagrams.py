@@ -1,74 +1,63 @@
-"""Bifurcation diagrams, curves of bifurcation points, and region maps.
+"""Bifurcation diagrams, curves of bifurcation points, and points of codimension two.
 
-How each kind of point is named and its curve drawn its condition tells, see `conditions`; the
-symbols of parameters stand in `SYMBOLS`.
+How each kind of point is named and its curve drawn its condition tells, see `conditions`.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
 import matplotlib
-import matplotlib.colors
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
-from scipy import ndimage
 
 from ..bifurcations.curves import BifurcationCurve
-from ..bifurcations.diagrams import BifurcationDiagram, Branch, RegionMap, interior
+from ..bifurcations.diagrams import BifurcationDiagram, Branch
+from ..bifurcations.special import SpecialPoint
+from ..checks import require
 from ..cycles.cycle import Cycle
-from ..model.equilibria import equilibria as find_equilibria
-from ..model.oscillator import Oscillator
-from .phase import draw_equilibrium
-from .style import BELT_COLOURS, belt_colour, draw_key, figure_of, new_axes, new_figure, spread
+from ..cycles.functionals import amplitude, period
+from .style import figure_of, new_axes, parameter_label, spread
 
 UNSTABLE_COLOUR = "0.6"
-#: Parameters by the end of their path in the oscillator; % is the number of the belt.
-SYMBOLS = {
-    "damping": r"\zeta",
-    "omega": r"\omega",
-    "velocity": r"\nu_%",
-    "load": r"u_{0,%}",
-    "lower": r"\mathrm{lower\ edge}_%",
-    "upper": r"\mathrm{upper\ edge}_%",
-    "static": r"\mu_{s,%}",
-    "residual": r"p_{1,%}",
-    "quadratic": r"p_{2,%}",
-    "steepness": r"p_{3,%}",
-}
-WORDS = {"damping": "damping", "velocity": "belt velocity", "load": "load"}
 
 
 # --- diagrams -----------------------------------------------------------------------------------
 
 
-def parameter_symbol(name: str) -> str:
-    """The paper's symbol of a parameter, by its path such as "belts[0].velocity"."""
-    *_, last = name.split(".")
-    belt = name.partition("[")[2].partition("]")[0]
-    return SYMBOLS[last].replace("%", belt) if last in SYMBOLS else rf"\mathrm{{{last}}}"
+#: The quantities that have a name, and what their axis is called.
+QUANTITIES = {
+    "amplitude": "amplitude of $x_1$",
+    "x1": "displacement $x_1$",
+    "x2": "velocity $x_2$",
+    "period": "period $T$",
+}
+Quantity = str | Callable[[Cycle], Any]
 
 
 def plot_diagram(
-    diagram: BifurcationDiagram, ax: Axes | None = None, *, quantity: str = "x2"
+    diagram: BifurcationDiagram, ax: Axes | None = None, *, quantity: Quantity | None = None
 ) -> Axes:
     """A bifurcation diagram in the manner of the paper's Figs. 3 and 7.
 
-    quantity: "x2": equilibria are drawn at x2 = 0, cycles that stick by the velocity of each belt
-    that they stick to, two of these joined by double arrows where they belong to one cycle, other
-    cycles by their largest x2. "x1": smallest and largest x1; "period". Stable is black, unstable
-    grey; unstable cycles are dashed. Dotted lines are the special points, the names of the regions
-    between them stand at the upper edge. Returns the axes.
+    quantity: what is drawn, see `BifurcationDiagram.plot`. In "x2" the velocities of two belts that
+    one cycle sticks to are joined by double arrows. Stable is black, unstable grey; unstable cycles
+    are dashed. Dotted lines are the special points; in the plane of the paper's Fig. 6 the names of
+    the regions between them stand at the upper edge. Returns the axes.
     """
-    known = ("x2", "x1", "period")
-    if quantity not in known:
-        raise ValueError(f"quantity must be one of {', '.join(known)}, got {quantity!r}")
+    quantity = _default_quantity(diagram) if quantity is None else quantity
+    if isinstance(quantity, str) or not callable(quantity):
+        expected = f"one of {', '.join(QUANTITIES)}, or a function of a cycle"
+        require(quantity in list(QUANTITIES), "quantity", expected, repr(quantity))
+    # What has a name is known of equilibria, too.
+    named = ((amplitude, "amplitude"), (period, "period"))
+    quantity = next((name for one, name in named if quantity is one), quantity)
+    curves = [_curves_of(branch, quantity) for branch in diagram.branches]
     ax = new_axes() if ax is None else ax
-    for branch in diagram.branches:
+    for branch, drawn in zip(diagram.branches, curves, strict=True):
         for rows in _stretches_of(branch.stable):
-            _draw_rows(ax, branch, rows, quantity)
+            _draw_rows(ax, branch, rows, [curve[rows] for curve in drawn])
     first, last = diagram.regions[0][0], diagram.regions[-1][1]
     ax.set_xlim(first, last)
     ax.margins(y=0.08)
@@ -76,13 +65,40 @@ def plot_diagram(
     if quantity == "x2":
         _join_stick_phases(ax, diagram)
     _name_points(ax, diagram)
-    _name_regions(ax, diagram)
-    *_, last_part = diagram.name.split(".")
-    word = WORDS.get(last_part, "parameter")
-    ax.set_xlabel(f"{word} ${parameter_symbol(diagram.name)}$")
-    labels = {"x2": "velocity $x_2$", "x1": "displacement $x_1$", "period": "period"}
-    ax.set_ylabel(labels[quantity])
+    if diagram.as_paper:
+        _name_regions(ax, diagram)
+    ax.set_xlabel(parameter_label(diagram.name))
+    ax.set_ylabel(QUANTITIES[quantity] if isinstance(quantity, str) else _name_of(quantity))
     return ax
+
+
+def _default_quantity(diagram: BifurcationDiagram) -> str:
+    cycles = [branch for branch in diagram.branches if branch.kind == "cycle"]
+    if not cycles:
+        return "x1"
+    sticks = any(np.any(np.isfinite(branch.stick_velocities)) for branch in cycles)
+    return "amplitude" if sticks else "x2"
+
+
+def _curves_of(branch: Branch, quantity: Quantity) -> list[np.ndarray]:
+    """What is drawn of a branch, [rows] each, NaN where it has no such quantity."""
+    if not isinstance(quantity, str):
+        return [branch.evaluated(quantity)]
+    if quantity == "x1":
+        return [branch.x1_min, branch.x1_max]
+    if quantity == "x2":
+        stuck = np.any(~np.isnan(branch.stick_velocities), axis=1)
+        return [*branch.stick_velocities.T, np.where(stuck, np.nan, branch.x2_max)]
+    return [getattr(branch, quantity)]
+
+
+def _name_of(functional: Any) -> str:
+    """What a functional is called: its name in words, and the arguments that it was given."""
+    if isinstance(functional, functools.partial):
+        given = [*map(repr, functional.args), *(f"{k} {v}" for k, v in functional.keywords.items())]
+        return f"{_name_of(functional.func)} ({', '.join(given)})"
+    name = getattr(functional, "__name__", type(functional).__name__)
+    return "quantity" if name == "<lambda>" else name.strip("_").replace("_", " ")
 
 
 def _stretches_of(flags: np.ndarray) -> list[slice]:
@@ -91,7 +107,7 @@ def _stretches_of(flags: np.ndarray) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
-def _draw_rows(ax: Axes, branch: Branch, rows: slice, quantity: str) -> None:
+def _draw_rows(ax: Axes, branch: Branch, rows: slice, curves: Sequence[np.ndarray]) -> None:
     stable, values = bool(branch.stable[rows][0]), branch.values[rows]
     is_cycle = branch.kind == "cycle"
     style: dict[str, Any] = {
@@ -102,17 +118,6 @@ def _draw_rows(ax: Axes, branch: Branch, rows: slice, quantity: str) -> None:
         "zorder": 3 if stable else 2.5,
         "label": f"{'' if stable else 'un'}stable {'cycle' if is_cycle else 'fixed point'}",
     }
-    if quantity == "period":
-        curves = [branch.period[rows]] if is_cycle else []
-    elif quantity == "x1":
-        curves = [branch.x1_min[rows], branch.x1_max[rows]]
-    else:
-        stuck = ~np.isnan(branch.stick_velocities[rows])
-        any_stuck = np.any(stuck, axis=1)
-        curves = [
-            column for column in branch.stick_velocities[rows].T if not np.all(np.isnan(column))
-        ]
-        curves.append(np.where(any_stuck, np.nan, branch.x2_max[rows]))
     for curve in curves:
         if not np.all(np.isnan(curve)):
             ax.plot(values, curve, **style)
@@ -176,7 +181,7 @@ def _name_regions(ax: Axes, diagram: BifurcationDiagram) -> None:
         )
 
 
-# --- curves and region maps ---------------------------------------------------------------------
+# --- curves ---------------------------------------------------------------------------------------
 
 
 def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> Axes:
@@ -200,10 +205,8 @@ def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> A
                 dot = {"marker": "o", "markersize": 3.5, "color": "black", "zorder": 5}
                 ax.plot(*point.values, linestyle="none", label="double sliding", **dot)
     if curves:
-        words = [WORDS.get(name.rpartition(".")[2], "parameter") for name in curves[0].names]
-        symbols = [parameter_symbol(name) for name in curves[0].names]
-        ax.set_xlabel(f"{words[0]} ${symbols[0]}$")
-        ax.set_ylabel(f"{words[1]} ${symbols[1]}$")
+        first, second = map(parameter_label, curves[0].names)
+        ax.set(xlabel=first, ylabel=second)
     return ax
 
 
@@ -216,91 +219,17 @@ def _kinds_along(curve: BifurcationCurve, path: np.ndarray) -> np.ndarray:
     return np.array(kinds)
 
 
-def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
-    """The regions of a plane of two parameters by name, and the curves that bound them.
-
-    The colour tells what the stable cycle sticks to (that of the belt; both: violet; none: white),
-    paler where an equilibrium is stable, too. Without `ax` a figure is made that shows the portrait
-    of every region beside the map, as the paper's Fig. 6 does. Returns the axes of the map.
-    """
-    if ax is None:
-        figure = new_figure()
-        figure.set_size_inches(7.2, 9.4)
-        return draw_region_map(regions, figure)
-    (x, y), label = regions.values, regions.label
-    known = sorted(set(np.unique(label).tolist()))
-    colours = np.array([_region_colour(name) for name in known])
-    image = colours[np.searchsorted(known, label)]
-    ax.pcolormesh(x, y, np.swapaxes(image, 0, 1), shading="nearest", rasterized=True, zorder=0)
-    plot_curves(regions.curves, ax)
-    for name in regions.regions:
-        parts: Any = ndimage.label(label == name)[0]  # type: ignore[index]
-        for part in range(1, int(np.max(parts)) + 1):
-            # Strips one cell wide, such as the line of equal velocities, are left unnamed.
-            inside = parts == part
-            if not np.any(ndimage.binary_erosion(inside)):
-                continue
-            row, column = interior(inside)
-            halo = [withStroke(linewidth=2.5, foreground="white")]
-            style = {"ha": "center", "va": "center", "path_effects": halo, "zorder": 6}
-            ax.text(x[row], y[column], name, **style)
-    ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
-    if not regions.curves:
-        ax.set(xlabel=regions.names[0], ylabel=regions.names[1])
+def plot_special_point(point: SpecialPoint, ax: Axes | None = None) -> Axes:
+    """A point of codimension two in the plane of the two parameters. Returns the axes."""
+    ax = new_axes() if ax is None else ax
+    words = "".join(f" {one.lower()}" if one.isupper() else one for one in point.kind).strip()
+    belts = f", belt{'s' * (len(point.belts) > 1)} {' and '.join(map(str, point.belts))}"
+    ax.plot(*point.values, marker="o", markersize=4.5, color="black", linestyle="none")
+    ax.annotate(
+        words + belts * bool(point.belts),
+        point.values,
+        xytext=(6, 4),
+        textcoords="offset points",
+    )
+    ax.set(xlabel="first parameter", ylabel="second parameter")
     return ax
-
-
-def _region_colour(name: str) -> tuple[float, float, float]:
-    """Pale for cycles, paler where an equilibrium is stable beside them; white for no cycle."""
-    letters = {"a": BELT_COLOURS[0], "b": BELT_COLOURS[1], "c": "#7F5FA8"}
-    if not name or name[0] in "16":
-        return (1.0, 1.0, 1.0)
-    colour = np.array(matplotlib.colors.to_rgb(letters.get(name[1:2], "#555555")))
-    strength = 0.18 if name[0] in "25" else 0.38
-    red, green, blue = 1 - strength * (1 - colour)
-    return float(red), float(green), float(blue)
-
-
-def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
-    """The map above, below it a sketch of the phase portrait of each region, in its example."""
-    names = [name for name in regions.regions if _has_area(regions, name)]
-    columns = 5
-    rows = -(-len(names) // columns)
-    parts: Any = figure.subfigures(2, 1, height_ratios=(6, 1.25 * rows))
-    upper, lower = parts
-    ax = upper.subplots()
-    plot_region_map(regions, ax)
-    ax.set_aspect("equal")
-    handles, labels = ax.get_legend_handles_labels()
-    by_label = dict(zip(labels, handles, strict=True))
-    upper.legend(by_label.values(), by_label.keys(), loc="outside right center", handlelength=2.4)
-    axes = lower.subplots(rows, columns, squeeze=False)
-    for axis in axes.flat[len(names) :]:
-        axis.axis("off")
-    for axis, name in zip(axes.flat, names, strict=False):
-        _draw_sketch(axis, regions.oscillator(name), regions.cycles[name], name)
-    draw_key(lower)
-    return ax
-
-
-def _has_area(regions: RegionMap, name: str) -> bool:
-    return bool(np.any(ndimage.binary_erosion(regions.label == name)))
-
-
-def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle], name: str) -> None:
-    loops = [np.asarray(cycle.sample(300)) for cycle in cycles]
-    rests = find_equilibria(osc)
-    x1 = float(rests.x1[0])
-    for i, belt in enumerate(osc.belts):
-        level = float(belt.velocity / osc.omega)
-        ax.axhline(level, color=belt_colour(i), linewidth=0.9, zorder=1, label=f"belt {i}")
-    for cycle, loop in zip(cycles, loops, strict=True):
-        style: dict[str, Any] = {"linewidth": 1.4, "label": "stable cycle"}
-        if not cycle.stable:
-            style = {"linewidth": 0.9, "linestyle": (0, (3, 2)), "label": "unstable cycle"}
-        ax.plot(*loop.T, color="black", zorder=3, **style)
-    for row in rests:
-        draw_equilibrium(ax, row)
-    reach = max([0.5, *(1.2 * float(np.max(np.abs(loop[:, 0] - x1))) for loop in loops)])
-    ax.set(xlim=(x1 - reach, x1 + reach), ylim=(-0.85, 0.85), xticks=[], yticks=[])
-    ax.set_title(name, pad=2)

@@ -1,25 +1,69 @@
 """Which picture belongs to which result: what `result.plot()` draws."""
 
+from collections.abc import Callable
 from typing import Any
 
 from matplotlib.axes import Axes
 
+from ..bifurcations.conditions import BifurcationPoint
 from ..bifurcations.curves import BifurcationCurve
-from ..bifurcations.diagrams import BifurcationDiagram, RegionMap
+from ..bifurcations.diagrams import BifurcationDiagram
+from ..bifurcations.regions import RegionMap
+from ..bifurcations.special import SpecialPoint
+from ..cycles.cycle import Cycle
 from ..cycles.portrait import Portrait
-from .diagrams import plot_curves, plot_diagram, plot_region_map
-from .phase import plot_portrait
+from ..cycles.separatrices import Separatrix
+from ..inverse.design import Design
+from ..inverse.fit import Fit
+from ..model.equilibria import Equilibria
+from ..motion.simulate import Arcs, Events, Trajectory
+from ..sweeps.basins import Basins, BasinStability
+from ..sweeps.store import Verified
+from ..sweeps.sweep import Explanation
+from .diagrams import plot_curves, plot_diagram, plot_special_point
+from .histories import plot_arcs, plot_events, plot_trajectory
+from .inverse import plot_fit
+from .phase import plot_portrait, plot_separatrix
+from .points import plot_cycle, plot_design, plot_equilibria, plot_point
+from .regions import plot_region_map
+from .style import add_key, figure_of
+from .sweeps import plot_basins, plot_blocks, plot_explanation, plot_stability
+
+
+def _plot_curve(curve: BifurcationCurve, ax: Axes | None = None) -> Axes:
+    return plot_curves([curve], ax)
+
+
+PICTURES: dict[type, Callable[..., Axes]] = {
+    Arcs: plot_arcs,
+    Basins: plot_basins,
+    BasinStability: plot_stability,
+    BifurcationCurve: _plot_curve,
+    BifurcationDiagram: plot_diagram,
+    BifurcationPoint: plot_point,
+    Cycle: plot_cycle,
+    Design: plot_design,
+    Equilibria: plot_equilibria,
+    Events: plot_events,
+    Explanation: plot_explanation,
+    Fit: plot_fit,
+    Portrait: plot_portrait,
+    RegionMap: plot_region_map,
+    Separatrix: plot_separatrix,
+    SpecialPoint: plot_special_point,
+    Trajectory: plot_trajectory,
+    Verified: plot_blocks,
+}
 
 
 def draw_result(result: Any, ax: Axes | None, **options: Any) -> Axes:
-    """Draw a result into the axes (None: new ones), which are returned; options: of its `plot`."""
-    match result:
-        case BifurcationCurve():
-            return plot_curves([result], ax, **options)
-        case BifurcationDiagram():
-            return plot_diagram(result, ax, **options)
-        case RegionMap():
-            return plot_region_map(result, ax, **options)
-        case Portrait():
-            return plot_portrait(result, ax, **options)
-    raise TypeError(f"result must be one that has a picture, got {type(result).__name__}")
+    """Draw a result into the axes (None: new ones), which are returned, with a key below them of
+    what they label; options: of its `plot`."""
+    picture = PICTURES.get(type(result))
+    if picture is None:
+        raise TypeError(f"result must be one that has a picture, got {type(result).__name__}")
+    drawn = picture(result, ax, **options)
+    # A figure of several axes has a key of its own.
+    if ax is not None or not figure_of(drawn).legends:
+        add_key(drawn)
+    return drawn

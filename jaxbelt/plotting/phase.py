@@ -24,13 +24,14 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from ..cycles.portrait import Portrait
+from ..cycles.separatrices import Separatrix
 from ..model.equilibria import Equilibria, EquilibriumKind
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.modes import mode_acceleration, mode_of_state
 from ..model.oscillator import Oscillator
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
-from .style import belt_colour, draw_key, figure_of, journal_figure, new_axes, new_figure, spread
+from .style import belt_colour, figure_of, journal_figure, new_axes, new_figure, spread
 
 #: A second mark of the belts, for print without colour.
 BELT_HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\")
@@ -69,7 +70,7 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
     """
     if ax is None:
         ax = tuple(new_figure().subplots(2, sharex=True))
-    t, ys = _path_of(trajectory)
+    t, ys = path_of(trajectory)
     upper, lower = ax
     for axes, component, name in ((upper, 0, "displacement $x_1$"), (lower, 1, "velocity $x_2$")):
         axes.plot(t, ys[:, component], color="black", linewidth=0.9)
@@ -77,9 +78,7 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
         axes.margins(x=0)
     for belt, begin, end in stick_phases(trajectory):
         for axes in ax:
-            axes.axvspan(
-                begin, end, label=f"sticks to belt {belt}", zorder=0, **_belt_shading(belt)
-            )
+            axes.axvspan(begin, end, label=f"sticks to belt {belt}", zorder=0, **belt_shading(belt))
     upper.tick_params(labelbottom=False)
     lower.set_xlabel(r"time $\tau$")
     figure_of(lower).align_ylabels(ax)
@@ -118,14 +117,15 @@ def stick_phases(trajectory: Trajectory) -> list[tuple[int, float, float]]:
     return sorted(phases, key=lambda phase: phase[1])
 
 
-def _belt_shading(belt: int) -> dict[str, Any]:
+def belt_shading(belt: int) -> dict[str, Any]:
+    """How the stick phases of a belt are shaded: pale, with hatches for print without colour."""
     colour = matplotlib.colors.to_rgba(belt_colour(belt))
     pale = tuple(1 - 0.28 * (1 - channel) for channel in colour[:3])
     hatch = BELT_HATCHES[belt % len(BELT_HATCHES)]
     return {"facecolor": pale, "edgecolor": (*colour[:3], 0.45), "linewidth": 0.0, "hatch": hatch}
 
 
-def _path_of(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+def path_of(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Times and states of a trajectory, its events among the samples so that corners are sharp."""
     t = np.concatenate([trajectory.ts, trajectory.events.t])
     ys = np.concatenate([trajectory.ys, trajectory.events.y])
@@ -156,7 +156,7 @@ def plot_phase_portrait(
     if isinstance(trajectories, Trajectory):
         trajectories = (trajectories,)
     ax = new_axes() if ax is None else ax
-    paths = [_path_of(trajectory)[1] for trajectory in trajectories]
+    paths = [path_of(trajectory)[1] for trajectory in trajectories]
     loops = [np.asarray(cycle.sample(400)) for cycle in cycles]
     equilibria = find_equilibria(osc) if equilibria is None else equilibria
     window = _window(osc, [*paths, *loops], equilibria, xlim, ylim)
@@ -183,9 +183,9 @@ def plot_portrait(portrait: Portrait, ax: Axes | None = None) -> Axes:
     """All that there is at one oscillator, see `Portrait`: its cycles and equilibria as in
     `plot_phase_portrait`, and its separatrices, with an arrow in the direction of time.
 
-    ax: None makes new ones, with a key below. Returns the axes.
+    Returns the axes.
     """
-    given, ax = ax, new_axes() if ax is None else ax
+    ax = new_axes() if ax is None else ax
     osc, cycles = portrait.oscillator, [*portrait.cycles, *portrait.unstable]
     paths = [np.asarray(one.ys) for one in portrait.separatrices if not one.stable]
     paths += [np.asarray(cycle.sample(400)) for cycle in cycles]
@@ -193,19 +193,35 @@ def plot_portrait(portrait: Portrait, ax: Axes | None = None) -> Axes:
     shown = {"equilibria": portrait.equilibria, "xlim": x1, "ylim": x2}
     plot_phase_portrait(osc, cycles=cycles, ax=ax, **shown)
     for one in portrait.separatrices:
-        path = np.asarray(one.ys)
-        style = STABLE_SEPARATRIX if one.stable else UNSTABLE_SEPARATRIX
-        ax.plot(*path.T, zorder=3, **style)
-        # From the point, whichever way it is passed.
-        away = path[::-1] if one.stable else path
-        outside = (away < [x1[0], x2[0]]) | (away > [x1[1], x2[1]])
-        leaves = np.append(np.flatnonzero(np.any(outside, axis=1)), len(away))[0]
-        index = _index_at_distance(ax, away[: max(leaves - 1, 1)], ARROW_DISTANCE)
-        index = len(path) - 1 - index if one.stable else index
-        _draw_arrowheads(ax, path, style["color"], [index])
-    if given is None:
-        draw_key(figure_of(ax), ncols=3)
+        _draw_separatrix(ax, one)
     return ax
+
+
+def plot_separatrix(separatrix: Separatrix, ax: Axes | None = None) -> Axes:
+    """A separatrix, with an arrow in the direction of time, and its point. Returns the axes."""
+    ax = new_axes() if ax is None else ax
+    x1, x2 = np.asarray(separatrix.ys).T
+    ax.set(xlim=_with_margin([x1.min(), x1.max()]), ylim=_with_margin([x2.min(), x2.max()]))
+    _draw_separatrix(ax, separatrix)
+    words = "its end" if separatrix.stable else "its beginning"
+    dot = {"marker": "o", "markersize": 5, "color": "black", "linestyle": "none", "zorder": 5}
+    ax.plot(*np.asarray(separatrix.point)[:, None], label=words, **dot)
+    ax.set_xlabel("displacement $x_1$")
+    ax.set_ylabel("velocity $x_2$")
+    return ax
+
+
+def _draw_separatrix(ax: Axes, one: Separatrix) -> None:
+    path, (left, right), (bottom, top) = np.asarray(one.ys), ax.get_xlim(), ax.get_ylim()
+    style = STABLE_SEPARATRIX if one.stable else UNSTABLE_SEPARATRIX
+    ax.plot(*path.T, zorder=3, **style)
+    # From the point, whichever way it is passed.
+    away = path[::-1] if one.stable else path
+    outside = (away < [left, bottom]) | (away > [right, top])
+    leaves = np.append(np.flatnonzero(np.any(outside, axis=1)), len(away))[0]
+    index = _index_at_distance(ax, away[: max(leaves - 1, 1)], ARROW_DISTANCE)
+    index = len(path) - 1 - index if one.stable else index
+    _draw_arrowheads(ax, path, style["color"], [index])
 
 
 def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:

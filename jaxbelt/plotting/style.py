@@ -4,13 +4,15 @@ The colours are those of Okabe and Ito, which colour-blind readers can tell apar
 of this folder import matplotlib, and `import jaxbelt` imports none of them.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
+from matplotlib.transforms import ScaledTranslation
 
 #: One colour a belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
 BELT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
@@ -29,6 +31,26 @@ KEY_ORDER = (
     "pseudo-equilibria",
     "saddle",
 )
+
+#: Parameters by the end of their path in the oscillator, or by the name of the argument of a
+#: function without its number: what they are called, and their symbol; % is the number of the belt.
+PARAMETERS = {
+    "damping": ("damping", r"\zeta"),
+    "omega": ("frequency", r"\omega"),
+    "velocity": ("belt velocity", r"\nu_%"),
+    "load": ("load", r"u_{0,%}"),
+    "lower": ("lower contact edge of belt %", ""),
+    "upper": ("upper contact edge of belt %", ""),
+    "static": ("static friction", r"\mu_{s,%}"),
+    "kinetic": ("kinetic friction", r"\mu_{k,%}"),
+    "residual": ("residual friction", r"p_{1,%}"),
+    "quadratic": ("quadratic friction", r"p_{2,%}"),
+    "steepness": ("steepness of friction", r"p_{3,%}"),
+    "friction.velocity": ("Stribeck velocity", r"v_{s,%}"),
+    "nu": ("belt velocity", r"\nu_%"),
+    "sigma": ("contact edge", r"\sigma_%"),
+    "zeta": ("damping", r"\zeta"),
+}
 
 #: Settings for a journal's page, see `journal_style`.
 JOURNAL: dict[Any, Any] = {
@@ -60,11 +82,13 @@ def journal_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def draw_key(figure: Figure | SubFigure, note: str = "", *, ncols: int | None = None) -> None:
+def draw_key(
+    figure: Figure, note: str = "", *, ncols: int | None = None, leave_out: Axes | None = None
+) -> None:
     """Below the axes of a figure a note, and one key for all that they label, in so many columns
-    (None: in one line)."""
+    (None: as many as there is room for); leave_out: axes that have a key of their own."""
     by_label: dict[str, Any] = {}
-    for axes in figure.axes:
+    for axes in (one for one in figure.axes if one is not leave_out):
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             by_label.setdefault(label, handle)
     first = [label for label in by_label if label.startswith(("to ", "belt "))]
@@ -73,12 +97,65 @@ def draw_key(figure: Figure | SubFigure, note: str = "", *, ncols: int | None = 
         [by_label[label] for label in labels],
         labels,
         loc="outside lower center",
-        ncols=ncols or len(labels),
+        ncols=ncols or _key_columns(72 * figure.get_size_inches()[0], labels),
+        frameon=False,
         handlelength=1.8,
         columnspacing=1.4,
         title=note or None,
         title_fontsize="small",
     )
+
+
+def add_key(ax: Axes) -> None:
+    """Below the axes a key for all that they label, each thing once."""
+    by_label: dict[str, Any] = {}
+    for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+        by_label.setdefault(label, handle)
+    if not by_label:
+        return
+    known = [label for label in KEY_ORDER if label in by_label]
+    labels = [*(label for label in by_label if label not in known), *known]
+    # Below the numbers and the name of the axis, whatever the height of the axes.
+    figure, size = figure_of(ax), matplotlib.rcParams["font.size"]
+    below = ScaledTranslation(0, -(3.4 * size + 4) / 72, figure.dpi_scale_trans)
+    width = ax.get_window_extent().width * 72 / figure.dpi
+    ax.legend(
+        [by_label[label] for label in labels],
+        labels,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.0),
+        bbox_transform=ax.transAxes + below,
+        borderaxespad=0.0,
+        ncols=_key_columns(width, labels),
+        frameon=False,
+        handlelength=2.2,
+        columnspacing=1.4,
+    )
+
+
+def _key_columns(width: float, labels: Sequence[str]) -> int:
+    """How many columns of a key there is room for in a width, in points; rows of one length."""
+    size = matplotlib.rcParams["font.size"]
+    letters = 0.48 * size * np.array([len(label.replace("$", "")) for label in labels])
+    count = len(labels)
+    while count > 1 and np.sum(np.sort(letters)[-count:]) + 4.0 * size * count > width:
+        count -= 1
+    rows = -(-len(labels) // count)
+    return -(-len(labels) // rows)
+
+
+def parameter_label(name: str) -> str:
+    """What an axis of a parameter is called, word and symbol; name: the path to it in the
+    oscillator, such as "belts[0].velocity", or that of the argument of a function, such as nu0."""
+    path, belt = name.split("."), name.partition("[")[2].partition("]")[0]
+    ends = (".".join(path[-2:]), path[-1], name.rstrip("0123456789"))
+    known = next((end for end in ends if end in PARAMETERS), None)
+    if known is None:
+        return f"parameter ${name}$" if len(name) == 1 else f"parameter {name}"
+    word, symbol = PARAMETERS[known]
+    belt = belt or name[len(name.rstrip("0123456789")) :]
+    symbol = symbol.replace("%", belt) if belt else symbol.replace(",%", "").replace("_%", "")
+    return f"{word.replace('%', belt)} ${symbol}$" if symbol else word.replace("%", belt)
 
 
 def save(figure: Figure, path: Path, dpi: int = 220) -> None:

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib.colors
 import numpy as np
@@ -9,12 +10,15 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from ..checks import require
-from ..sweeps.basins import Basins
+from ..sweeps.basins import Basins, BasinStability
 from ..sweeps.datasets import decoded
+from ..sweeps.store import Verified
+from ..sweeps.sweep import Explanation
 from .phase import plot_phase_portrait
-from .style import draw_key, figure_of, journal_figure, new_axes
+from .style import add_key, belt_colour, draw_key, figure_of, journal_figure, new_axes
 
 #: Attractors of a sweep, those with the shortest names first (Okabe and Ito).
 ATTRACTOR_COLOURS = ("#F0F0F0", "#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#999999")
@@ -23,24 +27,36 @@ ATTRACTOR_COLOURS = ("#F0F0F0", "#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#D5
 def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Axes:
     """A variable of a sweep over its two axes longer than one, or along its one.
 
-    dataset: what `sweep` returned; variable: a name in it. "kind" shows equilibria, and cycles by
-    the belts that they stick to, as the letters of the paper's Fig. 6. `ValueError` if the axes of
-    the sweep are not one or two.
+    dataset: what `sweep` or `attractors` returned; variable: a name in it. "kind" shows
+    equilibria, and cycles by the belts that they stick to. Along one axis a variable of each belt,
+    or of each attractor, is as many lines. Returns the axes. `ValueError` if there is no such
+    variable, or if its axes are not one or two: choose with `dataset.isel(belt=0)` and the like.
     """
+    names = ", ".join(map(str, dataset.data_vars))
+    require(variable in dataset, "variable", f"one of {names}", repr(variable))
     ax = new_axes() if ax is None else ax
     values = (
         _words_for_kinds(dataset) if variable == "kind" else dataset[variable].squeeze(drop=True)
     )
     require(values.ndim in (1, 2), "dataset", "a sweep with one or two axes", f"{values.ndim}")
-    names = [f"{dataset[name].long_name}  {_math_name(name)}" for name in map(str, values.dims)]
-    if values.ndim == 1:
-        ax.plot(dataset[values.dims[0]], values, color="black", linewidth=0.8)
-        ax.set(xlabel=names[0], ylabel=dataset[variable].long_name)
+    names = [_axis_label(dataset, name) for name in map(str, values.dims)]
+    label = dataset[variable].attrs.get("long_name", variable)
+    (last,) = values.dims[-1:]
+    if values.ndim == 1 or (last in ("belt", "attractor") and variable != "kind"):
+        x, lines = dataset[values.dims[0]], values.values.reshape(values.shape[0], -1).T
+        for i, line in enumerate(lines):
+            style: dict[str, Any] = {"color": "black", "linewidth": 1.1}
+            style["drawstyle"] = "steps-mid" if variable == "kind" else "default"
+            if len(lines) > 1:
+                style |= {"color": belt_colour(i), "label": f"{last} {i}"}
+            ax.plot(x, line, linestyle=("-", "--", ":", "-.")[i % 4], **style)
+        ax.set(xlabel=names[0], ylabel=label)
+        add_key(ax)
         return ax
     x, y = (dataset[name].values for name in values.dims)
     if variable != "kind":
         mesh = ax.pcolormesh(x, y, values.T, cmap="viridis", rasterized=True)
-        figure_of(ax).colorbar(mesh, ax=ax, label=dataset[variable].long_name)
+        figure_of(ax).colorbar(mesh, ax=ax, label=label)
     else:
         present, codes = np.unique(values.values.astype(str), return_inverse=True)
         order = sorted(range(len(present)), key=lambda i: (len(present[i]), present[i]))
@@ -56,6 +72,12 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
         )
     ax.set(xlabel=names[0], ylabel=names[1])
     return ax
+
+
+def _axis_label(dataset: xr.Dataset, name: str) -> str:
+    """The name of an axis in words, and as a formula where it is an argument of a class."""
+    words = dataset[name].attrs.get("long_name", name)
+    return words if words == name or name == "attractor" else f"{words}, {_math_name(name)}"
 
 
 def _math_name(name: str) -> str:
@@ -122,3 +144,55 @@ def draw_basins(basins: Basins) -> Figure:
     plot_basins(basins, ax=figure.subplots())
     draw_key(figure, ncols=2)
     return figure
+
+
+def plot_stability(stability: BasinStability, ax: Axes | None = None) -> Axes:
+    """The fractions of the starts as bars, with their standard errors."""
+    ax = new_axes() if ax is None else ax
+    kinds, fractions = list(stability.fractions), list(stability.fractions.values())
+    errors = [stability.standard_errors[kind] for kind in kinds]
+    style = {"color": "#A9CCE3", "edgecolor": "black", "linewidth": 0.8, "capsize": 4}
+    ax.bar(kinds, fractions, yerr=errors, width=0.6, **style)
+    for place, fraction in enumerate(fractions):
+        above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center"}
+        ax.annotate(f"{fraction:.3g}", (place, fraction + errors[place]), **above)
+    words = f"fraction of {stability.n:,} starts"
+    ax.set(xlabel="what they lead to", ylabel=words, ylim=(0.0, 1.12))
+    return ax
+
+
+def plot_explanation(explanation: Explanation, ax: Axes | None = None) -> Axes:
+    """How long the compilation and the runs of a sweep take, as bars."""
+    ax = new_axes() if ax is None else ax
+    seconds = {"compilation": explanation.compile_seconds, "runs": explanation.seconds}
+    bars = ax.barh(list(seconds), list(seconds.values()), color="#A9CCE3", edgecolor="black")
+    ax.bar_label(bars, fmt="%.3g s", padding=4)
+    ax.invert_yaxis()
+    ax.margins(x=0.15)
+    runs, blocks = explanation.runs, explanation.blocks
+    told = f"{runs:,} run{'s' * (runs != 1)}, {blocks:,} block{'s' * (blocks != 1)}"
+    ax.set_title(f"{told}, {explanation.bytes / 1e6:,.3g} MB", fontsize="medium")
+    ax.set(xlabel="time in seconds", ylabel="part of the sweep")
+    return ax
+
+
+def plot_blocks(verified: Verified, ax: Axes | None = None) -> Axes:
+    """The blocks of a store in rows, each coloured by its state."""
+    ax = new_axes() if ax is None else ax
+    states = {"right": "#009E73", "to do": "#D9D9D9", "bad": "#D55E00"}
+    table = verified.table()
+    columns = max(1, int(np.ceil(np.sqrt(len(table)))))
+    rows = max(1, -(-len(table) // columns))
+    image = np.full(rows * columns, -1)
+    image[: len(table)] = [list(states).index(state) for state in table.state]
+    palette = matplotlib.colors.ListedColormap(["white", *states.values()])
+    grid = image.reshape(rows, columns)
+    ax.imshow(grid, cmap=palette, vmin=-1.5, vmax=2.5, aspect="auto", interpolation="nearest")
+    for (state, colour), blocks in zip(
+        states.items(), (verified.done, verified.to_do, verified.bad), strict=True
+    ):
+        ax.add_patch(Rectangle((0, 0), 0, 0, color=colour, label=f"{state}: {len(blocks):,}"))
+    for axis, name in ((ax.xaxis, "block in its row"), (ax.yaxis, f"row of {columns} blocks")):
+        axis.set_major_locator(MaxNLocator(integer=True))
+        axis.set_label_text(name)
+    return ax

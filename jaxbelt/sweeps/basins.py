@@ -21,6 +21,8 @@ from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
 from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator, check_oscillator
+from ..results import Status, draw
+from ..tables import table_of
 from .attractor import KINDS, Attractor
 from .datasets import decoded, flags
 from .question import LONG_ENOUGH
@@ -29,7 +31,12 @@ from .sweep import sweep
 from .threads import run
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
+
+
+#: What the table of basins tells of cycles, in numbers.
+OF_CYCLES = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
 
 
 class Basins(eqx.Module):
@@ -52,6 +59,37 @@ class Basins(eqx.Module):
     def label(self) -> "xarray.DataArray":
         return self.dataset["label"]
 
+    def table(self) -> "pandas.DataFrame":
+        """A row for each attractor, and one for undecided starts: label, attractor (its words),
+        fraction of the starts, and of a cycle x1_min, x1_max, x2_min, x2_max, period, multiplier
+        and signature; last the unstable cycle, label -2, where there is one. Every start by itself
+        is in `basins.dataset.to_dataframe()`."""
+        labels, cycles = np.asarray(self.label), iter(self.cycles)
+        rows = []
+        for number, name in enumerate(self.attractors):
+            of_cycle = next(cycles).row() if name.startswith("cycle") else {}
+            rows.append((number, name, of_cycle))
+        rows.append((-1, "undecided", {}))
+        if int(self.boundary.status) == Status.OK:
+            rows.append((-2, "unstable cycle", self.boundary.row()))
+        return table_of(
+            [
+                {
+                    "label": number,
+                    "attractor": name,
+                    "fraction": float(np.mean(labels == number)),
+                    **{key: of_cycle.get(key, np.nan) for key in OF_CYCLES},
+                    "signature": of_cycle.get("signature", ""),
+                }
+                for number, name, of_cycle in rows
+            ]
+        )
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw which start leads where, with the cycles, into the axes `ax` (None: new ones), which
+        are returned."""
+        return draw(self, ax)
+
     def __repr__(self) -> str:
         labels = np.asarray(self.label)
         parts = [f"{np.mean(labels == i):.1%} {name}" for i, name in enumerate(self.attractors)]
@@ -71,6 +109,22 @@ class BasinStability(eqx.Module):
     fractions: dict[str, float]
     standard_errors: dict[str, float]
     n: int
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each kind: kind, fraction, standard_error, n."""
+        return table_of(
+            {
+                "kind": list(self.fractions),
+                "fraction": list(self.fractions.values()),
+                "standard_error": [self.standard_errors[kind] for kind in self.fractions],
+                "n": [self.n] * len(self.fractions),
+            }
+        )
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the fractions as bars, with their standard errors, into the axes `ax` (None: new
+        ones), which are returned."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         parts = [
@@ -115,7 +169,7 @@ def basins(
     dataset["label"] = (
         ("x1", "x2"),
         labels,
-        {"long_name": "number of the attractor", "units": "1"}
+        {"long_name": "number of the attractor"}
         | flags({-1: "undecided", **dict(enumerate(attractors))}, "int32"),
     )
     return Basins(oscillator, dataset, attractors, cycles, unstable_cycle(oscillator))

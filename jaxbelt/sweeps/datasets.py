@@ -133,7 +133,7 @@ class Table:
     def attributes(self, name: str) -> dict[str, Any]:
         """The attributes of a variable, but for the flags of categories that are numbered."""
         variable = self.variable(name)
-        told = {"long_name": variable.long_name, "units": "1"}
+        told = {"long_name": variable.long_name}
         return told | (flags(variable.meanings, variable.dtype) if variable.meanings else {})
 
     def coordinates(self) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
@@ -142,7 +142,7 @@ class Table:
         if any("belt" in self.dims(name) for name in self.shapes):
             axes["belt"] = np.arange(len(self.grid.example.belts))
         return {
-            name: (name, values, {"long_name": AXIS_NAMES.get(name, name), "units": "1"})
+            name: (name, values, {"long_name": AXIS_NAMES.get(name, name)})
             for name, values in axes.items()
         }
 

@@ -63,7 +63,7 @@ def attractors(
     ranks = np.argsort(-fractions, axis=-1, kind="stable")
     fractions, first = (np.take_along_axis(part, ranks, axis=-1) for part in (fractions, first))
     coordinates: dict[str, Any] = {name: dataset.coords[name] for name in others}
-    told = {"long_name": "fraction of the starts that lead there", "units": "1"}
+    told = {"long_name": "fraction of the starts that lead there"}
     variables: dict[str, Any] = {"fraction": ((*others, "attractor"), fractions, told)}
     for name, one in dataset.items():
         if name in OF_RUNS or not set(order) <= set(one.dims):
@@ -76,7 +76,7 @@ def attractors(
         missing = (fractions == 0).reshape(index.shape)
         values = np.where(missing, _nothing(values.dtype), values)
         variables[str(name)] = ((*others, "attractor", *extra), values, one.attrs)
-    named = {"long_name": "number of the attractor", "units": "1"}
+    named = {"long_name": "number of the attractor"}
     coordinates["attractor"] = ("attractor", numbers, named)
     return dataset.drop_dims(order).assign_coords(coordinates).assign(variables)
 

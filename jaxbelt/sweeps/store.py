@@ -30,12 +30,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..checks import require
+from ..results import draw
+from ..tables import table_of
 from .datasets import NUMBERED, renumber
 from .grid import Blocks, Grid
 from .locks import locked
 from .question import Question
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
 
 #: Version of the layout described above.
@@ -404,6 +407,18 @@ class Verified:
     to_do: tuple[int, ...]
     bad: tuple[int, ...]
     finished: bool
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each block, in order: block, state ("right", "to do" or "bad")."""
+        named = {"right": self.done, "to do": self.to_do, "bad": self.bad}
+        pairs = sorted((block, state) for state, blocks in named.items() for block in blocks)
+        blocks, states = [block for block, _ in pairs], [state for _, state in pairs]
+        return table_of({"block": np.array(blocks, int), "state": np.array(states, str)})
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the blocks in rows, coloured by their states, into the axes `ax` (None: new ones),
+        which are returned."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         bad = f" ({', '.join(map(str, self.bad[:10]))}{', ...' * (len(self.bad) > 10)})"

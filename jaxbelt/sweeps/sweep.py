@@ -5,11 +5,11 @@ puts the results where they belong, in memory or in a store. `explain` says befo
 is.
 """
 
+import dataclasses
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,8 @@ from jaxtyping import ArrayLike
 
 from ..checks import as_array, require
 from ..model.oscillator import Oscillator
+from ..results import draw
+from ..tables import table_of
 from .along import Along
 from .audit import chosen, differing
 from .clusters import check_executor, do_on_cluster
@@ -30,6 +32,7 @@ from .threads import CHUNK, run
 from .work import do_runs
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
 
 
@@ -207,7 +210,7 @@ def _audited(question: Question, results: Memory | Store, share: float) -> dict[
     return {"audited": len(runs), "audit_differed": len(differ)}
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Explanation:
     """What `explain` returns.
 
@@ -221,6 +224,15 @@ class Explanation:
     bytes: int
     compile_seconds: float
     seconds: float
+
+    def table(self) -> "pandas.DataFrame":
+        """One row: runs, blocks, bytes, compile_seconds, seconds."""
+        return table_of([dataclasses.asdict(self)])
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw how long compilation and runs take, as a bar, into the axes `ax` (None: new ones),
+        which are returned."""
+        return draw(self, ax)
 
     def __repr__(self) -> str:
         return (

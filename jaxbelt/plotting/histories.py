@@ -1,0 +1,81 @@
+"""What happens when: a trajectory, its events and its arcs over time, each in one pair of axes."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from ..motion.simulate import Arcs, Events, Trajectory
+from ..results import EventKind
+from ..tables import require_single
+from .phase import belt_shading, path_of, stick_phases
+from .style import belt_colour, new_axes
+
+#: The marks of events, and what they are called.
+EVENT_MARKS = {
+    EventKind.STICK: ("v", "sticks to belt {}"),
+    EventKind.SLIP: ("^", "slips from belt {}"),
+    EventKind.CROSS: ("x", "crosses boundary {}"),
+    EventKind.EDGE: ("s", "edge of belt {}"),
+}
+#: How contacts are drawn (Okabe and Ito), by their code, and what they are called.
+CONTACT_STYLES = {
+    0: ("#222222", "", "sticks"),
+    1: ("#56B4E9", "", "slips, belt faster"),
+    -1: ("#E69F00", "", "slips, mass faster"),
+    2: ("white", "////", "does not touch"),
+}
+
+
+def plot_trajectory(trajectory: Trajectory, ax: Axes | None = None) -> Axes:
+    """Displacement and velocity over time, stick phases shaded in the colour of their belt."""
+    require_single(trajectory, trajectory.ts, 1)
+    ax = new_axes() if ax is None else ax
+    t, ys = path_of(trajectory)
+    ax.plot(t, ys[:, 0], color="black", linewidth=1.1, label="displacement $x_1$")
+    ax.plot(t, ys[:, 1], color="0.35", linewidth=0.9, linestyle="--", label="velocity $x_2$")
+    for belt, begin, end in stick_phases(trajectory):
+        ax.axvspan(begin, end, label=f"sticks to belt {belt}", zorder=0, **belt_shading(belt))
+    ax.margins(x=0)
+    ax.set_xlabel(r"time $\tau$")
+    ax.set_ylabel("displacement $x_1$, velocity $x_2$")
+    return ax
+
+
+def plot_events(events: Events, ax: Axes | None = None) -> Axes:
+    """The events over time, a line for each kind and belt."""
+    ax = new_axes() if ax is None else ax
+    table = events.table()
+    lines = sorted({(int(belt), EventKind[kind]) for kind, belt in zip(table.kind, table.belt)})
+    for height, (belt, kind) in enumerate(lines):
+        t = table.t[(table.kind == kind.name) & (table.belt == belt)]
+        marker, _ = EVENT_MARKS[kind]
+        style = {"color": belt_colour(belt), "markersize": 5, "linestyle": "none"}
+        ax.plot(t, np.full(len(t), height), marker=marker, **style)
+    names = [EVENT_MARKS[kind][1].format(belt) for belt, kind in lines]
+    ax.set_yticks(range(len(lines)), names)
+    ax.set(xlabel=r"time $\tau$", ylabel="event", ylim=(-0.6, len(lines) - 0.4))
+    return ax
+
+
+def plot_arcs(arcs: Arcs, ax: Axes | None = None) -> Axes:
+    """The contact of each belt over time, as a bar."""
+    ax = new_axes() if ax is None else ax
+    table = arcs.table()
+    spans = np.array(table[["t", "duration"]])
+    # An arc that lasts for ever is drawn a little beyond the others.
+    known = spans[np.isfinite(spans[:, 1])]
+    last = np.max(known.sum(axis=1), initial=np.max(spans[:, 0], initial=0.0))
+    spans[:, 1] = np.minimum(spans[:, 1], 1.05 * last + 1.0 - spans[:, 0])
+    belts = [name for name in table if str(name).startswith("contact_")]
+    for belt, name in enumerate(belts):
+        for code, (colour, hatch, words) in CONTACT_STYLES.items():
+            wanted = table[name].abs() == 2 if code == 2 else table[name] == code
+            bars = spans[wanted.to_numpy()]
+            if len(bars):
+                style = {"facecolor": colour, "hatch": hatch, "edgecolor": "0.6", "linewidth": 0.0}
+                ax.broken_barh(bars.tolist(), (belt - 0.35, 0.7), label=words, **style)
+    ax.set_yticks(range(len(belts)), [f"belt {belt}" for belt in range(len(belts))])
+    ax.set(xlabel=r"time $\tau$", ylabel="contact", ylim=(-0.6, len(belts) - 0.4))
+    ax.xaxis.set_major_locator(MaxNLocator(8))
+    ax.margins(x=0)
+    return ax

@@ -1,0 +1,55 @@
+"""Single results in the phase plane: a cycle, a bifurcation point, equilibria."""
+
+from matplotlib.axes import Axes
+
+from ..bifurcations.conditions import BifurcationPoint
+from ..checks import require
+from ..cycles.cycle import Cycle
+from ..inverse.design import Design
+from ..model.equilibria import Equilibria
+from ..results import Status
+from ..tables import require_single
+from .phase import draw_equilibrium, plot_phase_portrait
+from .style import new_axes
+
+
+def plot_cycle(cycle: Cycle, ax: Axes | None = None) -> Axes:
+    """A cycle with the boundaries and equilibria of its oscillator."""
+    require_single(cycle, cycle.period, 0)
+    status = Status(int(cycle.status))
+    require(status == Status.OK, "cycle", "one with status OK, to be drawn", status.name)
+    return plot_phase_portrait(cycle.oscillator, cycles=[cycle], ax=ax)
+
+
+def plot_design(design: Design, ax: Axes | None = None) -> Axes:
+    """The designed cycle."""
+    return plot_cycle(design.cycle, ax)
+
+
+def plot_point(point: BifurcationPoint, ax: Axes | None = None) -> Axes:
+    """The phase plane at a bifurcation point, with the cycle where there is one."""
+    require_single(point, point.value, 0)
+    status = Status(int(point.status))
+    require(status == Status.OK, "point", "one with status OK, to be drawn", status.name)
+    cycles = [point.cycle] if int(point.cycle.status) == Status.OK else []
+    ax = plot_phase_portrait(point.oscillator, cycles=cycles, ax=ax)
+    ax.set_title(f"{point.condition.words} at {float(point.value):.6g}", fontsize="medium")
+    return ax
+
+
+def plot_equilibria(equilibria: Equilibria, ax: Axes | None = None) -> Axes:
+    """Equilibria on the line x2 = 0, stable ones filled."""
+    table = equilibria.table()
+    rows = [equilibria] if equilibria.kind.ndim == 0 else list(equilibria)
+    ax = new_axes() if ax is None else ax
+    ax.axhline(0.0, color="0.7", linewidth=0.6, zorder=1)
+    for row in rows:
+        if int(row.kind):
+            draw_equilibrium(ax, row)
+    if len(table):
+        left, right = float(table.x1_lower.min()), float(table.x1_upper.max())
+        margin = 0.2 * (right - left) or 0.5
+        ax.set(xlim=(left - margin, right + margin), ylim=(-1.0, 1.0))
+    ax.set_xlabel("displacement $x_1$")
+    ax.set_ylabel("velocity $x_2$")
+    return ax

@@ -1,0 +1,235 @@
+"""Every public result has a table, a DataFrame, and a picture that can be saved."""
+
+import inspect
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from matplotlib.axes import Axes
+
+import jaxbelt as jb
+from jaxbelt.numerics.continuation import Stop
+from jaxbelt.plotting.draw import draw_result
+from jaxbelt.plotting.style import parameter_label
+
+#: Public classes that are no results: what a user writes down.
+NO_RESULTS = {
+    *(jb.AbstractFriction, jb.Conti, jb.Coulomb, jb.Stribeck, jb.Belt, jb.Oscillator),
+    *(jb.AtEvents, jb.AtExtrema, jb.AtSection, jb.AtTimes),
+    *(jb.EquilibriumKind, jb.EventKind, jb.Status),
+    *(jb.BeltAtRest, jb.BoundaryEquilibrium, jb.CornerCollision, jb.CrossingSliding),
+    *(jb.FoldOfCycles, jb.GrazingEdge, jb.GrazingSliding, jb.Hopf, jb.NonsmoothFold),
+    *(jb.PseudoHopf, jb.SlidingExchange, jb.SuddenSliding),
+}
+PUBLIC = [getattr(jb, name) for name in jb.__all__]
+RESULTS = [one for one in PUBLIC if inspect.isclass(one) and one not in NO_RESULTS]
+
+
+def nu0(osc):
+    return osc.belts[0].velocity
+
+
+@pytest.fixture(scope="module")
+def results() -> dict[type, Any]:
+    """One of each; numbers that no test is about are made up, which compiles nothing."""
+    osc, span = jb.presets.class_b(0.45, 0.35), np.linspace(0.0, 1.0, 5)
+    run = jb.simulate(osc, (3.0, 0.0), 20.0)
+    cycle, inner = jb.find_cycle(osc, (3.0, 0.0)), jb.unstable_cycle(osc)
+    point, rests = jb.refine(jb.NonsmoothFold(belt=1), osc, where=nu0), jb.equilibria(osc)
+    ts, ys = jnp.asarray(span), jnp.asarray(np.column_stack([np.cos(span), np.sin(span)]))
+    separatrix = jb.Separatrix(ys[-1], "left", True, ts, ys, "outside", -1)
+    special, none = jb.SpecialPoint("DoubleSliding", (0,), (0.49, 0.5), 1e-12), jnp.zeros((0, 2))
+    rows = np.column_stack([span, span**2])
+    curve = jb.BifurcationCurve(
+        *(jb.NonsmoothFold(1), rows, (jb.NonsmoothFold,) * 5, span, span, np.ones((5, 5))),
+        *((special,), (Stop.LEFT_SPAN, Stop.LEFT_SPAN), ("nu0", "nu1")),
+    )
+    label = np.array([["1", "2b"], ["2b", "2b"]])
+    axes = {"x1": [1.0, 2.0], "x2": [-0.5, 0.5]}
+    dataset = xr.Dataset({"label": (("x1", "x2"), np.array([[0, 1], [0, -1]]))}, axes)
+    regions = ((0.0, 0.5, "2b"), (0.5, 0.6, "1"))
+    kinds = {"equilibrium": 0.25, "cycle": 0.75}
+    zero, two = jnp.zeros(()), jnp.zeros(2)
+    found = [
+        *(run, run.events, run.arcs, cycle, rests, point, special, curve, separatrix),
+        jb.Portrait(osc, rests, (cycle,), (inner,), (separatrix,), False, 3.0, none, run.status),
+        jb.BifurcationDiagram((point,), (), regions, osc, "belts[0].velocity", True),
+        jb.RegionMap(
+            *(("nu0", "nu1"), (np.array([0.4, 0.6]), np.array([0.3, 0.5])), label, (curve,)),
+            *({"1": (), "2b": (cycle, inner)}, label == "", (), jb.presets.class_b),
+        ),
+        jb.Basins(osc, dataset, ("cycle that sticks to belt 1", "rest at 1.36"), (cycle,), inner),
+        jb.BasinStability(kinds, dict.fromkeys(kinds, 0.01), 1000),
+        jb.Fit(
+            *(osc, ("damping",), ts[1:2], ts[1:2], ts[:1, None], two, two, ts, ys, 0.1 * ys, two),
+            *(zero, zero, two, 1, 1, run.status),
+        ),
+        jb.Design(osc, cycle, ("damping",), ts[1:2], ts[2:4], ts[2:4], 3, run.status),
+        jb.Explanation(4096, 4, 300_000, 1.5, 0.1),
+        jb.Verified((0, 1, 3), (4,), (2,), False),
+    ]
+    return {type(one): one for one in found}
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+def test_every_public_class_is_a_result_or_known_to_be_none(results):
+    assert set(results) == set(RESULTS)
+
+
+#: How many rows the table of each has, and some of its columns.
+TABLES = {
+    jb.Arcs: (None, "t x1 x2 duration contact_0 contact_1"),
+    jb.Basins: (4, "label attractor fraction x1_min period multiplier signature"),
+    jb.BasinStability: (2, "kind fraction standard_error n"),
+    jb.BifurcationCurve: (6, "condition belts nu0 nu1 multiplier residual special"),
+    jb.BifurcationDiagram: (1, "branch kind value stable x1_min x2_max period amplitude signature"),
+    jb.BifurcationPoint: (1, "kind belts value error residual x1_min period multiplier status"),
+    jb.Cycle: (1, "stable x1_max period amplitude multiplier stick_duration_1 signature status"),
+    jb.Design: (3, "what name value wanted"),
+    jb.Equilibria: (1, "kind stable x1 x1_lower x1_upper rate frequency contact_0"),
+    jb.Events: (None, "t x1 x2 kind belt"),
+    jb.Explanation: (1, "runs blocks bytes compile_seconds seconds"),
+    jb.Fit: (3, "name estimate standard_error lower upper"),
+    jb.Portrait: (4, "what number kind stable x1_min period multiplier rate"),
+    jb.RegionMap: (6, "curve condition belts nu0 nu1 multiplier residual special"),
+    jb.Separatrix: (5, "t x1 x2"),
+    jb.SpecialPoint: (1, "kind belts value_0 value_1 residual"),
+    jb.Trajectory: (None, "t x1 x2 contact_0 contact_1"),
+    jb.Verified: (5, "block state"),
+}
+
+
+@pytest.mark.parametrize("kind", RESULTS, ids=lambda kind: kind.__name__)
+def test_it_has_a_table(results, kind):
+    table, (rows, columns) = results[kind].table(), TABLES[kind]
+    assert isinstance(table, pd.DataFrame) and set(columns.split()) <= set(table.columns)
+    assert len(table) == rows if rows else len(table) > 3
+    assert table.index.tolist() == list(range(len(table)))
+    # Numbers and words that a file takes and gives back.
+    assert all(np.ndim(value) == 0 for value in table.to_numpy().ravel())
+
+
+@pytest.mark.parametrize("kind", RESULTS, ids=lambda kind: kind.__name__)
+def test_it_has_a_picture(results, kind, tmp_path):
+    result = results[kind]
+    ax = result.plot()
+    assert isinstance(ax, Axes)
+    ax.figure.savefig(tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+    # Axes that are given are drawn into and come back.
+    given = plt.figure().add_subplot()
+    assert result.plot(given) is given
+    for one in (ax, given):
+        assert one.get_xlabel() and one.get_ylabel()
+        assert "[1]" not in one.get_xlabel() + one.get_ylabel() + one.get_title()
+    labels = set(given.get_legend_handles_labels()[1])
+    key = given.get_legend()
+    shown = [text.get_text() for text in key.get_texts()] if key else []
+    assert sorted(shown) == sorted(labels)
+
+
+def test_tables_tell_what_the_results_hold(results):
+    run, cycle = results[jb.Trajectory], results[jb.Cycle]
+    table = run.table()
+    np.testing.assert_array_equal(table[["x1", "x2"]], run.ys)
+    np.testing.assert_array_equal(table.contact_1, run.modes[:, 1])
+    assert run.events.table().kind.tolist() == [jb.EventKind(int(k)).name for k in run.events.kind]
+    (row,) = cycle.table().to_dict("records")
+    assert row["signature"] == "stick1-slip1" and row["status"] == "OK" and row["stable"]
+    assert row["amplitude"] == float(jb.amplitude(cycle))
+    assert row["stick_duration_1"] == float(jb.stick_duration(cycle, belt=1))
+    (point,) = results[jb.BifurcationPoint].table().to_dict("records")
+    assert point["value"] == pytest.approx(0.538734800481, abs=1e-11) and point["belts"] == "1"
+    lower, upper = results[jb.Fit].intervals()[0]
+    fitted = results[jb.Fit].table().iloc[0]
+    assert (fitted["lower"], fitted["upper"]) == (float(lower), float(upper))
+    states = results[jb.Verified].table().state.tolist()
+    assert states == ["right", "right", "bad", "right", "to do"]
+
+
+def test_what_was_not_found_has_a_table_and_no_picture():
+    nothing = jb.unstable_cycle(jb.presets.class_b(0.1, 0.35))
+    (row,) = nothing.table().to_dict("records")
+    assert row["status"] == "NO_UNSTABLE_CYCLE" and row["signature"] == "" and not row["stable"]
+    assert all(np.isnan(row[name]) for name in ("period", "x1_min", "stick_duration_1"))
+    with pytest.raises(ValueError, match="cycle must be one with status OK, to be drawn, got NO_"):
+        nothing.plot()
+
+
+@pytest.mark.parametrize("kind", [jb.Trajectory, jb.Events, jb.Arcs, jb.Cycle, jb.BifurcationPoint])
+def test_batches_are_refused_by_name(results, kind):
+    batch = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], results[kind])
+    for method in (batch.table, batch.plot):
+        with pytest.raises(ValueError, match=f"{kind.__name__} must be a single one"):
+            method()
+
+
+def test_what_has_no_picture_is_refused():
+    with pytest.raises(TypeError, match="result must be one that has a picture, got str"):
+        draw_result("text", None)
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [
+        ("belts[0].velocity", r"belt velocity $\nu_0$"),
+        ("belts[1].friction.steepness", "steepness of friction $p_{3,1}$"),
+        ("belts[0].friction.velocity", "Stribeck velocity $v_{s,0}$"),
+        ("belts[1].lower", "lower contact edge of belt 1"),
+        ("damping", r"damping $\zeta$"),
+        ("nu1", r"belt velocity $\nu_1$"),
+        ("sigma", r"contact edge $\sigma$"),
+        ("sigma0", r"contact edge $\sigma_0$"),
+        ("s", "parameter $s$"),
+        ("slow", "parameter slow"),
+    ],
+)
+def test_parameters_are_named_by_word_and_symbol(name, label):
+    assert parameter_label(name) == label
+
+
+# --- sweeps, which are datasets -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def dataset() -> xr.Dataset:
+    """What a sweep gives, made up."""
+    named = {"long_name": "time stuck"}
+    kind = {"flag_values": np.array([1, 2]), "flag_meanings": "equilibrium cycle"}
+    nus = np.linspace(0.2, 0.6, 3)
+    values = np.arange(18.0).reshape(3, 3, 2)
+    return xr.Dataset(
+        {
+            "stick_duration": (("nu0", "nu1", "belt"), values, named),
+            "sticks": (("nu0", "nu1", "belt"), values > 9),
+            "kind": (("nu0", "nu1"), 1 + (values[..., 0] > 9), kind),
+        },
+        {
+            "nu0": ("nu0", nus, {"long_name": "velocity of belt 0"}),
+            "nu1": ("nu1", nus, {"long_name": "velocity of belt 1"}),
+            "belt": [0, 1],
+        },
+    )
+
+
+def test_sweeps_are_drawn_with_words(dataset):
+    ax = jb.plot_sweep(dataset, "kind")
+    assert ax.get_xlabel() == r"velocity of belt 0, $\nu_{0}$"
+    ax = jb.plot_sweep(dataset.isel(nu1=0), "stick_duration")
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["belt 0", "belt 1"]
+    assert ax.get_ylabel() == "time stuck"
+    assert len(jb.plot_sweep(dataset.isel(belt=0), "stick_duration").collections) == 1
+    with pytest.raises(ValueError, match="variable must be one of stick_duration, sticks, kind"):
+        jb.plot_sweep(dataset, "nope")
+    with pytest.raises(ValueError, match="dataset must be a sweep with one or two axes, got 3"):
+        jb.plot_sweep(dataset, "stick_duration")
