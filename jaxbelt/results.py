@@ -5,10 +5,9 @@ sentence of advice for a code.
 """
 
 import enum
+import operator
 from collections.abc import Callable
 from typing import Any
-
-import numpy as np
 
 
 class Status(enum.IntEnum):
@@ -123,8 +122,11 @@ ADVICE = {
 
 
 def describe(status) -> str:
-    """The sentence that goes with a status code."""
-    return ADVICE[Status(int(np.asarray(status)))]
+    """The sentence that goes with a status code; status: a `Status`, or its number."""
+    try:
+        return ADVICE[Status(operator.index(status))]
+    except (TypeError, ValueError):
+        raise ValueError(f"status must be a Status, or its number, got {status!r}") from None
 
 
 class EventKind(enum.IntEnum):

@@ -26,7 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, require
+from ..checks import (
+    as_array,
+    as_whole,
+    check_arguments,
+    check_finite,
+    check_positive,
+    require_one_of,
+    require_value,
+)
 from ..cycles.attractors import Runs, distinct, lead_to_one_cycle, stuck_belts
 from ..cycles.cycle import Cycle, find_cycle, polish, unstable_cycle
 from ..cycles.shooting import Loop, cut
@@ -124,7 +132,7 @@ def bifurcation_diagram(
     osc, where, span, resolution: as for `scan`, which finds the special points. rows: about how
     many values of the parameter are computed. `ValueError` names an impossible argument.
     """
-    require(isinstance(rows, int) and rows > 0, "rows", "a positive integer", repr(rows))
+    rows, resolution = as_whole(rows, "rows"), as_whole(resolution, "resolution")
     path = ParameterPath(osc, where, span)
     points = search(path, resolution)
     # A point on an end of the span has one side only.
@@ -223,7 +231,7 @@ class RegionMap(eqx.Module):
 
     def example(self, name: str) -> tuple[float, float]:
         """The values of the parameters in the cell of a region that is farthest from its bounds."""
-        require(name in self.regions, "name", f"one of {', '.join(self.regions)}", repr(name))
+        require_one_of(name, self.regions, "name")
         return _example(self.values, self.label == name)
 
     def oscillator(self, name: str) -> Oscillator:
@@ -282,12 +290,18 @@ def region_map(
     how many lines parallel to each axis curves are looked for, 0 for none. `ValueError` names an
     impossible argument.
     """
-    require(len(axes) == 2, "axes", "two arguments of make and their values", list(axes))
+    expected = "a dictionary, two arguments of make and their values"
+    require_value(isinstance(axes, Mapping) and len(axes) == 2, "axes", expected, axes)
     names = tuple(axes)
+    check_arguments(make, names, "make")
     values = [np.asarray(as_array(axes[name], name, (None,))) for name in names]
     for name, along in zip(names, values, strict=True):
         increases = along.size > 1 and np.all(np.diff(along) > 0)
-        require(increases, name, "two values or more that increase", along)
+        require_value(increases, name, "two values or more that increase", along)
+    starts = _checked_starts(starts)
+    step = float(as_array(step, "step"))
+    check_positive(step, "step")
+    lines = as_whole(lines, "lines", 0)
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:
         cells = beside.submit(_cells, make, names, values, dict(axes), starts)
@@ -295,6 +309,15 @@ def region_map(
         label, cycles = cells.result()
     pair = (names[0], names[1]), (values[0], values[1])
     return RegionMap(*pair, label, tuple(curves), cycles, make)
+
+
+def _checked_starts(starts: Any) -> tuple[tuple[float, float], ...]:
+    expected = "a list of (x1, x2), such as [(3.0, 0.0)]"
+    shape = np.shape(starts) if isinstance(starts, tuple | list | np.ndarray) else ()
+    require_value(len(shape) == 2 and shape[0] and shape[1] == 2, "starts", expected, starts)
+    rows = as_array(starts, "starts", (None, 2))
+    check_finite(rows, "starts")
+    return tuple((float(x1), float(x2)) for x1, x2 in np.asarray(rows))
 
 
 def _cells(make, names, values, axes, starts):

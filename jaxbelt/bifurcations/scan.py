@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import as_whole
 from ..cycles.attractors import (
     is_same,
     itinerary,
@@ -74,6 +75,7 @@ def scan(
     the value where it happens, good to about 1e-9 of the span. `ValueError` names an impossible
     argument.
     """
+    resolution = as_whole(resolution, "resolution")
     return search(ParameterPath(osc, where, span, conditions), resolution)
 
 

@@ -14,7 +14,16 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, check_finite, is_concrete, number, pick, require
+from ..checks import (
+    as_array,
+    as_whole,
+    check_finite,
+    is_concrete,
+    number,
+    pick,
+    require,
+    require_value,
+)
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.events import Signature
 from ..model.modes import select
@@ -125,7 +134,7 @@ class Cycle(eqx.Module):
 
     def sample(self, n: int) -> Array:
         """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
-        return _sample_cycle(self, n)
+        return _sample_cycle(self, as_whole(n, "n"))
 
     def __repr__(self) -> str:
         if not is_concrete(self.unknowns) or self.unknowns.ndim != 2:
@@ -276,7 +285,8 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     check_oscillator(osc)
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
-    loop, count, status = _loop_reached(osc, y0, max_arcs or SIZES[-1])
+    room = SIZES[-1] if max_arcs is None else as_whole(max_arcs, "max_arcs")
+    loop, count, status = _loop_reached(osc, y0, room)
     if max_arcs is None and is_concrete(count):
         needed = int(count) if int(status) == Status.OK else 0
         loop = pick(loop, slice(room_of(needed)))
@@ -305,8 +315,9 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
     """
     check_oscillator(osc)
     whole = isinstance(around, int) and around >= 0
-    require(whole, "around", "the number of an equilibrium, 0 or more", repr(around))
-    loop, status, distance = separating_loop(osc, max_arcs or SIZES[0], around)
+    require_value(whole, "around", "the number of an equilibrium, 0 or more", around)
+    room = SIZES[0] if max_arcs is None else as_whole(max_arcs, "max_arcs")
+    loop, status, distance = separating_loop(osc, room, around)
     return _if_meant(exactly(osc, loop, status), loop, distance)
 
 

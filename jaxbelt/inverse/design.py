@@ -13,15 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..bifurcations.conditions import AbstractCondition
+from ..bifurcations.conditions import AbstractCondition, check_conditions
 from ..bifurcations.refine import refine
-from ..checks import as_array, check_finite, require
+from ..checks import as_array, as_numbers, check_finite, require, require_callable, require_value
 from ..cycles.cycle import Cycle, find_cycle
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
 from ..results import Status, describe
-from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of
+from .selection import ITERATIONS, LONGEST_CHANGE, Selection, check_report, selection_of
 
 #: Targets are met to this fraction of their size (or of one, where they are smaller).
 MET = 1e-9
@@ -66,6 +66,10 @@ def distance_to(
     found by `refine` from the oscillator of the cycle; one that is not there is infinitely far.
     """
 
+    require(len(conditions) > 0, "conditions", "one or more, such as jb.Hopf()", "none")
+    check_conditions(conditions)
+    require_callable(where, "where", "a function such as `lambda osc: osc.belts[0].velocity`")
+
     def distance(cycle: Cycle) -> Array:
         osc = cycle.oscillator
         value = jax.tree.leaves(osc)[leaf_index(osc, where)]
@@ -107,6 +111,7 @@ def design(
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     functionals, intervals = _checked_targets(targets)
+    check_report(report)
     selection, u = selection_of(oscillator, where, bounds)
     tell = report or (lambda text: None)
 
@@ -173,13 +178,18 @@ def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
 
 
 def _checked_targets(targets):
-    pairs = list(targets)
-    require(len(pairs) > 0, "targets", "at least one pair (functional, value)", targets)
+    expected = "a list of pairs (functional, value), such as [(jb.amplitude, 1.0)]"
+    is_many = isinstance(targets, Sequence) and len(targets) > 0
+    require_value(is_many, "targets", expected, targets)
     intervals = []
-    for pair in pairs:
-        fine = isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])
-        require(fine, "targets", "pairs (functional, value)", repr(pair))
-        lower, upper = pair[1] if isinstance(pair[1], tuple) else (pair[1], pair[1])
-        require(float(lower) <= float(upper), "targets", "intervals (lower, upper)", repr(pair[1]))
-        intervals.append((float(lower), float(upper)))
-    return tuple(functional for functional, _ in pairs), np.array(intervals)
+    for pair in targets:
+        fine = isinstance(pair, tuple | list) and len(pair) == 2 and callable(pair[0])
+        require_value(fine, "targets", expected, targets)
+        wanted = pair[1] if isinstance(pair[1], tuple | list) else (pair[1], pair[1])
+        name = f"target of {getattr(pair[0], '__name__', 'functional')}"
+        require_value(np.shape(wanted) == (2,), name, "a value or (lower, upper)", pair[1])
+        lower, upper = np.asarray(as_numbers(wanted, name, (2,))).tolist()
+        expected = "a value or (lower, upper), lower <= upper"
+        require_value(lower <= upper, name, expected, pair[1])
+        intervals.append((lower, upper))
+    return tuple(functional for functional, _ in targets), np.array(intervals)

@@ -31,14 +31,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, check_finite, require
+from ..checks import as_array, as_whole, check_finite, require, require_value
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import simulate
 from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
 from ..results import Status, describe
 from .record import WINDOW, Record, record_of
-from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of
+from .selection import ITERATIONS, LONGEST_CHANGE, Selection, check_report, selection_of
 
 #: Each stage joins so many neighbouring windows.
 JOIN = 3
@@ -335,7 +335,8 @@ def fit(
     """
     check_oscillator(oscillator, "oscillator")
     times, values, sigmas = _checked_record(ts, x1, x2, noise)
-    require(isinstance(starts, int) and starts > 0, "starts", "a positive integer", starts)
+    starts = as_whole(starts, "starts")
+    check_report(report)
     selection, u = selection_of(oscillator, where, bounds)
     tell = report or (lambda text: None)
 
@@ -369,7 +370,7 @@ def _checked_record(ts, x1, x2, noise):
     times = np.asarray(as_array(ts, "ts", (None,)))
     check_finite(times, "ts")
     require(len(times) >= 8, "ts", "at least 8 times", len(times))
-    require(np.all(np.diff(times) > 0), "ts", "increasing", times)
+    require_value(np.all(np.diff(times) > 0), "ts", "increasing", times)
     require(x1 is not None or x2 is not None, "x1", "given, or x2", None)
     columns = []
     for name, column in (("x1", x1), ("x2", x2)):
@@ -377,16 +378,16 @@ def _checked_record(ts, x1, x2, noise):
             columns.append(np.full(len(times), np.nan))
             continue
         columns.append(np.asarray(as_array(column, name, (len(times),))))
-        require(not np.any(np.isinf(columns[-1])), name, "finite, or NaN", column)
+        require_value(not np.any(np.isinf(columns[-1])), name, "finite, or NaN", columns[-1])
         known = int(np.sum(np.isfinite(columns[-1])))
         require(known >= 8, name, "at least 8 data", known)
     both = x1 is not None and x2 is not None
     if isinstance(noise, tuple):
         sigmas = noise
     else:
-        require(not both or noise is None, "noise", "a pair, for x1 and x2", noise)
+        require_value(not both or noise is None, "noise", "a pair, for x1 and x2", noise)
         sigmas = (noise, noise)
-    require(len(sigmas) == 2, "noise", "a number or a pair", noise)
+    require_value(len(sigmas) == 2, "noise", "a number or a pair", noise)
     sigmas = [None if sigma is None else float(as_array(sigma, "noise")) for sigma in sigmas]
     for sigma in sigmas:
         require(sigma is None or 0 < sigma < np.inf, "noise", "> 0", sigma)

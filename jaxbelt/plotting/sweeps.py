@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from ..checks import require
+from ..checks import require, require_one_of, require_value
 from ..sweeps.basins import Basins
 from ..sweeps.datasets import decoded
 from .phase import plot_phase_portrait
@@ -27,6 +27,7 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     the belts that they stick to, as the letters of the paper's Fig. 6. `ValueError` if the axes of
     the sweep are not one or two.
     """
+    require_one_of(variable, map(str, dataset.data_vars), "variable")
     ax = new_axes() if ax is None else ax
     values = (
         _words_for_kinds(dataset) if variable == "kind" else dataset[variable].squeeze(drop=True)
@@ -87,6 +88,7 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     basins: from `basins`. Basins of cycles are pale blue and green, those of equilibria pale
     orange, undecided starts white. Returns the axes.
     """
+    require_value(isinstance(basins, Basins), "basins", "what jb.basins returns", basins)
     ax = new_axes() if ax is None else ax
     labels = np.asarray(basins.label)
     x1, x2 = np.asarray(basins.dataset["x1"]), np.asarray(basins.dataset["x2"])

@@ -12,14 +12,24 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..checks import as_array, check_positive, require, require_usable_jax
+from ..checks import (
+    as_array,
+    check_positive,
+    in_words,
+    require,
+    require_one_of,
+    require_usable_jax,
+    require_value,
+)
 from ..kernel.lanes import Observer, Program
+from ..spelling import did_you_mean
 from .along import Along
 from .attractor import Attractor
 from .datasets import Table
 from .grid import Grid
 from .moments import AtEvents, bytecode, checked
 from .observers import Final, Reduce
+from .reducers import check_reducer
 from .threads import CHUNK
 
 #: Default t1 of attractor runs: some 500 loops, where nearly all have long been decided.
@@ -44,16 +54,21 @@ class Question:
         grid = Grid(make, axes, y0)
         _observer(observe)
         if t1 is None:
-            require(observe == "attractor", "t1", "given", "None")
+            given = 'given, the end of each run, but for observe="attractor"'
+            require(observe == "attractor", "t1", given, "None")
             t1 = LONG_ENOUGH
         numbers: dict[str, Any] = {"t1": t1, "rtol": rtol, "atol": atol}
         for name, value in numbers.items():
             numbers[name] = float(as_array(value, name))
             check_positive(numbers[name], name)
         wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
+        fits = isinstance(wanted, Sequence)
+        require_value(fits, "derivatives", "a tuple of names of axes", wanted)
         for name in wanted:
-            known = ", ".join(grid.axes)
-            require(name in grid.axes, "derivatives", f"names of axes, {known}", repr(name))
+            known, came = ", ".join(grid.axes), in_words(name) + did_you_mean(name, grid.axes)
+            require(name in grid.axes, "derivatives", f"names of axes, {known}", came)
+        if not isinstance(observe, str | Observer):
+            check_reducer(observe, grid.example)
         return cls(grid, observe, numbers, tuple(wanted))
 
     def arguments(self) -> tuple[Any, ...]:
@@ -134,11 +149,13 @@ def _observer(observe: Any) -> Observer:
     if isinstance(observe, Observer):
         return observe
     if isinstance(observe, str):
-        require(observe in NAMED, "observe", '"final", "attractor" or a reducer', repr(observe))
+        require_one_of(observe, NAMED, "observe", " or an object with init, update, finish")
         return NAMED[observe]()
     methods = ("init", "update", "finish")
     fits = all(callable(getattr(observe, name, None)) for name in methods)
-    require(fits, "observe", '"final", "attractor" or an object with init, update, finish', observe)
+    fits = fits and not isinstance(observe, type)
+    expected = '"final", "attractor" or an object with init, update, finish'
+    require_value(fits, "observe", expected, observe)
     if hasattr(observe, "at") or hasattr(observe, "rates"):
         checked(getattr(observe, "at", (AtEvents(),)))
         return Along(observe)

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..checks import require
+from ..checks import as_path, require
 from .datasets import NUMBERED, renumber
 from .grid import Blocks, Grid
 from .locks import locked
@@ -420,7 +420,8 @@ def verify(path: str | Path, repair: bool = False) -> Verified:
     made the store does them again. `ValueError` if there is no store that this version knows,
     `OSError` if a sweep is writing it and `repair` is wanted.
     """
-    path = Path(path)
+    path = as_path(path, "path")
+    require(path.exists(), "path", "that of a store, a folder", f"{path}, which is not there")
     root = _open(path, "r")
     if not repair:
         return _verified(root)
