@@ -17,11 +17,12 @@ from .commands.verify import verify
 app = typer.Typer(name="jaxbelt", no_args_is_help=True, rich_markup_mode="markdown")
 
 
-def show_version(wanted: bool) -> None:
-    """Print the version and end."""
+def show_version(wanted: bool) -> bool:
+    """Print the version and end, where that is wanted."""
     if wanted:
         print(f"jaxbelt {jaxbelt.__version__}")
         raise typer.Exit
+    return wanted
 
 
 @app.callback()

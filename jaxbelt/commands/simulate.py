@@ -115,13 +115,15 @@ def simulate(
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
         check_description(system, arguments, belt)
         turn_on_float64()
+        import numpy as np
+
         osc = oscillator(system, arguments, belt, damping, omega)
         with console.status("simulating (the first seconds are compilation)"):
             trajectory = jb.simulate(
                 osc,
                 start,
                 t1,
-                ts=[t1 * i / (samples - 1) for i in range(samples)],
+                ts=np.array([t1 * i / (samples - 1) for i in range(samples)]),
                 rtol=tolerance,
                 atol=tolerance,
                 formulation=formulation,
