@@ -7,6 +7,7 @@ is asked for, so that the command line answers at once what it can answer withou
 from typing import TYPE_CHECKING
 
 from . import presets
+from .activity import show_progress
 from .bifurcations.conditions import BifurcationPoint, SpecialPoint
 from .bifurcations.crossings import CrossingSliding, SlidingExchange
 from .bifurcations.curves import BifurcationCurve, bifurcation_curve
@@ -129,6 +130,7 @@ __all__ = [
     "refine",
     "region_map",
     "scan",
+    "show_progress",
     "simulate",
     "slip_duration",
     "stick_duration",

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..activity import announced, tell
 from ..checks import as_array, as_interval, as_whole, check_positive, require, require_value
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
@@ -126,6 +127,7 @@ class BifurcationCurve(eqx.Module):
         )
 
 
+@announced("bifurcation_curve")
 def bifurcation_curve(
     point: BifurcationPoint,
     where: tuple[Callable[[Oscillator], Any], Callable[[Oscillator], Any]]
@@ -255,6 +257,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
     rows: list[_Row] = []
     special: list[SpecialPoint] = []
     while True:
+        tell(f"{len(rows)} points on one side")
         points, found, beyond, end = _leg(problem, track, u, direction, origin)
         rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
         special += found

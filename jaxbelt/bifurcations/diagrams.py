@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..activity import announced, tell
 from ..checks import (
     as_array,
     as_whole,
@@ -119,6 +120,7 @@ class BifurcationDiagram(eqx.Module):
         )
 
 
+@announced("bifurcation_diagram")
 def bifurcation_diagram(
     osc: Oscillator | Callable[..., Oscillator],
     where: Callable[[Oscillator], Any] | None = None,
@@ -143,6 +145,7 @@ def bifurcation_diagram(
     path.look(np.concatenate(nodes))
     middles = [float(values[len(values) // 2]) for values in nodes]
     labels = [path.label(value) for value in middles]
+    tell(f"branches between {len(points)} points")
     for stretch, around in _separated(labels):
         found = edges_touched(path, nodes[stretch], around)
         points = by_value([*points, *found])
@@ -274,6 +277,7 @@ def interior(inside: np.ndarray) -> tuple[int, int]:
     return int(row), int(column)
 
 
+@announced("region_map")
 def region_map(
     make: Callable[..., Oscillator],
     axes: Mapping[str, ArrayLike],
@@ -413,8 +417,9 @@ def _bounds(make, names, values, step, lines) -> list[BifurcationCurve]:
     # The next lines are searched while curves are followed from those before.
     with ThreadPoolExecutor(1) as ahead:
         searches = [(line, ahead.submit(points_on, *line)) for line in across]
-        for (along, fixed), found in searches:
+        for count, ((along, fixed), found) in enumerate(searches, 1):
             for point in found.result():
+                tell(f"{len(curves)} curves from {count} of {len(across)} lines")
                 pair = np.empty(2)
                 pair[along], pair[1 - along] = float(point.value), fixed
                 if point.status == Status.OK and not any(

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, require, require_value
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
@@ -33,6 +34,7 @@ NEAR_GUESS, QUITE_NEAR, SHORT_STEP = 0.015, 0.05, 0.25
 REACHES, INTERVALS = (2e-3, 1.2e-2, 5e-2, 0.2), 15
 
 
+@announced("refine")
 def refine(
     condition: AbstractCondition,
     osc: Oscillator | Callable[..., Oscillator],

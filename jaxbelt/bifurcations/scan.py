@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ..activity import announced, tell
 from ..checks import as_whole
 from ..cycles.attractors import (
     is_same,
@@ -51,6 +52,7 @@ LOOKED_FOR: tuple[type[AbstractCondition], ...] = (
 NEAR = 1 / 400
 
 
+@announced("scan")
 def scan(
     osc: Oscillator | Callable[..., Oscillator],
     where: Callable[[Oscillator], Any] | None = None,
@@ -96,6 +98,7 @@ def search(
     path.look(np.concatenate(stretches))
     settled = [path.beside(at) for at in path.breaks]
     while intervals := path.changes(settled):
+        tell(f"{len(path.labels)} values seen, {len(points)} points found")
         values: list[float] = []
         for a, b in intervals:
             is_narrow = b - a <= NEAR * path.length

@@ -94,18 +94,17 @@ def basins(
         import numpy as np
 
         grid = [np.linspace(*span, points) for span in (x1, x2)]
-        with console.status("following the starts (the first seconds are compilation)"):
-            found = jb.basins(osc, x1=grid[0], x2=grid[1], progress=False)
-            lines, data = [repr(found)], _as_data(found)
-            if starts:
-                key = jax.random.key(seed)
-                stability = jb.basin_stability(osc, box=(x1, x2), n=starts, key=key)
-                lines.append(repr(stability))
-                data["stability"] = {
-                    "starts": starts,
-                    "fractions": stability.fractions,
-                    "standard_errors": stability.standard_errors,
-                }
+        found = jb.basins(osc, x1=grid[0], x2=grid[1])
+        lines, data = [repr(found)], _as_data(found)
+        if starts:
+            key = jax.random.key(seed)
+            stability = jb.basin_stability(osc, box=(x1, x2), n=starts, key=key)
+            lines.append(repr(stability))
+            data["stability"] = {
+                "starts": starts,
+                "fractions": stability.fractions,
+                "standard_errors": stability.standard_errors,
+            }
         from ..plotting.style import journal_style, save
         from ..plotting.sweeps import draw_basins
 

@@ -105,13 +105,12 @@ def diagram(
         def along(p):
             return oscillator(system, {**arguments, parameter: p}, belt, damping, omega)
 
-        with console.status("looking along the parameter (the first minute is compilation)"):
-            if parameter in EDGES:
-                found = jb.bifurcation_diagram(along, span=span, rows=rows)
-                found = replace(found, name=parameter)
-            else:
-                osc = oscillator(system, arguments, belt, damping, omega)
-                found = jb.bifurcation_diagram(osc, _where(osc, parameter), span, rows=rows)
+        if parameter in EDGES:
+            found = jb.bifurcation_diagram(along, span=span, rows=rows)
+            found = replace(found, name=parameter)
+        else:
+            osc = oscillator(system, arguments, belt, damping, omega)
+            found = jb.bifurcation_diagram(osc, _where(osc, parameter), span, rows=rows)
         from ..plotting.diagrams import plot_diagram
         from ..plotting.style import draw_key, journal_figure, journal_style, save
 

@@ -67,8 +67,7 @@ def region_map(
         make = class_along(system, axes)
         # Other numbers of cells, lest cells lie on the line where both are the same.
         values = {axes[0]: np.linspace(*p, cells), axes[1]: np.linspace(*q, cells + 1)}
-        with console.status("sweeping, then following curves (the first minutes are compilation)"):
-            found = jb.region_map(make, values)
+        found = jb.region_map(make, values)
         from ..plotting.diagrams import draw_region_map
         from ..plotting.style import journal_figure, journal_style, save
 

@@ -118,18 +118,17 @@ def simulate(
         import numpy as np
 
         osc = oscillator(system, arguments, belt, damping, omega)
-        with console.status("simulating (the first seconds are compilation)"):
-            trajectory = jb.simulate(
-                osc,
-                start,
-                t1,
-                ts=np.array([t1 * i / (samples - 1) for i in range(samples)]),
-                rtol=tolerance,
-                atol=tolerance,
-                formulation=formulation,
-                v_star=v_star,
-                eps=eps,
-            )
+        trajectory = jb.simulate(
+            osc,
+            start,
+            t1,
+            ts=np.array([t1 * i / (samples - 1) for i in range(samples)]),
+            rtol=tolerance,
+            atol=tolerance,
+            formulation=formulation,
+            v_star=v_star,
+            eps=eps,
+        )
         from ..paper import steady_cycle
         from ..plotting.phase import draw_overview
         from ..plotting.style import journal_style, save

@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
+from ..activity import announced
 from ..checks import (
     as_array,
     as_whole,
@@ -270,6 +271,7 @@ def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -
     return _polished(osc, loop, status, steps)[0]
 
 
+@announced("find_cycle")
 def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Cycle:
     """The steady cycle that the start y0 leads to.
 
@@ -300,6 +302,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
 LOOPS_TRIED, REFINEMENTS = 32, 3
 
 
+@announced("unstable_cycle")
 def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = None) -> Cycle:
     """The unstable cycle around a stable equilibrium, that touches no boundary (no sliding).
 

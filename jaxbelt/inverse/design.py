@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..activity import announced
 from ..bifurcations.conditions import AbstractCondition, check_conditions
 from ..bifurcations.refine import refine
 from ..checks import as_array, as_numbers, check_finite, require, require_callable, require_value
@@ -21,7 +22,7 @@ from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
 from ..results import Status, describe
-from .selection import ITERATIONS, LONGEST_CHANGE, Selection, check_report, selection_of
+from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of, told_to
 
 #: Targets are met to this fraction of their size (or of one, where they are smaller).
 MET = 1e-9
@@ -85,6 +86,7 @@ def distance_to(
     return distance
 
 
+@announced("design")
 def design(
     oscillator: Oscillator,
     targets: Sequence[Any],
@@ -92,7 +94,7 @@ def design(
     where: Callable[[Oscillator], Any],
     bounds: Sequence[Any] | None = None,
     y0: ArrayLike | tuple = (3.0, 0.0),
-    report: Callable[[str], None] | None = print,
+    report: Callable[[str], None] | None = None,
 ) -> Design:
     """Parameters for which functionals of the cycle have wanted values.
 
@@ -100,7 +102,8 @@ def design(
     `Cycle`, such as `jb.amplitude` or `lambda c: jb.stick_duration(c, 1)`, and its value, or an
     interval (lower, upper) that it is to lie in; `distance_to` is the functional that keeps a
     bifurcation away. where, bounds: the parameters that may be changed, as for `fit`. y0: the
-    start (x1, x2) that leads to the cycle. report: is told of the progress; None for silence.
+    start (x1, x2) that leads to the cycle. report: is told of the progress, too, a line at a time,
+    such as `print`.
 
     Damped Newton steps with exact derivatives; with fewer targets than parameters, the shortest
     ones. What no choice within the bounds reaches ends with the status UNREACHABLE, and so does
@@ -111,9 +114,8 @@ def design(
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     functionals, intervals = _checked_targets(targets)
-    check_report(report)
     selection, u = selection_of(oscillator, where, bounds)
-    tell = report or (lambda text: None)
+    tell = told_to(report)
 
     def evaluate(u):
         return _achieved(functionals, selection, oscillator, y0, jnp.asarray(u))

@@ -31,6 +31,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
+from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, require, require_value
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import simulate
@@ -38,7 +39,7 @@ from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
 from ..results import Status, describe
 from .record import WINDOW, Record, record_of
-from .selection import ITERATIONS, LONGEST_CHANGE, Selection, check_report, selection_of
+from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of, told_to
 
 #: Each stage joins so many neighbouring windows.
 JOIN = 3
@@ -297,6 +298,7 @@ class Fit(eqx.Module):
         return "\n".join([head, *rows, *advice])
 
 
+@announced("fit")
 def fit(
     oscillator: Oscillator,
     ts: ArrayLike,
@@ -307,7 +309,7 @@ def fit(
     noise: ArrayLike | tuple[ArrayLike | None, ArrayLike | None] | None = None,
     bounds: Sequence[Any] | None = None,
     starts: int = 8,
-    report: Callable[[str], None] | None = print,
+    report: Callable[[str], None] | None = None,
 ) -> Fit:
     """Parameters of an oscillator from a measured record of its motion, with standard errors.
 
@@ -325,7 +327,8 @@ def fit(
     estimates it from how far neighbouring data scatter about a smooth curve. bounds: for each
     parameter (lower, upper) or None, which keeps positive what cannot be negative; a parameter
     stays inside by reparametrisation, so an estimate at a bound is one that wants to leave. starts:
-    of the search, spread about the guess. report: is told of the progress; None for silence.
+    of the search, spread about the guess. report: is told of the progress, too, a line at a time,
+    such as `print`.
 
     What can be told from a record: the velocity of a belt that the mass sticks to, its static
     friction and the damping, well; the kinetic law where slip speeds vary; the velocity of a belt
@@ -336,9 +339,8 @@ def fit(
     check_oscillator(oscillator, "oscillator")
     times, values, sigmas = _checked_record(ts, x1, x2, noise)
     starts = as_whole(starts, "starts")
-    check_report(report)
     selection, u = selection_of(oscillator, where, bounds)
-    tell = report or (lambda text: None)
+    tell = told_to(report)
 
     record = record_of(times, values, sigmas)
     linearized = functools.partial(_linearized, selection, oscillator, record)

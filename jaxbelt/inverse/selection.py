@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..activity import tell
 from ..checks import as_numbers, require, require_value
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_groups, names_of
@@ -54,10 +55,19 @@ class Selection(eqx.Module):
         return jax.tree.unflatten(structure, leaves)
 
 
-def check_report(report: Any) -> None:
-    """Raise unless it can be told of the progress, or is None."""
+def told_to(report: Callable[[str], None] | None) -> Callable[[str], None]:
+    """What says how far a search is, in the line of its activity and to `report`, or a
+    `ValueError`."""
+
     fits = report is None or callable(report)
     require_value(fits, "report", "a function of a text, such as print, or None", report)
+
+    def both(text: str) -> None:
+        tell(text.strip())
+        if report is not None:
+            report(text)
+
+    return both
 
 
 def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, np.ndarray]:

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..activity import Activity, announced, tell
 from ..checks import (
     as_array,
     as_interval,
@@ -104,27 +105,29 @@ def basins(
 
     x1, x2: displacements and velocities of the starts, increasing, [n] and [m], dimensionless. t1:
     when a run that reached no attractor is given up. rtol, atol: tolerances of a step. progress:
-    whether to show a bar, as in `sweep`. `ValueError` names an argument that is impossible.
+    whether to show how far it is, as in `sweep`. `ValueError` names an argument that is impossible.
     """
     check_oscillator(oscillator, "oscillator")
     axes = {name: _starts_along(values, name) for name, values in (("x1", x1), ("x2", x2))}
-    dataset = sweep(
-        lambda: oscillator,
-        axes,
-        t1=t1,
-        rtol=rtol,
-        atol=atol,
-        observe="attractor",
-        progress=progress,
-    )
-    labels, attractors, cycles = _labels(oscillator, dataset)
+    with Activity("basins", progress):
+        dataset = sweep(
+            lambda: oscillator,
+            axes,
+            t1=t1,
+            rtol=rtol,
+            atol=atol,
+            observe="attractor",
+        )
+        tell("telling the attractors apart")
+        labels, attractors, cycles = _labels(oscillator, dataset)
+        boundary = unstable_cycle(oscillator)
     dataset["label"] = (
         ("x1", "x2"),
         labels,
         {"long_name": "number of the attractor", "units": "1"}
         | flags({-1: "undecided", **dict(enumerate(attractors))}, "int32"),
     )
-    return Basins(oscillator, dataset, attractors, cycles, unstable_cycle(oscillator))
+    return Basins(oscillator, dataset, attractors, cycles, boundary)
 
 
 def _starts_along(values: Any, name: str) -> np.ndarray:
@@ -219,6 +222,7 @@ def _words_for(kind: str, sticks: np.ndarray, x1: float) -> str:
     return f"cycle that sticks to {belts}" if belts else "cycle that never sticks"
 
 
+@announced("basin_stability")
 def basin_stability(
     oscillator: Oscillator,
     *,

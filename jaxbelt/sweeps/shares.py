@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..activity import announced
 from ..checks import require, require_callable
 from ..cycles.attractors import Runs, is_same
 from ..cycles.cycle import find_cycle
@@ -30,6 +31,7 @@ OF_RUNS = ("transient", "status")
 NO_PARAMETERS = ("x1", "x2", "belt")
 
 
+@announced("attractors")
 def attractors(
     dataset: "xarray.Dataset", make: Callable[..., Oscillator] | None = None
 ) -> "xarray.Dataset":

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import ArrayLike
 
+from ..activity import announced
 from ..checks import as_array, as_path, require, require_value
 from ..model.oscillator import Oscillator
 from .along import Along
@@ -232,6 +233,7 @@ class Explanation:
         )
 
 
+@announced("explain")
 def explain(
     make: Callable[..., Oscillator],
     axes: Mapping[str, Any],
