@@ -290,6 +290,7 @@ MISTAKES = [
     ("jb.plot_phase_portrait(osc, xlim=(1, 0))", "xlim " + PAIR + r"\(1, 0\)"),
     ("jb.plot_vector_field(osc, kind='arrow')", "kind must be .*, got 'arrow' .did you mean"),
     ("jb.plot_basins(osc)", r"basins must be what jb.basins returns, got Oscillator\("),
+    ("jb.show_progress('yes')", "wanted must be True, False or None, got 'yes'"),
     # --- the command line
     ("jaxbelt simulat", "No such command 'simulat'"),
     ("jaxbelt simulate --class q", "class must be a, b, c or d, got q"),

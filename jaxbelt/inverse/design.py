@@ -114,8 +114,8 @@ def design(
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     functionals, intervals = _checked_targets(targets)
-    selection, u = selection_of(oscillator, where, bounds)
     tell = told_to(report)
+    selection, u = selection_of(oscillator, where, bounds)
 
     def evaluate(u):
         return _achieved(functionals, selection, oscillator, y0, jnp.asarray(u))

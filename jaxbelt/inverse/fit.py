@@ -339,8 +339,8 @@ def fit(
     check_oscillator(oscillator, "oscillator")
     times, values, sigmas = _checked_record(ts, x1, x2, noise)
     starts = as_whole(starts, "starts")
-    selection, u = selection_of(oscillator, where, bounds)
     tell = told_to(report)
+    selection, u = selection_of(oscillator, where, bounds)
 
     record = record_of(times, values, sigmas)
     linearized = functools.partial(_linearized, selection, oscillator, record)
