@@ -182,7 +182,7 @@ def test_cycles_in_the_examples_are_those_of_the_names(cells):
 
 
 def test_impossible_axes_are_named():
-    with pytest.raises(ValueError, match="axes must be two arguments of make"):
+    with pytest.raises(ValueError, match="axes must be a dictionary, two arguments of make"):
         jb.region_map(jb.presets.class_b, {"nu0": NU0S})
     with pytest.raises(ValueError, match="nu1 must be two values or more that increase"):
         jb.region_map(jb.presets.class_b, {"nu0": NU0S, "nu1": NU1S[::-1]})

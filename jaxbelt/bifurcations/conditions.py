@@ -186,7 +186,9 @@ class AbstractCondition(eqx.Module):
     def check(self, osc: Oscillator) -> None:
         """`ValueError` where the oscillator cannot meet it."""
         n = len(osc.belts)
-        for belt in (self.belt,) if hasattr(self, "belt") else self.belts_concerned:
+        # Of a field `belt` that is None, too.
+        belts = [vars(self)["belt"]] if "belt" in vars(self) else self.belts_concerned
+        for belt in belts:
             there = isinstance(belt, int) and 0 <= belt < n
             require_value(there, "belt", f"0 to {n - 1}", belt)
         plain = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(self))

@@ -100,7 +100,8 @@ class Oscillator(eqx.Module):
 
     Arguments: damping (zeta = c/sqrt(k m)), belts (one `Belt` or more), omega (sqrt(k/m) > 0,
     default 1); scalars, dimensionless. `ValueError` for anything else. For batches build it
-    inside `jax.vmap`.
+    inside `jax.vmap`. A negative damping is possible; starts far out may then go to infinity,
+    which `portrait(osc).escapes` tells.
     """
 
     damping: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "damping"))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
@@ -226,7 +227,7 @@ def _words_for(kind: str, sticks: np.ndarray, x1: float) -> str:
 def basin_stability(
     oscillator: Oscillator,
     *,
-    box: ArrayLike | Sequence[Any],
+    box: Any,
     n: int = 10_000,
     key: Array,
     t1: float = LONG_ENOUGH,
@@ -241,7 +242,7 @@ def basin_stability(
     """
     check_oscillator(oscillator, "oscillator")
     require_value(np.shape(box) == (2, 2), "box", "((x1 from, to), (x2 from, to))", box)
-    corners = np.array([as_interval(box[i], f"box[{i}], {x}") for i, x in enumerate(("x1", "x2"))])
+    corners = np.array([as_interval(ends, f"box[{i}], x{i + 1}") for i, ends in enumerate(box)])
     n = as_whole(n, "n")
     _check_key(key)
     numbers = {"t1": t1, "rtol": rtol, "atol": atol}
@@ -258,7 +259,7 @@ def basin_stability(
 def _check_key(key: Any) -> None:
     """Raise unless it is a key of JAX, of either sort."""
     dtype, shape = getattr(key, "dtype", np.dtype(object)), np.shape(key)
-    typed = jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
+    typed = jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
     raw = dtype == np.uint32 and shape == (2,)
     require_value(typed or raw, "key", "one key, such as jax.random.key(0)", key)
 

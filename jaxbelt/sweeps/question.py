@@ -95,8 +95,9 @@ class Question:
         return {
             "title": "sweep of a belt-driven dry-friction oscillator",
             "make": _name_of_function(grid.make),
+            "call": self.call(),
             "oscillator": f"{_plain(repr(grid.example))}, where the axes do not say otherwise",
-            "start": ", ".join(start) or "along the axes",
+            "start": ", ".join(start) + self._only_one_start() or "along the axes",
             **self.numbers,
             "observe": observe if isinstance(observe, str) else type(observe).__name__,
             "derivatives": ", ".join(self.derivatives) or "none",
@@ -104,14 +105,23 @@ class Question:
             "units": "all quantities are dimensionless; time is tau = omega t",
         }
 
-    def call(self) -> str:
-        """How to ask it again."""
-        shown = self.attributes()
-        settings = ", ".join(f"{name}={value!r}" for name, value in self.numbers.items())
-        start = tuple(self.grid.y0.values())
+    def _only_one_start(self) -> str:
+        """What is to be known of attractors that are looked for from one start at each point."""
+        if self.observe != "attractor" or any(name in self.grid.axes for name in ("x1", "x2")):
+            return ""
         return (
-            f"jaxbelt.sweep({shown['make']}, {{axes: the coordinates}}, y0={start}, {settings}, "
-            f"observe={shown['observe']!r}, derivatives={self.derivatives!r}, store=...)"
+            ": of several attractors the one that this start leads to; axes x1 and x2, and then "
+            "jaxbelt.attractors, show the others"
+        )
+
+    def call(self) -> str:
+        """How to ask it again, as a line of Python; `dataset` is that of the results."""
+        settings = ", ".join(f"{name}={value!r}" for name, value in self.numbers.items())
+        start, axes = tuple(self.grid.y0.values()), list(self.grid.axes)
+        return (
+            f"jaxbelt.sweep({_name_of_function(self.grid.make)}, "
+            f"{{name: dataset[name] for name in {axes}}}, y0={start}, {settings}, "
+            f"observe={_plain(repr(self.observe))}, derivatives={self.derivatives!r})"
         )
 
     def identity(self) -> dict[str, str]:
@@ -163,7 +173,24 @@ def _observer(observe: Any) -> Observer:
 
 
 def _name_of_function(make: Callable) -> str:
-    return getattr(make, "__qualname__", None) or _plain(repr(make))
+    """The function as it is written: its full name, the call that made it, or its text."""
+    if isinstance(make, functools.partial):
+        given = [*map(_value, make.args), *(f"{k}={_value(v)}" for k, v in make.keywords.items())]
+        return f"functools.partial({', '.join([_name_of_function(make.func), *given])})"
+    name = getattr(make, "__qualname__", None)
+    if name is None:
+        return _plain(repr(make))
+    if "<" not in name and make.__module__ != "__main__":
+        return f"{make.__module__}.{name}"
+    try:
+        return inspect.getsource(make).strip()
+    except (OSError, TypeError):
+        return name
+
+
+def _value(value: Any) -> str:
+    """An argument that was fixed; arrays of one number as that number."""
+    return repr(float(value)) if np.ndim(value) == 0 and hasattr(value, "dtype") else repr(value)
 
 
 def _plain(text: str) -> str:

@@ -20,17 +20,18 @@ def check_reducer(reducer: Any, osc: Oscillator) -> None:
         moment = code
     if hasattr(reducer, "rates"):
         forces = jax.ShapeDtypeStruct((len(osc.belts),), jnp.float64)
-        motion = Motion(number, number, number, number, forces)
+        motion = jax.eval_shape(Motion, number, number, number, number, forces)
         integrals = _tried("rates", "(osc, motion)", lambda m: reducer.rates(osc, m), motion)
     state = _tried(
         "init", "(osc, x1, x2)", lambda x1, x2: reducer.init(osc, x1, x2), number, number
     )
-    event = RunEvent(number, number, number, code, code, moment, integrals)
+    place = number, number, number
+    event = jax.eval_shape(RunEvent, *place, code, code, moment, integrals)
     new = _tried("update", "(state, event)", reducer.update, state, event)
     same = jax.tree.map(jnp.shape, new) == jax.tree.map(jnp.shape, state)
     came = f"{_shapes(new)} where init returns {_shapes(state)}"
     require(same, "observe.update", "a method that returns a state such as init does", came)
-    end = RunEnd(number, number, number, code, integrals)
+    end = jax.eval_shape(RunEnd, *place, code, integrals)
     results = _tried("finish", "(state, end)", reducer.finish, state, end)
     expected = "a method that returns a dictionary of results"
     require(isinstance(results, Mapping), "observe.finish", expected, _shapes(results))

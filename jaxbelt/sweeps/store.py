@@ -310,7 +310,6 @@ def _create(path: Path, question: Question) -> None:
         "jaxbelt_schema": SCHEMA,
         "jaxbelt_question": json.dumps(identity),
         "jaxbelt_hash": hashlib.sha256(json.dumps(identity).encode()).hexdigest(),
-        "jaxbelt_call": question.call(),
     }
     new = path.with_name(f".{path.name}.new")
     shutil.rmtree(new, ignore_errors=True)
