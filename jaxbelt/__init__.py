@@ -6,7 +6,9 @@ Everything a user needs is `import jaxbelt as jb`. Turn 64-bit floats on first:
 Inside, data goes one way: parameters, modes, motion, cycles, bifurcations, pictures. The code is a
 ladder that shows it. Read from top to bottom, a module imports only what stands before it:
 
+    spelling        what was perhaps meant by a word
     results         status codes and what to do about them
+    activity        what takes long says what it does
     numerics/       compiling
     checks          arguments, checked at the public edge
     tables          results as tables
@@ -17,155 +19,57 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     motion/         integrators arcs sensitivities sampling batches runs smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
     cycles/         backwards returns separatrices portrait
-    sweeps/         marks observers moments along attractor queue threads audit
+    sweeps/         marks observers moments along reducers attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     bifurcations/   special labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   path scan refine curves faces regions diagrams switch_folds
     inverse/        selection record fit design
     plotting/       style phase histories points diagrams regions sweeps inverse model draw
     paper           the paper's table and figures
-    __init__        the public names
+    api             the public names
+    __init__        the same, imported when the first of them is used
     commands/       options reproduce simulate diagram map sweep basins verify
     cli             the command line
 """
 
-import importlib.metadata
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
-from . import presets
-from .bifurcations.conditions import BifurcationPoint
-from .bifurcations.crossings import CrossingSliding, SlidingExchange
-from .bifurcations.curves import BifurcationCurve, bifurcation_curve
-from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
-from .bifurcations.edges import CornerCollision, GrazingEdge
-from .bifurcations.folds import FoldOfCycles
-from .bifurcations.refine import refine
-from .bifurcations.regions import RegionMap, region_map
-from .bifurcations.rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
-from .bifurcations.scan import scan
-from .bifurcations.special import SpecialPoint
-from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
-from .cycles.cycle import Cycle, find_cycle, unstable_cycle
-from .cycles.functionals import (
-    amplitude,
-    energy_dissipated,
-    energy_fed,
-    gap,
-    peak,
-    period,
-    slip_duration,
-    stick_duration,
-    stick_fraction,
-)
-from .cycles.portrait import Portrait, portrait
-from .cycles.separatrices import Separatrix
-from .inverse.design import Design, design, distance_to
-from .inverse.fit import Fit, fit
-from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
-from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck
-from .model.oscillator import Belt, Oscillator
-from .motion.simulate import Arcs, Events, Trajectory, simulate
-from .results import EventKind, Status, describe, draw_with
-from .sweeps.basins import Basins, BasinStability, basin_stability, basins
-from .sweeps.datasets import decoded
-from .sweeps.moments import AtEvents, AtExtrema, AtSection, AtTimes
-from .sweeps.shares import attractors
-from .sweeps.store import Verified, verify
-from .sweeps.sweep import Explanation, explain, sweep
+from .results import draw_with
 
 if TYPE_CHECKING:
-    from .plotting.model import plot_friction_law
-    from .plotting.phase import plot_phase_portrait, plot_time_history, plot_vector_field
-    from .plotting.sweeps import plot_basins, plot_sweep
-
-__version__ = importlib.metadata.version("jaxbelt")
-
-__all__ = [
-    "AbstractFriction",
-    "Arcs",
-    "AtEvents",
-    "AtExtrema",
-    "AtSection",
-    "AtTimes",
-    "BasinStability",
-    "Basins",
-    "Belt",
-    "BeltAtRest",
-    "BifurcationCurve",
-    "BifurcationDiagram",
-    "BifurcationPoint",
-    "BoundaryEquilibrium",
-    "Conti",
-    "CornerCollision",
-    "Coulomb",
-    "CrossingSliding",
-    "Cycle",
-    "Design",
-    "Equilibria",
-    "EquilibriumKind",
-    "EventKind",
-    "Events",
-    "Explanation",
-    "Fit",
-    "FoldOfCycles",
-    "GrazingEdge",
-    "GrazingSliding",
-    "Hopf",
-    "NonsmoothFold",
-    "Oscillator",
-    "Portrait",
-    "PseudoHopf",
-    "RegionMap",
-    "Separatrix",
-    "SlidingExchange",
-    "SpecialPoint",
-    "Status",
-    "Stribeck",
-    "SuddenSliding",
-    "Trajectory",
-    "Verified",
-    "amplitude",
-    "attractors",
-    "basin_stability",
-    "basins",
-    "bifurcation_curve",
-    "bifurcation_diagram",
-    "decoded",
-    "describe",
-    "design",
-    "distance_to",
-    "energy_dissipated",
-    "energy_fed",
-    "equilibria",
-    "explain",
-    "find_cycle",
-    "fit",
-    "gap",
-    "lyapunov_coefficient",
-    "peak",
-    "period",
-    "plot_basins",
-    "plot_friction_law",
-    "plot_phase_portrait",
-    "plot_sweep",
-    "plot_time_history",
-    "plot_vector_field",
-    "portrait",
-    "presets",
-    "refine",
-    "region_map",
-    "scan",
-    "simulate",
-    "slip_duration",
-    "stick_duration",
-    "stick_fraction",
-    "sweep",
-    "unstable_cycle",
-    "verify",
-]
+    from .api import *  # noqa: F403
 
 
-# Matplotlib is imported when something is drawn, not before.
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        import importlib.metadata
+
+        return importlib.metadata.version("jaxbelt")
+    # A module is no public name; its import asks for it here before it is done.
+    if name == "api" or (name.startswith("__") and name != "__all__"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from . import api
+
+    if name.startswith("plot_") and name in api.__all__:
+        # Matplotlib is imported when something is drawn, not before.
+        from .plotting import model, phase, sweeps
+
+        return next(getattr(m, name) for m in (model, phase, sweeps) if hasattr(m, name))
+    if name == "__all__" or name in api.__all__:
+        globals()[name] = value = getattr(api, name)
+        return value
+    from .spelling import did_you_mean
+
+    meant = did_you_mean(name, api.__all__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}{meant}")
+
+
+def __dir__() -> list[str]:
+    from . import api
+
+    return [*globals(), *api.__all__]
 
 
 def _with_matplotlib(result: Any, ax: Any, **options: Any) -> Any:
@@ -177,13 +81,11 @@ def _with_matplotlib(result: Any, ax: Any, **options: Any) -> Any:
 draw_with(_with_matplotlib)
 
 
-def __getattr__(name: str) -> Any:
-    if name.startswith("plot_") and name in __all__:
-        from .plotting import model, phase, sweeps
-
-        return next(getattr(m, name) for m in (model, phase, sweeps) if hasattr(m, name))
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+def _before_fork() -> None:
+    """Have it noted in the child that JAX was in use, though nothing of jaxbelt was until then."""
+    if "jax" in sys.modules:
+        from .numerics import compiling as compiling
 
 
-def __dir__() -> list[str]:
-    return [*globals(), *(name for name in __all__ if name.startswith("plot_"))]
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_before_fork)

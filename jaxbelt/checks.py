@@ -1,10 +1,15 @@
 """What a user may pass in, checked once at the public edge.
 
 Every check runs before tracing and raises a `ValueError` that names the field, what was expected
-and what came. Under `jit`, `vmap` and derivatives values are not known, so only their dtype and
-shape are checked there; results then carry a status and NaN instead of an exception.
+and what came (see `in_words`), in one line. Under `jit`, `vmap` and derivatives values are not
+known, so only their dtype and shape are checked there; results then carry a status and NaN instead
+of an exception.
 """
 
+import inspect
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,6 +19,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from .numerics.compiling import is_concrete, require_own_threads
+from .spelling import did_you_mean
 
 TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
 
@@ -29,10 +35,151 @@ def pick(tree: Any, index: Any) -> Any:
 def require(condition: Any, field: str, expected: str, got: Any) -> None:
     """Raise `ValueError("<field> must be <expected>, got <got>")` unless `condition` holds.
 
-    Where `expected` tells a number, ask first: to print an array takes longer than to check it.
+    got: words, or any other value, which is put `in_words`. Where `expected` tells a number, ask
+    first: to print an array takes longer than to check it.
     """
     if not condition:
-        raise ValueError(f"{field} must be {expected}, got {got}")
+        came = got if isinstance(got, str) else in_words(got)
+        raise ValueError(f"{field} must be {expected}, got {came}")
+
+
+def require_value(condition: Any, field: str, expected: str, value: Any) -> None:
+    """`require` where `value` is what came itself, which may be a text."""
+    if not condition:
+        require(False, field, expected, in_words(value))
+
+
+#: What came is told in no more letters than this.
+LONGEST = 100
+
+
+def in_words(value: Any) -> str:
+    """What came, in one line: numbers as they are, arrays with many by their shape, functions and
+    classes by their names."""
+    if isinstance(value, Tracer):
+        return f"a traced {type(value).__name__} of shape {np.shape(value)}"
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return _array_in_words(value)
+    if inspect.isclass(value):
+        return f"the class {value.__name__}, not an object of it"
+    if inspect.isroutine(value):
+        return f"the function {getattr(value, '__qualname__', value)}"
+    if isinstance(value, tuple | list) and type(value) in (tuple, list) and len(value) <= 6:
+        parts = ", ".join(map(in_words, value))
+        text = f"[{parts}]" if isinstance(value, list) else f"({parts}{',' * (len(value) == 1)})"
+    else:
+        text = " ".join(repr(value).split())
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def _array_in_words(value: Any) -> str:
+    if np.size(value) > 8 or jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        ends = f", from {value[0]:.6g} to {value[-1]:.6g}" if _is_row(value) else ""
+        return f"an array of {value.dtype} of shape {value.shape}{ends}"
+    return str(value) if value.ndim < 2 else " ".join(str(value).split())
+
+
+def _is_row(value: Any) -> bool:
+    return (
+        value.ndim == 1
+        and np.issubdtype(value.dtype, np.floating)
+        and isinstance(value, np.ndarray)
+    )
+
+
+def require_one_of(value: Any, names: Iterable[str], field: str, more: str = "") -> None:
+    """Raise unless `value` is one of some words; what was perhaps meant is told.
+
+    more: what else is allowed, such as " or a reducer".
+    """
+    names = list(names)
+    if not (isinstance(value, str) and value in names):
+        *first, last = (f'"{name}"' for name in names)
+        joint = ", " if more else " or "
+        expected = (", ".join(first) + joint + last if first else last) + more
+        require(False, field, expected, in_words(value) + did_you_mean(value, names))
+
+
+def require_callable(value: Any, field: str, expected: str) -> None:
+    """Raise unless `value` can be called."""
+    require_value(callable(value), field, expected, value)
+
+
+def as_whole(value: Any, field: str, least: int = 1) -> int:
+    """`value` as an integer that is `least` or more, or a `ValueError`."""
+    fits = isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= least
+    kinds = {0: "an integer >= 0", 1: "a positive integer"}
+    require_value(fits, field, kinds.get(least, f"an integer >= {least}"), value)
+    return int(value)
+
+
+def as_interval(value: Any, field: str) -> tuple[float, float]:
+    """`value` as two numbers (first, last), first < last, or a `ValueError`."""
+    expected = "(first, last), two numbers with first < last"
+    require(value is not None, field, expected, "None")
+    is_pair = not isinstance(value, str | dict) and np.shape(value) == (2,)
+    require_value(is_pair, field, expected, value)
+    ends = np.asarray(as_numbers(value, field, (2,)))
+    check_finite(ends, field)
+    first, last = ends.tolist()
+    require(first < last, field, expected, f"({first:.12g}, {last:.12g})")
+    return first, last
+
+
+def as_path(value: Any, field: str) -> Path:
+    """`value` as the path of a file or folder, or a `ValueError`."""
+    require_value(
+        isinstance(value, str | os.PathLike), field, "the path of a file or folder", value
+    )
+    return Path(value)
+
+
+def check_arguments(make: Any, names: Sequence[str], field: str, others: str = "") -> None:
+    """Raise unless `make` is a function that can be called with arguments of these names alone.
+
+    others: names beside those of `make` that stand for something else, in words.
+    """
+    expected = "a function that returns an Oscillator, such as jb.presets.class_b"
+    require_callable(make, field, expected)
+    try:
+        parameters = inspect.signature(make).parameters
+    except (TypeError, ValueError):
+        return
+    if not any(p.kind == p.VAR_KEYWORD for p in parameters.values()):
+        for name in names:
+            known = f"arguments of {field} ({', '.join(parameters)}){others}"
+            came = repr(name) + did_you_mean(name, parameters)
+            require(name in parameters, "axes", known, came)
+    free = [
+        one.name
+        for one in parameters.values()
+        if one.default is one.empty and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
+    ]
+    missing = [name for name in free if name not in names]
+    if missing:
+        fix = ", ".join(f"{name}=..." for name in missing)
+        alone = f"a function of {', '.join(names)} alone" if names else "a function of nothing"
+        require(
+            False,
+            field,
+            alone,
+            f"one that needs {', '.join(missing)}, too: functools.partial({field}, {fix}) fixes it",
+        )
+
+
+def traceable(function: Callable[[], Any], field: str, expected: str) -> Any:
+    """What `function` gives, which calls a user's; a `ValueError` where that fails as it is traced.
+
+    What jaxbelt itself refuses is told as it is.
+    """
+    try:
+        return function()
+    except (TypeError, AttributeError, jax.errors.JAXTypeError) as error:
+        came = str(error).partition("\n")[0]
+        raise ValueError(
+            f"{field} must be {expected}, made of what JAX can trace (jnp.sqrt and jnp.where, say, "
+            f"not math.sqrt, np.sqrt, float or if), got {type(error).__name__}: {came}"
+        ) from error
 
 
 def require_usable_jax() -> None:
@@ -64,6 +211,7 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
 def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array | np.ndarray:
     """The same, but left in NumPy if it is known: for what goes into a compiled function anyway."""
     require_usable_jax()
+    given, wanted = value, "a number" if shape == () else "numbers"
     dtype = getattr(value, "dtype", None)
     if dtype is None:
         try:
@@ -73,10 +221,14 @@ def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Ar
             try:
                 value = jnp.stack([jnp.asarray(v, dtype=jnp.float64) for v in value])
             except Exception:
-                raise ValueError(f"{field} must be a number, got {value!r}") from None
+                raise ValueError(f"{field} must be {wanted}, got {in_words(given)}") from None
         dtype = value.dtype
         if not np.issubdtype(dtype, np.number):
-            raise ValueError(f"{field} must be a number, got {value!r}")
+            raise ValueError(f"{field} must be {wanted}, got {in_words(given)}")
+    elif not isinstance(value, jax.Array | np.ndarray | np.generic):
+        # Such as a column of pandas, or a tensor of another library.
+        value = _of_other_library(value, field, wanted)
+        dtype = value.dtype
     if jnp.issubdtype(dtype, jnp.complexfloating) or not (
         jnp.issubdtype(dtype, jnp.integer) or dtype == jnp.float64
     ):
@@ -96,6 +248,17 @@ def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Ar
             else f"of shape ({', '.join('n' if n is None else str(n) for n in shape)})"
         )
         raise ValueError(f"{field} must be {wanted}, got shape {array.shape}")
+    return array
+
+
+def _of_other_library(value: Any, field: str, wanted: str) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+    except Exception:
+        array = np.array(None)
+    if not np.issubdtype(array.dtype, np.number):
+        name = f"{type(value).__module__.partition('.')[0]}.{type(value).__name__}"
+        raise ValueError(f"{field} must be {wanted}, got a {name} of {value.dtype}")
     return array
 
 

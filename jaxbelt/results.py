@@ -5,10 +5,9 @@ sentence of advice for a code.
 """
 
 import enum
+import operator
 from collections.abc import Callable
 from typing import Any
-
-import numpy as np
 
 
 class Status(enum.IntEnum):
@@ -55,7 +54,8 @@ ADVICE = {
         "given. Loosen rtol and atol, or check the size of the parameters."
     ),
     Status.NOT_FINITE: (
-        "A parameter, the start or the solution is not a finite number; look for NaN in the input."
+        "A parameter, the start or the solution is not a finite number; look for NaN in the input, "
+        "and, where damping is negative, for motions that grow beyond all bounds."
     ),
     Status.EQUILIBRIUM: (
         "The orbit comes to rest at an equilibrium: this start leads to no cycle. Start further "
@@ -63,7 +63,8 @@ ADVICE = {
     ),
     Status.NOT_SETTLED: (
         "No loop of the orbit repeated within the budget of arcs: it approaches its attractor very "
-        "slowly. Start nearer to the cycle, or move away from the bifurcation point."
+        "slowly, or, where damping is negative, grows beyond all bounds. Start nearer to the "
+        "cycle, or move away from the bifurcation point."
     ),
     Status.TOO_MANY_ARCS: "A loop has more arcs than there is room for: pass a larger max_arcs.",
     Status.NO_CONVERGENCE: (
@@ -123,8 +124,11 @@ ADVICE = {
 
 
 def describe(status) -> str:
-    """The sentence that goes with a status code."""
-    return ADVICE[Status(int(np.asarray(status)))]
+    """The sentence that goes with a status code; status: a `Status`, or its number."""
+    try:
+        return ADVICE[Status(operator.index(status))]
+    except (TypeError, ValueError):
+        raise ValueError(f"status must be a Status, or its number, got {status!r}") from None
 
 
 class EventKind(enum.IntEnum):

@@ -143,8 +143,8 @@ def test_impossible_grids_are_named(arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"box": ((0.0, 0.0), (0.0, 1.0))}, "box must be not empty"),
-        ({"box": (0.0, 1.0)}, "box must be of shape"),
+        ({"box": ((0.0, 0.0), (0.0, 1.0))}, r"box\[0\], x1 must be \(first, last\)"),
+        ({"box": (0.0, 1.0)}, r"box must be \(\(x1 from"),
         ({"box": BOX, "n": 0}, "n must be a positive integer"),
     ],
 )

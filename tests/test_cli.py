@@ -17,6 +17,8 @@ from jaxbelt import paper as reproduce
 from jaxbelt.cli import app
 from jaxbelt.commands.map import write_table
 from jaxbelt.commands.options import belts_of_class, parse_belt
+from jaxbelt.commands.sweep import VARIABLES
+from jaxbelt.sweeps.question import Question
 from jaxbelt.tables import table_of
 
 runner = CliRunner()
@@ -123,14 +125,14 @@ def test_belts_are_parsed():
         ),
         ("--belt 0.3,load=-1", "load of belt must be >= 0, got -1.0"),
         ("--omega 0", "omega must be > 0, got 0.0"),
-        ("--t1 -1", "t1 must be > t0 = 0.0, got -1.0"),
-        ("--t1 inf", "t1 must be finite, got inf"),
-        ("--start nan 0", "y0 must be finite, got [nan  0.]"),
+        ("--t1 -1", "t1 must be finite and > 0, got -1.0"),
+        ("--t1 inf", "t1 must be finite and > 0, got inf"),
+        ("--start nan 0", "start must be finite, got nan 0.0"),
         ("--samples 1", "samples must be at least 2, got 1"),
-        ("--tolerance 0", "rtol must be > 0, got 0.0"),
+        ("--tolerance 0", "tolerance must be finite and > 0, got 0.0"),
         (
             "--formulation exact",
-            'formulation must be "filippov", "switch" or "smooth", got \'exact\'',
+            "formulation must be one of filippov, switch, smooth, got exact",
         ),
     ],
 )
@@ -179,14 +181,52 @@ def test_the_command_turns_on_float64_by_itself(tmp_path):
     program = "from jaxbelt.cli import app; app(prog_name='jaxbelt')"
     environment = {key: value for key, value in os.environ.items() if key != "JAX_ENABLE_X64"}
     run = subprocess.run(
-        [sys.executable, "-c", program, "simulate", "--t1", "-1"],
+        [sys.executable, "-c", program, "simulate", "--damping", "nan"],
         capture_output=True,
         text=True,
         cwd=tmp_path,
         env=environment,
         timeout=120,
     )
-    assert (run.returncode, run.stderr) == (2, "Error: t1 must be > t0 = 0.0, got -1.0\n")
+    assert (run.returncode, run.stderr) == (2, "Error: damping must be finite, got nan\n")
+
+
+def test_help_and_mistakes_in_options_import_nothing_that_computes(tmp_path):
+    program = """
+import sys
+from typer.testing import CliRunner
+from jaxbelt.cli import app
+for words in (["--help"], ["--version"], ["sweep", "--help"], ["simulate", "--class", "q"],
+              ["sweep", "nu0=0:1", "--variable", "kind"], ["basins", "--x1", "1", "0"]):
+    result = CliRunner().invoke(app, words)
+    print(result.exit_code, sorted({"jax", "numpy", "matplotlib", "xarray"} & sys.modules.keys()))
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path, timeout=120
+    )
+    assert run.stdout.splitlines() == ["0 []"] * 3 + ["2 []"] * 3, run.stderr
+
+
+def test_the_version_is_told():
+    result = runner.invoke(app, ["--version"])
+    assert (result.exit_code, result.output) == (0, f"jaxbelt {jb.__version__}\n")
+
+
+def test_scripts_read_json(tmp_path):
+    out = tmp_path / "run"
+    result = runner.invoke(app, ["simulate", *SPAN.split(), "--json", "--out", str(out)])
+    told = json.loads(result.stdout)
+    trajectory = jb.simulate(jb.presets.class_b(0.45, 0.35), (3.0, 0.0), 50.0, ts=TIMES)
+    assert told["status"] == "OK" and told["events"] == len(trajectory.events.t)
+    assert [told["t"], told["x1"], told["x2"]] == [50.0, *trajectory.ys[-1].tolist()]
+    assert told["written"] == [f"{out}{end}" for end in (".png", ".csv", "_events.csv")]
+
+
+def test_variables_of_the_command_are_those_of_datasets():
+    axes = {"nu0": [0.45], "nu1": [0.35]}
+    for observe, names in VARIABLES.items():
+        question = Question.of(jb.presets.class_b, axes, (3.0, 0.0), 10.0, 1e-8, 1e-8, observe, ())
+        assert set(question.table.shapes) == set(names)
 
 
 @pytest.mark.parametrize("command", ["reproduce", "simulate"])

@@ -280,7 +280,7 @@ def test_an_exchange_ends_where_the_cycle_does(points):
     [
         ((nu0, nu0), PLANE, "where must be two different parameters"),
         ((nu0, nu1), ((0.0, 0.7), (-0.7, 0.7)), "span must be around the point"),
-        ((nu0, nu1), ((-0.7, np.nan), (-0.7, 0.7)), "span must be finite"),
+        ((nu0, nu1), ((-0.7, np.nan), (-0.7, 0.7)), "be finite"),
     ],
 )
 def test_impossible_arguments_are_named(points, where, span, message):

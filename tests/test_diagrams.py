@@ -322,7 +322,7 @@ def test_a_cell_on_the_line_of_a_belt_at_rest_is_not_an_area(cells):
 
 
 def test_impossible_axes_are_named():
-    with pytest.raises(ValueError, match="axes must be two arguments of make"):
+    with pytest.raises(ValueError, match="axes must be a dictionary, two arguments of make"):
         jb.region_map(jb.presets.class_b, {"nu0": NU0S})
     with pytest.raises(ValueError, match="nu1 must be two values or more that increase"):
         jb.region_map(jb.presets.class_b, {"nu0": NU0S, "nu1": NU1S[::-1]})

@@ -174,7 +174,7 @@ def test_local_cubics_are_exact_for_cubics():
         ({"where": lambda o: o.belts}, "where must be a function that selects parameters"),
         ({"where": lambda o: (o.damping, o.damping)}, "where must be free of repeats"),
         ({"bounds": [(0.6, 0.7)]}, "damping must be inside of its bounds"),
-        ({"bounds": []}, "bounds must be 1 pairs"),
+        ({"bounds": []}, "bounds must be a list with one"),
         ({"noise": -1.0}, "noise must be > 0"),
         ({"ts": TS[::-1]}, "ts must be increasing"),
         ({"x1": np.zeros(3)}, "x1 must be of shape"),
@@ -227,9 +227,9 @@ def test_design_says_so_when_a_target_is_out_of_reach():
 @pytest.mark.parametrize(
     ("targets", "message"),
     [
-        ([], "targets must be at least one pair"),
-        ([(0.5, stick)], "targets must be pairs"),
-        ([(stick, (1.0, 0.5))], "targets must be intervals"),
+        ([], "targets must be a list of pairs"),
+        ([(0.5, stick)], "targets must be a list of pairs"),
+        ([(stick, (1.0, 0.5))], "target of stick must be a value or"),
     ],
 )
 def test_impossible_targets_are_named(targets, message):

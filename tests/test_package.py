@@ -119,12 +119,14 @@ HIDDEN_WAYS = {"__import__", "eval", "exec", "import_module", "importlib", "modu
 def test_modules_are_imported_by_statements_only(module: str):
     """So that the test above sees every import."""
     used = set(".".join(set(imported_names(module)) - {"importlib.metadata"}).split("."))
+    # The package asks whether JAX was imported.
+    hidden = HIDDEN_WAYS - ({"modules"} if module == "__init__" else set())
     for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
         if isinstance(node, ast.Name) and node.id != "importlib":
             used.add(node.id)
         elif isinstance(node, ast.Attribute):
             used.add(node.attr)
-    assert used.isdisjoint(HIDDEN_WAYS)
+    assert used.isdisjoint(hidden)
 
 
 @pytest.mark.parametrize("module", [name for name in LADDER if name != "numerics.compiling"])
@@ -150,16 +152,18 @@ def test_matplotlib_is_imported_by_plotting_only(module: str):
 
 def test_importing_jaxbelt_is_light_and_leaves_the_settings_of_jax_alone():
     program = """
-import sys, jax
+import sys, jaxbelt
+print("jax" in sys.modules)
+import jax
 before = jax.config.values.copy()
-import jaxbelt
+jaxbelt.simulate  # with it, all that stands behind the public names
 heavy = {"matplotlib", "optax", "pandas", "scipy.ndimage", "scipy.optimize", "xarray", "zarr"}
 print(sorted(heavy & sys.modules.keys()), jax.config.values == before)
 """
     run = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120
     )
-    assert run.stdout.split() == ["[]", "True"]
+    assert run.stdout.split() == ["False", "[]", "True"]
 
 
 def test_version_is_that_of_the_project():

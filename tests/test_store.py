@@ -95,7 +95,8 @@ def test_a_store_is_what_the_sweep_gives(path, whole):
     assert jb.decoded(plain).equals(jb.decoded(whole))
     told = plain.attrs
     assert (
-        told["jaxbelt_schema"] == stores.SCHEMA and "jaxbelt.sweep(class_b" in told["jaxbelt_call"]
+        told["jaxbelt_schema"] == stores.SCHEMA
+        and "jaxbelt.sweep(jaxbelt.presets.class_b" in told["call"]
     )
     assert " at 0x" not in json.dumps({k: str(v) for k, v in told.items()})
     assert jb.verify(path) == stores.Verified((0, 1, 2, 3, 4), (), (), True)

@@ -1,7 +1,9 @@
 """`sweep`: the dataset, derivatives, reducers, stores, and what it says about bad input."""
 
 import functools
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import ClassVar
 
 import jax
@@ -20,6 +22,7 @@ from jaxbelt import Status
 from jaxbelt.cli import app
 from jaxbelt.kernel.lanes import Observer, Variable
 from jaxbelt.sweeps import store
+from jaxbelt.sweeps.question import Question
 from jaxbelt.sweeps.threads import CHUNK
 
 NU0, NU1 = np.linspace(-0.6, 0.55, 4), np.array([0.35, -0.2])
@@ -223,7 +226,7 @@ def test_a_reducer_sees_every_event(dataset):
         (dict(t1=-1.0), "t1 must be > 0"),
         (dict(t1=None), "t1 must be given"),
         (dict(y0=(np.nan, 0.0)), "y0 must be finite"),
-        (dict(observe="end"), 'observe must be "final", "attractor" or a reducer'),
+        (dict(observe="end"), 'observe must be "final", "attractor" or an object'),
         (dict(derivatives=("mu",)), "derivatives must be names of axes, nu0, nu1, got 'mu'"),
         (dict(make=lambda nu0, nu1: nu0), "make must be a function that returns an Oscillator"),
     ],
@@ -259,3 +262,51 @@ def test_the_command_writes_data_and_a_picture(tmp_path):
     assert (
         done.exit_code == 2 and "NAME=FROM:TO:COUNT or NAME=VALUE, got 'nu0=0.1:0.2'" in done.output
     )
+
+
+def with_steepness(nu0, steepness):
+    law = jb.Conti(static=1.0, residual=0.6, steepness=steepness)
+    return jb.Oscillator(0.5, (jb.Belt(nu0, law),))
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (jb.presets.class_a, "jaxbelt.presets.class_a"),
+        (
+            functools.partial(jb.presets.class_b, nu1=np.float64(0.35)),
+            "functools.partial(jaxbelt.presets.class_b, nu1=0.35)",
+        ),
+        (functools.partial(with_steepness, steepness=9.0), None),
+        (lambda nu0: jb.presets.class_b(nu0, 0.3), None),
+    ],
+)
+def test_attributes_tell_how_to_ask_again(make, name):
+    axes = {"nu0": [0.1, 0.2]}
+    question = Question.of(make, axes, (3.0, 0.0), 10.0, 1e-8, 1e-8, "final", ())
+    told = question.attributes()
+    assert name is None or told["make"] == name
+    assert told["make"] in told["call"]
+    if "lambda" in told["make"]:
+        return  # the text of its line
+    asked = {}
+    modules = {"functools": functools, __name__: sys.modules[__name__], "dataset": axes}
+    modules["jaxbelt"] = SimpleNamespace(
+        presets=jb.presets, sweep=lambda *args, **named: asked.update(args=args, **named)
+    )
+    eval(told["call"], modules)
+    again = asked.pop("args")
+    osc, same = (one(0.3) if one is make else one(nu0=0.3) for one in (make, again[0]))
+    assert repr(osc) == repr(same) and again[1] == axes
+    assert asked == {
+        "y0": (3.0, 0.0), "t1": 10.0, "rtol": 1e-8, "atol": 1e-8, "observe": "final",
+        "derivatives": (),
+    }  # fmt: skip
+
+
+def test_one_start_is_told_not_to_show_every_attractor():
+    arguments = {"nu0": [0.1]}, (3.0, 0.0), None, 1e-8, 1e-8, "attractor", ()
+    alone = Question.of(jb.presets.class_a, *arguments).attributes()["start"]
+    assert "x1 = 3.0, x2 = 0.0: of several attractors the one" in alone
+    several = Question.of(jb.presets.class_a, {"nu0": [0.1], "x1": [1.0, 2.0]}, *arguments[1:])
+    assert several.attributes()["start"] == "x2 = 0.0"

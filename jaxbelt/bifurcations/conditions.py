@@ -20,7 +20,7 @@ is static.
 
 import abc
 import functools
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -31,7 +31,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import is_concrete, number, require
+from ..checks import is_concrete, number, require, require_value
 from ..cycles.attractors import place_of
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import SIZES, Chain, Loop, cut, meshed
@@ -114,6 +114,17 @@ class Stopping(NamedTuple):
     velocities: np.ndarray
 
 
+def check_conditions(conditions: Any, field: str = "conditions") -> tuple["AbstractCondition", ...]:
+    """`conditions` as a tuple, or a `ValueError`."""
+    expected = "a tuple of conditions, such as (jb.Hopf(),)"
+    is_many = isinstance(conditions, Iterable) and not isinstance(conditions, str | dict)
+    require_value(is_many, field, expected, conditions)
+    conditions = tuple(conditions)
+    for one in conditions:
+        require_value(isinstance(one, AbstractCondition), field, expected, one)
+    return conditions
+
+
 class AbstractCondition(eqx.Module):
     """What is to happen at a bifurcation point."""
 
@@ -162,8 +173,11 @@ class AbstractCondition(eqx.Module):
     def check(self, osc: Oscillator) -> None:
         """`ValueError` where the oscillator cannot meet it."""
         n = len(osc.belts)
-        for belt in self.belts_concerned:
-            require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
+        # Of a field `belt` that is None, too.
+        belts = [vars(self)["belt"]] if "belt" in vars(self) else self.belts_concerned
+        for belt in belts:
+            there = isinstance(belt, int) and 0 <= belt < n
+            require_value(there, "belt", f"0 to {n - 1}", belt)
         plain = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(self))
         require(plain, "condition", "made of plain numbers", self)
 
@@ -356,8 +370,10 @@ class BifurcationPoint(eqx.Module):
         if not is_concrete(self.value) or self.value.ndim:
             return f"BifurcationPoint({self.condition!r}, value={self.value.shape})"
         if int(self.status) != Status.OK:
-            name = Status(int(self.status)).name
-            return f"BifurcationPoint({self.condition!r}, {name}: {describe(self.status)})"
+            name, advice = Status(int(self.status)).name, describe(self.status)
+            if "jb.scan" not in advice:
+                advice += " Every bifurcation point in an interval is found by jb.scan."
+            return f"BifurcationPoint({self.condition!r}, {name}: {advice})"
         return (
             f"BifurcationPoint({self.condition!r}, value {number(self.value)}, "
             f"residual {float(self.residual):.1e}, {int(self.iterations)} iterations, "

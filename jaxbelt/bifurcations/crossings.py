@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..checks import require_value
 from ..cycles.shooting import SIZES, Chain, Loop, meshed
 from ..model.equilibria import candidates
 from ..model.modes import mode_of, stick_limit
@@ -150,6 +151,11 @@ class SlidingExchange(AbstractCycleCondition):
 
     caption: ClassVar[str] = "sliding exchange"
     line: ClassVar[Line] = Line("exchange", "black", (0, (3, 1, 1, 1)))
+
+    def check(self, osc):
+        two = isinstance(self.belts, tuple | list) and len(set(self.belts)) == len(self.belts) == 2
+        require_value(two, "belts", "two different numbers, such as (0, 1)", self.belts)
+        super().check(osc)
 
     def guess(self, osc, size):
         _, _, orbit = orbit_after_stick(osc, self.belts[0])

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, check_finite, require
+from ..activity import announced, tell
+from ..checks import as_array, as_interval, as_whole, check_positive, require, require_value
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import Family, Variation
@@ -131,6 +132,7 @@ class BifurcationCurve(eqx.Module):
         )
 
 
+@announced("bifurcation_curve")
 def bifurcation_curve(
     point: BifurcationPoint,
     where: tuple[Callable[[Oscillator], Any], Callable[[Oscillator], Any]]
@@ -152,10 +154,19 @@ def bifurcation_curve(
     found: with `make` at a fixed q, or in any other way. So (p, q) need not be told; where one
     oscillator is at several places of the plane (of `p**2`, say), `at` is near the one meant.
     """
-    require(isinstance(point, BifurcationPoint), "point", "a BifurcationPoint", repr(point))
-    require(int(point.status) == Status.OK, "point", "one with status OK", repr(point))
-    limits = np.stack([np.asarray(as_array(ends, "span", (2,))) for ends in span])
-    check_finite(limits, "span")
+    require_value(
+        isinstance(point, BifurcationPoint),
+        "point",
+        "a BifurcationPoint, such as jb.refine(...)",
+        point,
+    )
+    require_value(int(point.status) == Status.OK, "point", "one with status OK", point)
+    two = isinstance(span, tuple | list | np.ndarray) and len(span) == 2 and np.ndim(span[0]) > 0
+    require_value(two, "span", "((first, last), (first, last)), one pair a parameter", span)
+    limits = np.array([as_interval(ends, f"span[{i}]") for i, ends in enumerate(span)])
+    step = float(as_array(step, "step"))
+    check_positive(step, "step")
+    max_points = as_whole(max_points, "max_points")
     near = None if at is None else np.asarray(as_array(at, "at", (2,)))
     variation = _varied_by_two(point.oscillator, where, near, limits)
     start = variation.values_of(point.oscillator, limits, near)
@@ -176,8 +187,8 @@ def _varied_by_two(osc: Oscillator, where: Any, at: Any, limits: np.ndarray) -> 
         make: Any = where
         return Variation.of_function(make, values, "where")
     two = isinstance(where, tuple | list) and len(where) == 2
-    require(two, "where", "two functions, or one of both parameters", repr(where))
-    require(at is None, "at", "left out where `where` selects the parameters", repr(at))
+    require_value(two, "where", "two functions, or one of both parameters", where)
+    require_value(at is None, "at", "left out where `where` selects the parameters", at)
     numbers = [leaf_index(osc, one) for one in where]
     require(numbers[0] != numbers[1], "where", "two different parameters", "one twice")
     return Variation.of_leaves(osc, numbers)
@@ -251,6 +262,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
     rows: list[_Row] = []
     special: list[SpecialPoint] = []
     while True:
+        tell(f"{len(rows)} points on one side")
         points, found, beyond, end = _leg(problem, track, u, direction, origin)
         rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
         special += found

@@ -20,7 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..checks import require
+from ..activity import announced, tell
+from ..checks import as_whole, require
 from ..cycles.cycle import Cycle, polish
 from ..cycles.shooting import Loop, cut
 from ..model.equilibria import candidates
@@ -167,6 +168,7 @@ class BifurcationDiagram(eqx.Module):
         )
 
 
+@announced("bifurcation_diagram")
 def bifurcation_diagram(
     osc: Oscillator | Callable[..., Oscillator],
     where: Callable[[Oscillator], Any] | None = None,
@@ -180,7 +182,7 @@ def bifurcation_diagram(
     osc, where, span, resolution: as for `scan`, which finds the special points. rows: about how
     many values of the parameter are computed. `ValueError` names an impossible argument.
     """
-    require(isinstance(rows, int) and rows > 0, "rows", "a positive integer", repr(rows))
+    rows, resolution = as_whole(rows, "rows"), as_whole(resolution, "resolution")
     path = ParameterPath(osc, where, span)
     points = search(path, resolution)
     # A point on an end of the span has one side only.
@@ -191,6 +193,7 @@ def bifurcation_diagram(
     path.look(np.concatenate(nodes))
     middles = [float(values[len(values) // 2]) for values in nodes]
     labels = [path.label(value) for value in middles]
+    tell(f"branches between {len(points)} points")
     for stretch, around in _separated(labels):
         found = edges_touched(path, nodes[stretch], around)
         points = by_value([*points, *found])

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..checks import as_array, check_finite, require
+from ..checks import as_interval
 from ..cycles.attractors import (
     SOLVED,
     Itinerary,
@@ -35,10 +35,11 @@ from ..cycles.settling import AT_REST
 from ..cycles.shooting import SIZES, Loop, cut
 from ..model.equilibria import candidates
 from ..model.oscillator import Oscillator
+from ..model.parameters import leaf_index
 from ..model.variations import varied
 from ..numerics.compiling import each, jit
 from ..results import Status
-from .conditions import AbstractCondition
+from .conditions import AbstractCondition, check_conditions
 from .guesses import settled_loops
 from .labels import AttractingCycle, Label
 
@@ -59,19 +60,19 @@ class ParameterPath:
     """A path in one parameter: its labels, each computed once, and loops of the cycles in them."""
 
     def __init__(self, osc, where, span, conditions: Sequence[AbstractCondition] = ()):
-        require(span is not None, "span", "(first, last)", "None")
-        span = as_array(span, "span", (2,))
-        check_finite(span, "span")
-        self.first, self.last = (float(end) for end in span)
-        require(self.first < self.last, "span", "(first, last) with first < last", tuple(span))
+        # `where` first: where it is left out, the span stands in its place.
+        if isinstance(osc, Oscillator):
+            leaf_index(osc, where)
+        self.first, self.last = as_interval(span, "span")
         self.variation = varied(osc, where, (self.first,))
+        conditions = check_conditions(conditions)
         for value in (self.first, self.last):
             self.variation.check(value)
         #: The one that was given, or that at the first value.
         self.osc = osc if isinstance(osc, Oscillator) else self.at(self.first)
         for condition in conditions:
             condition.check(self.osc)
-        self.conditions = tuple(conditions)
+        self.conditions = conditions
         self.length = self.last - self.first
         (self.name,) = self.variation.names
         self.labels: dict[float, Label] = {}

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..checks import as_array, check_finite, is_concrete, require
+from ..activity import announced
+from ..checks import as_array, as_whole, check_finite, is_concrete, require, require_value
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
@@ -33,6 +34,7 @@ NEAR_GUESS, QUITE_NEAR, SHORT_STEP = 0.015, 0.05, 0.25
 REACHES, INTERVALS = (2e-3, 1.2e-2, 5e-2, 0.2), 15
 
 
+@announced("refine")
 def refine(
     condition: AbstractCondition,
     osc: Oscillator | Callable[..., Oscillator],
@@ -61,10 +63,11 @@ def refine(
     guess that leads to no such point gives a status that says why, and NaN. `ValueError` names an
     impossible argument.
     """
-    require(isinstance(condition, AbstractCondition), "condition", "such as jb.Hopf()", condition)
-    variation, near, value = _begun(osc, where, at)
-    condition.check(near)
-    point = condition.point(variation, near, value, max_arcs or condition.room)
+    fits = isinstance(condition, AbstractCondition)
+    require_value(fits, "condition", "such as jb.Hopf()", condition)
+    room = None if max_arcs is None else as_whole(max_arcs, "max_arcs")
+    variation, near, value = _begun(condition, osc, where, at)
+    point = condition.point(variation, near, value, room or condition.room)
     return _bracketed(point, variation, value) if is_outermost(near, value, point) else point
 
 
@@ -108,12 +111,15 @@ def _possible(variation: Variation, guess: float, end: float) -> float:
     return guess
 
 
-def _begun(osc: Any, where: Any, at: Any) -> tuple[Variation, Oscillator, Any]:
+def _begun(
+    condition: AbstractCondition, osc: Any, where: Any, at: Any
+) -> tuple[Variation, Oscillator, Any]:
     """What is varied, and the oscillator and the value, [1], to begin from."""
     if isinstance(osc, Oscillator) or not callable(osc):
-        require(at is None, "at", "left out where osc is an Oscillator", repr(at))
+        require_value(at is None, "at", "left out where osc is an Oscillator", at)
         check_oscillator(osc)
         number = leaf_index(osc, where)
+        condition.check(osc)
         value = jnp.asarray(jax.tree.leaves(osc)[number], dtype=jnp.float64)
         return Variation.of_leaves(osc, [number]), osc, value.reshape(1)
     require(at is not None, "at", "the value of the parameter to begin from", "None")
@@ -123,4 +129,6 @@ def _begun(osc: Any, where: Any, at: Any) -> tuple[Variation, Oscillator, Any]:
     if is_concrete(at):
         variation.check(float(at))
     value = at.reshape(1)
-    return variation, variation.oscillator(value), value
+    near = variation.oscillator(value)
+    condition.check(near)
+    return variation, near, value

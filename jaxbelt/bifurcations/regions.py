@@ -17,7 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, require
+from ..activity import announced, tell
+from ..checks import (
+    as_array,
+    as_whole,
+    check_arguments,
+    check_finite,
+    check_positive,
+    require_one_of,
+    require_value,
+)
 from ..cycles.attractors import Runs, distinct, itinerary, lead_to_one_cycle, stuck_belts
 from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
 from ..model.equilibria import EquilibriumKind, equilibria
@@ -113,7 +122,7 @@ class RegionMap(eqx.Module):
 
     def example(self, name: str) -> tuple[float, float]:
         """The values of the parameters in the cell of a region that is farthest from its bounds."""
-        require(name in self.regions, "name", f"one of {', '.join(self.regions)}", repr(name))
+        require_one_of(name, self.regions, "name")
         return _example(self.values, self.label == name)
 
     def oscillator(self, name: str) -> Oscillator:
@@ -173,6 +182,7 @@ def interior(inside: np.ndarray) -> tuple[int, int]:
     return int(row), int(column)
 
 
+@announced("region_map")
 def region_map(
     make: Callable[..., Oscillator],
     axes: Mapping[str, ArrayLike],
@@ -189,12 +199,18 @@ def region_map(
     how many lines parallel to each axis curves are looked for, 0 for none. `ValueError` names an
     impossible argument.
     """
-    require(len(axes) == 2, "axes", "two arguments of make and their values", list(axes))
+    expected = "a dictionary, two arguments of make and their values"
+    require_value(isinstance(axes, Mapping) and len(axes) == 2, "axes", expected, axes)
     names = tuple(axes)
+    check_arguments(make, names, "make")
     values = [np.asarray(as_array(axes[name], name, (None,))) for name in names]
     for name, along in zip(names, values, strict=True):
         increases = along.size > 1 and np.all(np.diff(along) > 0)
-        require(increases, name, "two values or more that increase", along)
+        require_value(increases, name, "two values or more that increase", along)
+    starts = _checked_starts(starts)
+    step = float(as_array(step, "step"))
+    check_positive(step, "step")
+    lines = as_whole(lines, "lines", 0)
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:
         cells = beside.submit(_cells, make, names, values, dict(axes), starts)
@@ -233,6 +249,15 @@ def _names_between(make, names, values, label, on_line, curves, starts):
             name = region_of(opposite, len(osc.belts), bool(rests[0]), stuck)
             found.append((p, q, name))
     return tuple(found)
+
+
+def _checked_starts(starts: Any) -> tuple[tuple[float, float], ...]:
+    expected = "a list of (x1, x2), such as [(3.0, 0.0)]"
+    shape = np.shape(starts) if isinstance(starts, tuple | list | np.ndarray) else ()
+    require_value(len(shape) == 2 and shape[0] and shape[1] == 2, "starts", expected, starts)
+    rows = as_array(starts, "starts", (None, 2))
+    check_finite(rows, "starts")
+    return tuple((float(x1), float(x2)) for x1, x2 in np.asarray(rows))
 
 
 def _cells(make, names, values, axes, starts):
@@ -334,8 +359,9 @@ def _bounds(make, names, values, step, lines) -> list[BifurcationCurve]:
     # The next lines are searched while curves are followed from those before.
     with ThreadPoolExecutor(1) as ahead:
         searches = [(line, ahead.submit(points_on, *line)) for line in across]
-        for (along, fixed), found in searches:
+        for count, ((along, fixed), found) in enumerate(searches, 1):
             for point in found.result():
+                tell(f"{len(curves)} curves from {count} of {len(across)} lines")
                 pair = np.empty(2)
                 pair[along], pair[1 - along] = float(point.value), fixed
                 if point.status == Status.OK and not any(

@@ -26,7 +26,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import is_concrete, require
+from ..checks import is_concrete, require_value
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
@@ -295,7 +295,7 @@ def check_edge(osc: Oscillator, belt: Any) -> None:
     """`ValueError` where a belt has no finite contact edge."""
     if is_concrete(osc):
         ends = [osc.belts[belt].lower, osc.belts[belt].upper]
-        require(np.any(np.isfinite(ends)), "belt", "one with a finite edge", repr(belt))
+        require_value(np.any(np.isfinite(ends)), "belt", "one with a finite edge", belt)
 
 
 def _edges_of(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:

@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from ..activity import announced, tell
+from ..checks import as_whole
 from ..cycles.attractors import (
     is_same,
     itinerary,
@@ -50,6 +52,7 @@ LOOKED_FOR: tuple[type[AbstractCondition], ...] = (
 NEAR = 1 / 400
 
 
+@announced("scan")
 def scan(
     osc: Oscillator | Callable[..., Oscillator],
     where: Callable[[Oscillator], Any] | None = None,
@@ -74,6 +77,7 @@ def scan(
     the value where it happens, good to about 1e-9 of the span. `ValueError` names an impossible
     argument.
     """
+    resolution = as_whole(resolution, "resolution")
     return search(ParameterPath(osc, where, span, conditions), resolution)
 
 
@@ -94,6 +98,7 @@ def search(
     path.look(np.concatenate(stretches))
     settled = [path.beside(at) for at in path.breaks]
     while intervals := path.changes(settled):
+        tell(f"{len(path.labels)} values seen, {len(points)} points found")
         values: list[float] = []
         for a, b in intervals:
             is_narrow = b - a <= NEAR * path.length

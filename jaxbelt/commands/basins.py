@@ -2,10 +2,8 @@
 
 import csv
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import jax
-import numpy as np
 import typer
 
 import jaxbelt as jb
@@ -14,17 +12,21 @@ from .options import (
     Belts,
     Class,
     Damping,
+    Json,
     Nu0,
     Nu1,
     Omega,
     Sigma,
     Sigma0,
     Sigma1,
-    check_out,
+    check_description,
+    check_range,
     make_console,
     oscillator,
+    outputs,
     plain_errors,
     say,
+    turn_on_float64,
 )
 
 
@@ -52,8 +54,9 @@ def basins(
     ] = 10_000,
     seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
     out: Annotated[
-        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv.")
+        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
     ] = Path("basins"),
+    as_json: Json = False,
 ) -> None:
     """Where each start leads: basins of attraction, and the unstable cycle between them.
 
@@ -61,6 +64,8 @@ def basins(
       with the stable cycles, and the unstable one dashed.
 
     - **OUT.csv**: x1, x2 and label of every start of the grid.
+
+    - **OUT.nc**: the same and all that is known of each run, as **sweep** writes it.
 
     Prints the fraction of the window that leads to each kind of attractor, with its standard error
     (basin stability), from random starts. An oscillator is described as for **simulate**.
@@ -72,30 +77,52 @@ def basins(
     - jaxbelt basins --belt 1.4,law=stribeck,static=1,kinetic=0.5,stribeck_velocity=0.5
       --damping 0.1 --x1 -2 2 --x2 0 2
     """
-    from ..plotting.style import journal_style, save
-    from ..plotting.sweeps import draw_basins
-
     console = make_console()
     with plain_errors():
         if points < 2:
             raise ValueError(f"points must be at least 2, got {points}")
+        if starts < 0:
+            raise ValueError(f"starts must be 0 or more, got {starts}")
+        check_range("x1", x1)
+        check_range("x2", x2)
+        written = outputs(out, ".png", ".csv", ".nc")
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
+        check_description(system, arguments, belt)
+        turn_on_float64()
         osc = oscillator(system, arguments, belt, damping, omega)
+        import jax
+        import numpy as np
+
         grid = [np.linspace(*span, points) for span in (x1, x2)]
-        written = [out.with_name(out.name + end) for end in (".png", ".csv")]
-        for path in written:
-            check_out(path)
-        with console.status("following the starts (the first seconds are compilation)"):
-            found = jb.basins(osc, x1=grid[0], x2=grid[1], progress=False)
-            lines = [repr(found)]
-            if starts:
-                key = jax.random.key(seed)
-                lines.append(repr(jb.basin_stability(osc, box=(x1, x2), n=starts, key=key)))
+        found = jb.basins(osc, x1=grid[0], x2=grid[1])
+        lines, data = [repr(found)], _as_data(found)
+        if starts:
+            key = jax.random.key(seed)
+            stability = jb.basin_stability(osc, box=(x1, x2), n=starts, key=key)
+            lines.append(repr(stability))
+            data["stability"] = {
+                "starts": starts,
+                "fractions": stability.fractions,
+                "standard_errors": stability.standard_errors,
+            }
+        from ..plotting.style import journal_style, save
+        from ..plotting.sweeps import draw_basins
+
+        out.parent.mkdir(parents=True, exist_ok=True)
         with journal_style():
             save(draw_basins(found), written[0])
+        # Version 3 of the format, which needs no library but SciPy.
+        found.dataset.to_netcdf(written[2], engine="scipy")
         with written[1].open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(["x1", "x2", "label"])
             for (i, j), label in np.ndenumerate(np.asarray(found.label)):
                 writer.writerow([float(grid[0][i]), float(grid[1][j]), int(label)])
-    say(console, lines, written)
+    say(console, lines, written, as_json=as_json, data=data)
+
+
+def _as_data(found: "jb.Basins") -> dict[str, Any]:
+    """The fractions of the grid by the words for their attractors."""
+    labels = found.label.values
+    shares = {name: float((labels == i).mean()) for i, name in enumerate(found.attractors)}
+    return {"attractors": shares, "undecided": float((labels < 0).mean())}

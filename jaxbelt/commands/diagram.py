@@ -5,31 +5,38 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
-import numpy as np
 import typer
 
 import jaxbelt as jb
-from jaxbelt.model.parameters import names_of
 
+from ..spelling import did_you_mean
 from .options import (
     Belts,
     Class,
     Damping,
+    Json,
     Nu0,
     Nu1,
     Omega,
     Sigma,
     Sigma0,
     Sigma1,
+    check_description,
+    check_range,
     make_console,
     oscillator,
+    outputs,
+    plain,
     plain_errors,
     say,
+    turn_on_float64,
 )
 
 #: Arguments of classes that may be varied, other than velocities: an edge of two belts, or of one.
 EDGES = ("sigma", "sigma0", "sigma1")
+#: What a diagram shows.
+QUANTITIES = ("x2", "x1", "period")
+POINT_COLUMNS = ("value", "kind", "belts", "error", "status")
 #: Short names of parameters that may be varied.
 PARAMETERS = {"nu0": "belts[0].velocity", "nu1": "belts[1].velocity", "zeta": "damping"}
 
@@ -60,6 +67,7 @@ def diagram(
     out: Annotated[
         Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
     ] = Path("diagram"),
+    as_json: Json = False,
 ) -> None:
     """Equilibria and cycles along a parameter, and every bifurcation point, found by itself.
 
@@ -81,44 +89,57 @@ def diagram(
 
     - jaxbelt diagram --class c --nu0 0.35 --nu1 -0.25 --vary sigma --span -1 1
     """
-    from ..plotting.diagrams import plot_diagram
-    from ..plotting.style import draw_key, journal_figure, journal_style, save
-
     console = make_console()
     with plain_errors():
+        if rows < 1:
+            raise ValueError(f"rows must be at least 1, got {rows}")
+        if quantity not in QUANTITIES:
+            raise ValueError(f"quantity must be one of {', '.join(QUANTITIES)}, got {quantity}")
+        check_range("span", span)
+        written = outputs(out, ".png", ".csv", "_points.csv")
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
+        varied = {parameter: span[0]} if parameter in EDGES else {}
+        check_description(system, arguments | varied, belt)
+        turn_on_float64()
 
         def along(p):
             return oscillator(system, {**arguments, parameter: p}, belt, damping, omega)
 
-        with console.status("looking along the parameter (the first minute is compilation)"):
-            if parameter in EDGES:
-                found = jb.bifurcation_diagram(along, span=span, rows=rows)
-                found = replace(found, name=parameter)
-            else:
-                osc = oscillator(system, arguments, belt, damping, omega)
-                found = jb.bifurcation_diagram(osc, _where(osc, parameter), span, rows=rows)
+        if parameter in EDGES:
+            found = jb.bifurcation_diagram(along, span=span, rows=rows)
+            found = replace(found, name=parameter)
+        else:
+            osc = oscillator(system, arguments, belt, damping, omega)
+            found = jb.bifurcation_diagram(osc, _where(osc, parameter), span, rows=rows)
+        from ..plotting.diagrams import plot_diagram
+        from ..plotting.style import draw_key, journal_figure, journal_style, save
+
         with journal_style():
             figure = journal_figure(7.2, 4.2)
             plot_diagram(found, figure.subplots(), quantity=quantity)
             draw_key(figure)
             out.parent.mkdir(parents=True, exist_ok=True)
-            written = [out.with_name(out.name + end) for end in (".png", ".csv", "_points.csv")]
             save(figure, written[0])
         write_branches(found, written[1])
         write_points(found.points, written[2])
-    say(console, [repr(found), *map(repr, found.points)], written)
+    regions = [{"from": a, "to": b, "name": name} for a, b, name in found.regions]
+    data = {"parameter": found.name, "points": _as_data(found.points), "regions": regions}
+    lines = [repr(found), *map(repr, found.points)]
+    say(console, lines, written, as_json=as_json, data=data)
 
 
-def _where(osc: jb.Oscillator, name: str) -> Any:
+def _where(osc: "jb.Oscillator", name: str) -> Any:
     """What selects the parameter of that name or path."""
+    import jax
+
+    from ..model.parameters import names_of
+
     paths = names_of(osc)
     path = PARAMETERS.get(name, name)
     if path not in paths:
-        edges = ", ".join(EDGES)
-        raise ValueError(
-            f"vary must be nu0, nu1, zeta, {edges} or one of {', '.join(paths)}, got {name}"
-        )
+        known = (*PARAMETERS, *EDGES, *paths)
+        meant = did_you_mean(name, known)
+        raise ValueError(f"vary must be one of {', '.join(known)}, got {name}{meant}")
     return lambda osc: jax.tree.leaves(osc)[paths.index(path)]
 
 
@@ -126,15 +147,23 @@ def write_points(points, path: Path) -> None:
     """value, kind, belts, error and status, a row a bifurcation point."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["value", "kind", "belts", "error", "status"])
-        for point in points:
-            status = jb.Status(int(point.status)).name
-            belts = " ".join(map(str, point.condition.belts_concerned))
-            row = [float(point.value), point.kind, belts, float(point.error)]
-            writer.writerow([*row, status])
+        writer.writerow(POINT_COLUMNS)
+        writer.writerows(map(_row_of_point, points))
 
 
-def write_branches(found: jb.BifurcationDiagram, path: Path) -> None:
+def _row_of_point(point: "jb.BifurcationPoint") -> list[Any]:
+    belts = " ".join(map(str, point.condition.belts_concerned))
+    status = jb.Status(int(point.status)).name
+    return [float(point.value), point.kind, belts, float(point.error), status]
+
+
+def _as_data(points) -> list[dict[str, Any]]:
+    """The same rows for JSON."""
+    rows = [dict(zip(POINT_COLUMNS, _row_of_point(point), strict=True)) for point in points]
+    return [row | {name: plain(row[name]) for name in ("value", "error")} for row in rows]
+
+
+def write_branches(found: "jb.BifurcationDiagram", path: Path) -> None:
     """A row an equilibrium or cycle, see `jaxbelt diagram --help`."""
     fields = ("values", "stable", "x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -143,7 +172,7 @@ def write_branches(found: jb.BifurcationDiagram, path: Path) -> None:
         names = [f"stick_duration{i}" for i in belts]
         writer.writerow(["branch", "kind", "value", *fields[1:], *names])
         for number, branch in enumerate(found.branches):
-            columns = [np.asarray(getattr(branch, name)).tolist() for name in fields]
-            sticks = np.asarray(branch.stick_durations).tolist()
+            columns = [getattr(branch, name).tolist() for name in fields]
+            sticks = branch.stick_durations.tolist()
             for row, durations in zip(zip(*columns, strict=True), sticks, strict=True):
                 writer.writerow([number, branch.kind, *row, *durations])

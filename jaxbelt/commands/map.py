@@ -4,12 +4,22 @@ import csv
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 import jaxbelt as jb
 
-from .options import Class, class_along, make_console, plain_errors, say
+from .options import (
+    Class,
+    Json,
+    check_axes,
+    check_range,
+    class_along,
+    make_console,
+    outputs,
+    plain_errors,
+    say,
+    turn_on_float64,
+)
 
 
 def region_map(
@@ -27,6 +37,7 @@ def region_map(
     out: Annotated[
         Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
     ] = Path("map"),
+    as_json: Json = False,
 ) -> None:
     """The regions of a plane of two parameters, and the curves that bound them: Fig. 6.
 
@@ -42,38 +53,44 @@ def region_map(
 
     Example: jaxbelt map --class b --cells 400
     """
-    from ..plotting.regions import draw_region_map
-    from ..plotting.style import journal_figure, journal_style, save
-
     console = make_console()
     with plain_errors():
-        make = class_along(system, axes)
+        check_axes(system, axes)
         if cells < 2:
             raise ValueError(f"cells must be at least 2, got {cells}")
+        check_range("p", p)
+        check_range("q", q)
+        written = outputs(out, ".png", ".csv", "_curves.csv")
+        turn_on_float64()
+        import numpy as np
+
+        make = class_along(system, axes)
         # Other numbers of cells, lest cells lie on the line where both are the same.
         values = {axes[0]: np.linspace(*p, cells), axes[1]: np.linspace(*q, cells + 1)}
-        with console.status("sweeping, then following curves (the first minutes are compilation)"):
-            found = jb.region_map(make, values)
+        found = jb.region_map(make, values)
+        from ..plotting.regions import draw_region_map
+        from ..plotting.style import journal_figure, journal_style, save
+
         with journal_style():
             figure = journal_figure(7.2, 9.0)
             draw_region_map(found, figure)
             out.parent.mkdir(parents=True, exist_ok=True)
-            ends = (".png", ".csv", "_curves.csv")
-            written = [out.with_name(out.name + end) for end in ends]
             save(figure, written[0])
         write_cells(found, written[1])
         write_table(found.table(), written[2])
-    say(console, [repr(found)], written)
+    cells_of = {name: int((found.label == name).sum()) for name in found.regions}
+    data = {"axes": list(found.names), "cells": cells_of, "curves": len(found.curves)}
+    say(console, [repr(found)], written, as_json=as_json, data=data)
 
 
-def write_cells(found: jb.RegionMap, path: Path) -> None:
+def write_cells(found: "jb.RegionMap", path: Path) -> None:
     """Both parameters and the name of the region, a row a cell."""
-    first, second = (np.asarray(values).tolist() for values in found.values)
+    first, second = (values.tolist() for values in found.values)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow([*found.names, "region"])
-        for (i, j), name in np.ndenumerate(found.label):
-            writer.writerow([first[i], second[j], name])
+        for p, names in zip(first, found.label, strict=True):
+            writer.writerows([p, q, name] for q, name in zip(second, names, strict=True))
 
 
 def write_table(table: Any, path: Path) -> None:

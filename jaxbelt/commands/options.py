@@ -1,8 +1,15 @@
-"""What the commands share: options that describe an oscillator, errors in one sentence."""
+"""What the commands share: options that describe an oscillator, errors in one sentence.
+
+Neither this module nor those of the commands import what computes before it is used. So help, and
+mistakes in the options, are told at once.
+"""
 
 import functools
+import json
+import math
 import os
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +20,8 @@ from rich.console import Console
 
 import jaxbelt as jb
 
+from ..spelling import did_you_mean
+
 #: The arguments of the four classes of the paper, and what they are unless given.
 CLASSES = {
     "a": {"nu0": 0.2},
@@ -20,11 +29,11 @@ CLASSES = {
     "c": {"nu0": 0.2, "nu1": 0.4, "sigma": 0.8},
     "d": {"nu0": 0.2, "nu1": 0.4, "sigma0": 0.5, "sigma1": 1.0},
 }
-#: The friction laws by name, and what their arguments are unless given.
-LAWS: dict[str, tuple[type[jb.AbstractFriction], dict[str, float | None]]] = {
-    "conti": (jb.Conti, {"static": 1.0, "residual": 0.6, "steepness": 10.0, "quadratic": 0.0}),
-    "coulomb": (jb.Coulomb, {"static": None, "kinetic": None}),
-    "stribeck": (jb.Stribeck, {"static": None, "kinetic": None, "stribeck_velocity": None}),
+#: The friction laws by name: their classes, and what their arguments are unless given.
+LAWS: dict[str, tuple[str, dict[str, float | None]]] = {
+    "conti": ("Conti", {"static": 1.0, "residual": 0.6, "steepness": 10.0, "quadratic": 0.0}),
+    "coulomb": ("Coulomb", {"static": None, "kinetic": None}),
+    "stribeck": ("Stribeck", {"static": None, "kinetic": None, "stribeck_velocity": None}),
 }
 
 
@@ -44,13 +53,47 @@ def plain_errors() -> Iterator[None]:
         raise typer.Exit(2) from None
 
 
+def turn_on_float64() -> None:
+    """What every command does before it computes: the package itself never touches JAX's settings,
+    a program of its own may."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+
+
+def outputs(out: Path, *ends: str) -> list[Path]:
+    """The files that `out` stands for, if they can be written; asked before the computing."""
+    paths = [out.with_name(out.name + end) for end in ends]
+    for path in paths:
+        check_out(path)
+    return paths
+
+
 def check_out(out: Path) -> None:
-    """Raise unless a file can be written there; before the computing, not after."""
-    out.parent.mkdir(parents=True, exist_ok=True)
+    """Raise unless a file can be written there; folders on the way are made later."""
     if out.is_dir():
         raise IsADirectoryError(f"out must be a file, got the folder {out}")
-    if not os.access(out if out.exists() else out.parent, os.W_OK):
-        raise PermissionError(f"out must be a place that can be written to, got {out}")
+    there = next(folder for folder in out.absolute().parents if folder.exists())
+    try:
+        if out.exists() and not os.access(out, os.W_OK):
+            raise PermissionError
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError:
+        raise OSError(f"out must be a place that can be written to, got {out}") from None
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raise unless a number is finite and > 0, as what computes does, but before it is imported."""
+    if not 0 < value < math.inf:
+        raise ValueError(f"{name} must be finite and > 0, got {value}")
+
+
+def check_range(name: str, ends: tuple[float, float]) -> None:
+    """Raise unless an option FROM TO is an interval."""
+    first, last = ends
+    if not -math.inf < first < last < math.inf:
+        raise ValueError(f"{name} must be FROM TO with FROM < TO, got {first} {last}")
 
 
 def make_console() -> Console:
@@ -59,71 +102,144 @@ def make_console() -> Console:
     return console if console.is_terminal else Console(width=200)
 
 
-def say(console: Console, lines: Iterable[str], written: Iterable[Path]) -> None:
-    """Print lines as they are, and which files were written."""
-    for line in (*lines, f"Written: {', '.join(map(str, written))}"):
+def say(
+    console: Console,
+    lines: Iterable[str],
+    written: Iterable[Path],
+    *,
+    as_json: bool = False,
+    data: dict[str, Any] | None = None,
+) -> None:
+    """Print lines as they are, and which files were written; or `data`, with these, as JSON."""
+    if as_json:
+        print(json.dumps({**(data or {}), "written": [str(path) for path in written]}))
+        return
+    told = ", ".join(map(str, written))
+    for line in (*lines, *([f"Written: {told}"] if told else [])):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
+def plain(value: Any) -> Any:
+    """A number, or an array of them, as JSON has it: what is not finite is null."""
+    import numpy as np
+
+    def one(x: Any) -> Any:
+        return [one(part) for part in x] if isinstance(x, list) else x if np.isfinite(x) else None
+
+    return one(np.asarray(value).tolist())
+
+
+def _of_classes(name: str) -> str:
+    """The defaults of an argument of the classes, for the help."""
+    values: dict[float, list[str]] = {}
+    for system, arguments in CLASSES.items():
+        if name in arguments:
+            values.setdefault(arguments[name], []).append(system)
+    return "; ".join(f"{value} in {', '.join(names)}" for value, names in values.items())
+
+
+def _argument(name: str, text: str) -> Any:
+    return typer.Option(help=text, show_default=_of_classes(name))
+
+
 Class = Annotated[str, typer.Option("--class", help="The paper's class of contact: a, b, c or d.")]
-Nu0 = Annotated[float | None, typer.Option(help="Velocity of belt 0.")]
-Nu1 = Annotated[float | None, typer.Option(help="Velocity of belt 1 (classes b, c, d).")]
-Sigma = Annotated[float | None, typer.Option(help="Edge between the belts (class c).")]
-Sigma0 = Annotated[float | None, typer.Option(help="Where belt 1 begins (class d).")]
-Sigma1 = Annotated[float | None, typer.Option(help="Where belt 0 ends (class d).")]
+Nu0 = Annotated[float | None, _argument("nu0", "Velocity of belt 0.")]
+Nu1 = Annotated[float | None, _argument("nu1", "Velocity of belt 1 (classes b, c, d).")]
+Sigma = Annotated[float | None, _argument("sigma", "Edge between the belts (class c).")]
+Sigma0 = Annotated[float | None, _argument("sigma0", "Where belt 1 begins (class d).")]
+Sigma1 = Annotated[float | None, _argument("sigma1", "Where belt 0 ends (class d).")]
 Belts = Annotated[
     list[str] | None,
     typer.Option(
         "--belt",
         help="A belt in full, instead of a class; give it once a belt. A velocity, then "
         "name=value with commas between: load, lower, upper (its contact interval), law.",
+        show_default="the belts of the class",
     ),
 ]
 Damping = Annotated[float, typer.Option(help="zeta = c / sqrt(k m).")]
 Omega = Annotated[float, typer.Option(help="sqrt(k / m).")]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print the results as one line of JSON, for scripts.")
+]
 
 
-def oscillator(system, arguments, belt, damping, omega) -> jb.Oscillator:
+def oscillator(system, arguments, belt, damping, omega) -> "jb.Oscillator":
     """The oscillator that the options describe: a class with its arguments, or belts in full."""
-    given = {name: value for name, value in arguments.items() if value is not None}
-    belts = belts_of_class(system, given) if not belt else _belts_in_full(belt, given)
-    return jb.Oscillator(damping, belts, omega)
+    belts = belts_of_class(system, arguments) if not belt else list(map(parse_belt, belt))
+    from ..model.oscillator import Oscillator
+
+    return Oscillator(damping, belts, omega)
 
 
-def class_along(
-    system: str, axes: Iterable[str], others: tuple[str, ...] = ()
-) -> Callable[..., jb.Oscillator]:
-    """A class as a function of its arguments that are axes; others: further names of axes."""
+def check_description(
+    system: str, arguments: dict[str, float | None], belt: list[str] | None = None
+) -> None:
+    """Raise unless these options describe belts; numbers are left to the classes themselves."""
+    given = _given(arguments)
+    if belt:
+        if given:
+            raise ValueError(f"with --belt no class must be described, got {', '.join(given)}")
+        for text in belt:
+            _parts_of_belt(text)
+        return
+    check_class(system)
+    names = CLASSES[system]
+    for name in given:
+        if name not in names:
+            raise ValueError(f"class {system} must have only {', '.join(names)}, got {name}")
+
+
+def _given(arguments: dict[str, float | None]) -> dict[str, float]:
+    return {name: value for name, value in arguments.items() if value is not None}
+
+
+def check_class(system: str) -> None:
+    """Raise unless it is one of the paper's classes."""
     if system not in CLASSES:
         raise ValueError(f"class must be a, b, c or d, got {system}")
-    names = (*CLASSES[system], *others)
+
+
+def check_axes(system: str, axes: Iterable[str], others: tuple[str, ...] = ()) -> None:
+    """Raise unless all axes are arguments of the class, or among other names, and come once."""
+    check_class(system)
+    names, seen = (*CLASSES[system], *others), set()
     for name in axes:
         if name not in names:
-            raise ValueError(f"axes of class {system} must be among {', '.join(names)}, got {name}")
+            meant = did_you_mean(name, names)
+            known = ", ".join(names)
+            raise ValueError(f"axes of class {system} must be among {known}, got {name}{meant}")
+        if name in seen:
+            raise ValueError(f"axes must be different ones, got {name} twice")
+        seen.add(name)
+
+
+def class_along(system: str, axes: Iterable[str]) -> "Callable[..., jb.Oscillator]":
+    """A class as a function of its arguments that are axes."""
     fixed = {name: value for name, value in CLASSES[system].items() if name not in axes}
-    return functools.partial(getattr(jb.presets, f"class_{system}"), **fixed)
-
-
-def belts_of_class(system: str, given: dict[str, float]) -> tuple[jb.Belt, ...]:
-    """The belts of a class of the paper, with the arguments that are given."""
-    if system not in CLASSES:
-        raise ValueError(f"class must be a, b, c or d, got {system}")
-    arguments = CLASSES[system]
-    for name in given:
-        if name not in arguments:
-            raise ValueError(f"class {system} must have only {', '.join(arguments)}, got {name}")
     make = getattr(jb.presets, f"class_{system}")
-    return make(**{**arguments, **given}).belts
+    return functools.partial(make, **fixed) if fixed else make
 
 
-def _belts_in_full(texts: list[str], given: dict[str, float]) -> list[jb.Belt]:
-    if given:
-        raise ValueError(f"with --belt no class must be described, got {', '.join(given)}")
-    return [parse_belt(text) for text in texts]
+def belts_of_class(system: str, arguments: dict[str, float | None]) -> "tuple[jb.Belt, ...]":
+    """The belts of a class of the paper, with the arguments that are given."""
+    from .. import presets
+
+    make = getattr(presets, f"class_{system}")
+    return make(**CLASSES[system] | _given(arguments)).belts
 
 
-def parse_belt(text: str) -> jb.Belt:
+def parse_belt(text: str) -> "jb.Belt":
     """The belt that a text such as `0.3,load=0.5,law=coulomb,static=0.8,kinetic=0.5` describes."""
+    law, friction, numbers = _parts_of_belt(text)
+    from ..model import friction as laws
+    from ..model.oscillator import Belt
+
+    return Belt(friction=getattr(laws, law)(**friction), **numbers)
+
+
+def _parts_of_belt(text: str) -> tuple[str, dict[str, float], dict[str, float]]:
+    """The class of its law, and the arguments of that and of the belt."""
     velocity, *parts = text.split(",")
     words = dict.fromkeys(["velocity"], velocity)
     for part in parts:
@@ -133,20 +249,25 @@ def parse_belt(text: str) -> jb.Belt:
         words[name.strip()] = value
     name_of_law = words.pop("law", "conti").strip()
     if name_of_law not in LAWS:
-        raise ValueError(f"law of belt {text!r} must be {', '.join(LAWS)}, got {name_of_law}")
+        meant = did_you_mean(name_of_law, LAWS)
+        raise ValueError(
+            f"law of belt {text!r} must be {', '.join(LAWS)}, got {name_of_law}{meant}"
+        )
     law, defaults = LAWS[name_of_law]
     known = ("velocity", "load", "lower", "upper", *defaults)
-    numbers: dict[str, Any] = {}
+    numbers: dict[str, float] = {}
     for name, word in words.items():
         if name not in known:
-            raise ValueError(f"belt {text!r} must have only {', '.join(known)}, got {name}")
+            meant = did_you_mean(name, known)
+            raise ValueError(f"belt {text!r} must have only {', '.join(known)}, got {name}{meant}")
         try:
             numbers[name] = float(word)
         except ValueError:
             raise ValueError(f"{name} of belt {text!r} must be a number, got {word!r}") from None
-    friction = {}
+    friction: dict[str, float] = {}
     for name, default in defaults.items():
-        friction[name.removeprefix("stribeck_")] = numbers.pop(name, default)
-        if friction[name.removeprefix("stribeck_")] is None:
+        value = numbers.pop(name, default)
+        if value is None:
             raise ValueError(f"belt {text!r} must have {name}, which {name_of_law} needs")
-    return jb.Belt(friction=law(**friction), **numbers)
+        friction[name.removeprefix("stribeck_")] = value
+    return law, friction, numbers

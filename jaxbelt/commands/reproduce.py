@@ -7,13 +7,14 @@ import rich.table
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from .options import make_console, plain_errors
+from .options import Json, check_out, make_console, plain_errors, say, turn_on_float64
 
 
 def reproduce(
     out: Annotated[
         Path, typer.Option(help="Folder for the files; made where it is not there.")
     ] = Path("reproduction"),
+    as_json: Json = False,
 ) -> None:
     """Recompute the table and the figures of Casini and Vestroni (2004).
 
@@ -24,17 +25,22 @@ def reproduce(
 
     Example: **jaxbelt reproduce --out results**
     """
+    console = make_console()
+    with plain_errors():
+        if out.exists() and not out.is_dir():
+            raise ValueError(f"out must be a folder, got the file {out}")
+        check_out(out / "critical_values.json")
+    turn_on_float64()
     # Imported late, with matplotlib behind it, to keep `--help` quick.
     from .. import paper
 
-    console = make_console()
     columns = (
         TextColumn("{task.description:<32}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    with plain_errors(), Progress(*columns, console=console) as progress:
+    with plain_errors(), Progress(*columns, console=console, disable=as_json) as progress:
         task = progress.add_task("", total=paper.steps())
         started = False
 
@@ -45,6 +51,11 @@ def reproduce(
 
         values = paper.reproduce(out, report)
         progress.update(task, advance=1, description="done")
+    if as_json:
+        names = ["critical_values.json", *(f"{name}.png" for name in paper.FIGURES)]
+        data = {"critical_values": paper.table_as_json(values)}
+        say(console, [], [out / name for name in names], as_json=True, data=data)
+        return
     console.print(_table_of(values))
     for line in (
         *paper.REMARKS,

@@ -1,29 +1,38 @@
 """`jaxbelt simulate`: one oscillator from one start."""
 
 import csv
+import math
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 import jaxbelt as jb
 
+from ..spelling import did_you_mean
 from .options import (
     Belts,
     Class,
     Damping,
+    Json,
     Nu0,
     Nu1,
     Omega,
     Sigma,
     Sigma0,
     Sigma1,
+    check_description,
+    check_positive,
     make_console,
     oscillator,
+    outputs,
+    plain,
     plain_errors,
     say,
+    turn_on_float64,
 )
+
+FORMULATIONS = ("filippov", "switch", "smooth")
 
 
 def simulate(
@@ -58,6 +67,7 @@ def simulate(
     out: Annotated[
         Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
     ] = Path("trajectory"),
+    as_json: Json = False,
 ) -> None:
     """Follow one oscillator from one start; write a picture and the numbers.
 
@@ -89,59 +99,77 @@ def simulate(
 
     - jaxbelt simulate --belt 0.3 --belt 0.5,law=coulomb,static=0.8,kinetic=0.5,lower=0.2
     """
-    from ..paper import steady_cycle
-    from ..plotting.phase import draw_overview
-    from ..plotting.style import journal_style, save
-
     console = make_console()
     with plain_errors():
         if samples < 2:
             raise ValueError(f"samples must be at least 2, got {samples}")
+        if formulation not in FORMULATIONS:
+            meant = did_you_mean(formulation, FORMULATIONS)
+            names = ", ".join(FORMULATIONS)
+            raise ValueError(f"formulation must be one of {names}, got {formulation}{meant}")
+        check_positive("t1", t1)
+        check_positive("tolerance", tolerance)
+        if not all(map(math.isfinite, start)):
+            raise ValueError(f"start must be finite, got {start[0]} {start[1]}")
+        written = outputs(out, ".png", ".csv", "_events.csv")
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
+        check_description(system, arguments, belt)
+        turn_on_float64()
+        import numpy as np
+
         osc = oscillator(system, arguments, belt, damping, omega)
-        with console.status("simulating (the first seconds are compilation)"):
-            trajectory = jb.simulate(
-                osc,
-                start,
-                t1,
-                ts=np.array([t1 * i / (samples - 1) for i in range(samples)]),
-                rtol=tolerance,
-                atol=tolerance,
-                formulation=formulation,
-                v_star=v_star,
-                eps=eps,
-            )
+        trajectory = jb.simulate(
+            osc,
+            start,
+            t1,
+            ts=np.array([t1 * i / (samples - 1) for i in range(samples)]),
+            rtol=tolerance,
+            atol=tolerance,
+            formulation=formulation,
+            v_star=v_star,
+            eps=eps,
+        )
+        from ..paper import steady_cycle
+        from ..plotting.phase import draw_overview
+        from ..plotting.style import journal_style, save
+
         out.parent.mkdir(parents=True, exist_ok=True)
-        written = [out.with_name(out.name + end) for end in (".png", ".csv", "_events.csv")]
         cycle = steady_cycle(trajectory)
         with journal_style():
             figure = draw_overview(osc, trajectory, cycles=[cycle] if cycle else [])
             save(figure, written[0])
         write_samples(trajectory, written[1])
         write_events(trajectory, written[2])
-    say(console, [repr(trajectory)], written)
+    data = {
+        "status": jb.Status(int(trajectory.status)).name,
+        "t": plain(trajectory.ts[-1]),
+        "x1": plain(trajectory.ys[-1, 0]),
+        "x2": plain(trajectory.ys[-1, 1]),
+        "events": len(trajectory.events.t),
+    }
+    say(console, [repr(trajectory)], written, as_json=as_json, data=data)
     if int(trajectory.status) >= jb.Status.TOO_MANY_SEGMENTS:
         raise typer.Exit(1)
 
 
-def write_samples(trajectory: jb.Trajectory, path: Path) -> None:
+def write_samples(trajectory: "jb.Trajectory", path: Path) -> None:
     """t, x1, x2 and the contact code of every belt, a row a sample; numbers to the last digit."""
-    modes = np.asarray(trajectory.modes)
+    modes = trajectory.modes
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["t", "x1", "x2", *(f"mode{i}" for i in range(modes.shape[1]))])
-        ts, ys = np.asarray(trajectory.ts).tolist(), np.asarray(trajectory.ys).tolist()
+        ts, ys = trajectory.ts.tolist(), trajectory.ys.tolist()
         for t, y, mode in zip(ts, ys, modes.tolist(), strict=True):
             writer.writerow([t, *y, *mode])
 
 
-def write_events(trajectory: jb.Trajectory, path: Path) -> None:
+def write_events(trajectory: "jb.Trajectory", path: Path) -> None:
     """t, x1, x2, kind and belt, a row an event."""
     events = trajectory.events
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["t", "x1", "x2", "kind", "belt"])
-        columns = (np.asarray(events.t).tolist(), np.asarray(events.y).tolist())
-        kinds = [jb.EventKind(kind).name for kind in np.asarray(events.kind).tolist()]
-        for t, y, kind, belt in zip(*columns, kinds, np.asarray(events.belt).tolist(), strict=True):
+        columns = events.t.tolist(), events.y.tolist()
+        kinds = [jb.EventKind(kind).name for kind in events.kind.tolist()]
+        for t, y, kind, belt in zip(*columns, kinds, events.belt.tolist(), strict=True):
             writer.writerow([t, *y, kind, belt])

@@ -1,14 +1,38 @@
 """`jaxbelt sweep`: a class of the paper from every point of a grid."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 import jaxbelt as jb
 
-from .options import Class, check_out, class_along, make_console, plain_errors, say
+from ..spelling import did_you_mean
+from .options import (
+    Class,
+    Json,
+    check_axes,
+    check_out,
+    check_positive,
+    class_along,
+    make_console,
+    plain_errors,
+    say,
+    turn_on_float64,
+)
+
+#: What may be observed: the variables of the dataset, and what the picture shows of them unless
+#: told otherwise.
+VARIABLES = {
+    "attractor": (
+        *("kind", "signature", "sticks", "period", "stick_duration", "x1_min", "x1_max"),
+        *("x2_min", "x2_max", "transient", "n_events", "status"),
+    ),
+    "final": ("x1_end", "x2_end", "mode_end", "n_events", "status"),
+}
+#: Variables with a number for each belt: too many for a picture.
+OF_BELTS = ("sticks", "stick_duration", "mode_end")
 
 
 def sweep(
@@ -25,14 +49,21 @@ def sweep(
         str, typer.Option(help="attractor (what each run leads to) or final (where it ends).")
     ] = "attractor",
     variable: Annotated[
-        str | None, typer.Option(help="What the picture shows [kind, or x1_end]")
+        str | None,
+        typer.Option(
+            help="What the picture shows, a variable of the dataset.",
+            show_default="kind, of the final state x1_end",
+        ),
     ] = None,
     start: Annotated[
         tuple[float, float],
         typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0."),
     ] = (3.0, 0.0),
     t1: Annotated[
-        float | None, typer.Option(help="End of each run [30000 for attractors, 100]")
+        float | None,
+        typer.Option(
+            help="End of each run.", show_default="30000 for attractors, 100 for the final state"
+        ),
     ] = None,
     tolerance: Annotated[
         float, typer.Option(help="Relative and absolute tolerance of the integrator.")
@@ -48,6 +79,7 @@ def sweep(
         str | None,
         typer.Option(
             metavar="FROM:TO",
+            show_default="all",
             help="Do only these blocks of a store, 0:64 for the first 64; other processes may do "
             "others at the same time. --dry-run tells how many there are.",
         ),
@@ -55,6 +87,7 @@ def sweep(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only tell how much it is and how long it will take.")
     ] = False,
+    as_json: Json = False,
 ) -> None:
     """Run one of the paper's classes from every point of a grid; write the data and a picture.
 
@@ -79,29 +112,60 @@ def sweep(
         part = None if blocks is None else parse_blocks(blocks)
         if part and out.suffix != ".zarr":
             raise ValueError(f"out must end in .zarr where blocks are given, got {out}")
-        values = dict(map(parse_axis, axes))
-        make = class_along(system, values, ("x1", "x2"))
+        parsed = list(map(parse_axis, axes))
+        check_axes(system, [name for name, _ in parsed], ("x1", "x2"))
+        values = dict(parsed)
+        if observe not in VARIABLES:
+            meant = did_you_mean(observe, VARIABLES)
+            raise ValueError(f"observe must be attractor or final, got {observe}{meant}")
+        shown = variable or VARIABLES[observe][0]
+        drawn = part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2)
+        _check_variable(shown, observe)
+        check_positive("tolerance", tolerance)
+        if t1 is not None:
+            check_positive("t1", t1)
+        if out.suffix == ".nc":
+            check_out(out)
+        check_out(out.with_suffix(".png"))
+        turn_on_float64()
+        make = class_along(system, values)
         if t1 is None and observe != "attractor":
             t1 = 100.0
         asked: dict[str, Any] = dict(
             y0=start, t1=t1, rtol=tolerance, atol=tolerance, observe=observe
         )
         if dry_run:
-            console.print(repr(jb.explain(make, values, **asked)), highlight=False, soft_wrap=True)
+            told = jb.explain(make, values, **asked)
+            say(console, [repr(told)], [], as_json=as_json, data=asdict(told))
             return
         if out.suffix == ".zarr":
             dataset = jb.sweep(make, values, **asked, store=out, blocks=part)
         else:
-            check_out(out)
             dataset = jb.sweep(make, values, **asked)
+            out.parent.mkdir(parents=True, exist_ok=True)
             # Version 3 of the format, which needs no library but SciPy.
             dataset.to_netcdf(out, engine="scipy")
         written = [out]
-        if part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2):
+        if drawn:
             written.append(out.with_suffix(".png"))
-            shown = variable or ("kind" if observe == "attractor" else "x1_end")
             _draw(dataset, shown, written[1])
-    say(console, [repr(dataset)], written)
+    say(console, [repr(dataset)], written, as_json=as_json, data=_as_data(dataset))
+
+
+def _check_variable(name: str, observe: str) -> None:
+    """Raise unless the picture can show that variable."""
+    known = [one for one in VARIABLES[observe] if one not in OF_BELTS]
+    if name not in known:
+        meant = did_you_mean(name, known)
+        raise ValueError(f"variable must be one of {', '.join(known)}, got {name}{meant}")
+
+
+def _as_data(dataset: Any) -> dict[str, Any]:
+    """How much there is, and how the runs ended."""
+    statuses = jb.decoded(dataset[["status"]]).status.values.ravel().tolist()
+    counts = {name or "not run": statuses.count(name) for name in sorted(set(statuses))}
+    sizes = {str(name): size for name, size in dataset.sizes.items()}
+    return {"sizes": sizes, "variables": [str(name) for name in dataset], "status": counts}
 
 
 def _draw(dataset: Any, variable: str, out: Path) -> None:
@@ -122,15 +186,17 @@ def parse_blocks(text: str) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def parse_axis(text: str) -> tuple[str, np.ndarray]:
+def parse_axis(text: str) -> tuple[str, list[float]]:
     """The name and the values that a text such as `nu0=-0.7:0.7:512` or `nu1=0.35` describes."""
     name, equals, words = text.partition("=")
     parts = words.split(":")
     try:
         if equals and len(parts) == 1:
-            return name, np.array([float(words)])
+            return name, [float(words)]
         if equals and len(parts) == 3 and int(parts[2]) > 0:
-            return name, np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
+            import numpy as np
+
+            return name, np.linspace(float(parts[0]), float(parts[1]), int(parts[2])).tolist()
     except ValueError:
         pass
     raise ValueError(f"an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got {text!r}")

@@ -1,5 +1,6 @@
 """`jaxbelt verify`: whether a store is right."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -7,7 +8,7 @@ import typer
 
 import jaxbelt as jb
 
-from .options import make_console, plain_errors
+from .options import Json, make_console, plain_errors, say, turn_on_float64
 
 
 def verify(
@@ -15,6 +16,7 @@ def verify(
     repair: Annotated[
         bool, typer.Option("--repair", help="Mark bad blocks, so that the sweep does them again.")
     ] = False,
+    as_json: Json = False,
 ) -> None:
     """Compute the checksums of a store again and tell which of its blocks are right.
 
@@ -24,7 +26,10 @@ def verify(
     Example: **jaxbelt verify plane.zarr --repair**
     """
     with plain_errors():
+        if not store.is_dir():
+            raise ValueError(f"store must be a folder that sweep wrote, got {store}")
+        turn_on_float64()
         found = jb.verify(store, repair)
-    make_console().print(repr(found), highlight=False, soft_wrap=True)
+    say(make_console(), [repr(found)], [], as_json=as_json, data=asdict(found))
     if found.bad and not repair:
         raise typer.Exit(1)

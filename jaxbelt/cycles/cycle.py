@@ -15,7 +15,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, check_finite, is_concrete, number, pick, require
+from ..activity import announced
+from ..checks import (
+    as_array,
+    as_whole,
+    check_finite,
+    is_concrete,
+    number,
+    pick,
+    require,
+    require_value,
+)
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.events import Signature, signature_name
 from ..model.modes import select
@@ -130,7 +140,7 @@ class Cycle(eqx.Module):
 
     def sample(self, n: int) -> Array:
         """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
-        return _sample_cycle(self, n)
+        return _sample_cycle(self, as_whole(n, "n"))
 
     def row(self) -> dict[str, Any]:
         """What `table` tells of it."""
@@ -302,6 +312,7 @@ def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -
     return _polished(osc, loop, status, steps)[0]
 
 
+@announced("find_cycle")
 def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Cycle:
     """The steady cycle that the start y0 leads to.
 
@@ -317,7 +328,8 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     check_oscillator(osc)
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
-    loop, count, status = _loop_reached(osc, y0, max_arcs or SIZES[-1])
+    room = SIZES[-1] if max_arcs is None else as_whole(max_arcs, "max_arcs")
+    loop, count, status = _loop_reached(osc, y0, room)
     if max_arcs is None and is_concrete(count):
         needed = int(count) if int(status) == Status.OK else 0
         loop = pick(loop, slice(room_of(needed)))
@@ -331,6 +343,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
 LOOPS_TRIED, REFINEMENTS = 32, 3
 
 
+@announced("unstable_cycle")
 def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = None) -> Cycle:
     """The unstable cycle around a stable equilibrium, that touches no boundary (no sliding).
 
@@ -346,8 +359,9 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
     """
     check_oscillator(osc)
     whole = isinstance(around, int) and around >= 0
-    require(whole, "around", "the number of an equilibrium, 0 or more", repr(around))
-    loop, status, distance = separating_loop(osc, max_arcs or SIZES[0], around)
+    require_value(whole, "around", "the number of an equilibrium, 0 or more", around)
+    room = SIZES[0] if max_arcs is None else as_whole(max_arcs, "max_arcs")
+    loop, status, distance = separating_loop(osc, room, around)
     return _if_meant(exactly(osc, loop, status), loop, distance)
 
 

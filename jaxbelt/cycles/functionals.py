@@ -5,11 +5,13 @@ parameters, forward and reverse, and works on batches under `jax.vmap`. All quan
 dimensionless: times in units of 1/omega, energies in units of k L^2 where L is the unit of length.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..checks import require
+from ..checks import require_one_of, require_value
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
@@ -21,7 +23,7 @@ _COORDINATES = {"x1": 0, "x2": 1}
 
 def period(cycle: Cycle) -> Array:
     """Duration of one loop."""
-    return cycle.period
+    return _checked_cycle(cycle).period
 
 
 def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
@@ -31,7 +33,8 @@ def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
     """
     if belt is None:
         return jnp.sum(jnp.where(_is_stuck(cycle), cycle.unknowns[..., 2], 0.0), axis=-1)
-    return cycle.stick_durations[..., _belt_index(cycle, belt)]
+    number = _belt_index(cycle, belt)
+    return cycle.stick_durations[..., number]
 
 
 def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
@@ -41,8 +44,9 @@ def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
     is no such belt.
     """
     if belt is None:
-        return cycle.period - stick_duration(cycle)
-    codes = cycle.chain.codes[..., _belt_index(cycle, belt)]
+        return _checked_cycle(cycle).period - stick_duration(cycle)
+    number = _belt_index(cycle, belt)
+    codes = cycle.chain.codes[..., number]
     return jnp.sum(jnp.where(jnp.abs(codes) == 1, cycle.unknowns[..., 2], 0.0), axis=-1)
 
 
@@ -80,27 +84,33 @@ def energy_fed(cycle: Cycle) -> Array:
 
     In a steady cycle it equals `energy_dissipated`. Negative parts occur: a belt can brake.
     """
-    return _energies(cycle)[0]
+    return _energies(_checked_cycle(cycle))[0]
 
 
 def energy_dissipated(cycle: Cycle) -> Array:
     """Energy that damping and slipping contacts turn into heat in one loop."""
-    return _energies(cycle)[1]
+    return _energies(_checked_cycle(cycle))[1]
+
+
+def _checked_cycle(cycle: Any) -> Cycle:
+    expected = "a Cycle, such as jb.find_cycle(...)"
+    require_value(isinstance(cycle, Cycle), "cycle", expected, cycle)
+    return cycle
 
 
 def _is_stuck(cycle: Cycle) -> Array:
-    return jnp.any(cycle.chain.codes == 0, axis=-1)
+    return jnp.any(_checked_cycle(cycle).chain.codes == 0, axis=-1)
 
 
 def _belt_index(cycle: Cycle, belt: int) -> int:
-    n = len(cycle.oscillator.belts)
-    require(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", repr(belt))
+    n = len(_checked_cycle(cycle).oscillator.belts)
+    require_value(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", belt)
     return belt
 
 
 def _values(cycle: Cycle, coordinate: str) -> Array:
-    require(coordinate in _COORDINATES, "coordinate", '"x1" or "x2"', repr(coordinate))
-    return cycle.unknowns[..., _COORDINATES[coordinate]]
+    require_one_of(coordinate, _COORDINATES, "coordinate")
+    return _checked_cycle(cycle).unknowns[..., _COORDINATES[coordinate]]
 
 
 @jit

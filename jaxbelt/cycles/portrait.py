@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..activity import announced
 from ..checks import is_concrete, pick, require
 from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.events import signature_name
@@ -143,6 +144,7 @@ def _row(what: str, number: int, kind: str, stable: Any, ys: np.ndarray, **more:
     }
 
 
+@announced("portrait")
 def portrait(osc: Oscillator) -> Portrait:
     """All equilibria, attracting and unstable cycles, and separatrices of an oscillator.
 

@@ -13,16 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..bifurcations.conditions import AbstractCondition
+from ..activity import announced
+from ..bifurcations.conditions import AbstractCondition, check_conditions
 from ..bifurcations.refine import refine
-from ..checks import as_array, check_finite, require
+from ..checks import as_array, as_numbers, check_finite, require, require_callable, require_value
 from ..cycles.cycle import Cycle, find_cycle
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of
+from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of, told_to
 
 if TYPE_CHECKING:
     import pandas
@@ -88,6 +89,10 @@ def distance_to(
     found by `refine` from the oscillator of the cycle; one that is not there is infinitely far.
     """
 
+    require(len(conditions) > 0, "conditions", "one or more, such as jb.Hopf()", "none")
+    check_conditions(conditions)
+    require_callable(where, "where", "a function such as `lambda osc: osc.belts[0].velocity`")
+
     def distance(cycle: Cycle) -> Array:
         osc = cycle.oscillator
         value = jax.tree.leaves(osc)[leaf_index(osc, where)]
@@ -103,6 +108,7 @@ def distance_to(
     return distance
 
 
+@announced("design")
 def design(
     oscillator: Oscillator,
     targets: Sequence[Any],
@@ -110,7 +116,7 @@ def design(
     where: Callable[[Oscillator], Any],
     bounds: Sequence[Any] | None = None,
     y0: ArrayLike | tuple = (3.0, 0.0),
-    report: Callable[[str], None] | None = print,
+    report: Callable[[str], None] | None = None,
 ) -> Design:
     """Parameters for which functionals of the cycle have wanted values.
 
@@ -118,7 +124,8 @@ def design(
     `Cycle`, such as `jb.amplitude` or `lambda c: jb.stick_duration(c, 1)`, and its value, or an
     interval (lower, upper) that it is to lie in; `distance_to` is the functional that keeps a
     bifurcation away. where, bounds: the parameters that may be changed, as for `fit`. y0: the
-    start (x1, x2) that leads to the cycle. report: is told of the progress; None for silence.
+    start (x1, x2) that leads to the cycle. report: is told of the progress, too, a line at a time,
+    such as `print`.
 
     Damped Newton steps with exact derivatives; with fewer targets than parameters, the shortest
     ones. What no choice within the bounds reaches ends with the status UNREACHABLE, and so does
@@ -129,8 +136,8 @@ def design(
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     functionals, intervals = _checked_targets(targets)
+    tell = told_to(report)
     selection, u = selection_of(oscillator, where, bounds)
-    tell = report or (lambda text: None)
 
     def evaluate(u):
         return _achieved(functionals, selection, oscillator, y0, jnp.asarray(u))
@@ -195,13 +202,18 @@ def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
 
 
 def _checked_targets(targets):
-    pairs = list(targets)
-    require(len(pairs) > 0, "targets", "at least one pair (functional, value)", targets)
+    expected = "a list of pairs (functional, value), such as [(jb.amplitude, 1.0)]"
+    is_many = isinstance(targets, Sequence) and len(targets) > 0
+    require_value(is_many, "targets", expected, targets)
     intervals = []
-    for pair in pairs:
-        fine = isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])
-        require(fine, "targets", "pairs (functional, value)", repr(pair))
-        lower, upper = pair[1] if isinstance(pair[1], tuple) else (pair[1], pair[1])
-        require(float(lower) <= float(upper), "targets", "intervals (lower, upper)", repr(pair[1]))
-        intervals.append((float(lower), float(upper)))
-    return tuple(functional for functional, _ in pairs), np.array(intervals)
+    for pair in targets:
+        fine = isinstance(pair, tuple | list) and len(pair) == 2 and callable(pair[0])
+        require_value(fine, "targets", expected, targets)
+        wanted = pair[1] if isinstance(pair[1], tuple | list) else (pair[1], pair[1])
+        name = f"target of {getattr(pair[0], '__name__', 'functional')}"
+        require_value(np.shape(wanted) == (2,), name, "a value or (lower, upper)", pair[1])
+        lower, upper = np.asarray(as_numbers(wanted, name, (2,))).tolist()
+        expected = "a value or (lower, upper), lower <= upper"
+        require_value(lower <= upper, name, expected, pair[1])
+        intervals.append((lower, upper))
+    return tuple(functional for functional, _ in targets), np.array(intervals)

@@ -31,7 +31,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, check_finite, require
+from ..activity import announced
+from ..checks import as_array, as_whole, check_finite, require, require_value
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import simulate
 from ..motion.smoothing import smooth_field
@@ -39,7 +40,7 @@ from ..numerics.compiling import jit
 from ..results import Status, describe, draw
 from ..tables import table_of
 from .record import WINDOW, Record, record_of
-from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of
+from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of, told_to
 
 if TYPE_CHECKING:
     import pandas
@@ -329,6 +330,7 @@ def _standard_errors_in(level: float) -> float:
     return float(jax.scipy.stats.norm.ppf(0.5 + 0.5 * level))
 
 
+@announced("fit")
 def fit(
     oscillator: Oscillator,
     ts: ArrayLike,
@@ -339,7 +341,7 @@ def fit(
     noise: ArrayLike | tuple[ArrayLike | None, ArrayLike | None] | None = None,
     bounds: Sequence[Any] | None = None,
     starts: int = 8,
-    report: Callable[[str], None] | None = print,
+    report: Callable[[str], None] | None = None,
 ) -> Fit:
     """Parameters of an oscillator from a measured record of its motion, with standard errors.
 
@@ -357,7 +359,8 @@ def fit(
     estimates it from how far neighbouring data scatter about a smooth curve. bounds: for each
     parameter (lower, upper) or None, which keeps positive what cannot be negative; a parameter
     stays inside by reparametrisation, so an estimate at a bound is one that wants to leave. starts:
-    of the search, spread about the guess. report: is told of the progress; None for silence.
+    of the search, spread about the guess. report: is told of the progress, too, a line at a time,
+    such as `print`.
 
     What can be told from a record: the velocity of a belt that the mass sticks to, its static
     friction and the damping, well; the kinetic law where slip speeds vary; the velocity of a belt
@@ -367,9 +370,9 @@ def fit(
     """
     check_oscillator(oscillator, "oscillator")
     times, values, sigmas = _checked_record(ts, x1, x2, noise)
-    require(isinstance(starts, int) and starts > 0, "starts", "a positive integer", starts)
+    starts = as_whole(starts, "starts")
+    tell = told_to(report)
     selection, u = selection_of(oscillator, where, bounds)
-    tell = report or (lambda text: None)
 
     record = record_of(times, values, sigmas)
     linearized = functools.partial(_linearized, selection, oscillator, record)
@@ -403,7 +406,7 @@ def _checked_record(ts, x1, x2, noise):
     times = np.asarray(as_array(ts, "ts", (None,)))
     check_finite(times, "ts")
     require(len(times) >= 8, "ts", "at least 8 times", len(times))
-    require(np.all(np.diff(times) > 0), "ts", "increasing", times)
+    require_value(np.all(np.diff(times) > 0), "ts", "increasing", times)
     require(x1 is not None or x2 is not None, "x1", "given, or x2", None)
     columns = []
     for name, column in (("x1", x1), ("x2", x2)):
@@ -411,16 +414,16 @@ def _checked_record(ts, x1, x2, noise):
             columns.append(np.full(len(times), np.nan))
             continue
         columns.append(np.asarray(as_array(column, name, (len(times),))))
-        require(not np.any(np.isinf(columns[-1])), name, "finite, or NaN", column)
+        require_value(not np.any(np.isinf(columns[-1])), name, "finite, or NaN", columns[-1])
         known = int(np.sum(np.isfinite(columns[-1])))
         require(known >= 8, name, "at least 8 data", known)
     both = x1 is not None and x2 is not None
     if isinstance(noise, tuple):
         sigmas = noise
     else:
-        require(not both or noise is None, "noise", "a pair, for x1 and x2", noise)
+        require_value(not both or noise is None, "noise", "a pair, for x1 and x2", noise)
         sigmas = (noise, noise)
-    require(len(sigmas) == 2, "noise", "a number or a pair", noise)
+    require_value(len(sigmas) == 2, "noise", "a number or a pair", noise)
     sigmas = [None if sigma is None else float(as_array(sigma, "noise")) for sigma in sigmas]
     for sigma in sigmas:
         require(sigma is None or 0 < sigma < np.inf, "noise", "> 0", sigma)

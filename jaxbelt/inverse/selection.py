@@ -1,6 +1,7 @@
 """Which parameters an inverse problem may change, and within which bounds."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..checks import require
+from ..activity import tell
+from ..checks import as_numbers, require, require_value
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_groups, names_of
 
@@ -53,24 +55,60 @@ class Selection(eqx.Module):
         return jax.tree.unflatten(structure, leaves)
 
 
+def told_to(report: Callable[[str], None] | None) -> Callable[[str], None]:
+    """What says how far a search is, in the line of its activity and to `report`, or a
+    `ValueError`."""
+
+    fits = report is None or callable(report)
+    require_value(fits, "report", "a function of a text, such as print, or None", report)
+
+    def both(text: str) -> None:
+        tell(text.strip())
+        if report is not None:
+            report(text)
+
+    return both
+
+
 def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, np.ndarray]:
     """What `where` selects, a leaf or a tuple of leaves kept equal for each parameter; and u."""
     groups, leaves = leaf_groups(osc, where), jax.tree.leaves(osc)
-    if bounds is None:
-        bounds = [None] * len(groups)
-    require(len(bounds) == len(groups), "bounds", f"{len(groups)} pairs or None", repr(bounds))
     named = names_of(osc)
     names = tuple(" = ".join(named[leaf] for leaf in group) for group in groups)
     values = np.array([float(leaves[group[0]]) for group in groups])
     pairs = []
-    for group, name, value, pair in zip(groups, names, values, bounds, strict=True):
-        lower, upper = (_least(osc, group[0]), np.inf) if pair is None else map(float, pair)
-        require(lower < value < upper, name, f"inside of its bounds {lower}, {upper}", value)
+    for group, name, value, pair in zip(
+        groups, names, values, _pairs_of(bounds, names), strict=True
+    ):
+        lower, upper = (_least(osc, group[0]), np.inf) if pair is None else pair
+        inside = f"inside of its bounds ({lower:.12g}, {upper:.12g})"
+        require(lower < value < upper, name, inside, f"{value:.12g}")
         pairs.append((lower, upper))
     lower, upper = jnp.asarray(pairs).T
     size = jnp.asarray(np.maximum(np.abs(values), 0.1))
     selection = Selection(groups, names, lower, upper, size)
     return selection, np.asarray(selection.unbounded(jnp.asarray(values)))
+
+
+def _pairs_of(bounds: Any, names: Sequence[str]) -> list[tuple[float, float] | None]:
+    """A pair or None for each parameter, or a `ValueError`."""
+    if bounds is None:
+        return [None] * len(names)
+    many = "one (lower, upper) or None" + " for each" * (len(names) > 1)
+    expected = f"a list with {many} of {', '.join(names)}"
+    fits = isinstance(bounds, Sequence | np.ndarray) and not isinstance(bounds, str)
+    fits = fits and len(bounds) == len(names)
+    fits = fits and all(pair is None or np.shape(pair) == (2,) for pair in bounds)
+    require_value(fits, "bounds", expected, bounds)
+    pairs: list[tuple[float, float] | None] = []
+    for name, pair in zip(names, bounds, strict=True):
+        if pair is not None:
+            field = f"bounds of {name}"
+            lower, upper = (float(end) for end in as_numbers(pair, field, (2,)))
+            require_value(lower < upper, field, "(lower, upper), lower < upper", (lower, upper))
+            pair = lower, upper
+        pairs.append(pair)
+    return pairs
 
 
 def _least(osc: Oscillator, leaf: int) -> float:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -24,6 +25,7 @@ from ..checks import (
     is_concrete,
     number,
     require,
+    traceable,
 )
 
 
@@ -58,6 +60,31 @@ class AbstractFriction(eqx.Module):
             for name, value in vars(self).items()
         )
         return f"{type(self).__name__}({values})"
+
+
+#: Laws of one's own whose `mu` was traced.
+_traced: set[type] = set()
+
+
+def check_law(law: AbstractFriction) -> None:
+    """Raise a `ValueError` where `mu` of a law of one's own cannot be traced, once for each class.
+
+    A law that asks NumPy for an exponential gives right numbers by itself and fails inside of what
+    is compiled.
+    """
+    kind = type(law)
+    if kind in _traced or kind.__module__ == __name__:
+        return
+    speed = jax.ShapeDtypeStruct((), jnp.float64)
+
+    def coefficients() -> Any:
+        return jax.eval_shape(law.mu, speed)
+
+    found = traceable(coefficients, f"mu of {kind.__name__}", "a function of the speed")
+    fits = isinstance(found, jax.ShapeDtypeStruct) and found.shape == ()
+    fits = fits and found.dtype == jnp.float64
+    require(fits, f"mu of {kind.__name__}", "a function that returns one float64 a speed", found)
+    _traced.add(kind)
 
 
 class Conti(AbstractFriction):

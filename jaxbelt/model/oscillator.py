@@ -19,6 +19,7 @@ with the relative velocity r_i = nu_i - omega x2 of belt i. The paper's symbols,
 What happens where the field is not smooth is told in `modes`.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -36,13 +37,16 @@ from ..checks import (
     number,
     require,
     require_own_threads,
+    require_value,
 )
 from ..numerics.compiling import traced_once
-from .friction import AbstractFriction
+from .friction import AbstractFriction, check_law
 
 
 def _as_friction(law: Any) -> AbstractFriction:
-    require(isinstance(law, AbstractFriction), "friction", "a law such as jb.Conti(...)", repr(law))
+    fits = isinstance(law, AbstractFriction)
+    require_value(fits, "friction", "a law such as jb.Conti(...)", law)
+    check_law(law)
     return law
 
 
@@ -84,16 +88,24 @@ class Belt(eqx.Module):
         )
 
 
+def _as_belts(belts: Any) -> tuple[Belt, ...]:
+    expected = "a tuple of belts, such as (jb.Belt(...), jb.Belt(...))"
+    fits = isinstance(belts, Iterable) and not isinstance(belts, str | dict)
+    require_value(fits, "belts", expected, belts)
+    return tuple(belts)
+
+
 class Oscillator(eqx.Module):
     """A mass on a spring and a dashpot, in contact with one belt or more.
 
     Arguments: damping (zeta = c/sqrt(k m)), belts (one `Belt` or more), omega (sqrt(k/m) > 0,
     default 1); scalars, dimensionless. `ValueError` for anything else. For batches build it
-    inside `jax.vmap`.
+    inside `jax.vmap`. A negative damping is possible; starts far out may then go to infinity,
+    which `portrait(osc).escapes` tells.
     """
 
     damping: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "damping"))
-    belts: tuple[Belt, ...] = eqx.field(converter=lambda belts: tuple(belts))
+    belts: tuple[Belt, ...] = eqx.field(converter=_as_belts)
     omega: Float[Array, ""] = eqx.field(
         converter=lambda value: as_array(value, "omega"), default=1.0
     )
@@ -110,7 +122,7 @@ class Oscillator(eqx.Module):
         check_positive(osc.omega, "omega")
         require(len(osc.belts) > 0, "belts", "at least one Belt", "none")
         for i, belt in enumerate(osc.belts):
-            require(isinstance(belt, Belt), f"belts[{i}]", "a Belt", belt)
+            require_value(isinstance(belt, Belt), f"belts[{i}]", "a Belt", belt)
             Belt.check(belt, f"belt {i}")
 
     def __repr__(self) -> str:
@@ -125,8 +137,11 @@ def check_oscillator(osc: Any, field: str = "osc") -> None:
     The entries that take one ask this first; in a forked process they raise a `RuntimeError`.
     """
     require_own_threads()
-    require(
-        isinstance(osc, Oscillator), field, "an Oscillator, such as jb.presets.class_b(...)", osc
+    require_value(
+        isinstance(osc, Oscillator),
+        field,
+        "an Oscillator, such as jb.presets.class_b(...)",
+        osc,
     )
     check_scalars(osc)
     Oscillator.check(osc)

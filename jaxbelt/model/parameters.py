@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..checks import is_concrete, require
+from ..checks import is_concrete, require, require_callable
 from .oscillator import Oscillator
 
 
@@ -77,10 +77,14 @@ def leaf_groups(osc: Oscillator, where: Any) -> tuple[tuple[int, ...], ...]:
 
 def _ask(osc: Oscillator, where: Any, expected: str) -> Any:
     """What `where` selects of a copy whose leaves are `Parameter`s."""
-    require(callable(where), "where", expected, repr(where))
+    require_callable(where, "where", expected)
     leaves = [Parameter(index, name) for index, name in enumerate(names_of(osc))]
     try:
         return where(jax.tree.unflatten(jax.tree.structure(osc), leaves))
+    except IndexError as error:
+        raise ValueError(
+            f"where must be {expected}, got one of a belt that is not there"
+        ) from error
     except Exception as error:
         came = str(error).partition("\n")[0]
         raise ValueError(f"where must be {expected}, got {type(error).__name__}: {came}") from error

@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 
-from ..checks import is_concrete, require
+from ..checks import is_concrete, require, require_callable, require_value
 from ..numerics.compiling import depends, is_affine, is_outermost
 from .oscillator import Oscillator, check_oscillator, check_scalars
 from .parameters import is_number, is_real, leaf_index, names_of
@@ -128,7 +129,8 @@ class Variation:
 
         def numbers(*p):
             osc = make(*p)
-            told = f"one that returns {type(osc).__name__}"
+            kind = "a number" if isinstance(osc, Tracer) else type(osc).__name__
+            told = f"one that returns {kind}"
             require(isinstance(osc, Oscillator), argument, expected, told)
             check_scalars(osc)
             leaves = jax.tree.leaves(osc)
@@ -363,7 +365,7 @@ def varied(osc: Any, where: Any, values: Sequence[Any]) -> Variation:
         return osc
     if callable(osc) and not isinstance(osc, Oscillator):
         alone = "left out where osc is a function of the parameter"
-        require(where is None, "where", alone, repr(where))
+        require_value(where is None, "where", alone, where)
         make: Any = osc
         return Variation.of_function(make, values)
     check_oscillator(osc)
@@ -372,7 +374,7 @@ def varied(osc: Any, where: Any, values: Sequence[Any]) -> Variation:
 
 def _by_position(make: Any, count: int, argument: str, expected: str):
     """A function that takes so many numbers, one after another, and the names of its arguments."""
-    require(callable(make), argument, expected, repr(make))
+    require_callable(make, argument, expected)
     try:
         signature = inspect.signature(make)
     except (TypeError, ValueError):
@@ -385,7 +387,8 @@ def _by_position(make: Any, count: int, argument: str, expected: str):
     try:
         signature.bind(*[0.0] * count)
     except TypeError:
-        require(False, argument, expected, f"one of {signature}")
+        came = ", ".join(signature.parameters)
+        require(False, argument, expected, f"one of ({came})")
     return make, tuple([*(one.name for one in given), "p", "q"][:count])
 
 

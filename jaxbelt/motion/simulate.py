@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..activity import announced
 from ..checks import as_numbers, check_finite, check_positive, is_concrete, require
 from ..model.modes import contact, has_edges
 from ..model.oscillator import Oscillator, check_oscillator
@@ -183,6 +184,7 @@ def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution)
     return Trajectory(ts, ys, modes, events, arcs, status)
 
 
+@announced("simulate")
 def simulate(
     osc: Oscillator,
     y0: ArrayLike | tuple,

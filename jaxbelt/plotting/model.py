@@ -6,6 +6,7 @@ from jaxtyping import Array
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon, Rectangle
 
+from ..checks import as_array, check_positive, require_value
 from ..model.friction import AbstractFriction
 from ..numerics.compiling import jit
 from .style import belt_colour, new_axes
@@ -23,6 +24,10 @@ def plot_friction_law(
 
     A stuck mass takes any value on the vertical bar at nu_R = 0. Returns the axes.
     """
+    law = "a law such as jb.Conti(...)"
+    require_value(isinstance(friction, AbstractFriction), "friction", law, friction)
+    speed = float(as_array(speed, "speed"))
+    check_positive(speed, "speed")
     ax = new_axes() if ax is None else ax
     r = jnp.linspace(0.0, speed, 401)
     mu, static = np.asarray(_coefficient(friction, r)), float(friction.static)

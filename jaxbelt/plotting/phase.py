@@ -23,12 +23,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from ..checks import as_interval, require_one_of, require_value
 from ..cycles.portrait import Portrait
 from ..cycles.separatrices import Separatrix
 from ..model.equilibria import Equilibria, EquilibriumKind
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.modes import mode_acceleration, mode_of_state
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
 from .style import belt_colour, figure_of, journal_figure, new_axes, new_figure, spread
@@ -68,6 +69,7 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
 
     trajectory: from `simulate`. ax: two axes, for x1 and for x2. Returns the two.
     """
+    _check_trajectory(trajectory, "trajectory")
     if ax is None:
         ax = tuple(new_figure().subplots(2, sharex=True))
     t, ys = path_of(trajectory)
@@ -95,6 +97,17 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
             borderaxespad=0.2,
         )
     return ax
+
+
+def _check_trajectory(trajectory: Any, field: str) -> None:
+    expected = "a Trajectory, such as jb.simulate(...)"
+    require_value(isinstance(trajectory, Trajectory), field, expected, trajectory)
+
+
+def _check_window(xlim: Any, ylim: Any) -> None:
+    for name, limits in (("xlim", xlim), ("ylim", ylim)):
+        if limits is not None:
+            as_interval(limits, name)
 
 
 def stick_phases(trajectory: Trajectory) -> list[tuple[int, float, float]]:
@@ -153,8 +166,16 @@ def plot_phase_portrait(
     thick and solid, unstable ones dashed. equilibria: None takes those of `osc`. xlim, ylim: the
     window; None fits what is drawn. Returns the axes.
     """
+    check_oscillator(osc)
     if isinstance(trajectories, Trajectory):
         trajectories = (trajectories,)
+    many = isinstance(trajectories, Sequence)
+    require_value(many, "trajectories", "one or several of simulate", trajectories)
+    for trajectory in trajectories:
+        _check_trajectory(trajectory, "trajectories")
+    fits = isinstance(cycles, Sequence) and all(hasattr(cycle, "sample") for cycle in cycles)
+    require_value(fits, "cycles", "a list of cycles, such as [jb.find_cycle(...)]", cycles)
+    _check_window(xlim, ylim)
     ax = new_axes() if ax is None else ax
     paths = [path_of(trajectory)[1] for trajectory in trajectories]
     loops = [np.asarray(cycle.sample(400)) for cycle in cycles]
@@ -409,8 +430,9 @@ def plot_vector_field(
     boundaries. On a sliding set it points along the boundary. xlim, ylim: the window; None takes
     one that holds all fixed points. Returns the axes.
     """
-    if kind not in ("streamlines", "arrows"):
-        raise ValueError(f'kind must be "streamlines" or "arrows", got {kind!r}')
+    check_oscillator(osc)
+    require_one_of(kind, ("streamlines", "arrows"), "kind")
+    _check_window(xlim, ylim)
     ax = new_axes() if ax is None else ax
     (left, right), (bottom, top) = _window(osc, [], None, xlim, ylim)
     ax.set(xlim=(left, right), ylim=(bottom, top))

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from ..checks import require
+from ..checks import require, require_one_of, require_value
 from ..sweeps.basins import Basins, BasinStability
 from ..sweeps.datasets import decoded
 from ..sweeps.store import Verified
@@ -32,8 +32,7 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     or of each attractor, is as many lines. Returns the axes. `ValueError` if there is no such
     variable, or if its axes are not one or two: choose with `dataset.isel(belt=0)` and the like.
     """
-    names = ", ".join(map(str, dataset.data_vars))
-    require(variable in dataset, "variable", f"one of {names}", repr(variable))
+    require_one_of(variable, map(str, dataset.data_vars), "variable")
     ax = new_axes() if ax is None else ax
     values = (
         _words_for_kinds(dataset) if variable == "kind" else dataset[variable].squeeze(drop=True)
@@ -109,6 +108,7 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     basins: from `basins`. Basins of cycles are pale blue and green, those of equilibria pale
     orange, undecided starts white. Returns the axes.
     """
+    require_value(isinstance(basins, Basins), "basins", "what jb.basins returns", basins)
     ax = new_axes() if ax is None else ax
     labels = np.asarray(basins.label)
     x1, x2 = np.asarray(basins.dataset["x1"]), np.asarray(basins.dataset["x2"])

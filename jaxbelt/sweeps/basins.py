@@ -12,10 +12,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, check_finite, require
+from ..activity import Activity, announced, tell
+from ..checks import (
+    as_array,
+    as_interval,
+    as_whole,
+    check_finite,
+    check_positive,
+    in_words,
+    require,
+    require_value,
+)
 from ..cycles.attractors import Runs, is_same
 from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
 from ..kernel.lanes import Program
@@ -149,30 +160,43 @@ def basins(
 
     x1, x2: displacements and velocities of the starts, increasing, [n] and [m], dimensionless. t1:
     when a run that reached no attractor is given up. rtol, atol: tolerances of a step. progress:
-    whether to show a bar, as in `sweep`. `ValueError` names an argument that is impossible.
+    whether to show how far it is, as in `sweep`. `ValueError` names an argument that is impossible.
     """
     check_oscillator(oscillator, "oscillator")
-    axes = {"x1": np.asarray(as_array(x1, "x1", (None,))), "x2": as_array(x2, "x2", (None,))}
-    for name, values in axes.items():
-        check_finite(values, name)
-        require(np.all(np.diff(values) > 0), name, "increasing", values)
-    dataset = sweep(
-        lambda: oscillator,
-        axes,
-        t1=t1,
-        rtol=rtol,
-        atol=atol,
-        observe="attractor",
-        progress=progress,
-    )
-    labels, attractors, cycles = _labels(oscillator, dataset)
+    axes = {name: _starts_along(values, name) for name, values in (("x1", x1), ("x2", x2))}
+    with Activity("basins", progress):
+        dataset = sweep(
+            lambda: oscillator,
+            axes,
+            t1=t1,
+            rtol=rtol,
+            atol=atol,
+            observe="attractor",
+        )
+        tell("telling the attractors apart")
+        labels, attractors, cycles = _labels(oscillator, dataset)
+        boundary = unstable_cycle(oscillator)
     dataset["label"] = (
         ("x1", "x2"),
         labels,
         {"long_name": "number of the attractor"}
         | flags({-1: "undecided", **dict(enumerate(attractors))}, "int32"),
     )
-    return Basins(oscillator, dataset, attractors, cycles, unstable_cycle(oscillator))
+    return Basins(oscillator, dataset, attractors, cycles, boundary)
+
+
+def _starts_along(values: Any, name: str) -> np.ndarray:
+    """The starts along one axis, or a `ValueError`."""
+    if isinstance(values, tuple) and len(values) == 2:
+        # Elsewhere such a tuple is an interval; taken as numbers it would be two starts.
+        from_, to = map(in_words, values)
+        expected = f"the values of all starts, such as np.linspace({from_}, {to}, 201)"
+        require(False, name, expected, f"{in_words(values)}; for two starts write {list(values)}")
+    along = np.asarray(as_array(values, name, (None,)))
+    check_finite(along, name)
+    require(along.size > 0, name, "one value or more", "none")
+    require_value(np.all(np.diff(along) > 0), name, "increasing", along)
+    return along
 
 
 def _labels(
@@ -253,10 +277,11 @@ def _words_for(kind: str, sticks: np.ndarray, x1: float) -> str:
     return f"cycle that sticks to {belts}" if belts else "cycle that never sticks"
 
 
+@announced("basin_stability")
 def basin_stability(
     oscillator: Oscillator,
     *,
-    box: ArrayLike | Sequence[Any],
+    box: Any,
     n: int = 10_000,
     key: Array,
     t1: float = LONG_ENOUGH,
@@ -270,15 +295,27 @@ def basin_stability(
     sqrt(f (1 - f) / n). `ValueError` names an argument that is impossible.
     """
     check_oscillator(oscillator, "oscillator")
-    corners = as_array(box, "box", (2, 2))
-    check_finite(corners, "box")
-    require(np.all(np.asarray(corners)[:, 0] < np.asarray(corners)[:, 1]), "box", "not empty", box)
-    require(isinstance(n, int) and n > 0, "n", "a positive integer", n)
+    require_value(np.shape(box) == (2, 2), "box", "((x1 from, to), (x2 from, to))", box)
+    corners = np.array([as_interval(ends, f"box[{i}], x{i + 1}") for i, ends in enumerate(box)])
+    n = as_whole(n, "n")
+    _check_key(key)
+    numbers = {"t1": t1, "rtol": rtol, "atol": atol}
+    for name, value in numbers.items():
+        numbers[name] = float(as_array(value, name))
+        check_positive(numbers[name], name)
     starts = jax.random.uniform(key, (2, n), minval=corners[:, :1], maxval=corners[:, 1:])
-    kinds = _kinds(oscillator, np.asarray(starts), t1, rtol, atol)
+    kinds = _kinds(oscillator, np.asarray(starts), **numbers)
     fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(KINDS)}
     errors = {name: float(np.sqrt(f * (1 - f) / n)) for name, f in fractions.items()}
     return BasinStability(fractions, errors, n)
+
+
+def _check_key(key: Any) -> None:
+    """Raise unless it is a key of JAX, of either sort."""
+    dtype, shape = getattr(key, "dtype", np.dtype(object)), np.shape(key)
+    typed = jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
+    raw = dtype == np.uint32 and shape == (2,)
+    require_value(typed or raw, "key", "one key, such as jax.random.key(0)", key)
 
 
 def _kinds(osc: Oscillator, starts: np.ndarray, t1, rtol, atol) -> np.ndarray:

@@ -19,7 +19,7 @@ from typing import Any
 
 import jax
 
-from ..checks import require
+from ..checks import require_value
 from .question import Question
 from .store import Store
 from .work import Tell, counts, do_runs
@@ -36,7 +36,7 @@ def check_executor(executor: Any) -> None:
     """Raise unless it is a client that can be waited for."""
     methods = ("submit", "scheduler_info", "cancel", "asynchronous")
     fits = all(hasattr(executor, name) for name in methods) and not executor.asynchronous
-    require(fits, "executor", "a dask.distributed.Client (not asynchronous)", repr(executor))
+    require_value(fits, "executor", "a dask.distributed.Client (not asynchronous)", executor)
 
 
 def do_on_cluster(client: Any, question: Question, store: Store, tell: Tell) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..checks import require_value
 from ..kernel.lanes import Program, Variable
 from ..results import Status
 from .grid import Blocks, Grid
@@ -44,6 +45,7 @@ def decoded(dataset: "xarray.Dataset") -> "xarray.Dataset":
     attributes `flag_values` and `flag_meanings` becomes one of strings, so that
     `decoded(dataset).kind == "cycle"` is what it says; what has no meaning becomes "".
     """
+    check_dataset(dataset)
     return dataset.assign(
         {
             name: variable.copy(data=words_of(variable.values, variable.attrs)).drop_attrs()
@@ -51,6 +53,12 @@ def decoded(dataset: "xarray.Dataset") -> "xarray.Dataset":
             if "flag_meanings" in variable.attrs
         }
     )
+
+
+def check_dataset(dataset: Any) -> None:
+    """Raise unless it is an `xarray.Dataset`, or passes for one."""
+    fits = all(hasattr(dataset, name) for name in ("data_vars", "dims", "assign"))
+    require_value(fits, "dataset", "an xarray.Dataset, such as sweep(...) returns", dataset)
 
 
 def words_of(values: np.ndarray, attributes: dict[str, Any]) -> np.ndarray:

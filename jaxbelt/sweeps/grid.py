@@ -1,7 +1,6 @@
 """The grid of a sweep: its points, the oscillators there, and the blocks in which it is done."""
 
 import functools
-import inspect
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -10,7 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..checks import as_array, check_finite, is_concrete, require
+from ..checks import (
+    as_array,
+    check_arguments,
+    check_finite,
+    is_concrete,
+    require,
+    require_callable,
+    require_value,
+    traceable,
+)
 from ..kernel.lanes import Observer, Program
 from ..model.oscillator import Oscillator, check_scalars
 from .threads import CHUNK
@@ -20,12 +28,13 @@ class Grid:
     """The points of a sweep and the oscillators there."""
 
     def __init__(self, make: Callable[..., Oscillator], axes: Mapping[str, Any], y0: Any):
-        require(callable(make), "make", "a function that returns an Oscillator", repr(make))
-        require(
+        returns = "a function that returns an Oscillator"
+        require_callable(make, "make", returns)
+        require_value(
             isinstance(axes, Mapping) and len(axes) > 0,
             "axes",
             "a dictionary of values",
-            repr(axes),
+            axes,
         )
         self.make = make
         self.axes = {
@@ -40,37 +49,18 @@ class Grid:
         self.shape = tuple(values.size for values in self.axes.values())
         self.runs = math.prod(self.shape)
         self.names = [name for name in self.axes if name not in self.y0]
-        self._accepted_by(make)
+        check_arguments(make, self.names, "make", ", x1 or x2")
         # An oscillator of the sweep, for the structure and for what does not vary. Whatever is
         # impossible in it is told here; runs that are not finite are told by their status.
         finite = {name: self.axes[name][np.isfinite(self.axes[name])] for name in self.names}
         first = {name: float(v[0]) if v.size else 0.0 for name, v in finite.items()}
         self.example = make(**first)
-        require(
-            isinstance(self.example, Oscillator),
-            "make",
-            "a function that returns an Oscillator",
-            f"one that returns {type(self.example).__name__}",
-        )
+        came = f"one that returns {type(self.example).__name__}"
+        require(isinstance(self.example, Oscillator), "make", returns, came)
         check_scalars(self.example)
         leaves, self.structure = jax.tree.flatten(self.example)
-        self.mapped = self._varying()
+        self.mapped = traceable(self._varying, "make", returns)
         self.shared = [leaf for leaf, mapped in zip(leaves, self.mapped, strict=True) if not mapped]
-
-    def _accepted_by(self, make):
-        try:
-            parameters = inspect.signature(make).parameters
-        except (TypeError, ValueError):
-            return
-        if any(p.kind == p.VAR_KEYWORD for p in parameters.values()):
-            return
-        for name in self.names:
-            require(
-                name in parameters,
-                "axes",
-                f"arguments of make ({', '.join(parameters)}), x1 or x2",
-                repr(name),
-            )
 
     def _varying(self) -> tuple[bool, ...]:
         """For each leaf of the oscillator whether it depends on an axis."""

@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import require
+from ..checks import require_callable, require_one_of, require_value
 from ..model.modes import Mode, force_rounding, mode_acceleration
 from ..model.oscillator import Oscillator
 
@@ -41,7 +41,7 @@ class AtExtrema:
     of: str
 
     def __post_init__(self):
-        require(self.of in ("x1", "x2"), "of", '"x1" or "x2"', repr(self.of))
+        require_one_of(self.of, ("x1", "x2"), "of")
 
 
 @dataclass(frozen=True, repr=False)
@@ -56,8 +56,8 @@ class AtSection:
     direction: int = 0
 
     def __post_init__(self):
-        require(callable(self.function), "function", "a function of osc, x1 and x2", self.function)
-        require(self.direction in (-1, 0, 1), "direction", "-1, 0 or 1", repr(self.direction))
+        require_callable(self.function, "function", "a function of osc, x1 and x2")
+        require_value(self.direction in (-1, 0, 1), "direction", "-1, 0 or 1", self.direction)
 
     def __repr__(self) -> str:
         """The same for the same function, in any process: stores compare it."""
@@ -77,10 +77,13 @@ class AtTimes:
     times: Any
 
     def __post_init__(self):
-        times = np.asarray(self.times, dtype=float)
-        require(times.ndim == 1 and times.size > 0, "times", "of shape (n)", times.shape)
+        try:
+            times = np.asarray(self.times, dtype=float)
+        except (TypeError, ValueError):
+            times = np.zeros(0)
+        require_value(times.ndim == 1 and times.size > 0, "times", "numbers, [n]", self.times)
         fits = np.all(np.diff(times) > 0) and times[0] >= 0 and np.isfinite(times[-1])
-        require(fits, "times", "finite, >= 0 and increasing", times)
+        require_value(fits, "times", "finite, >= 0 and increasing", times)
         object.__setattr__(self, "times", tuple(times.tolist()))
 
 
@@ -97,7 +100,7 @@ def checked(at: Any) -> tuple[Any, ...]:
     """The moments of a reducer, or a `ValueError`."""
     fits = isinstance(at, tuple) and at and all(isinstance(one, MOMENTS) for one in at)
     names = ", ".join(kind.__name__ for kind in MOMENTS)
-    require(fits, "observe.at", f"a tuple of {names}", repr(at))
+    require_value(fits, "observe.at", f"a tuple of {names}", at)
     return at
 
 

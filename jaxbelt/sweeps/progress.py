@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from ..activity import SHOWN_AFTER, Activity, is_wanted, tell
 from ..results import Status
 
 
@@ -16,16 +17,14 @@ class SweepProgress:
 
     It says "compiling" until the first runs are done, then how many there are, how many in a
     second, and how many ended otherwise than with the status OK. Runs of an earlier call count as
-    done, but not for the time that is left.
+    done, but not for the time that is left. Within another activity there is no bar, and that one
+    is told.
     """
 
-    #: Seconds before a bar is shown that nobody asked for.
-    PATIENCE = 3.0
-
     def __init__(self, total: int, done: int, wanted: bool | None):
-        console = Console(stderr=True)
         self.bar: Progress | None = None
-        if not ((console.is_terminal or console.is_jupyter) if wanted is None else wanted):
+        self.total, self.completed = total, done
+        if not (is_wanted() and not Activity.under_way if wanted is None else wanted):
             return
         columns = (
             TextColumn("{task.description}"),
@@ -34,9 +33,9 @@ class SweepProgress:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self.bar = Progress(*columns, console=console)
+        self.bar = Progress(*columns, console=Console(stderr=True))
         self.task = self.bar.add_task("compiling", total=total, completed=done, told="")
-        self.patience = threading.Timer(0.0 if wanted else self.PATIENCE, self._show)
+        self.patience = threading.Timer(0.0 if wanted else SHOWN_AFTER, self._show)
         self.patience.daemon = True
         self.lock, self.ended = threading.Lock(), False
         self.statuses: Counter[int] = Counter()
@@ -54,9 +53,11 @@ class SweepProgress:
 
     def advance(self, counts: Mapping[int, int]) -> None:
         """More runs are done, so many with each status."""
-        if self.bar is None:
-            return
         now, more = time.monotonic(), sum(counts.values())
+        self.completed += more
+        if self.bar is None:
+            tell(f"{self.completed:,} of {self.total:,} runs")
+            return
         with self.lock:
             # The first results may come long after the first runs began: they give no rate.
             known = 0 if self.began is None else self.statuses.total() + more

@@ -12,14 +12,24 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..checks import as_array, check_positive, require, require_usable_jax
+from ..checks import (
+    as_array,
+    check_positive,
+    in_words,
+    require,
+    require_one_of,
+    require_usable_jax,
+    require_value,
+)
 from ..kernel.lanes import Observer, Program
+from ..spelling import did_you_mean
 from .along import Along
 from .attractor import Attractor
 from .datasets import Table
 from .grid import Grid
 from .moments import AtEvents, bytecode, checked
 from .observers import Final, Reduce
+from .reducers import check_reducer
 from .threads import CHUNK
 
 #: Default t1 of attractor runs: some 500 loops, where nearly all have long been decided.
@@ -44,16 +54,21 @@ class Question:
         grid = Grid(make, axes, y0)
         _observer(observe)
         if t1 is None:
-            require(observe == "attractor", "t1", "given", "None")
+            given = 'given, the end of each run, but for observe="attractor"'
+            require(observe == "attractor", "t1", given, "None")
             t1 = LONG_ENOUGH
         numbers: dict[str, Any] = {"t1": t1, "rtol": rtol, "atol": atol}
         for name, value in numbers.items():
             numbers[name] = float(as_array(value, name))
             check_positive(numbers[name], name)
         wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
+        fits = isinstance(wanted, Sequence)
+        require_value(fits, "derivatives", "a tuple of names of axes", wanted)
         for name in wanted:
-            known = ", ".join(grid.axes)
-            require(name in grid.axes, "derivatives", f"names of axes, {known}", repr(name))
+            known, came = ", ".join(grid.axes), in_words(name) + did_you_mean(name, grid.axes)
+            require(name in grid.axes, "derivatives", f"names of axes, {known}", came)
+        if not isinstance(observe, str | Observer):
+            check_reducer(observe, grid.example)
         return cls(grid, observe, numbers, tuple(wanted))
 
     def arguments(self) -> tuple[Any, ...]:
@@ -80,8 +95,9 @@ class Question:
         return {
             "title": "sweep of a belt-driven dry-friction oscillator",
             "make": _name_of_function(grid.make),
+            "call": self.call(),
             "oscillator": f"{_plain(repr(grid.example))}, where the axes do not say otherwise",
-            "start": ", ".join(start) or "along the axes",
+            "start": ", ".join(start) + self._only_one_start() or "along the axes",
             **self.numbers,
             "observe": observe if isinstance(observe, str) else type(observe).__name__,
             "derivatives": ", ".join(self.derivatives) or "none",
@@ -89,14 +105,23 @@ class Question:
             "units": "all quantities are dimensionless; time is tau = omega t",
         }
 
-    def call(self) -> str:
-        """How to ask it again."""
-        shown = self.attributes()
-        settings = ", ".join(f"{name}={value!r}" for name, value in self.numbers.items())
-        start = tuple(self.grid.y0.values())
+    def _only_one_start(self) -> str:
+        """What is to be known of attractors that are looked for from one start at each point."""
+        if self.observe != "attractor" or any(name in self.grid.axes for name in ("x1", "x2")):
+            return ""
         return (
-            f"jaxbelt.sweep({shown['make']}, {{axes: the coordinates}}, y0={start}, {settings}, "
-            f"observe={shown['observe']!r}, derivatives={self.derivatives!r}, store=...)"
+            ": of several attractors the one that this start leads to; axes x1 and x2, and then "
+            "jaxbelt.attractors, show the others"
+        )
+
+    def call(self) -> str:
+        """How to ask it again, as a line of Python; `dataset` is that of the results."""
+        settings = ", ".join(f"{name}={value!r}" for name, value in self.numbers.items())
+        start, axes = tuple(self.grid.y0.values()), list(self.grid.axes)
+        return (
+            f"jaxbelt.sweep({_name_of_function(self.grid.make)}, "
+            f"{{name: dataset[name] for name in {axes}}}, y0={start}, {settings}, "
+            f"observe={_plain(repr(self.observe))}, derivatives={self.derivatives!r})"
         )
 
     def identity(self) -> dict[str, str]:
@@ -134,11 +159,13 @@ def _observer(observe: Any) -> Observer:
     if isinstance(observe, Observer):
         return observe
     if isinstance(observe, str):
-        require(observe in NAMED, "observe", '"final", "attractor" or a reducer', repr(observe))
+        require_one_of(observe, NAMED, "observe", " or an object with init, update, finish")
         return NAMED[observe]()
     methods = ("init", "update", "finish")
     fits = all(callable(getattr(observe, name, None)) for name in methods)
-    require(fits, "observe", '"final", "attractor" or an object with init, update, finish', observe)
+    fits = fits and not isinstance(observe, type)
+    expected = '"final", "attractor" or an object with init, update, finish'
+    require_value(fits, "observe", expected, observe)
     if hasattr(observe, "at") or hasattr(observe, "rates"):
         checked(getattr(observe, "at", (AtEvents(),)))
         return Along(observe)
@@ -146,7 +173,24 @@ def _observer(observe: Any) -> Observer:
 
 
 def _name_of_function(make: Callable) -> str:
-    return getattr(make, "__qualname__", None) or _plain(repr(make))
+    """The function as it is written: its full name, the call that made it, or its text."""
+    if isinstance(make, functools.partial):
+        given = [*map(_value, make.args), *(f"{k}={_value(v)}" for k, v in make.keywords.items())]
+        return f"functools.partial({', '.join([_name_of_function(make.func), *given])})"
+    name = getattr(make, "__qualname__", None)
+    if name is None:
+        return _plain(repr(make))
+    if "<" not in name and make.__module__ != "__main__":
+        return f"{make.__module__}.{name}"
+    try:
+        return inspect.getsource(make).strip()
+    except (OSError, TypeError):
+        return name
+
+
+def _value(value: Any) -> str:
+    """An argument that was fixed; arrays of one number as that number."""
+    return repr(float(value)) if np.ndim(value) == 0 and hasattr(value, "dtype") else repr(value)
 
 
 def _plain(text: str) -> str:

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..checks import require
+from ..activity import announced
+from ..checks import require, require_callable
 from ..cycles.attractors import Runs, is_same
 from ..cycles.cycle import find_cycle
 from ..model.oscillator import Oscillator
 from ..results import Status
 from .attractor import CYCLE, EQUILIBRIUM, UNDECIDED
+from .datasets import check_dataset
 
 if TYPE_CHECKING:
     import xarray
@@ -29,6 +31,7 @@ OF_RUNS = ("transient", "status")
 NO_PARAMETERS = ("x1", "x2", "belt")
 
 
+@announced("attractors")
 def attractors(
     dataset: "xarray.Dataset", make: Callable[..., Oscillator] | None = None
 ) -> "xarray.Dataset":
@@ -47,7 +50,10 @@ def attractors(
     than a hundredth of their size, may be one that attracts weakly, or several: shooting tells, and
     what it does not find is undecided. `ValueError` where it is needed and `make` is not given.
     """
+    check_dataset(dataset)
     require("kind" in dataset, "dataset", 'that of sweep(..., observe="attractor")', "one without")
+    if make is not None:
+        require_callable(make, "make", "the function of the sweep")
     starts = [name for name in ("x1", "x2") if name in dataset.kind.dims]
     require(starts, "dataset", "one with an axis x1 or x2 of starts", f"{dataset.kind.dims}")
     others = [name for name in dataset.kind.dims if name not in starts]

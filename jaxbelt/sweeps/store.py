@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..checks import require
+from ..checks import as_path, require
 from ..results import draw
 from ..tables import table_of
 from .datasets import NUMBERED, renumber
@@ -313,7 +313,6 @@ def _create(path: Path, question: Question) -> None:
         "jaxbelt_schema": SCHEMA,
         "jaxbelt_question": json.dumps(identity),
         "jaxbelt_hash": hashlib.sha256(json.dumps(identity).encode()).hexdigest(),
-        "jaxbelt_call": question.call(),
     }
     new = path.with_name(f".{path.name}.new")
     shutil.rmtree(new, ignore_errors=True)
@@ -435,7 +434,8 @@ def verify(path: str | Path, repair: bool = False) -> Verified:
     made the store does them again. `ValueError` if there is no store that this version knows,
     `OSError` if a sweep is writing it and `repair` is wanted.
     """
-    path = Path(path)
+    path = as_path(path, "path")
+    require(path.exists(), "path", "that of a store, a folder", f"{path}, which is not there")
     root = _open(path, "r")
     if not repair:
         return _verified(root)

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ..checks import as_array, require
+from ..activity import announced
+from ..checks import as_array, as_path, require, require_value
 from ..model.oscillator import Oscillator
 from ..results import draw
 from ..tables import table_of
@@ -109,9 +110,12 @@ def sweep(
             '0 but for observe="final" and "attractor"',
             audit,
         )
+        known_wish = progress is None or isinstance(progress, bool)
+        require_value(known_wish, "progress", "True, False or None", progress)
+        store = None if store is None else as_path(store, "store")
         _check_where(question, store, executor, blocks, audit)
         if store is not None:
-            return _kept(question, Path(store), executor, blocks, progress, audit, known)
+            return _kept(question, store, executor, blocks, progress, audit, known)
         results = Memory(question.table)
         known.append(results)
         _do_and_show(question, results, progress)
@@ -186,7 +190,7 @@ def _check_where(question: Question, store, executor, blocks, audit: float) -> N
     if blocks is not None:
         fits = isinstance(blocks, Sequence) and len(blocks) == 2
         fits = fits and all(isinstance(b, int) for b in blocks) and 0 <= blocks[0] < blocks[1]
-        require(fits, "blocks", "two integers (first, last), 0 <= first < last", repr(blocks))
+        require_value(fits, "blocks", "two integers (first, last), 0 <= first < last", blocks)
         count = len(blocks_of(question.grid))
         require(blocks[0] < count, "blocks", f"among the {count:,} of this sweep", blocks)
         require(audit == 0, "audit", "0 where blocks is given", audit)
@@ -241,6 +245,7 @@ class Explanation:
         )
 
 
+@announced("explain")
 def explain(
     make: Callable[..., Oscillator],
     axes: Mapping[str, Any],

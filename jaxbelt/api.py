@@ -1,0 +1,139 @@
+"""The public names, with all that is behind them.
+
+`import jaxbelt` alone imports nothing: the package takes its names from here when the first of them
+is asked for, so that the command line answers at once what it can answer without computing.
+"""
+
+from typing import TYPE_CHECKING
+
+from . import presets
+from .activity import show_progress
+from .bifurcations.conditions import BifurcationPoint
+from .bifurcations.crossings import CrossingSliding, SlidingExchange
+from .bifurcations.curves import BifurcationCurve, bifurcation_curve
+from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
+from .bifurcations.edges import CornerCollision, GrazingEdge
+from .bifurcations.folds import FoldOfCycles
+from .bifurcations.refine import refine
+from .bifurcations.regions import RegionMap, region_map
+from .bifurcations.rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
+from .bifurcations.scan import scan
+from .bifurcations.special import SpecialPoint
+from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
+from .cycles.cycle import Cycle, find_cycle, unstable_cycle
+from .cycles.functionals import (
+    amplitude,
+    energy_dissipated,
+    energy_fed,
+    gap,
+    peak,
+    period,
+    slip_duration,
+    stick_duration,
+    stick_fraction,
+)
+from .cycles.portrait import Portrait, portrait
+from .cycles.separatrices import Separatrix
+from .inverse.design import Design, design, distance_to
+from .inverse.fit import Fit, fit
+from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
+from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck
+from .model.oscillator import Belt, Oscillator
+from .motion.simulate import Arcs, Events, Trajectory, simulate
+from .results import EventKind, Status, describe
+from .sweeps.basins import Basins, BasinStability, basin_stability, basins
+from .sweeps.datasets import decoded
+from .sweeps.moments import AtEvents, AtExtrema, AtSection, AtTimes
+from .sweeps.shares import attractors
+from .sweeps.store import Verified, verify
+from .sweeps.sweep import Explanation, explain, sweep
+
+if TYPE_CHECKING:
+    from .plotting.model import plot_friction_law
+    from .plotting.phase import plot_phase_portrait, plot_time_history, plot_vector_field
+    from .plotting.sweeps import plot_basins, plot_sweep
+
+__all__ = [
+    "AbstractFriction",
+    "Arcs",
+    "AtEvents",
+    "AtExtrema",
+    "AtSection",
+    "AtTimes",
+    "BasinStability",
+    "Basins",
+    "Belt",
+    "BeltAtRest",
+    "BifurcationCurve",
+    "BifurcationDiagram",
+    "BifurcationPoint",
+    "BoundaryEquilibrium",
+    "Conti",
+    "CornerCollision",
+    "Coulomb",
+    "CrossingSliding",
+    "Cycle",
+    "Design",
+    "Equilibria",
+    "EquilibriumKind",
+    "EventKind",
+    "Events",
+    "Explanation",
+    "Fit",
+    "FoldOfCycles",
+    "GrazingEdge",
+    "GrazingSliding",
+    "Hopf",
+    "NonsmoothFold",
+    "Oscillator",
+    "Portrait",
+    "PseudoHopf",
+    "RegionMap",
+    "Separatrix",
+    "SlidingExchange",
+    "SpecialPoint",
+    "Status",
+    "Stribeck",
+    "SuddenSliding",
+    "Trajectory",
+    "Verified",
+    "amplitude",
+    "attractors",
+    "basin_stability",
+    "basins",
+    "bifurcation_curve",
+    "bifurcation_diagram",
+    "decoded",
+    "describe",
+    "design",
+    "distance_to",
+    "energy_dissipated",
+    "energy_fed",
+    "equilibria",
+    "explain",
+    "find_cycle",
+    "fit",
+    "gap",
+    "lyapunov_coefficient",
+    "peak",
+    "period",
+    "plot_basins",
+    "plot_friction_law",
+    "plot_phase_portrait",
+    "plot_sweep",
+    "plot_time_history",
+    "plot_vector_field",
+    "portrait",
+    "presets",
+    "refine",
+    "region_map",
+    "scan",
+    "show_progress",
+    "simulate",
+    "slip_duration",
+    "stick_duration",
+    "stick_fraction",
+    "sweep",
+    "unstable_cycle",
+    "verify",
+]

@@ -1,0 +1,56 @@
+"""Whether a reducer of the user's own is one: its methods are tried on shapes, before any run."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ..checks import require
+from ..model.oscillator import Oscillator
+from .along import Motion
+from .observers import RunEnd, RunEvent
+
+
+def check_reducer(reducer: Any, osc: Oscillator) -> None:
+    """Raise a `ValueError` that names the method of `observe` which is not as `sweep` says."""
+    number, code = jax.ShapeDtypeStruct((), jnp.float64), jax.ShapeDtypeStruct((), jnp.int64)
+    moment = integrals = None
+    if hasattr(reducer, "at") or hasattr(reducer, "rates"):
+        moment = code
+    if hasattr(reducer, "rates"):
+        forces = jax.ShapeDtypeStruct((len(osc.belts),), jnp.float64)
+        motion = jax.eval_shape(Motion, number, number, number, number, forces)
+        integrals = _tried("rates", "(osc, motion)", lambda m: reducer.rates(osc, m), motion)
+    state = _tried(
+        "init", "(osc, x1, x2)", lambda x1, x2: reducer.init(osc, x1, x2), number, number
+    )
+    place = number, number, number
+    event = jax.eval_shape(RunEvent, *place, code, code, moment, integrals)
+    new = _tried("update", "(state, event)", reducer.update, state, event)
+    same = jax.tree.map(jnp.shape, new) == jax.tree.map(jnp.shape, state)
+    came = f"{_shapes(new)} where init returns {_shapes(state)}"
+    require(same, "observe.update", "a method that returns a state such as init does", came)
+    end = jax.eval_shape(RunEnd, *place, code, integrals)
+    results = _tried("finish", "(state, end)", reducer.finish, state, end)
+    expected = "a method that returns a dictionary of results"
+    require(isinstance(results, Mapping), "observe.finish", expected, _shapes(results))
+
+
+def _tried(name: str, arguments: str, method: Callable, *args: Any) -> Any:
+    """The shapes of what a method gives."""
+    try:
+        return jax.eval_shape(method, *args)
+    except Exception as error:
+        came = str(error).partition("\n")[0]
+        raise ValueError(
+            f"observe.{name} must be a method of {arguments} made of what JAX can trace "
+            f"(jnp.where, say, not if), got {type(error).__name__}: {came}"
+        ) from error
+
+
+def _shapes(tree: Any) -> str:
+    """What came, in words."""
+    if isinstance(tree, jax.ShapeDtypeStruct):
+        return f"an array of {tree.dtype} of shape {tree.shape}"
+    return f"a {type(tree).__name__} of {len(jax.tree.leaves(tree))} arrays"

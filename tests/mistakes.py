@@ -1,0 +1,453 @@
+"""Mistakes in how jaxbelt is called, each with what its message must say: run by `test_messages`.
+
+By itself, `python tests/mistakes.py` prints what came of each as a line of JSON. So the annotations
+of the package are unchecked there, as they are for its users.
+"""
+
+import json
+import math  # noqa: F401
+import shlex
+import sys
+import time
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from compilations import compilations
+from typer.testing import CliRunner
+
+import jaxbelt as jb
+
+LAW = "a law such as jb.Conti"
+OSC = r"osc must be an Oscillator, such as jb.presets.class_b\(...\), got "
+SELECTS = "where must be a function that selects one parameter of an oscillator with belts 0 to 1"
+PAIR = r"must be \(first, last\), two numbers with first < last, got "
+CYCLE = r"cycle must be a Cycle, such as jb.find_cycle\(...\), got "
+WHOLE = "must be a positive integer, got "
+POINT = r"point must be a BifurcationPoint, such as jb.refine\(...\), got "
+TARGETS = r"targets must be a list of pairs \(functional, value\), such as .* got "
+OBSERVE = '"final", "attractor" or an object with init, update, finish, got '
+
+#: What is called, and a pattern of the message; what begins with "jaxbelt" is a command.
+MISTAKES = [
+    # --- friction laws, belts, oscillators
+    ("jb.Conti(1.0)", "missing 2 required positional arguments: 'residual' and 'steepness'"),
+    ("jb.Conti('a', 0.6, 10.0)", "static must be a number, got 'a'"),
+    ("jb.Conti(-1.0, 0.6, 10.0)", r"static of Conti must be >= 0, got -1\.0"),
+    ("jb.Conti(1.0, 0.6, -10.0)", r"steepness of Conti must be >= 0, got -10\.0"),
+    ("jb.Coulomb(0.5, 0.8)", r"kinetic of Coulomb must be <= static = 0\.5, got 0\.8"),
+    ("jb.Stribeck(1.0, 0.5, 0.0)", r"velocity of Stribeck must be > 0, got 0\.0"),
+    ("jb.Belt(0.3, NumpyLaw())", "mu of NumpyLaw must be .* JAX can trace .*not .*np.sqrt"),
+    ("jb.Belt(0.3, BranchingLaw())", "mu of BranchingLaw must be .* JAX can trace .* or if"),
+    ("jb.Belt(0.3)", "missing 1 required positional argument: 'friction'"),
+    ("jb.Belt(0.3, 0.5)", f"friction must be {LAW}.*, got 0.5"),
+    ("jb.Belt(0.3, jb.Conti)", f"friction must be {LAW}.*, got the class Conti"),
+    ("jb.Belt(law, 0.3)", r"velocity must be a number, got Conti\("),
+    ("jb.Belt(None, law)", "velocity must be a number, got None"),
+    ("jb.Belt(math.inf, law)", "velocity of belt must be finite, got inf"),
+    ("jb.Belt(0.3, law, load=-1)", r"load of belt must be >= 0, got -1\.0"),
+    ("jb.Belt(0.3, law, lower=1.0, upper=0.0)", r"lower of belt must be < 0\.0, got 1\.0"),
+    ("jb.Oscillator(0.5, jb.Belt(0.3, law))", r"belts must be a tuple of belts.*, got Belt\("),
+    ("jb.Oscillator(0.5, [0.3, 0.4])", r"belts\[0\] must be a Belt, got 0\.3"),
+    ("jb.Oscillator(0.5, ())", "belts must be at least one Belt, got none"),
+    ("jb.Oscillator(0.5)", "missing 1 required positional argument: 'belts'"),
+    ("jb.Oscillator((belt,), 0.5)", r"damping must be a number, got \(Belt\("),
+    ("jb.Oscillator([0.5, 0.6], (belt,))", r"damping must be a scalar .*, got shape \(2,\)"),
+    ("jb.Oscillator(np.float32(0.5), (belt,))", "damping must be float64, got float32"),
+    ("jb.Oscillator(0.5, (belt,), omega=0)", r"omega must be > 0, got 0\.0"),
+    ("jb.Oscillator(dampng=0.5, belts=(belt,))", "unexpected keyword argument 'dampng'"),
+    ("jb.presets.class_b(0.3)", "missing 1 required positional argument: 'nu1'"),
+    ("jb.presets.class_b(row, 0.3)", r"velocity must be a scalar .*, got shape \(200,\)"),
+    ("jb.presets.class_d(0.3, 0.2, 1.0, 0.0)", r"sigma0 must be <= sigma1 = 0\.0, got 1\.0"),
+    # --- one motion
+    ("jb.simulate((3.0, 0.0), osc, 10.0)", OSC + r"\(3\.0, 0\.0\)"),
+    ("jb.simulate(jb.presets.class_b, (3.0, 0.0), 10.0)", OSC + "the function class_b"),
+    ("jb.simulate(osc, (3.0, 0.0))", "missing 1 required positional argument: 't1'"),
+    ("jb.simulate(osc, (3.0, 0.0, 1.0), 10.0)", r"y0 must be of shape \(2\), got shape \(3,\)"),
+    ("jb.simulate(osc, 3.0, 10.0)", r"y0 must be of shape \(2\), got shape \(\)"),
+    ("jb.simulate(osc, (3.0, math.nan), 10.0)", r"y0 must be finite, got \[ 3\. nan\]"),
+    ("jb.simulate(osc, {'x1': 3.0}, 10.0)", r"y0 must be numbers, got \{'x1': 3\.0\}"),
+    ("jb.simulate(osc, Foreign(), 10.0)", r"y0 must be numbers, got a \w+\.Foreign of string"),
+    ("jb.simulate(osc, (3.0, 0.0), '10')", "t1 must be a number, got '10'"),
+    ("jb.simulate(osc, (3.0, 0.0), (0, 10))", r"t1 must be a scalar .*, got shape \(2,\)"),
+    ("jb.simulate(osc, (3.0, 0.0), -1.0)", r"t1 must be > t0 = 0\.0, got -1\.0"),
+    ("jb.simulate(osc, (3.0, 0.0), 10.0, ts=row)", r"ts must be within .*, got .*\(200,\), from 0"),
+    ("jb.simulate(osc, (3.0, 0.0), 30.0, ts=row[::-1])", "ts must be increasing, got .*from 20 to"),
+    ("jb.simulate(osc, (3.0, 0.0), 10.0, ts=100)", r"ts must be of shape \(n\), got shape \(\)"),
+    ("jb.simulate(osc, (3.0, 0.0), 10.0, rtol=-1e-8)", "rtol must be > 0, got -1e-08"),
+    ("jb.simulate(osc, (3.0, 0.0), 10.0, tol=1e-8)", "unexpected keyword argument 'tol'"),
+    ("jb.simulate(osc, (3.0, 0.0), 9.0, formulation='exact')", "formulation must be .*got 'exact'"),
+    ("jb.simulate(osc, (3.0, 0.0), 9.0, max_segments=1e3)", f"max_segments {WHOLE}1000.0"),
+    # --- cycles, equilibria, functionals
+    ("jb.find_cycle(osc)", "missing 1 required positional argument: 'y0'"),
+    ("jb.find_cycle(osc, (1.0,))", r"y0 must be of shape \(2\), got shape \(1,\)"),
+    ("jb.find_cycle(osc, (3.0, 0.0), max_arcs=-3)", f"max_arcs {WHOLE}-3"),
+    ("jb.unstable_cycle(osc, around=0.5)", "around must be the number of an eq.*, got 0.5"),
+    ("jb.unstable_cycle(osc, max_arcs='many')", f"max_arcs {WHOLE}'many'"),
+    ("jb.equilibria([osc, osc])", OSC + r"\[Oscillator\("),
+    ("jb.lyapunov_coefficient(None)", OSC + "None"),
+    ("jb.portrait('osc')", OSC + "'osc'"),
+    ("jb.amplitude(osc)", CYCLE + r"Oscillator\("),
+    ("jb.period(None)", CYCLE + "None"),
+    ("jb.peak(cycle, 'x3')", 'coordinate must be "x1" or "x2", got \'x3\''),
+    ("jb.stick_duration(cycle, belt=5)", "belt must be 0 to 1, got 5"),
+    ("jb.stick_fraction(3.0)", CYCLE + r"3\.0"),
+    ("jb.slip_duration(cycle, '0')", "belt must be 0 to 1, got '0'"),
+    ("jb.gap(osc, 0)", CYCLE + r"Oscillator\("),
+    ("jb.energy_fed(osc)", CYCLE + r"Oscillator\("),
+    ("jb.energy_dissipated(cycle.chain)", CYCLE + "None"),
+    ("jb.describe(99)", "status must be a Status, or its number, got 99"),
+    # --- bifurcations
+    ("jb.refine(jb.Hopf, osc, where=nu0)", "condition must be such as .*, got the class Hopf"),
+    ("jb.refine(osc, jb.Hopf(), where=nu0)", r"condition must be such as .*, got Oscillator\("),
+    ("jb.refine(jb.Hopf(), osc)", SELECTS + ".*, got None"),
+    ("jb.refine(jb.Hopf(), osc, where='nu0')", SELECTS + ".*, got 'nu0'"),
+    ("jb.refine(jb.Hopf(), osc, where=nu2)", SELECTS + ".*, got one of a belt that is not there"),
+    ("jb.refine(jb.Hopf(), osc, where=both)", SELECTS + r".*, got \(belts\[0\]\.v.*, belts\[1\]"),
+    ("jb.refine(jb.Hopf(), osc, where=lambda o: o.belts[0])", SELECTS + ".*, got a whole Belt"),
+    ("jb.refine(jb.Hopf(), osc, where=lambda o: 0.3)", SELECTS + r".*, got 0\.3"),
+    ("jb.refine(jb.Hopf(), osc, where=nu0, at=0.3)", r"at must be left out where .*, got 0\.3"),
+    (
+        "jb.refine(jb.Hopf(), jb.presets.class_a)",
+        "at must be the value of the parameter .*got None",
+    ),
+    ("jb.refine(jb.Hopf(), lambda v: v, at=0.3)", "osc must be .* got one that returns a number"),
+    (
+        "jb.refine(jb.Hopf(), jb.presets.class_b, at=0.3)",
+        r"osc must be .*, got one of \(nu0, nu1\)",
+    ),
+    ("jb.refine(jb.NonsmoothFold(), osc, where=nu0)", "missing .* argument: 'belt'"),
+    ("jb.refine(jb.NonsmoothFold(2), osc, where=nu0)", "belt must be 0 to 1, got 2"),
+    ("jb.refine(jb.GrazingSliding(1.0), osc, where=nu0)", r"belt must be 0 to 1, got 1\.0"),
+    ("jb.refine(jb.CrossingSliding('1'), osc, where=nu0)", "belt must be 0 to 1, got '1'"),
+    ("jb.refine(jb.SuddenSliding(-1), osc, where=nu0)", "belt must be 0 to 1, got -1"),
+    ("jb.refine(jb.BeltAtRest(None), osc, where=nu0)", "belt must be 0 to 1, got None"),
+    ("jb.refine(jb.SlidingExchange(0), osc, where=nu0)", "belts must be two different .*, got 0"),
+    ("jb.refine(jb.GrazingEdge(0), osc, where=nu0)", "belt must be one with a finite edge, got 0"),
+    ("jb.refine(jb.CornerCollision(0), osc, where=nu0)", "belt must be one with a finite edge"),
+    ("jb.refine(jb.PseudoHopf(1), osc, where=nu0)", "belt must be one with a finite edge, got 1"),
+    ("jb.refine(jb.BoundaryEquilibrium(1), osc, where=nu0)", "belt must be one with a finite edge"),
+    ("jb.refine(jb.FoldOfCycles(), osc, where=nu0, max_arcs=0)", f"max_arcs {WHOLE}0"),
+    ("jb.scan(osc, nu0)", "span " + PAIR + "None"),
+    ("jb.scan(osc, (-0.7, 0.7))", SELECTS + r".*, got \(-0\.7, 0\.7\)"),
+    ("jb.scan(osc, nu0, (0.7, -0.7))", "span " + PAIR + r"\(0\.7, -0\.7\)"),
+    ("jb.scan(osc, nu0, (0.1, math.nan))", r"span must be finite, got \[0\.1 nan\]"),
+    ("jb.scan(osc, lambda o: o.omega, (-1.0, 1.0))", r"omega must be > 0, got -1\.0"),
+    ("jb.scan(osc, nu0, (-0.7, 0.7), resolution=0)", f"resolution {WHOLE}0"),
+    ("jb.scan(osc, nu0, (-0.7, 0.7), conditions=jb.Hopf())", r"conditions must be .* got Hopf\(\)"),
+    ("jb.scan(jb.presets.class_a, nu0, (0.1, 0.7))", "where must be left out .*got the function"),
+    ("jb.bifurcation_diagram(osc, nu0, row)", "span " + PAIR + r"an array of .*\(200,\)"),
+    ("jb.bifurcation_diagram(osc, nu0, (0.1, 0.7), rows=20.0)", f"rows {WHOLE}20.0"),
+    ("jb.bifurcation_curve(osc, (nu0, nu1), PLANE)", POINT + r"Oscillator\("),
+    ("jb.bifurcation_curve((), (nu0, nu1), PLANE)", POINT + r"\(\)"),
+    ("jb.bifurcation_curve(failed, (nu0, nu1), PLANE)", "point must be one with status OK, got"),
+    (
+        "jb.bifurcation_curve(point, nu0, PLANE)",
+        "where must be a function of two numbers .*got one",
+    ),
+    ("jb.bifurcation_curve(point, (nu0, nu0), PLANE)", "where must be two different .*, got one t"),
+    ("jb.bifurcation_curve(point, (nu0, nu1), (-1, 1))", r"span must be .*, got \(-1, 1\)"),
+    (
+        "jb.bifurcation_curve(point, (nu0, nu1), ((1, -1), (-1, 1)))",
+        r"span\[0\] must .*got \(1, -1",
+    ),
+    ("jb.bifurcation_curve(point, (nu0, nu1), PLANE, step=-1)", r"step must be > 0, got -1\.0"),
+    ("jb.region_map(jb.presets.class_b, {'nu0': row})", r"axes must be a dictionary, two .*'nu0'"),
+    ("jb.region_map(jb.presets.class_b, [row, row])", "axes must be a dictionary, two .*an array"),
+    (
+        "jb.region_map(jb.presets.class_b, {'nu0': row, 'mu1': row})",
+        "axes must be .* got 'mu1' .*nu1",
+    ),
+    (
+        "jb.region_map(jb.presets.class_c, {'nu0': row, 'nu1': row})",
+        "make must .* needs sigma, too",
+    ),
+    ("jb.region_map(jb.presets.class_b, AXES, starts=(3.0, 0.0))", r"starts must .*got \(3\.0, 0"),
+    ("jb.region_map(jb.presets.class_b, AXES, lines=-1)", "lines must be an integer >= 0, got -1"),
+    # --- sweeps and basins
+    (
+        "jb.sweep(jb.presets.class_b, {'nu0': row})",
+        "make must be .* needs nu1, too: functools.part",
+    ),
+    ("jb.sweep(osc, AXES, t1=10.0)", r"make must be a function .*, got Oscillator\("),
+    ("jb.sweep(AXES, jb.presets.class_b, t1=10.0)", "make must be a function .*, got {'nu0'"),
+    ("jb.sweep(jb.presets.class_b, {}, t1=10.0)", r"axes must be a dictionary of values, got \{\}"),
+    ("jb.sweep(jb.presets.class_b, {'nu': row, 'nu1': row})", "axes must be .*got 'nu' .*mean 'nu"),
+    ("jb.sweep(jb.presets.class_b, AXES | {'nu0': []})", "axis nu0 must be at least one value"),
+    (
+        "jb.sweep(jb.presets.class_b, AXES | {'nu0': 0.3})",
+        r"axis nu0 must be of .*, got shape \(\)",
+    ),
+    (
+        "jb.sweep(jb.presets.class_b, AXES | {'nu0': ['a', 'b']})",
+        "axis nu0 must be numbers, got .'a",
+    ),
+    ("jb.sweep(jb.presets.class_b, AXES | {'nu0': np.ones((3, 3))})", r"axis nu0 must .*\(3, 3\)"),
+    (
+        "jb.sweep(lambda nu0: 3.0, {'nu0': row}, t1=9.0)",
+        "make must be .* got one that returns float",
+    ),
+    ("jb.sweep(with_float, {'nu0': row}, t1=9.0)", "make must be .* JAX can trace .* float or if"),
+    ("jb.sweep(jb.presets.class_b, AXES)", "t1 must be given, .*, got None"),
+    ("jb.sweep(jb.presets.class_b, AXES, t1=-9.0)", r"t1 must be > 0, got -9\.0"),
+    ("jb.sweep(jb.presets.class_b, AXES, t1=9.0, y0=(3.0,))", r"y0 must be of shape \(2\), got"),
+    (
+        "jb.sweep(jb.presets.class_b, AXES, observe='atractor')",
+        OBSERVE + "'atractor' .did you mean",
+    ),
+    ("jb.sweep(jb.presets.class_b, AXES, t1=9.0, observe=Reducer)", OBSERVE + "the class Reducer"),
+    (
+        "jb.sweep(jb.presets.class_b, AXES, t1=9.0, observe=Reducer())",
+        "observe.finish must be .*dict",
+    ),
+    (
+        "jb.sweep(jb.presets.class_b, AXES, t1=9.0, observe=Growing())",
+        "observe.update must be .*tuple",
+    ),
+    (
+        "jb.sweep(jb.presets.class_b, AXES, t1=9.0, derivatives='nu3')",
+        "derivatives must .*got 'nu3'",
+    ),
+    (
+        "jb.sweep(jb.presets.class_b, AXES, t1=9.0, store=3)",
+        "store must be the path of a .*, got 3",
+    ),
+    (
+        "jb.sweep(jb.presets.class_b, AXES, t1=9.0, blocks=(0, 4))",
+        "store must be given, where block",
+    ),
+    ("jb.sweep(jb.presets.class_b, AXES, t1=9.0, audit=2)", r"audit must be a share .*, got 2\.0"),
+    (
+        "jb.sweep(jb.presets.class_b, AXES, t1=9.0, progress='yes')",
+        "progress must be True, .*'yes'",
+    ),
+    ("jb.explain(jb.presets.class_b, AXES, observe='finl')", OBSERVE + "'finl' .did you mean 'fin"),
+    ("jb.verify('nowhere.zarr')", "path must be that of a store, a folder, got nowhere.zarr"),
+    ("jb.decoded('sweep.nc')", "dataset must be an xarray.Dataset, .*, got 'sweep.nc'"),
+    ("jb.attractors({'kind': 3})", r"dataset must be an xarray.Dataset, .*, got \{'kind': 3\}"),
+    ("jb.AtExtrema('x3')", 'of must be "x1" or "x2", got \'x3\''),
+    ("jb.AtSection('x1')", "function must be a function of osc, x1 and x2, got 'x1'"),
+    ("jb.AtTimes([3.0, 1.0])", r"times must be .*increasing, got \[3\. 1\.\]"),
+    ("jb.basins(osc, x1=(0, 3), x2=(-1, 1))", r"x1 must be .*linspace\(0, 3, 201\), got \(0, 3\)"),
+    ("jb.basins(osc, row, row)", "takes 1 positional argument but 3 were given"),
+    ("jb.basins(osc, x1=row[::-1], x2=row)", "x1 must be increasing, got an array .*from 20 to 0"),
+    (
+        "jb.basin_stability(osc, box=BOX, key=0)",
+        r"key must be one key, .*jax.random.key\(0\), got 0",
+    ),
+    ("jb.basin_stability(osc, box=(0, 3, -1, 1), key=key)", r"box must be .*, got \(0, 3, -1, 1\)"),
+    (
+        "jb.basin_stability(osc, box=((3, 0), (-1, 1)), key=key)",
+        r"box\[0\], x1 must .*got \(3, 0\)",
+    ),
+    ("jb.basin_stability(osc, box=BOX, key=key, n=1e4)", f"n {WHOLE}10000.0"),
+    # --- from data to parameters
+    ("jb.fit(osc, row, row)", "missing 1 required keyword-only argument: 'where'"),
+    ("jb.fit(row, row, osc, where=nu0)", "oscillator must be an Oscillator, .* got an array"),
+    ("jb.fit(osc, row, where=nu0)", "x1 must be given, or x2, got None"),
+    ("jb.fit(osc, row, row[:-1], where=nu0)", r"x1 must be of shape \(200\), got shape \(199,\)"),
+    (
+        "jb.fit(osc, row[::-1], row, where=nu0)",
+        "ts must be increasing, got an array .*from 20 to 0",
+    ),
+    ("jb.fit(osc, row[:5], row[:5], where=nu0)", "ts must be at least 8 times, got 5"),
+    ("jb.fit(osc, row, row, where=nu0, noise=0.0)", r"noise must be > 0, got 0\.0"),
+    ("jb.fit(osc, row, row, row, where=nu0, noise=0.1)", r"noise must be a pair, .*got 0\.1"),
+    (
+        "jb.fit(osc, row, row, where=nu0, bounds=(0.0, 1.0))",
+        r"bounds must be a list .*got \(0\.0, 1",
+    ),
+    (
+        "jb.fit(osc, row, row, where=nu0, bounds=[(1.0, 0.0)])",
+        r"bounds of belts\[0\].* got \(1\.0, 0",
+    ),
+    (
+        "jb.fit(osc, row, row, where=nu0, bounds=[(0.5, 1.0)])",
+        "velocity must be inside .* got 0.45",
+    ),
+    (
+        "jb.fit(osc, row, row, where=twice)",
+        r"where must be free of repeats, got \(damping, damping",
+    ),
+    ("jb.fit(osc, row, row, where=nu0, starts=0)", f"starts {WHOLE}0"),
+    ("jb.fit(osc, row, row, where=nu0, report='loud')", "report must be a function .*, got 'loud'"),
+    ("jb.design(osc, jb.amplitude, where=nu0)", TARGETS + "the function amplitude"),
+    ("jb.design(osc, (jb.amplitude, 1.0), where=nu0)", TARGETS + r"\(the function amplitude, 1\.0"),
+    ("jb.design(osc, [(jb.amplitude, 'big')], where=nu0)", "target of amplitude must be numbers"),
+    ("jb.design(osc, [(jb.amplitude, (2, 1))], where=nu0)", r"target of amplitude .*got \(2, 1\)"),
+    (
+        "jb.design(osc, TARGET, where=nu0, bounds=[(1.0, 0.5)])",
+        r"bounds of belts\[0\].* got \(1\.0,",
+    ),
+    ("jb.distance_to(jb.Hopf, where=nu0)", "conditions must be a tuple .*, got the class Hopf"),
+    ("jb.distance_to(jb.Hopf(), where='nu0')", "where must be a function .*, got 'nu0'"),
+    # --- pictures
+    ("jb.plot_friction_law(osc)", r"friction must be a law .*, got Oscillator\("),
+    ("jb.plot_time_history(osc)", r"trajectory must be a Trajectory, .*, got Oscillator\("),
+    ("jb.plot_phase_portrait((), osc)", OSC + r"\(\)"),
+    ("jb.plot_phase_portrait(osc, osc)", r"trajectories must be .*, got Oscillator\("),
+    ("jb.plot_phase_portrait(osc, xlim=(1, 0))", "xlim " + PAIR + r"\(1, 0\)"),
+    ("jb.plot_vector_field(osc, kind='arrow')", "kind must be .*, got 'arrow' .did you mean"),
+    ("jb.plot_basins(osc)", r"basins must be what jb.basins returns, got Oscillator\("),
+    ("jb.show_progress('yes')", "wanted must be True, False or None, got 'yes'"),
+    # --- the command line
+    ("jaxbelt simulat", "No such command 'simulat'"),
+    ("jaxbelt simulate --class q", "class must be a, b, c or d, got q"),
+    ("jaxbelt simulate --class b --sigma 1", "class b must have only nu0, nu1, got sigma"),
+    ("jaxbelt simulate --t1 -1", r"t1 must be finite and > 0, got -1\.0"),
+    ("jaxbelt simulate --t1 long", "Invalid value for '--t1': .* valid (float|number)"),
+    ("jaxbelt simulate --nu0 nan", "velocity of belt must be finite, got nan"),
+    ("jaxbelt simulate --belt fast", "velocity of belt 'fast' must be a number, got 'fast'"),
+    ("jaxbelt simulate --belt 1,law=conty", "law of belt .* got conty .did you mean 'conti'"),
+    ("jaxbelt simulate --formulation exact", "formulation must be .*, got exact"),
+    ("jaxbelt simulate --out /dev/null/here/run", "out must be a place that can be .*here/run"),
+    ("jaxbelt diagram --vary sgma", "vary must be one of .*, got sgma .did you mean 'sigma'"),
+    ("jaxbelt diagram --vary sigma", "class b must have only nu0, nu1, got sigma"),
+    ("jaxbelt diagram --span 1 0", r"span must be FROM TO with FROM < TO, got 1\.0 0\.0"),
+    ("jaxbelt diagram --quantity x3", "quantity must be one of .*, got x3"),
+    ("jaxbelt map --axes nu0 nu0", "axes must be different ones, got nu0 twice"),
+    ("jaxbelt map --cells 1", "cells must be at least 2, got 1"),
+    ("jaxbelt basins --points 1", "points must be at least 2, got 1"),
+    ("jaxbelt basins --x1 3 0", r"x1 must be FROM TO with FROM < TO, got 3\.0 0\.0"),
+    ("jaxbelt sweep nu0", "an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got 'nu0'"),
+    ("jaxbelt sweep nu0=0:1:9 --variable nope", "variable must be one of kind, .*, got nope"),
+    ("jaxbelt sweep nu0=0:1:9 --observe atractor", "observe must be .* got atractor .did you mean"),
+    ("jaxbelt sweep nu0=0:1:9 --out plane.csv", "out must end in .nc or .zarr, got plane.csv"),
+    ("jaxbelt sweep nu0=0:1:9 --out p.zarr --blocks 4", "blocks must be FROM:TO, .*, got '4'"),
+    ("jaxbelt verify nowhere.zarr", "store must be a folder that sweep wrote, got nowhere.zarr"),
+    ("jaxbelt reproduce --out /dev/null", "out must be a folder, got the file /dev/null"),
+]
+
+
+# --- what the calls above are about ---------------------------------------------------------------
+
+
+class NumpyLaw(jb.AbstractFriction):
+    static: float = 1.0
+
+    def mu(self, speed):
+        return np.exp(-speed)
+
+
+class BranchingLaw(jb.AbstractFriction):
+    static: float = 1.0
+
+    def mu(self, speed):
+        return 1.0 if speed < 0.1 else 0.5
+
+
+class Foreign:
+    """Such as a column of words of another library."""
+
+    dtype = "string"
+
+    def __array__(self, dtype=None, copy=None):
+        return np.array(["a", "b"])
+
+
+class Reducer:
+    def init(self, osc, x1, x2):
+        return x1
+
+    def update(self, state, event):
+        return state
+
+    def finish(self, state, end):
+        return state
+
+
+class Growing(Reducer):
+    def update(self, state, event):
+        return state, event.t
+
+
+def with_float(nu0):
+    return jb.presets.class_a(float(nu0))
+
+
+def nu0(osc):
+    return osc.belts[0].velocity
+
+
+def nu1(osc):
+    return osc.belts[1].velocity
+
+
+def nu2(osc):
+    return osc.belts[2].velocity
+
+
+def both(osc):
+    return osc.belts[0].velocity, osc.belts[1].velocity
+
+
+def twice(osc):
+    return osc.damping, osc.damping
+
+
+def names() -> dict:
+    """What stands in the calls."""
+    osc, row = jb.presets.class_b(0.45, 0.35), np.linspace(0.0, 20.0, 200)
+    law = jb.presets.paper_friction()
+    # Results without what they would be computed from.
+    cycle = jb.Cycle(osc, *[None] * 5, jnp.asarray(0))
+    point, failed = (
+        jb.BifurcationPoint(
+            jb.Hopf(), *[np.float64("nan")] * 6, osc, cycle, np.asarray(status.value)
+        )
+        for status in (jb.Status.OK, jb.Status.NO_CONVERGENCE)
+    )
+    return globals() | {
+        "AXES": {"nu0": row, "nu1": row},
+        "BOX": ((0, 3), (-1, 1)),
+        "PLANE": ((-1, 1), (-1, 1)),
+        "TARGET": [(jb.amplitude, 1.0)],
+        "belt": jb.Belt(0.3, law),
+        "cycle": cycle,
+        "failed": failed,
+        "key": jax.random.key(0),
+        "law": law,
+        "osc": osc,
+        "point": point,
+        "row": row,
+    }
+
+
+def called(what: str, known: dict) -> tuple[str, str]:
+    """What kind of error comes, and its message."""
+    if what.startswith("jaxbelt "):
+        from jaxbelt.cli import app
+
+        result = CliRunner().invoke(app, shlex.split(what)[1:])
+        kind = "exit" if result.exit_code == 2 else repr(result.exception)
+        # The boxes around messages about unknown options fold them.
+        return kind, " ".join(result.stderr.replace("│", " ").split())
+    try:
+        eval(what, known)
+    except Exception as error:
+        return type(error).__name__, str(error)
+    return "nothing", ""
+
+
+def main() -> None:
+    """Print a line for each mistake: what was called, what came, what was compiled, and seconds."""
+    warnings.simplefilter("error")
+    jax.config.update("jax_enable_x64", True)
+    known = names()
+    # What each process does once: tricks are tried before they are first used, Matplotlib imported.
+    for what in ("jb.sweep(with_float, {'nu0': row}, t1=9.0)", "jb.plot_basins(osc)"):
+        called(what, known)
+    for what in ("jb.refine(jb.Hopf(), lambda v: v, at=0.3)", "jb.scan(osc, nu0, (1.0, -1.0))"):
+        called(what, known)
+    jax.block_until_ready(jnp.asarray(np.zeros(())))
+    for what, _ in MISTAKES:
+        began = time.perf_counter()
+        with compilations() as compiled:
+            kind, message = called(what, known)
+        row = [what, kind, message, compiled, time.perf_counter() - began]
+        print(json.dumps(row))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
