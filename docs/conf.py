@@ -20,7 +20,7 @@ copyright = "the jaxbelt developers"
 html_title = "jaxbelt"
 
 extensions = ["myst_nb", "sphinx_copybutton", "mathml", "reference"]
-exclude_patterns = ["README.md"]
+exclude_patterns = ["costs.md"]
 
 # Markdown, and the notebooks as they were stored.
 myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
@@ -31,7 +31,15 @@ nb_execution_mode = "off"
 nitpicky = True
 nitpick_ignore = [
     ("py:class", name)
-    for name in ("AbstractCondition", "Array", "ArrayLike", "Axes", "ClosedOrbit", "Path", "xarray.Dataset")
+    for name in (
+        "AbstractCondition",
+        "Array",
+        "ArrayLike",
+        "Axes",
+        "ClosedOrbit",
+        "Path",
+        "xarray.Dataset",
+    )
 ]
 
 html_theme = "furo"

@@ -96,9 +96,9 @@ def curve():
     """A bifurcation followed in two parameters, through points of codimension two."""
     osc = jb.presets.class_b(nu0=0.45, nu1=0.35)
     point = jb.refine(jb.NonsmoothFold(belt=1), osc, where=nu0)
-    plane = (nu0, lambda o: o.damping)
+    plane = (nu0, lambda o: o.belts[1].velocity)
     figure = journal_figure(5.2, 3.6)
-    jb.bifurcation_curve(point, plane, ((-0.7, 0.7), (0.1, 0.9))).plot(figure.subplots())
+    jb.bifurcation_curve(point, plane, ((-0.7, 0.7), (-0.7, 0.7))).plot(figure.subplots())
     return figure
 
 
@@ -181,9 +181,7 @@ def both(nu):
 
 CASES = {
     "Hopf": Case(jb.Hopf(), jb.presets.class_a, r"\nu_0", 0.18, 0.2, 0.165),
-    "NonsmoothFold": Case(
-        jb.NonsmoothFold(0), jb.presets.class_a, r"\nu_0", 0.26, 0.25, 0.28
-    ),
+    "NonsmoothFold": Case(jb.NonsmoothFold(0), jb.presets.class_a, r"\nu_0", 0.26, 0.25, 0.28),
     "GrazingSliding": Case(jb.GrazingSliding(0), both, r"\nu_0", -0.45, -0.40, -0.50),
     "CrossingSliding": Case(jb.CrossingSliding(1), weakly_held, "u_{01}", 0.3, 0.2, 0.4),
     "SlidingExchange": Case(jb.SlidingExchange((0, 1)), both, r"\nu_0", 0.36, 0.42, 0.28),

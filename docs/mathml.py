@@ -5,11 +5,20 @@ from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 
 
+#: Operators as they come, and as they are meant here: bars of an absolute value, close to what is
+#: in them, and the sign of what follows an equality.
+BAR, MINUS = '<mo stretchy="false">&#x0007C;</mo>', "<mo>&#x0003D;</mo><mo>&#x02212;</mo>"
+MEANT = {
+    BAR: BAR.replace("<mo", '<mo lspace="0" rspace="0" form="prefix"'),
+    MINUS: MINUS.replace("<mo>&#x02212;", '<mo form="prefix">&#x02212;'),
+}
+
+
 def _mathml(source: str, display: str) -> str:
-    # Bars stand for an absolute value here, and close to it.
-    bar = '<mo stretchy="false">&#x0007C;</mo>'
-    close = bar.replace("<mo", '<mo lspace="0" rspace="0" form="prefix"')
-    return convert(source, display=display).replace(bar, close)
+    equation = convert(source, display=display)
+    for operator, meant in MEANT.items():
+        equation = equation.replace(operator, meant)
+    return equation
 
 
 def _visit_inline(writer, node: nodes.math) -> None:

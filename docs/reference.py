@@ -180,7 +180,8 @@ def listed(paragraph: str, names: list[str]) -> Iterator[str]:
     if names:
         # "a, b, [n]: what", at the beginning of the text or of a sentence or clause.
         one = rf"(?:{'|'.join(map(re.escape, names))})"
-        term = rf"(?:^|(?<=[.;] )|(?<=\) )|(?<=^Arguments: ))({one}(?:(?:, | and | < ){one})*(?:, \[[^]:]*\])*): "
+        begin, several = r"(?:^|(?<=[.;] )|(?<=\) ))", rf"{one}(?:(?:, | and | < ){one})*"
+        term = rf"{begin}({several}(?:, \[[^]:]*\])*): "
     for piece in pieces:
         if heading := re.match(r"(Returns) (?=\S)|(?=`\w+Error`)", piece):
             yield from ("**Returns**" if heading[1] else "**Errors**", f": {piece}", "")
