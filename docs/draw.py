@@ -102,6 +102,14 @@ def curve():
     return figure
 
 
+def vector_field():
+    """The vector field of two belts that overlap; it jumps at the boundaries."""
+    osc = jb.presets.class_d(nu0=0.3, nu1=0.7, sigma0=-0.5, sigma1=1.0)
+    figure = journal_figure(5.2, 3.4)
+    jb.plot_vector_field(osc, xlim=(-2.0, 3.0), ylim=(-1.5, 1.5), ax=figure.subplots())
+    return figure
+
+
 def friction_laws():
     """Three friction laws."""
     laws = [
@@ -128,7 +136,7 @@ def period_map():
 
 
 GALLERY = [model, region_map, history, phase_plane, diagram, basins]
-GALLERY += [portrait, curve, period_map, friction_laws]
+GALLERY += [portrait, curve, period_map, vector_field, friction_laws]
 
 # --- bifurcations ---------------------------------------------------------------------------------
 

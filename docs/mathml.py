@@ -4,7 +4,6 @@ from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 
-
 #: Operators as they come, and as they are meant here: bars of an absolute value, close to what is
 #: in them, and the sign of what follows an equality.
 BAR, MINUS = '<mo stretchy="false">&#x0007C;</mo>', "<mo>&#x0003D;</mo><mo>&#x02212;</mo>"

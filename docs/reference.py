@@ -124,7 +124,7 @@ def members(name: str, thing: type) -> Iterator[str]:
         yield from ("", "| member | value | meaning |", "|---|---|---|")
         for member in thing:
             meaning = jaxbelt.describe(member) if thing is jaxbelt.Status else comment_of(member)
-            yield f"| `{thing.__name__}.{member.name}` | {member.value} | {meaning} |"
+            yield f"| `{member.name}` | {member.value} | {meaning} |"
         return
     for key, member in public_members(thing):
         doc = inspect.getdoc(member)
@@ -168,7 +168,10 @@ def markdown(doc: str, names: list[str]) -> Iterator[str]:
         if paragraph.startswith("    "):
             yield from ("```text", *textwrap.dedent(paragraph).splitlines(), "```", "")
         elif re.match(r"[-|] ?", paragraph):
-            yield from (*paragraph.splitlines(), "")
+            # Items begin with the names of what they are about.
+            about = r"^- ((?:\w+(?:, )?)+)(?=: )"
+            words = re.sub(about, r"- **\1**", paragraph, flags=re.MULTILINE)
+            yield from (*words.splitlines(), "")
         else:
             yield from listed(paragraph, names)
 
@@ -242,7 +245,9 @@ class LinkNames(SphinxPostTransform):
         for literal in list(self.document.findall(nodes.literal)):
             text = literal.astext()
             words = re.match(r"(?:jb\.|jaxbelt\.)?(\w+(?:\.\w+)?)(?:\([^()]*\))?$", text)
-            if words is None or isinstance(literal.parent, nodes.reference | addnodes.pending_xref):
+            linked = (nodes.reference, addnodes.pending_xref)
+            # What is explained there is no public name, if it is spelled like one.
+            if words is None or isinstance(literal.parent, (*linked, nodes.term)):
                 continue
             target = f"jaxbelt.{words[1]}"
             if target not in known:
