@@ -45,6 +45,7 @@ nitpick_ignore = [
 html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_use_index = False
 html_copy_source = False
 html_show_sourcelink = False
 html_math_renderer = "mathml"

@@ -84,8 +84,8 @@ def basins():
 
 
 def portrait():
-    """Everything there is at one oscillator whose belts overlap."""
-    osc = jb.presets.class_d(nu0=0.35, nu1=0.2, sigma0=0.0, sigma1=0.6)
+    """Everything there is at one oscillator, separatrices included."""
+    osc = jb.presets.class_d(nu0=-0.47, nu1=0.1, sigma0=0.14, sigma1=1.18)
     figure = journal_figure(5.2, 3.8)
     jb.portrait(osc).plot(figure.subplots())
     draw_key(figure, ncols=3)
@@ -131,7 +131,7 @@ def period_map():
     axes = {"nu0": nus, "nu1": nus}
     found = jb.sweep(jb.presets.class_b, axes, observe="attractor", progress=False)
     figure = journal_figure(4.6, 3.6)
-    found.period.plot(x="nu0", y="nu1", ax=figure.subplots(), cmap="cividis")
+    found.period.plot(x="nu0", y="nu1", ax=figure.subplots(), cmap="cividis", vmax=20)
     return figure
 
 

@@ -3,8 +3,8 @@
 Every public name has a page with its signature and an example; enumerations list their members;
 notebooks and theory have their pictures; no link is dead; nothing comes from the network. All of it
 is read from the HTML. Where chromium is there, every page is also opened in it, as wide as a phone
-and as a desktop screen: every picture has to load, every signature to be seen, nothing may be wider
-than the screen, and no request may leave the site.
+and as a desktop screen: every picture has to load, every signature to be seen, what is wider
+than the screen has to scroll by itself, and no request may leave the site.
 """
 
 import contextlib
@@ -138,11 +138,16 @@ const load = url => new Promise(done => { frame.onload = done; frame.src = url; 
     }
     for (const sig of doc.querySelectorAll("dt.sig"))
       if (!sig.getClientRects().length) say("signature not seen: " + sig.id);
-    const root = doc.documentElement;
-    if (root.scrollWidth > root.clientWidth + 1) {
-      const wide = [...doc.querySelectorAll("article *")].find(
-        one => one.getBoundingClientRect().right > root.clientWidth + 1);
-      say("wider than the screen: " + (wide ? wide.outerHTML.slice(0, 120) : root.scrollWidth));
+    const room = doc.documentElement.clientWidth + 1;
+    const scrolls = one => /auto|scroll/.test(frame.contentWindow.getComputedStyle(one).overflowX);
+    for (const one of doc.querySelectorAll("article *")) {
+      if (one.getBoundingClientRect().right <= room) continue;
+      let box = one;
+      while (box.tagName != "ARTICLE" && !scrolls(box)) box = box.parentElement;
+      if (box.tagName == "ARTICLE" || box.getBoundingClientRect().right > room) {
+        say("wider than the screen: " + one.outerHTML.slice(0, 100));
+        break;
+      }
     }
     for (const one of frame.contentWindow.performance.getEntriesByType("resource"))
       if (!one.name.startsWith(location.origin)) say("request to " + one.name);
