@@ -85,7 +85,7 @@ def basins():
 
 def portrait():
     """Everything there is at one oscillator, separatrices included."""
-    osc = jb.presets.class_d(nu0=-0.47, nu1=0.1, sigma0=0.14, sigma1=1.18)
+    osc = jb.presets.class_c(nu0=-0.3, nu1=0.3, sigma=0.1)
     figure = journal_figure(5.2, 3.8)
     jb.portrait(osc).plot(figure.subplots())
     draw_key(figure, ncols=3)
@@ -94,8 +94,8 @@ def portrait():
 
 def curve():
     """A bifurcation followed in two parameters, through points of codimension two."""
-    osc = jb.presets.class_b(nu0=0.45, nu1=0.35)
-    point = jb.refine(jb.NonsmoothFold(belt=1), osc, where=nu0)
+    osc = jb.presets.class_b(nu0=-0.45, nu1=0.35)
+    point = jb.refine(jb.GrazingSliding(belt=0), osc, where=nu0)
     plane = (nu0, lambda o: o.belts[1].velocity)
     figure = journal_figure(5.2, 3.6)
     jb.bifurcation_curve(point, plane, ((-0.7, 0.7), (-0.7, 0.7))).plot(figure.subplots())

@@ -23,8 +23,8 @@ SLOW = """
 AtEvents AtExtrema AtSection AtTimes BasinStability Basins-class BeltAtRest BifurcationCurve
 BifurcationDiagram BoundaryEquilibrium CornerCollision CrossingSliding Design-class Fit-class
 FoldOfCycles GrazingEdge Portrait-class PseudoHopf RegionMap Separatrix SpecialPoint attractors
-basin_stability basins bifurcation_curve bifurcation_diagram design distance_to fit plot_basins
-portrait region_map scan
+basin_stability basins bifurcation_curve bifurcation_diagram design distance_to find_cycle fit
+plot_basins portrait region_map scan
 """.split()
 
 
