@@ -134,10 +134,10 @@ def describe(status) -> str:
 class EventKind(enum.IntEnum):
     """What happens at an event of a trajectory."""
 
-    STICK = 1
-    SLIP = 2
-    CROSS = 3
-    EDGE = 4
+    STICK = 1  # the mass begins to stick to the belt
+    SLIP = 2  # slip onset: the belt no longer holds the mass
+    CROSS = 3  # the relative velocity changes its sign, and the mass goes on slipping
+    EDGE = 4  # the mass passes an end of the belt's contact interval
 
 
 #: What draws results. It stands above everything that computes them, in `plotting`, and the package

@@ -220,11 +220,12 @@ def test_ci_runs_the_test_commands_of_the_readme(mark):
 
 
 def test_every_public_name_has_its_place_in_the_reference():
-    pages = (ROOT / "docs" / "api").glob("*.md")
-    written = [page.read_text(encoding="utf-8") for page in pages]
-    named = {
-        name.rpartition(".")[2]
-        for text in written
-        for name in re.findall(r"^::: jaxbelt\.(\S+)$", text, re.MULTILINE)
-    }
-    assert set(jaxbelt.__all__) - named == {"presets"}
+    pages = [*(ROOT / "docs" / "api").glob("*.md"), *(ROOT / "docs" / "bifurcations").glob("*.md")]
+    shown = Counter(
+        name
+        for page in pages
+        for name in re.findall(r"^:::\{public\} (\S+)$", page.read_text("utf-8"), re.MULTILINE)
+    )
+    classes = {name for name in vars(jaxbelt.presets) if name.startswith("class_")}
+    presets = {f"presets.{name}" for name in classes}
+    assert shown == Counter({*jaxbelt.__all__, *presets} - {"presets"})

@@ -52,10 +52,10 @@ class EquilibriumKind(enum.IntEnum):
     """What sort: rest in a smooth field, held by belts at rest, between the sides of an edge; and a
     point of an edge that both its sides push away from, where nothing rests."""
 
-    FIXED_POINT = 1
-    SEGMENT = 2
-    PSEUDO_FOCUS = 3
-    SADDLE = 4
+    FIXED_POINT = 1  # rest in a smooth field
+    SEGMENT = 2  # held by belts at rest
+    PSEUDO_FOCUS = 3  # between the sides of a contact edge, each of which pushes to the other
+    SADDLE = 4  # a point of an edge that both its sides push away from; nothing rests there
 
 
 class Equilibria(eqx.Module):

@@ -1,0 +1,81 @@
+"""The documentation, built by Sphinx: `sphinx-build -W --keep-going docs site`.
+
+It needs no network, neither to be built nor to be read: no font or script comes from elsewhere, and
+equations are MathML (see `mathml`), which browsers draw themselves. Pages are Markdown. What the
+pages of public names say comes from the docstrings, see `reference`; notebooks are shown with the
+outputs stored in them.
+"""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+sys.path[:0] = [str(HERE), str(ROOT)]
+
+project = "jaxbelt"
+copyright = "the jaxbelt developers"
+html_title = "jaxbelt"
+
+extensions = ["myst_nb", "sphinx_copybutton", "mathml", "reference"]
+exclude_patterns = ["costs.md"]
+
+# Markdown, and the notebooks as they were stored.
+myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+nb_execution_mode = "off"
+
+# Every reference has to lead somewhere; types of other packages have no page here.
+nitpicky = True
+nitpick_ignore = [
+    ("py:class", name)
+    for name in (
+        "AbstractCondition",
+        "Array",
+        "ArrayLike",
+        "Axes",
+        "ClosedOrbit",
+        "Path",
+        "xarray.Dataset",
+    )
+]
+
+html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_use_index = False
+html_copy_source = False
+html_show_sourcelink = False
+html_math_renderer = "mathml"
+html_theme_options = {"navigation_with_keys": True}
+maximum_signature_line_length = 72
+python_use_unqualified_type_names = True
+toc_object_entries = False
+add_module_names = False
+copybutton_prompt_text = ">>> |\\.\\.\\. |\\$ "
+copybutton_prompt_is_regexp = True
+
+
+def take_notebooks() -> None:
+    """Copies the notebooks to where Sphinx looks for pages, without the views of progress bars."""
+    pages = HERE / "notebooks"
+    shutil.rmtree(pages, ignore_errors=True)
+    pages.mkdir()
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        notebook = json.loads(path.read_text(encoding="utf-8"))
+        notebook["metadata"].pop("widgets", None)
+        for cell in notebook["cells"]:
+            # What is a file of the project lies elsewhere from here.
+            cell["source"] = "".join(cell["source"]).replace("](../docs/", "](../")
+            if cell["cell_type"] == "code":
+                cell["outputs"] = [one for one in cell["outputs"] if not _is_widget(one)]
+        (pages / path.name).write_text(json.dumps(notebook), encoding="utf-8")
+
+
+def _is_widget(output: dict) -> bool:
+    return any("widget" in kind for kind in output.get("data", {}))
+
+
+take_notebooks()

@@ -1,0 +1,284 @@
+"""Draws the pictures of the documentation into docs/pictures: `python docs/draw.py [NAME ...]`.
+
+They are stored, for they take minutes. `gallery` has one function a picture, as its code is shown
+beside it; `bifurcations` draws every kind of bifurcation in one manner.
+"""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+jax.config.update("jax_enable_x64", True)
+matplotlib.use("Agg")
+
+import jaxbelt as jb
+from jaxbelt import paper
+from jaxbelt.bifurcations.conditions import AbstractCondition
+from jaxbelt.plotting.model import draw_mechanical_model
+from jaxbelt.plotting.style import draw_key, journal_figure, journal_style
+
+PICTURES = Path(__file__).parent / "pictures"
+
+# --- gallery --------------------------------------------------------------------------------------
+
+
+def nu0(osc):
+    """The velocity of belt 0."""
+    return osc.belts[0].velocity
+
+
+def model():
+    """The oscillator: mass, spring, dashpot and two belts."""
+    figure = journal_figure(5.2, 4.2)
+    figure.get_layout_engine().set(w_pad=0, h_pad=0)
+    draw_mechanical_model(figure.subplots())
+    return figure
+
+
+def region_map():
+    """The plane of both belt velocities: which motions there are, and what bounds them."""
+    return paper.draw_map(paper.map_b())
+
+
+def history():
+    """One run: displacement and velocity over time, stick phases shaded."""
+    osc = jb.presets.class_b(nu0=-0.2, nu1=0.35)
+    run = jb.simulate(osc, y0=(2.0, 0.0), t1=40.0)
+    figure = journal_figure(5.2, 3.4)
+    jb.plot_time_history(run, figure.subplots(2, sharex=True))
+    return figure
+
+
+def phase_plane():
+    """A run in the phase plane, and the stick-slip cycle that it settles on."""
+    osc = jb.presets.class_b(nu0=-0.2, nu1=0.35)
+    run = jb.simulate(osc, y0=(2.0, 0.0), t1=40.0)
+    figure = journal_figure(5.2, 3.6)
+    cycle = jb.find_cycle(osc, y0=(2.0, 0.0))
+    jb.plot_phase_portrait(osc, run, cycles=[cycle], ax=figure.subplots())
+    return figure
+
+
+def diagram():
+    """Equilibria and cycles along a path, with every bifurcation point on it."""
+    osc = jb.presets.class_b(nu0=0.3, nu1=0.35)
+    figure = journal_figure(6.6, 4.0)
+    jb.bifurcation_diagram(osc, nu0, (-0.7, 0.7)).plot(figure.subplots())
+    return figure
+
+
+def basins():
+    """Which start leads where, and the unstable cycle between the basins."""
+    osc = jb.presets.class_b(nu0=0.45, nu1=0.35)
+    found = jb.basins(osc, x1=np.linspace(-1, 4, 251), x2=np.linspace(-1.5, 1.5, 151))
+    figure = journal_figure(5.2, 3.6)
+    jb.plot_basins(found, ax=figure.subplots())
+    return figure
+
+
+def portrait():
+    """Everything there is at one oscillator, separatrices included."""
+    osc = jb.presets.class_c(nu0=-0.3, nu1=0.3, sigma=0.1)
+    figure = journal_figure(5.2, 3.8)
+    jb.portrait(osc).plot(figure.subplots())
+    draw_key(figure, ncols=3)
+    return figure
+
+
+def curve():
+    """A bifurcation followed in two parameters, through points of codimension two."""
+    osc = jb.presets.class_b(nu0=-0.45, nu1=0.35)
+    point = jb.refine(jb.GrazingSliding(belt=0), osc, where=nu0)
+    plane = (nu0, lambda o: o.belts[1].velocity)
+    figure = journal_figure(5.2, 3.6)
+    jb.bifurcation_curve(point, plane, ((-0.7, 0.7), (-0.7, 0.7))).plot(figure.subplots())
+    return figure
+
+
+def vector_field():
+    """The vector field of two belts that overlap; it jumps at the boundaries."""
+    osc = jb.presets.class_d(nu0=0.3, nu1=0.7, sigma0=-0.5, sigma1=1.0)
+    figure = journal_figure(5.2, 3.4)
+    jb.plot_vector_field(osc, xlim=(-2.0, 3.0), ylim=(-1.5, 1.5), ax=figure.subplots())
+    return figure
+
+
+def friction_laws():
+    """Three friction laws."""
+    laws = [
+        jb.Conti(static=1.0, residual=0.6, steepness=10.0),
+        jb.Stribeck(static=1.0, kinetic=0.6, velocity=0.2),
+        jb.Coulomb(static=1.0, kinetic=0.6),
+    ]
+    figure = journal_figure(6.6, 2.4)
+    for law, ax in zip(laws, figure.subplots(1, 3, sharey=True)):
+        jb.plot_friction_law(law, ax=ax)
+        ax.set_title(type(law).__name__)
+        ax.label_outer()
+    return figure
+
+
+def period_map():
+    """The period of what a start leads to, over a plane of two velocities."""
+    nus = np.linspace(-0.7, 0.7, 200)
+    axes = {"nu0": nus, "nu1": nus}
+    found = jb.sweep(jb.presets.class_b, axes, observe="attractor", progress=False)
+    figure = journal_figure(4.6, 3.6)
+    found.period.plot(x="nu0", y="nu1", ax=figure.subplots(), cmap="cividis", vmax=20)
+    return figure
+
+
+GALLERY = [model, region_map, history, phase_plane, diagram, basins]
+GALLERY += [portrait, curve, period_map, vector_field, friction_laws]
+
+# --- bifurcations ---------------------------------------------------------------------------------
+
+
+class Case(NamedTuple):
+    """A kind of bifurcation in one parameter: its oscillators, where it is, and to what sides."""
+
+    condition: AbstractCondition
+    make: Callable
+    symbol: str
+    guess: float
+    before: float
+    after: float
+
+
+class Lorentz(jb.AbstractFriction):
+    """mu(r) = kinetic + (static - kinetic)/(1 + (r/width)^2), steepest away from r = 0."""
+
+    static: float
+    kinetic: float
+    width: float
+
+    def mu(self, speed):
+        """Kinetic friction coefficient."""
+        return self.kinetic + (self.static - self.kinetic) / (1 + (speed / self.width) ** 2)
+
+
+def bell_shaped(nu):
+    """One belt with a law that is steepest at some speed."""
+    return jb.Oscillator(0.4, (jb.Belt(nu, Lorentz(1.0, 0.6, 0.4)),))
+
+
+def weakly_held(load):
+    """Two belts, of which belt 1 can hold little."""
+    belts = [(-0.1, 0.4, 12.0, 1.1), (0.035, 0.3, 4.0, load)]
+    return jb.Oscillator(
+        0.45, [jb.Belt(nu, jb.Conti(1.0, p1, p3), load=load) for nu, p1, p3, load in belts]
+    )
+
+
+def overlapping(sigma1):
+    """Belt 0 touches to the left of sigma1, belt 1 to the right of 0."""
+    return jb.presets.class_d(0.35, 0.2, 0.0, sigma1)
+
+
+def both(nu):
+    """The paper's class (b) with nu1 = 0.35."""
+    return jb.presets.class_b(nu, 0.35)
+
+
+CASES = {
+    "Hopf": Case(jb.Hopf(), jb.presets.class_a, r"\nu_0", 0.18, 0.2, 0.165),
+    "NonsmoothFold": Case(jb.NonsmoothFold(0), jb.presets.class_a, r"\nu_0", 0.26, 0.25, 0.28),
+    "GrazingSliding": Case(jb.GrazingSliding(0), both, r"\nu_0", -0.45, -0.40, -0.50),
+    "CrossingSliding": Case(jb.CrossingSliding(1), weakly_held, "u_{01}", 0.3, 0.2, 0.4),
+    "SlidingExchange": Case(jb.SlidingExchange((0, 1)), both, r"\nu_0", 0.36, 0.42, 0.28),
+    "SuddenSliding": Case(jb.SuddenSliding(0), both, r"\nu_0", 0.02, 0.1, -0.05),
+    "BeltAtRest": Case(
+        jb.BeltAtRest(1),
+        lambda nu: jb.presets.class_d(-0.47, nu, 0.14, 1.18),
+        r"\nu_1",
+        0.01,
+        -0.05,
+        0.05,
+    ),
+    "FoldOfCycles": Case(jb.FoldOfCycles(), bell_shaped, r"\nu_0", 0.49, 0.49, 0.51),
+    "GrazingEdge": Case(jb.GrazingEdge(0), overlapping, r"\sigma_1", 0.5, 0.45, 0.58),
+    "CornerCollision": Case(jb.CornerCollision(0), overlapping, r"\sigma_1", 0.61, 0.56, 0.66),
+    "BoundaryEquilibrium": Case(
+        jb.BoundaryEquilibrium(0), overlapping, r"\sigma_1", 0.73, 0.66, 0.82
+    ),
+    "PseudoHopf": Case(jb.PseudoHopf(0), overlapping, r"\sigma_1", 0.91, 0.87, 1.0),
+}
+
+
+def bifurcation(case: Case) -> Figure:
+    """Phase portraits before, at and after a point, in one window."""
+    point = jb.refine(case.condition, case.make, at=case.guess)
+    assert point.status == jb.Status.OK, point
+    value = float(point.value)
+    print(f"  {point.kind}: {value:.6f}")
+    before, after = (jb.portrait(case.make(at)) for at in (case.before, case.after))
+    osc = case.make(value)
+    cycles = [[*one.cycles, *one.unstable] for one in (before, after)]
+    cycles.insert(1, _cycles_at(osc, point, [*before.cycles, *after.cycles]))
+    rests = [before.equilibria, _at_the_point(jb.equilibria(osc)), after.equilibria]
+    window = _window_of([c for some in cycles for c in some], rests)
+    figure = journal_figure(7.2, 3.0)
+    axes = figure.subplots(1, 3, sharex=True, sharey=True)
+    titles = (f"${case.symbol} = {case.before:g}$", f"${case.symbol} = {value:.5g}$")
+    titles = (*titles, f"${case.symbol} = {case.after:g}$")
+    oscillators = (before.oscillator, osc, after.oscillator)
+    for ax, osc, some, rest, title in zip(axes, oscillators, cycles, rests, titles):
+        jb.plot_phase_portrait(osc, cycles=some, equilibria=rest, ax=ax, **window)
+        ax.set_title(title)
+        ax.label_outer()
+    draw_key(figure)
+    return figure
+
+
+def _cycles_at(osc: jb.Oscillator, point: jb.BifurcationPoint, beside: list[jb.Cycle]):
+    """The cycle at a point, those that the attracting ones beside it lead to, the unstable one."""
+    found = [jb.find_cycle(osc, y0=one.sample(2)[0]) for one in beside]
+    found = [point.cycle, *found, jb.unstable_cycle(osc)]
+    kept: list[jb.Cycle] = []
+    for one in found:
+        if int(one.status) == jb.Status.OK:
+            # One that is neutral at the point settles slowly, and is not told to many digits.
+            again = any(abs(float(one.x1_max) - float(other.x1_max)) < 1e-2 for other in kept)
+            kept += [] if again else [one]
+    return kept
+
+
+def _at_the_point(rests: jb.Equilibria) -> jb.Equilibria:
+    """Equilibria; what is neutral is drawn as unstable, whatever rounding says of it."""
+    neutral = np.abs(np.asarray(rests.rate)) < 1e-6
+    return eqx.tree_at(lambda rows: rows.stable, rests, np.asarray(rests.stable) & ~neutral)
+
+
+def _window_of(cycles: list[jb.Cycle], rests: list[jb.Equilibria]) -> dict:
+    """A window that holds all cycles and equilibria, with a margin, and the axis x2 = 0."""
+    paths = [np.asarray(cycle.sample(400)) for cycle in cycles]
+    ends = [np.asarray(x) for rest in rests for x in (rest.x1_lower, rest.x1_upper)]
+    x1 = np.concatenate([*(path[:, 0] for path in paths), *ends])
+    x2 = np.concatenate([*(path[:, 1] for path in paths), [0.0]])
+    if not paths:
+        x2 = np.array([-0.5, 0.5])
+    margins = [max(0.08 * np.ptp(x), 0.05) for x in (x1, x2)]
+    limits = [(x.min() - margin, x.max() + margin) for x, margin in zip((x1, x2), margins)]
+    return {"xlim": limits[0], "ylim": limits[1]}
+
+
+def main(names: list[str]) -> None:
+    """Draws the pictures of these names, or all."""
+    drawings = {draw.__name__: draw for draw in GALLERY}
+    drawings |= {name: lambda case=case: bifurcation(case) for name, case in CASES.items()}
+    for name in names or drawings:
+        print(name, flush=True)
+        with journal_style():
+            figure = drawings[name]()
+            figure.savefig(PICTURES / f"{name}.png", dpi=180, pil_kwargs={"optimize": True})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
