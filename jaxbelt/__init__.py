@@ -10,7 +10,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     numerics/       compiling
     checks          arguments, checked at the public edge
     numerics/       derivatives extrapolation newton continuation roots
-    model/          friction oscillator parameters variations modes events equilibria
+    model/          friction oscillator machine parameters variations modes events equilibria
     presets         the published systems
     kernel/         lanes step events rounds
     motion/         integrators arcs sensitivities sampling batches runs smoothing simulate
@@ -21,7 +21,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     bifurcations/   labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   path scan refine curves diagrams switch_folds
     inverse/        selection record fit design
-    plotting/       style phase diagrams sweeps model draw
+    si              results in SI units
+    plotting/       style phase diagrams sweeps model draw si
     paper           the paper's table and figures
     __init__        the public names
     commands/       options reproduce simulate diagram map sweep basins verify
@@ -65,9 +66,11 @@ from .inverse.design import Design, design, distance_to
 from .inverse.fit import Fit, fit
 from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
 from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck
+from .model.machine import Machine, PhysicalBelt, Units
 from .model.oscillator import Belt, Oscillator
 from .motion.simulate import Arcs, Events, Trajectory, simulate
 from .results import EventKind, Status, describe, draw_with
+from .si import in_si
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.datasets import decoded
 from .sweeps.moments import AtEvents, AtExtrema, AtSection, AtTimes
@@ -78,6 +81,7 @@ from .sweeps.sweep import Explanation, explain, sweep
 if TYPE_CHECKING:
     from .plotting.model import plot_friction_law
     from .plotting.phase import plot_phase_portrait, plot_time_history, plot_vector_field
+    from .plotting.si import plot_in_si
     from .plotting.sweeps import plot_basins
 
 __version__ = importlib.metadata.version("jaxbelt")
@@ -113,8 +117,10 @@ __all__ = [
     "GrazingEdge",
     "GrazingSliding",
     "Hopf",
+    "Machine",
     "NonsmoothFold",
     "Oscillator",
+    "PhysicalBelt",
     "Portrait",
     "PseudoHopf",
     "RegionMap",
@@ -125,6 +131,7 @@ __all__ = [
     "Stribeck",
     "SuddenSliding",
     "Trajectory",
+    "Units",
     "Verified",
     "amplitude",
     "attractors",
@@ -143,11 +150,13 @@ __all__ = [
     "find_cycle",
     "fit",
     "gap",
+    "in_si",
     "lyapunov_coefficient",
     "peak",
     "period",
     "plot_basins",
     "plot_friction_law",
+    "plot_in_si",
     "plot_phase_portrait",
     "plot_time_history",
     "plot_vector_field",
@@ -180,9 +189,9 @@ draw_with(_with_matplotlib)
 
 def __getattr__(name: str) -> Any:
     if name.startswith("plot_") and name in __all__:
-        from .plotting import model, phase, sweeps
+        from .plotting import model, phase, si, sweeps
 
-        return next(getattr(m, name) for m in (model, phase, sweeps) if hasattr(m, name))
+        return next(getattr(m, name) for m in (model, phase, si, sweeps) if hasattr(m, name))
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

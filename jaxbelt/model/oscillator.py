@@ -38,12 +38,7 @@ from ..checks import (
     require_own_threads,
 )
 from ..numerics.compiling import traced_once
-from .friction import AbstractFriction
-
-
-def _as_friction(law: Any) -> AbstractFriction:
-    require(isinstance(law, AbstractFriction), "friction", "a law such as jb.Conti(...)", repr(law))
-    return law
+from .friction import AbstractFriction, as_friction
 
 
 class Belt(eqx.Module):
@@ -55,7 +50,7 @@ class Belt(eqx.Module):
     """
 
     velocity: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "velocity"))
-    friction: AbstractFriction = eqx.field(converter=_as_friction)
+    friction: AbstractFriction = eqx.field(converter=as_friction)
     load: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "load"), default=1.0)
     lower: Float[Array, ""] = eqx.field(
         converter=lambda value: as_array(value, "lower"), default=-float("inf")

@@ -180,7 +180,9 @@ class Attractor(Observer):
         amplitude = loop.x1_max - loop.x1_min
         left = way_left(change, loop.change)
         moved, close = jnp.abs(lanes.x1 - loop.mark.x1), amplitude * REPEATED
-        stands = moved < self.STANDS * tol * amplitude
+        # Below the tolerance, too, a top may be on its way, as in every loop a little less.
+        on_its_way = (change * loop.change > 0) & (moved * left < amplitude)
+        stands = (moved < self.STANDS * tol * amplitude) & ~on_its_way
         # The moves of a slow spiral around a pseudo-focus shrink like the square of its size.
         converged = (moved * left <= close) | stands & (amplitude > jnp.sqrt(tol))
         exact = self.EXACT * amplitude
