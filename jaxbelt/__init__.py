@@ -22,7 +22,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     bifurcations/   path scan refine curves diagrams switch_folds
     inverse/        selection record fit design
     si              results in SI units
-    plotting/       style phase diagrams sweeps model draw si
+    plotting/       style phase diagrams sweeps model draw si explorer
     paper           the paper's table and figures
     __init__        the public names
     commands/       options reproduce simulate diagram map sweep basins verify
@@ -79,6 +79,7 @@ from .sweeps.store import Verified, verify
 from .sweeps.sweep import Explanation, explain, sweep
 
 if TYPE_CHECKING:
+    from .plotting.explorer import explore
     from .plotting.model import plot_friction_law
     from .plotting.phase import plot_phase_portrait, plot_time_history, plot_vector_field
     from .plotting.si import plot_in_si
@@ -147,6 +148,7 @@ __all__ = [
     "energy_fed",
     "equilibria",
     "explain",
+    "explore",
     "find_cycle",
     "fit",
     "gap",
@@ -188,12 +190,17 @@ draw_with(_with_matplotlib)
 
 
 def __getattr__(name: str) -> Any:
-    if name.startswith("plot_") and name in __all__:
-        from .plotting import model, phase, si, sweeps
+    if name in _drawing():
+        from .plotting import explorer, model, phase, si, sweeps
 
-        return next(getattr(m, name) for m in (model, phase, si, sweeps) if hasattr(m, name))
+        modules = (explorer, model, phase, si, sweeps)
+        return next(getattr(m, name) for m in modules if hasattr(m, name))
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *(name for name in __all__ if name.startswith("plot_"))]
+    return [*globals(), *_drawing()]
+
+
+def _drawing() -> list[str]:
+    return [name for name in __all__ if name.startswith("plot_") or name == "explore"]
