@@ -13,7 +13,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     checks          arguments, checked at the public edge
     tables          results as tables
     numerics/       derivatives extrapolation newton continuation roots
-    model/          friction oscillator parameters variations modes events equilibria
+    model/          friction oscillator machine parameters variations modes events equilibria
     presets         the published systems
     kernel/         lanes step events rounds
     motion/         integrators arcs sensitivities sampling batches runs smoothing simulate
@@ -24,7 +24,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     bifurcations/   special labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   path scan refine curves faces regions diagrams switch_folds
     inverse/        selection record fit design
+    si              results in SI units
     plotting/       style phase histories points diagrams regions sweeps inverse model draw
+    plotting/       si explorer
     paper           the paper's table and figures
     api             the public names
     __init__        the same, imported when the first of them is used
@@ -52,11 +54,12 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from . import api
 
-    if name.startswith("plot_") and name in api.__all__:
+    if name in api.__all__ and (name.startswith("plot_") or name == "explore"):
         # Matplotlib is imported when something is drawn, not before.
-        from .plotting import model, phase, sweeps
+        from .plotting import explorer, model, phase, si, sweeps
 
-        return next(getattr(m, name) for m in (model, phase, sweeps) if hasattr(m, name))
+        modules = explorer, model, phase, si, sweeps
+        return next(getattr(m, name) for m in modules if hasattr(m, name))
     if name == "__all__" or name in api.__all__:
         globals()[name] = value = getattr(api, name)
         return value

@@ -38,9 +38,11 @@ from .inverse.design import Design, design, distance_to
 from .inverse.fit import Fit, fit
 from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
 from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck
+from .model.machine import Machine, PhysicalBelt, Units
 from .model.oscillator import Belt, Oscillator
 from .motion.simulate import Arcs, Events, Trajectory, simulate
 from .results import EventKind, Status, describe
+from .si import in_si
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.datasets import decoded
 from .sweeps.moments import AtEvents, AtExtrema, AtSection, AtTimes
@@ -49,8 +51,10 @@ from .sweeps.store import Verified, verify
 from .sweeps.sweep import Explanation, explain, sweep
 
 if TYPE_CHECKING:
+    from .plotting.explorer import explore
     from .plotting.model import plot_friction_law
     from .plotting.phase import plot_phase_portrait, plot_time_history, plot_vector_field
+    from .plotting.si import plot_in_si
     from .plotting.sweeps import plot_basins, plot_sweep
 
 __all__ = [
@@ -84,8 +88,10 @@ __all__ = [
     "GrazingEdge",
     "GrazingSliding",
     "Hopf",
+    "Machine",
     "NonsmoothFold",
     "Oscillator",
+    "PhysicalBelt",
     "Portrait",
     "PseudoHopf",
     "RegionMap",
@@ -96,6 +102,7 @@ __all__ = [
     "Stribeck",
     "SuddenSliding",
     "Trajectory",
+    "Units",
     "Verified",
     "amplitude",
     "attractors",
@@ -111,14 +118,17 @@ __all__ = [
     "energy_fed",
     "equilibria",
     "explain",
+    "explore",
     "find_cycle",
     "fit",
     "gap",
+    "in_si",
     "lyapunov_coefficient",
     "peak",
     "period",
     "plot_basins",
     "plot_friction_law",
+    "plot_in_si",
     "plot_phase_portrait",
     "plot_sweep",
     "plot_time_history",

@@ -50,6 +50,10 @@ class AbstractFriction(eqx.Module):
         """mu(speed) as (numerator, denominator), denominator > 0; kernels divide last."""
         return self.mu(speed), jnp.ones_like(speed)
 
+    def in_units_of(self, speed: Array) -> "AbstractFriction":
+        """The same law for speeds that are given in units of `speed`; see `Machine`."""
+        return LawInUnits(self, speed)
+
     def check(self, owner: str) -> None:
         """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
         check_nonnegative(self.static, f"static of {owner}")
@@ -87,6 +91,42 @@ def check_law(law: AbstractFriction) -> None:
     _traced.add(kind)
 
 
+def as_friction(law: Any) -> AbstractFriction:
+    """The law, or a `ValueError` where it is none."""
+    fits = isinstance(law, AbstractFriction)
+    require_value(fits, "friction", "a law such as jb.Conti(...)", law)
+    check_law(law)
+    return law
+
+
+class LawInUnits(AbstractFriction):
+    """A law that takes its speeds in another unit: mu(r) is law.mu(unit r)."""
+
+    law: AbstractFriction
+    unit: Array
+
+    def __init__(self, law: AbstractFriction, unit: Array):
+        self.law, self.unit = law, unit
+
+    # The law's own: a copy would be a parameter of its own.
+    @property
+    def static(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.law.static
+
+    def fraction(self, speed: Array) -> tuple[Array, Array]:
+        return self.law.fraction(self.unit * speed)
+
+    def mu(self, speed: Array) -> Array:
+        """Kinetic friction coefficient of the law at unit times the speed, any shape."""
+        return self.law.mu(self.unit * speed)
+
+    def in_units_of(self, speed: Array) -> AbstractFriction:
+        return LawInUnits(self.law, self.unit * speed)
+
+    def check(self, owner: str) -> None:
+        type(self.law).check(self.law, owner)
+
+
 class Conti(AbstractFriction):
     """Conti's law, eqs. (7) and (16) of the paper: mu falls hyperbolically with the speed.
 
@@ -109,6 +149,10 @@ class Conti(AbstractFriction):
         check_nonnegative(self.residual, f"residual of {owner}")
         check_nonnegative(self.steepness, f"steepness of {owner}")
         check_finite(self.quadratic, f"quadratic of {owner}")
+
+    def in_units_of(self, speed: Array) -> AbstractFriction:
+        steepness, quadratic = self.steepness * speed, self.quadratic * speed**2
+        return Conti(self.static, self.residual, steepness, quadratic)
 
     def fraction(self, speed: Array) -> tuple[Array, Array]:
         mus, p1, p2, p3 = self.static, self.residual, self.quadratic, self.steepness
@@ -141,6 +185,9 @@ class Coulomb(AbstractFriction):
     def check(self, owner: str) -> None:
         _check_static_and_kinetic(self.static, self.kinetic, owner)
 
+    def in_units_of(self, speed: Array) -> AbstractFriction:
+        return self
+
     def mu(self, speed: Array) -> Array:
         """Kinetic friction coefficient, the same at every speed (any shape)."""
         return jnp.broadcast_to(self.kinetic, jnp.shape(speed))
@@ -165,6 +212,9 @@ class Stribeck(AbstractFriction):
     def check(self, owner: str) -> None:
         _check_static_and_kinetic(self.static, self.kinetic, owner)
         check_positive(self.velocity, f"velocity of {owner}")
+
+    def in_units_of(self, speed: Array) -> AbstractFriction:
+        return Stribeck(self.static, self.kinetic, self.velocity / speed)
 
     def mu(self, speed: Array) -> Array:
         """Kinetic friction coefficient mu(r) at speed r >= 0, dimensionless, any shape."""

@@ -40,14 +40,7 @@ from ..checks import (
     require_value,
 )
 from ..numerics.compiling import traced_once
-from .friction import AbstractFriction, check_law
-
-
-def _as_friction(law: Any) -> AbstractFriction:
-    fits = isinstance(law, AbstractFriction)
-    require_value(fits, "friction", "a law such as jb.Conti(...)", law)
-    check_law(law)
-    return law
+from .friction import AbstractFriction, as_friction
 
 
 class Belt(eqx.Module):
@@ -59,7 +52,7 @@ class Belt(eqx.Module):
     """
 
     velocity: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "velocity"))
-    friction: AbstractFriction = eqx.field(converter=_as_friction)
+    friction: AbstractFriction = eqx.field(converter=as_friction)
     load: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "load"), default=1.0)
     lower: Float[Array, ""] = eqx.field(
         converter=lambda value: as_array(value, "lower"), default=-float("inf")

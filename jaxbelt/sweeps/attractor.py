@@ -137,14 +137,15 @@ class Attractor(Observer):
         tops = jnp.where(released, 0, loop.tops + jnp.where(top, 1, 0))
         section = released | (top & (tops > self.SMOOTH))
         change = lanes.x1 - loop.previous
-        kind = self._kind(seen, lanes, passage, section, released, change, tol)
+        met, kind = self._kind(seen, lanes, passage, section, released, change, tol)
         going_on = (loop.kind == UNDECIDED) & (lanes.run >= 0)
         kind = materialise(jnp.where(going_on, kind, UNDECIDED), one).astype(loop.kind.dtype)
         found = kind != UNDECIDED
         resting = found & (kind != CYCLE)
         cycle = found & ~resting
         mark = loop.mark
-        renewed, new = mark.renewed(lanes, section & ~found, one)
+        # Where it comes back and has not settled, the next loop is compared with this one.
+        renewed, new = mark.renewed(lanes, section & ~found, one, met)
         # An attractor at rest is a point; a new mark begins a new loop.
         fresh = new | resting
         memory = _LoopSoFar(
@@ -174,18 +175,25 @@ class Attractor(Observer):
             memory=memory,
         )
 
-    def _kind(self, loop: _LoopSoFar, lanes, passage, section, released, change, tol) -> Array:
-        """What the lanes are found to lead to; section: lanes in a state to compare with marks;
-        released: those at the end of a stick phase; change: of x1 since the last top."""
+    def _kind(
+        self, loop: _LoopSoFar, lanes, passage, section, released, change, tol
+    ) -> tuple[Array, Array]:
+        """Whether the lanes are back at their marks, and what they are found to lead to.
+
+        section: lanes in a state to compare with marks; released: those at the end of a stick
+        phase; change: of x1 since the last top.
+        """
         amplitude = loop.x1_max - loop.x1_min
         left = way_left(change, loop.change)
         moved, close = jnp.abs(lanes.x1 - loop.mark.x1), amplitude * REPEATED
-        stands = moved < self.STANDS * tol * amplitude
+        # Below the tolerance, too, a top may be on its way, as in every loop a little less.
+        on_its_way = (change * loop.change > 0) & (moved * left < amplitude)
+        stands = (moved < self.STANDS * tol * amplitude) & ~on_its_way
         # The moves of a slow spiral around a pseudo-focus shrink like the square of its size.
         converged = (moved * left <= close) | stands & (amplitude > jnp.sqrt(tol))
         exact = self.EXACT * amplitude
-        repeats = section & loop.mark.met_by(lanes, jnp.where(released, exact, close))
-        repeats = repeats & (released | converged)
+        met = section & loop.mark.met_by(lanes, jnp.where(released, exact, close))
+        repeats = met & (released | converged)
 
         kind = jnp.where(repeats, CYCLE, UNDECIDED)
         # Motion that the tolerance does not resolve is at rest if it repeats or shrinks; but an
@@ -194,7 +202,7 @@ class Attractor(Observer):
         shrinks = section & (change < 0) & (loop.change < 0)
         kind = jnp.where(small & ~released & (repeats | shrinks), EQUILIBRIUM, kind)
         kind = jnp.where(passage.captured | passage.rests, EQUILIBRIUM, kind)
-        return jnp.where(passage.forever, STUCK_FOR_EVER, kind)
+        return met, jnp.where(passage.forever, STUCK_FOR_EVER, kind)
 
     def watch_rarely(self, osc, lanes, one):
         loop: _LoopSoFar = lanes.memory

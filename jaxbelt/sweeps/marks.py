@@ -37,10 +37,16 @@ class Mark(eqx.Module):
         same = (lanes.x2 == self.x2) & (code_of(lanes.mode) == self.code)
         return same & (jnp.abs(lanes.x1 - self.x1) <= close)
 
-    def renewed(self, lanes: Lanes, at: Array, one: Array) -> tuple["Mark", Array]:
-        """The marks when the lanes `at` are in a state to compare, and which of them are new."""
+    def renewed(
+        self, lanes: Lanes, at: Array, one: Array, met: Array | bool = False
+    ) -> tuple["Mark", Array]:
+        """The marks when the lanes `at` are in a state to compare, and which of them are new.
+
+        met: lanes that have come back to their mark, and are to go on from there.
+        """
         age = self.age + jnp.where(at, 1, 0)
-        new = materialise(at & (age >= self.limit), one)
+        old = age >= self.limit
+        new = materialise(at & (old | met), one)
         here = Mark(
             lanes.x1,
             lanes.x2,
@@ -48,6 +54,6 @@ class Mark(eqx.Module):
             lanes.t,
             lanes.events,
             jnp.zeros_like(age),
-            jnp.maximum(2 * self.limit, 1),
+            jnp.where(old, jnp.maximum(2 * self.limit, 1), self.limit),
         )
         return select(new, here, eqx.tree_at(lambda m: m.age, self, age)), new

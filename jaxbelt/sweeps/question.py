@@ -4,11 +4,13 @@ import functools
 import hashlib
 import importlib.metadata
 import inspect
+import itertools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -142,9 +144,10 @@ class Question:
         told["oscillator"] = ", ".join(parameters)
         told["make"] = _hash(" ".join(f"{x:.10e}" for x in rows.ravel().tolist()).encode())
         for i, belt in enumerate(grid.example.belts):
-            law = type(belt.friction)
             shown = _plain(repr(belt.friction))
-            told[f"the law of belt {i}"] = f"{shown} of {law.__qualname__}, {_source(law)}"
+            kinds = _kinds_in(belt.friction)
+            names = " with ".join(f"{kind.__qualname__}, {_source(kind)}" for kind in kinds)
+            told[f"the law of belt {i}"] = f"{shown} of {names}"
         told |= {name: repr(value) for name, value in self.numbers.items()}
         told["observe"] = repr(self.observe)
         if not isinstance(self.observe, str):
@@ -191,6 +194,15 @@ def _name_of_function(make: Callable) -> str:
 def _value(value: Any) -> str:
     """An argument that was fixed; arrays of one number as that number."""
     return repr(float(value)) if np.ndim(value) == 0 and hasattr(value, "dtype") else repr(value)
+
+
+def _kinds_in(module: eqx.Module) -> list[type]:
+    """The class of a module, and those of the modules that it is made of."""
+    parts = jax.tree.leaves(
+        list(vars(module).values()), is_leaf=lambda part: isinstance(part, eqx.Module)
+    )
+    nested = (_kinds_in(part) for part in parts if isinstance(part, eqx.Module))
+    return [type(module), *itertools.chain.from_iterable(nested)]
 
 
 def _plain(text: str) -> str:

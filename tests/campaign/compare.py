@@ -27,8 +27,8 @@ STEPS = 30
 DISTURBED = 6
 #: Statuses of runs that came to an end.
 ORDINARY = (engine.OK, engine.STUCK_FOREVER, engine.PSEUDO_FOCUS)
-#: The sweep's status of a run that takes too many steps.
-GAVE_UP = 4
+#: The package's statuses of runs that take too many segments or steps.
+GAVE_UP = (3, 4)
 GOOD = ("same", "tolerance", "corner")
 
 
@@ -37,7 +37,7 @@ def run(case, **options):
 
 
 def neighbours(case, by=NEIGHBOUR, joint=24, seed=0):
-    """The case with the start or a parameter moved up or down, then all of them at random."""
+    """The case with the start or a parameter moved up or down, then many of them at random."""
     osc, n = case.oscillator, len(case.oscillator.belts)
 
     def moved(shifts):
@@ -79,6 +79,9 @@ def neighbours(case, by=NEIGHBOUR, joint=24, seed=0):
     for k in range(joint):
         shifts = by * rng.uniform(-1, 1, size)
         yield moved(tied(shifts) if k % 2 else shifts)
+    for _ in range(joint):
+        # A run may come to several corners, and lie as it is in some of them.
+        yield moved(by * rng.uniform(-1, 1, size) * (rng.uniform(size=size) < 0.3))
 
 
 def spread(case, noise, reference, states):
@@ -99,7 +102,7 @@ def difference(case, told, mine, tol):
     if told.status != mine.status and focus in (told.status, mine.status):
         # Both may be right: one tells sooner than the other that a run converges.
         return _focus_difference(case, told, mine)
-    if told.status == GAVE_UP and mine.status == engine.BUDGET:
+    if told.status in GAVE_UP and mine.status == engine.BUDGET:
         return None  # too many events for both, and both say so
     if told.status != mine.status:
         return f"status {told.status}, not {mine.status}"
@@ -202,15 +205,22 @@ def judge(case, told, tol):
     if _rest_alike(case, told, mine):
         return "tolerance", mine
     grazing = case.distance is not None  # that is what it is made for: no excuse
+    others = []
     for seed in range(DISTURBED):
         for noise in (tol,) if grazing else (tol, 10 * tol):
             disturbed = run(case, noise=noise, seed=seed)
+            others += [disturbed] if noise == tol else []
             if disturbed.sequence != mine.sequence or disturbed.status != mine.status:
                 if difference(case, told, disturbed, 10 * noise) is None:
                     return "tolerance", mine
+    if what == "state" and not grazing and _among(told, others, mine):
+        return "tolerance", mine
     if not grazing and (mine.margin <= CORNER or mine.status == engine.CORNER):
         if told.status in ORDINARY and _rests_unstably(case):
             return "corner", mine
+        if what == "sequence" and _in_turn(told.events) == _in_turn(_rows(mine)):
+            if difference(case, replace(told, events=None), mine, tol) is None:
+                return "corner", mine
         for other in neighbours(case):
             his = run(other)
             if his.status == engine.CORNER:
@@ -219,6 +229,32 @@ def judge(case, told, tol):
                 return "corner", mine
         return f"corner: {what}", mine
     return what, mine
+
+
+def _among(told, others, mine):
+    """Whether a state is one of the disturbed runs', none of which has the sequence of the run.
+
+    A run of some ten thousand events has its sequence to no tolerance.
+    """
+    if any(run.sequence == mine.sequence for run in others):
+        return False
+    room = max(np.max(np.abs(np.array(run.y_end) - mine.y_end)) for run in others)
+    return bool(np.max(np.abs(np.array([told.x1, told.x2]) - mine.y_end)) <= room)
+
+
+def _rows(mine):
+    return [(t, k, b, *y) for t, (k, b), y in zip(mine.t, mine.sequence, mine.y)]
+
+
+def _in_turn(events):
+    """Kinds and belts of events; of those that happen at one instant in the order of belts."""
+    found, instant = [], -np.inf
+    for t, kind, belt, *_ in events:
+        if t - instant > CORNER:
+            found.append([])
+        instant = t
+        found[-1].append((int(kind), int(belt)))
+    return [sorted(together) for together in found]
 
 
 def _rest_alike(case, told, mine):
@@ -264,6 +300,8 @@ def judge_derivative(case, told, mine, direction, tol):
             disturbed = run(other, noise=noise, seed=i)
             if disturbed.sequence == mine.sequence:
                 others.append(derivatives.derivative(other, disturbed, direction))
+    # There is none where one of them is tangent to what it meets.
+    others = [other for other in others if np.all(np.isfinite(other))]
     far = np.max(np.abs(np.array(others) - right)) if others else 0.0
     good = np.all(np.abs(told - right) <= STEPS * far + 1e-7 * size)
     return ("same" if good else "derivative"), right

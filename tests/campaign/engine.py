@@ -866,6 +866,8 @@ def _flow(z, w, B, s, x1, x2, duration, steps):
 def flow(osc, mode, y, duration, step=0.01):
     """The state after a time, negative too, in the field of a slip mode; no events are looked
     for. NaN where the field ends."""
+    if not np.all(np.isfinite([*y, step])):
+        return np.nan, np.nan
     steps = max(1, round(abs(duration) / step))
     mode = np.array(mode, np.int64)
     return _flow(osc.damping, osc.omega, osc.table(), mode, *map(float, y), duration, steps)

@@ -1,0 +1,166 @@
+"""A machine in SI units, and the dimensionless oscillator that it is.
+
+    m X'' = -k X - c X' + sum over touching belts of  N_i mu_i(|R_i|) sgn(R_i),    R_i = V_i - X'
+
+One unit of time is sqrt(m/k); one of length is the deflection of the spring under the largest
+normal force, max N_i / k; velocity, force and energy follow from these. So the oscillator has
+omega = 1, its largest load is 1, and its laws take speeds in the unit of velocity.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ..checks import (
+    as_array,
+    check_finite,
+    check_nonnegative,
+    check_positive,
+    is_concrete,
+    number,
+    require,
+)
+from .friction import AbstractFriction, as_friction
+from .oscillator import Belt, Oscillator, check_oscillator
+
+
+class Units(eqx.Module):
+    """How much one of a dimensionless quantity of a `Machine` is.
+
+    time in s, length in m, velocity in m/s, force in N, energy in J.
+    """
+
+    time: Array
+    length: Array
+    velocity: Array
+    force: Array
+    energy: Array
+
+
+class PhysicalBelt(eqx.Module):
+    """A belt of a `Machine`, in SI units; it touches the mass while lower < X < upper.
+
+    Arguments, scalars: velocity V in m/s; friction, a law that takes speeds in m/s (`Conti`'s
+    steepness is then in s/m, `Stribeck`'s velocity in m/s); normal_force N >= 0 in newtons; lower
+    and upper, displacements in m from where the spring is at rest (default unbounded).
+    `ValueError` names a value that is not possible.
+    """
+
+    velocity: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "velocity"))
+    friction: AbstractFriction = eqx.field(converter=as_friction)
+    normal_force: Float[Array, ""] = eqx.field(
+        converter=lambda value: as_array(value, "normal_force")
+    )
+    lower: Float[Array, ""] = eqx.field(
+        converter=lambda value: as_array(value, "lower"), default=-float("inf")
+    )
+    upper: Float[Array, ""] = eqx.field(
+        converter=lambda value: as_array(value, "upper"), default=float("inf")
+    )
+
+    def __check_init__(self):
+        check_finite(self.velocity, "velocity")
+        check_nonnegative(self.normal_force, "normal_force")
+        if is_concrete((self.lower, self.upper)):
+            require(not np.isnan(self.lower), "lower", "a number", self.lower)
+            ordered = np.asarray(self.lower) < np.asarray(self.upper)
+            require(ordered, "lower", f"< upper = {self.upper}", self.lower)
+
+    def __repr__(self) -> str:
+        return (
+            f"PhysicalBelt(velocity={number(self.velocity)} m/s, friction={self.friction!r}, "
+            f"normal_force={number(self.normal_force)} N, lower={number(self.lower)} m, "
+            f"upper={number(self.upper)} m)"
+        )
+
+
+class Machine(eqx.Module):
+    """A mass on a spring and a dashpot, in contact with one belt or more, in SI units.
+
+    Arguments: mass m in kg, stiffness k in N/m, damping c in N s/m, belts (one `PhysicalBelt` or
+    more). `ValueError` names a value that is not possible.
+
+    `oscillator` is the dimensionless `Oscillator`, which all of this package takes; `units` what
+    one of its time, length, velocity, force and energy is; `start(x, v)` and `tau(t)` are what a
+    state and a time are there. `in_si` and `plot_in_si` bring results back. Everything is
+    differentiable by every number of the machine.
+    """
+
+    mass: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "mass"))
+    stiffness: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "stiffness"))
+    damping: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "damping"))
+    belts: tuple[PhysicalBelt, ...] = eqx.field(converter=lambda belts: tuple(belts))
+
+    def __check_init__(self):
+        check_positive(self.mass, "mass")
+        check_positive(self.stiffness, "stiffness")
+        check_finite(self.damping, "damping")
+        require(len(self.belts) > 0, "belts", "at least one PhysicalBelt", "none")
+        for i, belt in enumerate(self.belts):
+            require(isinstance(belt, PhysicalBelt), f"belts[{i}]", "a PhysicalBelt", repr(belt))
+
+    @property
+    def units(self) -> Units:
+        largest = jnp.max(jnp.stack([belt.normal_force for belt in self.belts]))
+        # Without any force on a belt no length stands out.
+        length = jnp.where(largest > 0, largest / self.stiffness, 1.0)
+        time, force = jnp.sqrt(self.mass / self.stiffness), self.stiffness * length
+        return Units(time, length, length / time, force, force * length)
+
+    @property
+    def oscillator(self) -> Oscillator:
+        units = self.units
+        belts = [
+            Belt(
+                belt.velocity / units.velocity,
+                belt.friction.in_units_of(units.velocity),
+                belt.normal_force / units.force,
+                belt.lower / units.length,
+                belt.upper / units.length,
+            )
+            for belt in self.belts
+        ]
+        return Oscillator(self.damping / jnp.sqrt(self.stiffness * self.mass), belts)
+
+    def start(self, displacement: ArrayLike, velocity: ArrayLike) -> tuple[Array, Array]:
+        """The dimensionless state (x1, x2) of a displacement in m and a velocity in m/s."""
+        units = self.units
+        return jnp.asarray(displacement) / units.length, jnp.asarray(velocity) / units.velocity
+
+    def tau(self, time: ArrayLike) -> Array:
+        """The dimensionless time of a time in s."""
+        return jnp.asarray(time) / self.units.time
+
+    def of_oscillator(self, osc: Oscillator) -> "Machine":
+        """This machine with the numbers of a dimensionless oscillator, such as a fit's.
+
+        In the units of this machine, with its mass and stiffness. `ValueError` for another number
+        of belts, and for an omega other than 1.
+        """
+        check_oscillator(osc)
+        require(len(osc.belts) == len(self.belts), "osc", f"of {len(self.belts)} belts", osc)
+        if is_concrete(osc.omega):
+            require(
+                np.asarray(osc.omega) == 1, "omega of osc", "1, as that of every machine", osc.omega
+            )
+        units = self.units
+        belts = [
+            PhysicalBelt(
+                belt.velocity * units.velocity,
+                belt.friction.in_units_of(1 / units.velocity),
+                belt.load * units.force,
+                belt.lower * units.length,
+                belt.upper * units.length,
+            )
+            for belt in osc.belts
+        ]
+        damping = osc.damping * jnp.sqrt(self.stiffness * self.mass)
+        return Machine(self.mass, self.stiffness, damping, belts)
+
+    def __repr__(self) -> str:
+        belts = ", ".join(map(repr, self.belts))
+        return (
+            f"Machine(mass={number(self.mass)} kg, stiffness={number(self.stiffness)} N/m, "
+            f"damping={number(self.damping)} N s/m, belts=({belts},))"
+        )

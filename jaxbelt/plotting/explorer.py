@@ -1,0 +1,146 @@
+"""An oscillator with a slider for each of its numbers, in a notebook: `explore`."""
+
+import io
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+from matplotlib.figure import Figure
+
+from ..checks import as_numbers, check_finite, check_positive
+from ..model.oscillator import Oscillator, check_oscillator
+from ..model.parameters import names_of
+from ..motion.simulate import simulate
+from ..results import Status, describe
+from .model import plot_friction_law
+from .phase import plot_phase_portrait, plot_time_history
+from .style import belt_colour
+
+#: Where the sliders of these numbers end, at least; other numbers go from 0 to 1 at least. They go
+#: to twice the value with which they begin, too.
+RANGES = {
+    "velocity": (-1.0, 1.0),
+    "lower": (-2.0, 2.0),
+    "upper": (-2.0, 2.0),
+    "steepness": (0.0, 20.0),
+    "omega": (0.1, 2.0),
+    "x1": (-4.0, 4.0),
+    "x2": (-3.0, 3.0),
+}
+
+
+class Explorer:
+    """Sliders beside a picture of the motion, which follows them; see `explore`.
+
+    sliders: ipywidgets by name, one for each finite number of the oscillator ("damping",
+    "belts[0].velocity") and for the start ("x1", "x2"); figure: what is drawn; message: how the run
+    ended, or why there is none; widget: all of it. A cell that ends in an explorer shows it.
+    """
+
+    def __init__(self, osc: Oscillator, start: tuple[float, float], t1: float):
+        try:
+            import ipywidgets
+        except ImportError:
+            raise ImportError("explore needs ipywidgets: pip install ipywidgets") from None
+
+        self._leaves, self._structure = jax.tree.flatten(osc)
+        self._names, self._t1 = names_of(osc), t1
+        numbers = dict(zip(self._names, map(float, self._leaves), strict=True))
+        numbers |= {"x1": start[0], "x2": start[1]}
+        self.sliders = {
+            name: _slider(ipywidgets, name, value)
+            for name, value in numbers.items()
+            if np.isfinite(value)
+        }
+        self.figure = Figure(figsize=(8.4, 4.6), dpi=80, layout="constrained")
+        left, right = self.figure.subfigures(1, 2, width_ratios=(1, 1.15))
+        self._axes = *left.subplots(2, height_ratios=(2, 1)), *right.subplots(2, sharex=True)
+        self.message = ipywidgets.Label()
+        self._picture = ipywidgets.Image(format="png")
+        for slider in self.sliders.values():
+            slider.observe(self._follow, names="value")
+        column = ipywidgets.VBox(list(self.sliders.values()))
+        self.widget = ipywidgets.HBox([column, ipywidgets.VBox([self._picture, self.message])])
+        self.redraw()
+
+    @property
+    def oscillator(self) -> Oscillator:
+        """The oscillator that the sliders show; `ValueError` where there can be none."""
+        values = [
+            jnp.asarray(self.sliders[name].value) if name in self.sliders else leaf
+            for name, leaf in zip(self._names, self._leaves, strict=True)
+        ]
+        osc = jax.tree.unflatten(self._structure, values)
+        check_oscillator(osc)
+        return osc
+
+    def redraw(self) -> None:
+        """Draw the motion of the oscillator that the sliders show."""
+        try:
+            osc = self.oscillator
+        except ValueError as error:
+            self.message.value = str(error)
+            return
+        start = self.sliders["x1"].value, self.sliders["x2"].value
+        run = simulate(osc, start, self._t1)
+        portrait, laws, upper, lower = self._axes
+        for axes in self._axes:
+            axes.clear()
+        plot_phase_portrait(osc, run, ax=portrait)
+        _draw_laws(osc, laws)
+        plot_time_history(run, (upper, lower))
+        page = io.BytesIO()
+        self.figure.savefig(page, format="png")
+        # Laid out once: that takes as long as all the rest, and nothing should jump.
+        self.figure.set_layout_engine("none")
+        self._picture.value = page.getvalue()
+        self.message.value = f"{Status(int(run.status)).name}: {describe(run.status)}"
+
+    def _follow(self, _: Any) -> None:
+        self.redraw()
+
+    def _ipython_display_(self) -> None:
+        from IPython.display import display
+
+        display(self.widget)
+
+
+def explore(
+    osc: Oscillator, start: ArrayLike | tuple = (1.5, 0.0), *, t1: ArrayLike = 60.0
+) -> Explorer:
+    """A live picture of an oscillator, in a notebook, with a slider for each of its numbers.
+
+    Phase portrait, time history and friction laws, drawn anew as sliders move. start: (x1, x2) at
+    the beginning; t1: until when it is followed; dimensionless, both. Needs ipywidgets, and raises
+    an `ImportError` without; `ValueError` names an impossible argument.
+    """
+    check_oscillator(osc)
+    state, until = as_numbers(start, "start", (2,)), as_numbers(t1, "t1")
+    check_finite(state, "start")
+    check_positive(until, "t1")
+    return Explorer(osc, (float(state[0]), float(state[1])), float(until))
+
+
+def _slider(ipywidgets: Any, name: str, value: float) -> Any:
+    least, most = RANGES.get(name.rpartition(".")[2], (0.0, 1.0))
+    least, most = min(least, 2 * value), max(most, 2 * value)
+    return ipywidgets.FloatSlider(
+        value,
+        description=name.removeprefix("belts"),
+        min=least,
+        max=most,
+        step=(most - least) / 400,
+        readout_format=".3g",
+        style={"description_width": "9em"},
+    )
+
+
+def _draw_laws(osc: Oscillator, ax: Any) -> None:
+    for number, belt in enumerate(osc.belts):
+        before = len(ax.lines)
+        plot_friction_law(belt.friction, ax, speed=2.0)
+        for line in ax.lines[before:]:
+            line.set_color(belt_colour(number) if len(line.get_xdata()) > 2 else "0.7")
+    ax.set_ylabel(r"$\mu\,\mathrm{sgn}\,\nu_{\mathrm{R}}$")

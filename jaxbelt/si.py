@@ -1,0 +1,209 @@
+"""Results in SI units: `in_si`.
+
+What a number is, is told by its name, as this package gives them. What has another name, such as a
+result of an observable of one's own, stays as it is.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .checks import require
+from .cycles.cycle import Cycle
+from .cycles.functionals import energy_dissipated
+from .model.machine import Machine, Units
+from .model.modes import mode_acceleration, mode_of
+from .model.oscillator import Oscillator
+from .motion.simulate import Trajectory
+from .results import EventKind, Status
+from .sweeps.basins import Basins
+from .sweeps.datasets import flags
+
+if TYPE_CHECKING:
+    import xarray
+
+#: What the variables of this package are, by their names.
+QUANTITIES = {
+    **dict.fromkeys(("t", "t_event", "period", "transient", "stick_duration"), "time"),
+    **dict.fromkeys(("x1", "x1_event", "x1_end", "x1_min", "x1_max", "amplitude"), "length"),
+    **dict.fromkeys(("x2", "x2_event", "x2_end", "x2_min", "x2_max"), "velocity"),
+    "force": "force",
+    "energy": "energy",
+}
+SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
+
+
+def in_si(
+    result: "Trajectory | Cycle | Basins | xarray.Dataset",
+    machine: Machine | Callable[..., Machine],
+) -> "xarray.Dataset":
+    """A result in SI units, as a dataset whose variables carry their units.
+
+    result: of the machine's oscillator, a `Trajectory`, a `Cycle`, `Basins`, or the dataset of a
+    sweep. machine: the `Machine`; where the sweep has axes other than starts, a function of these
+    that returns it, for its units may be others in each run.
+
+    Of a trajectory: `t` in s, `x1` in m, `x2` in m/s, `force`, the friction on the mass, in N
+    (exact formulation only), and `mode` at each sample; `t_event`, `x1_event`, `x2_event`,
+    `event_kind` and `event_belt`. Of a cycle: `period`, `stick_duration` of each belt, `x1_min`,
+    `x1_max`, `x2_min`, `x2_max`, `amplitude`, and `energy`, what friction and dashpot turn into
+    heat in one period. Of a dataset: its own variables, with derivatives by starts and parameters
+    where the units are the same in all runs; results of an observable of one's own stay
+    dimensionless. `TypeError` for anything else.
+    """
+    import xarray
+
+    match result:
+        case Trajectory():
+            return _trajectory(result, _one(machine))
+        case Cycle():
+            return _cycle(result, _one(machine))
+        case Basins():
+            return _dataset(result.dataset, machine)
+        case xarray.Dataset():
+            return _dataset(result, machine)
+    raise TypeError(
+        "result must be a Trajectory, a Cycle, Basins, or the dataset of a sweep, "
+        f"got {type(result).__name__}"
+    )
+
+
+def _one(machine: Any) -> Machine:
+    require(isinstance(machine, Machine), "machine", "a Machine", repr(machine))
+    return machine
+
+
+def _variable(dims: Any, values: Any, name: str, units: Units, long_name: str) -> tuple:
+    quantity = QUANTITIES[name]
+    scaled = np.asarray(values) * np.asarray(getattr(units, quantity))
+    return dims, scaled, {"long_name": long_name, "units": SYMBOLS[quantity]}
+
+
+@jax.jit
+def _friction_force(osc: Oscillator, codes: Array, ys: Array) -> Array:
+    """The force of all belts on the mass, [samples], of modes [samples, belts], in k times length.
+
+    What sets the spring, the dashpot and the inertia in balance; nothing is accelerated where the
+    mass sticks.
+    """
+
+    def at(codes, y):
+        mode, (x1, x2) = mode_of(codes), y
+        a = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
+        return a + x1 + osc.damping * x2
+
+    return jax.vmap(at)(codes.astype(jnp.float64), ys)
+
+
+def _trajectory(run: Trajectory, machine: Machine) -> "xarray.Dataset":
+    import xarray
+
+    units, osc = machine.units, machine.oscillator
+    require(run.ts.ndim == 1, "result", "one trajectory, not a batch", repr(run))
+    belts = len(osc.belts)
+    require(run.modes.shape[-1] == belts, "result", f"of a machine of {belts} belts", repr(run))
+
+    def variable(dims, values, name, long_name):
+        return _variable(dims, values, name, units, long_name)
+
+    events = run.events
+    found = {
+        "x1": variable("t", run.ys[:, 0], "x1", "displacement"),
+        "x2": variable("t", run.ys[:, 1], "x2", "velocity"),
+        "mode": (("t", "belt"), np.asarray(run.modes), {"long_name": "contact with the belt"}),
+        "t_event": variable("event", events.t, "t", "time of the event"),
+        "x1_event": variable("event", events.y[:, 0], "x1", "displacement at the event"),
+        "x2_event": variable("event", events.y[:, 1], "x2", "velocity at the event"),
+        "event_kind": (
+            "event",
+            np.asarray(events.kind, np.int8),
+            flags({kind.value: kind.name.lower() for kind in EventKind}, "int8"),
+        ),
+        "event_belt": ("event", np.asarray(events.belt), {"long_name": "belt of the event"}),
+    }
+    if run.arcs.t.size:
+        force = _friction_force(osc, run.modes, run.ys)
+        found["force"] = variable("t", force, "force", "friction on the mass")
+    time = variable("t", run.ts, "t", "time")
+    attrs = {"status": Status(int(run.status)).name}
+    return xarray.Dataset(found, {"t": time, "belt": np.arange(belts)}, attrs)
+
+
+def _cycle(cycle: Cycle, machine: Machine) -> "xarray.Dataset":
+    import xarray
+
+    require(cycle.unknowns.ndim == 2, "result", "one cycle, not a batch", repr(cycle))
+    told = {
+        "period": ((), cycle.period, "period"),
+        "stick_duration": ("belt", cycle.stick_durations, "time stuck to the belt in one loop"),
+        "x1_min": ((), cycle.x1_min, "smallest displacement"),
+        "x1_max": ((), cycle.x1_max, "largest displacement"),
+        "x2_min": ((), cycle.x2_min, "smallest velocity"),
+        "x2_max": ((), cycle.x2_max, "largest velocity"),
+        "amplitude": ((), (cycle.x1_max - cycle.x1_min) / 2, "half of the span of displacement"),
+        "energy": ((), energy_dissipated(cycle), "energy dissipated in one period"),
+    }
+    units = machine.units
+    found = {
+        name: _variable(dims, values, name, units, long_name)
+        for name, (dims, values, long_name) in told.items()
+    }
+    attrs = {"status": Status(int(cycle.status)).name}
+    return xarray.Dataset(found, {"belt": np.arange(len(machine.belts))}, attrs)
+
+
+def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
+    axes = [str(name) for name in dataset.dims if name in dataset.coords]
+    own = [name for name in axes if name not in ("x1", "x2", "belt")]
+    units = _units_of_runs(dataset, machine, own)
+    vary = sorted(name for name in SYMBOLS if np.ptp(np.asarray(getattr(units, name))) > 0)
+    changed = {}
+    for name in [*map(str, dataset.data_vars), *(axis for axis in axes if axis in QUANTITIES)]:
+        of, _, by = name.removeprefix("d_").partition("_d_") if name[:2] == "d_" else (name, "", "")
+        if of not in QUANTITIES:
+            continue
+        # A unit that varies with a parameter has a derivative, too; and the starts are one axis.
+        fits = not vary or (of == name and name not in axes)
+        require(fits, "result", f"without {name} where the units of {', '.join(vary)} vary", name)
+        unit = getattr(units, QUANTITIES[of])
+        told = {"units": SYMBOLS[QUANTITIES[of]]}
+        if by in QUANTITIES:
+            unit = unit / getattr(units, QUANTITIES[by])
+            told["units"] += f" / ({SYMBOLS[QUANTITIES[by]]})"
+        elif by:
+            told["units"] += f" / (unit of {by})"
+        if name in axes:
+            unit = float(np.ravel(unit)[0])
+        old = dataset[name]
+        values = (old * unit).transpose(*old.dims).values
+        changed[name] = (old.dims, values, old.attrs | told)
+    coordinates = {name: changed.pop(name) for name in axes if name in changed}
+    told = {"units": "SI where a variable says so; else dimensionless"}
+    return dataset.assign(changed).assign_coords(coordinates).assign_attrs(told)
+
+
+def _units_of_runs(dataset: "xarray.Dataset", machine: Any, own: list[str]) -> Units:
+    """The units of every run, arrays over the axes that are not starts."""
+    import xarray
+
+    if isinstance(machine, Machine):
+        expected = f"a function of {', '.join(own)} that returns the Machine of a run"
+        require(not own, "machine", expected, "one Machine")
+        return jax.tree.map(np.asarray, machine.units)
+    require(callable(machine), "machine", "a Machine, or a function that returns one", machine)
+
+    def units(*arguments):
+        found = machine(**dict(zip(own, arguments, strict=True)))
+        require(isinstance(found, Machine), "machine", "a function that returns a Machine", found)
+        return found.units
+
+    if not own:
+        return jax.tree.map(np.asarray, units())
+    grid = xarray.broadcast(*(dataset[name] for name in own))
+    found = jax.vmap(units)(*(jnp.asarray(np.ravel(one)) for one in grid))
+    shape = grid[0].shape
+    return jax.tree.map(lambda leaf: grid[0].copy(data=np.asarray(leaf).reshape(shape)), found)

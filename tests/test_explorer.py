@@ -1,0 +1,40 @@
+"""The live explorer: its sliders are the numbers of an oscillator, and moving one redraws."""
+
+import pytest
+
+import jaxbelt as jb
+
+
+def test_sliders_move_the_oscillator_and_the_picture():
+    explorer = jb.explore(jb.presets.class_d(0.45, 0.35, -0.5, 0.6), t1=20.0)
+    assert {"damping", "belts[0].velocity", "belts[1].lower", "x1"} <= explorer.sliders.keys()
+    assert "belts[0].lower" not in explorer.sliders  # it is unbounded there
+    png, message = explorer.widget.children[1].children
+    before = bytes(png.value)
+    assert before.startswith(b"\x89PNG") and message.value.startswith("OK")
+    explorer.sliders["belts[0].velocity"].value = -0.2
+    assert bytes(png.value) != before
+    assert float(explorer.oscillator.belts[0].velocity) == -0.2
+    assert float(explorer.oscillator.belts[1].velocity) == 0.35
+    before = bytes(png.value)
+    # What cannot be is told, and the picture stays.
+    explorer.sliders["belts[0].load"].min = -1.0
+    explorer.sliders["belts[0].load"].value = -0.5
+    assert message.value == "load of belt 0 must be >= 0, got -0.5"
+    assert bytes(png.value) == before
+    explorer.sliders["belts[0].load"].value = 1.0
+    explorer.sliders["x1"].value = 2.5
+    portrait = explorer.figure.axes[0]
+    assert portrait.lines and max(line.get_xdata()[0] for line in portrait.lines) == 2.5
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda osc: jb.explore(osc, (1.0, 2.0, 3.0)), "start must be of shape"),
+        (lambda osc: jb.explore(osc, t1=0.0), "t1 must be > 0"),
+    ],
+)
+def test_impossible_arguments(call, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        call(jb.presets.class_a(0.3))

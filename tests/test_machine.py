@@ -1,0 +1,216 @@
+"""Machines in SI units: the oscillator that they are, and results brought back."""
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import oracle
+import pytest
+from laws import Lorentz
+
+import jaxbelt as jb
+
+MASS, STIFFNESS, DAMPING = 0.5, 2000.0, 1.0
+
+
+def machine(V=0.02, N=5.0, mass=MASS):
+    return jb.Machine(
+        mass,
+        STIFFNESS,
+        DAMPING,
+        (
+            jb.PhysicalBelt(V, jb.Conti(0.4, 0.25, 100.0), N, upper=0.004),
+            jb.PhysicalBelt(0.05, jb.Conti(0.3, 0.2, 50.0, 0.3), 2.0, lower=0.001),
+        ),
+    )
+
+
+def its_oracle():
+    """In metres, and speeds in m/s: only time is scaled, as in the paper."""
+    omega = np.sqrt(STIFFNESS / MASS)
+    slow = oracle.Belt(0.02, *oracle.conti(0.4, 0.25, 100.0), 5.0 / STIFFNESS, upper=0.004)
+    fast = oracle.Belt(0.05, *oracle.conti(0.3, 0.2, 50.0, 0.3), 2.0 / STIFFNESS, lower=0.001)
+    return oracle.Oscillator(DAMPING / np.sqrt(STIFFNESS * MASS), (slow, fast), omega), omega
+
+
+@pytest.fixture(scope="module")
+def run():
+    m = machine()
+    times = m.tau(np.linspace(0.0, 0.5, 4001))
+    return jb.simulate(m.oscillator, m.start(0.003, 0.0), times[-1], ts=times)
+
+
+def test_motion_in_si_is_that_of_the_dimensional_oracle(run):
+    theirs, omega = its_oracle()
+    reference = oracle.simulate(theirs, (0.003, 0.0), 0.5 * omega)
+    ours = jb.in_si(run, machine())
+    assert ours.attrs["status"] == "OK" and ours.x1.units == "m" and ours.t.units == "s"
+    events = [(event.kind, event.belt) for event in reference.events]
+    kinds = jb.decoded(ours).event_kind.values
+    assert [(k.upper(), b) for k, b in zip(kinds, ours.event_belt.values)] == events
+    times = np.array([event.t for event in reference.events]) / omega
+    assert np.allclose(ours.t_event, times, rtol=0, atol=1e-10)
+    x1, x2 = reference.y_end
+    # Lengths are of the size 1e-3 here.
+    assert float(ours.x1[-1]) == pytest.approx(x1, abs=1e-12)
+    assert float(ours.x2[-1]) == pytest.approx(x2 * omega, abs=1e-10)
+
+
+def test_friction_force(run):
+    ours = jb.in_si(run, machine())
+    x, v = ours.x1.values, ours.x2.values
+    stuck = (ours["mode"].values == 0).any(axis=1)
+    assert 500 < stuck.sum() < 3500
+    # Nothing is accelerated where it sticks: the force is that of spring and dashpot.
+    assert np.allclose(ours.force[stuck], (STIFFNESS * x + DAMPING * v)[stuck], rtol=1e-12)
+    # Else it is what the laws say, in newtons at metres per second.
+    slow, fast = 0.02 - v, 0.05 - v
+    mu0 = 0.15 / (1 + 100.0 * abs(slow)) + 0.25
+    mu1 = 0.1 / (1 + 50.0 * abs(fast)) + 0.2 + 0.3 * fast**2
+    force = (x < 0.004) * 5.0 * mu0 * np.sign(slow) + (x > 0.001) * 2.0 * mu1 * np.sign(fast)
+    assert np.allclose(ours.force[~stuck], force[~stuck], rtol=0, atol=1e-9)
+
+
+def test_a_cycle_in_si():
+    m = machine()
+    cycle = jb.find_cycle(m.oscillator, m.start(0.003, 0.0))
+    ours = jb.in_si(cycle, m)
+    assert float(ours.period) == pytest.approx(float(cycle.period) * np.sqrt(MASS / STIFFNESS))
+    assert float(ours.x2_max) == pytest.approx(0.02, rel=1e-9)  # it sticks to the slow belt
+    # The heat of one loop is what the belts' drives give: force times velocity, in joules.
+    fed = float(jb.energy_fed(cycle) * m.units.energy)
+    assert float(ours.energy) == pytest.approx(fed, rel=1e-8)
+    assert ours.energy.units == "J" and ours.stick_duration.dims == ("belt",)
+
+
+def test_its_numbers_are_differentiable():
+    def numbers(V, N):
+        osc = machine(V, N).oscillator
+        return jnp.stack([osc.belts[0].velocity, osc.belts[0].load, osc.belts[1].load])
+
+    by_velocity, by_force = jax.jacfwd(numbers, (0, 1))(0.02, 5.0)
+    # nu = V sqrt(k m) / N and u1 = 2 / N, where N is the largest force, and u0 = 1.
+    root = np.sqrt(STIFFNESS * MASS)
+    assert np.allclose(by_velocity, [root / 5.0, 0.0, 0.0], rtol=1e-14)
+    assert np.allclose(by_force, [-0.02 * root / 25.0, 0.0, -2.0 / 25.0], rtol=1e-14, atol=1e-17)
+
+
+def test_laws_keep_their_coefficients_at_the_speeds_of_the_machine():
+    speeds = jnp.linspace(0.0, 0.3, 7)
+    laws = [
+        jb.Conti(0.3, 0.2, 50.0, 0.3),
+        jb.Coulomb(0.4, 0.3),
+        jb.Stribeck(0.4, 0.25, 0.01),
+        Lorentz(jnp.asarray(0.5), jnp.asarray(0.3), jnp.asarray(0.1)),
+    ]
+    for law in laws:
+        scaled = law.in_units_of(jnp.asarray(0.04))
+        assert np.allclose(scaled.mu(speeds / 0.04), law.mu(speeds), rtol=1e-14)
+        assert float(scaled.static) == float(law.static)
+        twice = scaled.in_units_of(jnp.asarray(1 / 0.04))
+        assert np.allclose(twice.mu(speeds), law.mu(speeds), rtol=1e-14)
+
+
+def test_there_and_back():
+    m = machine()
+    back = m.of_oscillator(m.oscillator)
+    for one, other in zip(jax.tree.leaves(back), jax.tree.leaves(m), strict=True):
+        assert float(one) == pytest.approx(float(other), rel=1e-14)
+    with pytest.raises(ValueError, match="osc must be of 2 belts"):
+        m.of_oscillator(jb.presets.class_a(0.3))
+    with pytest.raises(ValueError, match="omega of osc must be 1"):
+        m.of_oscillator(jb.Oscillator(0.1, m.oscillator.belts, omega=2.0))
+
+
+def test_without_forces_there_are_units_all_the_same():
+    free = jb.Machine(1.0, 4.0, 0.1, (jb.PhysicalBelt(0.1, jb.Coulomb(0.4, 0.3), 0.0),))
+    assert float(free.units.length) == 1.0 and float(free.units.time) == 0.5
+    assert float(free.oscillator.belts[0].load) == 0.0
+
+
+def swept(axes, make):
+    """Final states of its oscillators; derivatives are numbers like any other here."""
+    found = jb.sweep(make, axes, y0=(3.0, 0.0), t1=50.0)
+    return found.assign(d_x2_end_d_x1=found.x2_end, d_x1_end_d_V=found.x1_end)
+
+
+def test_sweeps_in_si():
+    axes = {"V": np.array([0.01, 0.02]), "x1": np.array([1.0, 2.0])}
+    dataset = swept(axes, lambda V: machine(V).oscillator)
+    units = machine().units
+    ours = jb.in_si(dataset, machine)
+    assert np.allclose(ours.x1_end, dataset.x1_end * float(units.length), rtol=1e-15)
+    assert np.allclose(ours.x1, dataset.x1 * float(units.length), rtol=1e-15)
+    assert ours.x1_end.units == ours.x1.units == "m" and ours.x2_end.units == "m s-1"
+    assert np.allclose(ours.d_x1_end_d_V, dataset.d_x1_end_d_V * float(units.length))
+    ratio = float(units.velocity / units.length)
+    assert np.allclose(ours.d_x2_end_d_x1, dataset.d_x2_end_d_x1 * ratio)
+    assert ours.d_x2_end_d_x1.units == "m s-1 / (m)"
+    assert ours.d_x1_end_d_V.units == "m / (unit of V)"
+    assert ours.n_events.identical(dataset.n_events.assign_coords(x1=ours.x1))
+    with pytest.raises(ValueError, match=r"result must be without x1 .* vary"):
+        jb.in_si(
+            dataset.drop_vars(["d_x2_end_d_x1", "d_x1_end_d_V"]), lambda V: machine(V, 500 * V)
+        )
+
+
+def test_units_may_differ_from_run_to_run():
+    axes = {"N": np.array([5.0, 1.0, 10.0])}
+    loads = swept(axes, lambda N: machine(0.02, N).oscillator)
+    plain = loads.drop_vars(["d_x2_end_d_x1", "d_x1_end_d_V"])
+    ours = jb.in_si(plain, lambda N: machine(0.02, N))
+    # The largest force is that of the second belt, 2 N, where the first has less.
+    lengths = np.array([5.0, 2.0, 10.0]) / STIFFNESS
+    assert np.allclose(ours.x1_end, loads.x1_end * lengths, rtol=1e-14)
+    with pytest.raises(ValueError, match="machine must be a function of N that returns"):
+        jb.in_si(loads, machine())
+    with pytest.raises(ValueError, match=r"result must be without d_x2_end_d_x1 .* vary"):
+        jb.in_si(loads, lambda N: machine(0.02, N))
+
+
+def test_basins_in_si():
+    m = machine()
+    basins = jb.basins(m.oscillator, x1=np.linspace(-1, 2, 3), x2=np.linspace(-1, 1, 3))
+    ours = jb.in_si(basins, m)
+    assert ours.x1.values == pytest.approx(np.linspace(-1, 2, 3) * 5.0 / STIFFNESS)
+    assert ours.label.identical(basins.label.assign_coords(x1=ours.x1, x2=ours.x2))
+
+
+def test_pictures_in_si(run):
+    m = machine()
+    ax = jb.plot_phase_portrait(m.oscillator, run)
+    before = ax.get_xlim()
+    assert jb.plot_in_si(ax, m) is ax
+    assert ax.get_xlabel() == "displacement $X$ (m)"
+    assert ax.get_ylabel() == r"velocity $\dot X$ (m/s)"
+    assert ax.get_xlim() == before
+    ticks = ax.get_xticks()
+    shown = [
+        float(label.get_text().replace("\N{MINUS SIGN}", "-")) for label in ax.get_xticklabels()
+    ]
+    assert np.allclose(shown, ticks * float(m.units.length), rtol=1e-5)
+    axes = jb.plot_in_si(jb.plot_time_history(run), m)
+    assert axes[1].get_xlabel() == "time $t$ (s)"
+    plt.close("all")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: jb.Machine(0.0, 1.0, 0.1, machine().belts), "mass must be > 0, got 0"),
+        (lambda: jb.Machine(1.0, -1.0, 0.1, machine().belts), "stiffness must be > 0, got -1"),
+        (lambda: jb.Machine(1.0, 1.0, np.nan, machine().belts), "damping must be finite"),
+        (lambda: jb.Machine(1.0, 1.0, 0.1, ()), "belts must be at least one PhysicalBelt"),
+        (
+            lambda: jb.Machine(1.0, 1.0, 0.1, [jb.Belt(1.0, jb.Coulomb(1, 1))]),
+            r"belts\[0\] must be",
+        ),
+        (lambda: jb.PhysicalBelt(1.0, 0.4, 1.0), "friction must be a law"),
+        (lambda: jb.PhysicalBelt(1.0, jb.Coulomb(1, 1), -1.0), "normal_force must be >= 0, got -1"),
+        (lambda: jb.PhysicalBelt(1.0, jb.Coulomb(1, 1), 1.0, 2.0, 1.0), "lower must be < upper"),
+        (lambda: jb.in_si(3.0, machine()), "result must be a Trajectory"),
+    ],
+)
+def test_what_cannot_be_is_told(wrong, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        wrong()
