@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import xarray
 
 #: What the variables of this package are, by their names.
-QUANTITIES = {
+DIMENSIONS = {
     **dict.fromkeys(("t", "t_event", "period", "transient", "stick_duration"), "time"),
     **dict.fromkeys(("x1", "x1_event", "x1_end", "x1_min", "x1_max", "amplitude"), "length"),
     **dict.fromkeys(("x2", "x2_event", "x2_end", "x2_min", "x2_max"), "velocity"),
@@ -78,7 +78,7 @@ def _one(machine: Any) -> Machine:
 
 
 def _variable(dims: Any, values: Any, name: str, units: Units, long_name: str) -> tuple:
-    quantity = QUANTITIES[name]
+    quantity = DIMENSIONS[name]
     scaled = np.asarray(values) * np.asarray(getattr(units, quantity))
     return dims, scaled, {"long_name": long_name, "units": SYMBOLS[quantity]}
 
@@ -162,18 +162,18 @@ def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
     units = _units_of_runs(dataset, machine, own)
     vary = sorted(name for name in SYMBOLS if np.ptp(np.asarray(getattr(units, name))) > 0)
     changed = {}
-    for name in [*map(str, dataset.data_vars), *(axis for axis in axes if axis in QUANTITIES)]:
+    for name in [*map(str, dataset.data_vars), *(axis for axis in axes if axis in DIMENSIONS)]:
         of, _, by = name.removeprefix("d_").partition("_d_") if name[:2] == "d_" else (name, "", "")
-        if of not in QUANTITIES:
+        if of not in DIMENSIONS:
             continue
         # A unit that varies with a parameter has a derivative, too; and the starts are one axis.
         fits = not vary or (of == name and name not in axes)
         require(fits, "result", f"without {name} where the units of {', '.join(vary)} vary", name)
-        unit = getattr(units, QUANTITIES[of])
-        told = {"units": SYMBOLS[QUANTITIES[of]]}
-        if by in QUANTITIES:
-            unit = unit / getattr(units, QUANTITIES[by])
-            told["units"] += f" / ({SYMBOLS[QUANTITIES[by]]})"
+        unit = getattr(units, DIMENSIONS[of])
+        told = {"units": SYMBOLS[DIMENSIONS[of]]}
+        if by in DIMENSIONS:
+            unit = unit / getattr(units, DIMENSIONS[by])
+            told["units"] += f" / ({SYMBOLS[DIMENSIONS[by]]})"
         elif by:
             told["units"] += f" / (unit of {by})"
         if name in axes:

@@ -57,6 +57,19 @@ MISTAKES = [
     ("jb.Oscillator(np.float32(0.5), (belt,))", "damping must be float64, got float32"),
     ("jb.Oscillator(0.5, (belt,), omega=0)", r"omega must be > 0, got 0\.0"),
     ("jb.Oscillator(dampng=0.5, belts=(belt,))", "unexpected keyword argument 'dampng'"),
+    ("jb.plot_sweep(dataset, 'knd')", "variable must be one of .*kind.*, got 'knd'"),
+    # --- machines
+    ("jb.Machine(0.0, 1.0, 0.1, (physical,))", r"mass must be > 0, got 0\.0"),
+    ("jb.Machine(1.0, 1.0, 0.1, (belt,))", r"belts\[0\] must be a PhysicalBelt, got Belt"),
+    ("jb.PhysicalBelt(0.1, law, -1.0)", r"normal_force must be >= 0, got -1\.0"),
+    ("jb.PhysicalBelt(0.1, 0.4, 1.0)", f"friction must be {LAW}.*, got 0.4"),
+    ("jb.Units(1.0)", "missing 4 required positional arguments"),
+    ("jb.in_si(3.0, machine)", "result must be a Trajectory, a Cycle, Basins.*, got float"),
+    ("jb.in_si(cycle, osc)", r"machine must be a Machine, got Oscillator\("),
+    ("jb.plot_in_si(cycle, osc)", r"machine must be a Machine, got Oscillator\("),
+    ("jb.explore((1.0, 0.0))", OSC + r"\(1\.0, 0\.0\)"),
+    ("jb.explore(osc, (1.0, 0.0, 2.0))", r"start must be of shape \(2\), got shape \(3,\)"),
+    ("jb.explore(osc, t1=0)", r"t1 must be > 0, got 0\.0"),
     ("jb.presets.class_b(0.3)", "missing 1 required positional argument: 'nu1'"),
     ("jb.presets.class_b(row, 0.3)", r"velocity must be a scalar .*, got shape \(200,\)"),
     ("jb.presets.class_d(0.3, 0.2, 1.0, 0.0)", r"sigma0 must be <= sigma1 = 0\.0, got 1\.0"),
@@ -390,6 +403,7 @@ def names() -> dict:
     """What stands in the calls."""
     osc, row = jb.presets.class_b(0.45, 0.35), np.linspace(0.0, 20.0, 200)
     law = jb.presets.paper_friction()
+    physical = jb.PhysicalBelt(0.1, law, 1.0)
     # Results without what they would be computed from.
     cycle = jb.Cycle(osc, *[None] * 5, jnp.asarray(0))
     point, failed = (
@@ -408,6 +422,8 @@ def names() -> dict:
         "failed": failed,
         "key": jax.random.key(0),
         "law": law,
+        "machine": jb.Machine(1.0, 1.0, 0.1, (physical,)),
+        "physical": physical,
         "osc": osc,
         "point": point,
         "row": row,

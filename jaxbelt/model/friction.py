@@ -25,6 +25,7 @@ from ..checks import (
     is_concrete,
     number,
     require,
+    require_value,
     traceable,
 )
 

@@ -55,8 +55,9 @@ class Explorer:
             if np.isfinite(value)
         }
         self.figure = Figure(figsize=(8.4, 4.6), dpi=80, layout="constrained")
-        left, right = self.figure.subfigures(1, 2, width_ratios=(1, 1.15))
-        self._axes = *left.subplots(2, height_ratios=(2, 1)), *right.subplots(2, sharex=True)
+        halves: Any = self.figure.subfigures(1, 2, width_ratios=(1, 1.15))
+        beside = halves[0].subplots(2, height_ratios=(2, 1))
+        self._axes = *beside, *halves[1].subplots(2, sharex=True)
         self.message = ipywidgets.Label()
         self._picture = ipywidgets.Image(format="png")
         for slider in self.sliders.values():
