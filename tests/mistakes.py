@@ -14,6 +14,7 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from compilations import compilations
 from typer.testing import CliRunner
 
@@ -419,6 +420,7 @@ def names() -> dict:
         "TARGET": [(jb.amplitude, 1.0)],
         "belt": jb.Belt(0.3, law),
         "cycle": cycle,
+        "dataset": xr.Dataset({"kind": ("nu0", [0])}),
         "failed": failed,
         "key": jax.random.key(0),
         "law": law,
