@@ -37,8 +37,12 @@ nitpick_ignore = [
         "ArrayLike",
         "Axes",
         "ClosedOrbit",
+        "Explorer",
         "Path",
+        "np.ndarray",
+        "pandas.DataFrame",
         "xarray.Dataset",
+        "xr.Dataset",
     )
 ]
 

@@ -114,8 +114,10 @@ def explore(
     """A live picture of an oscillator, in a notebook, with a slider for each of its numbers.
 
     Phase portrait, time history and friction laws, drawn anew as sliders move. start: (x1, x2) at
-    the beginning; t1: until when it is followed; dimensionless, both. Needs ipywidgets, and raises
-    an `ImportError` without; `ValueError` names an impossible argument.
+    the beginning; t1: until when it is followed; dimensionless, both. What is returned has
+    `sliders` by name, the `oscillator` that they show, its `figure`, and a `message` on how the run
+    ended. Needs ipywidgets, and raises an `ImportError` without; `ValueError` names an impossible
+    argument.
     """
     check_oscillator(osc)
     state, until = as_numbers(start, "start", (2,)), as_numbers(t1, "t1")
