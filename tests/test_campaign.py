@@ -245,6 +245,7 @@ def test_campaign(arguments, capsys):
     assert wrong == 0, capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_derivatives_of_an_edge_that_is_barely_passed():
     """Found by a campaign: beyond by 1.2e-10, so that x1 is on the edge to rounding at both ends,
     and the sweep lost the derivatives of one passage."""

@@ -35,7 +35,7 @@ def examples(path: Path) -> str:
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=pytest.mark.slow(first=True) if page in SLOW else [])
+        pytest.param(page, marks=pytest.mark.slow if page in SLOW else [])
         for page, path in sorted(PAGES.items())
         if examples(path)
     ],

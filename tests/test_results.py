@@ -20,6 +20,7 @@ from jaxbelt.plotting.style import parameter_label
 #: Public classes that are no results: what a user writes down.
 NO_RESULTS = {
     *(jb.AbstractFriction, jb.Conti, jb.Coulomb, jb.Stribeck, jb.Belt, jb.Oscillator),
+    *(jb.Machine, jb.PhysicalBelt, jb.Units),
     *(jb.AtEvents, jb.AtExtrema, jb.AtSection, jb.AtTimes),
     *(jb.EquilibriumKind, jb.EventKind, jb.Status),
     *(jb.BeltAtRest, jb.BoundaryEquilibrium, jb.CornerCollision, jb.CrossingSliding),
@@ -229,7 +230,7 @@ def test_sweeps_are_drawn_with_words(dataset):
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["belt 0", "belt 1"]
     assert ax.get_ylabel() == "time stuck"
     assert len(jb.plot_sweep(dataset.isel(belt=0), "stick_duration").collections) == 1
-    with pytest.raises(ValueError, match="variable must be one of stick_duration, sticks, kind"):
+    with pytest.raises(ValueError, match='variable must be "stick_duration", "sticks" or "kind"'):
         jb.plot_sweep(dataset, "nope")
     with pytest.raises(ValueError, match="dataset must be a sweep with one or two axes, got 3"):
         jb.plot_sweep(dataset, "stick_duration")
