@@ -330,7 +330,7 @@ def test_a_change_that_no_condition_explains_is_reported():
 @pytest.mark.parametrize(
     ("span", "message"),
     [
-        ((1.0, -1.0), "span must be .first, last. with first < last"),
+        ((1.0, -1.0), "span must be .first, last., two numbers with first < last, got .1"),
         ((0.0, np.inf), "span must be finite"),
         ((-1.0, 1.0), "load of belt 0 must be >= 0"),
     ],

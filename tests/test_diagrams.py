@@ -261,7 +261,7 @@ def test_an_example_lies_in_its_region(cells):
         assert expected_name(*cells.example(name)) == name
         osc = cells.oscillator(name)
         assert (float(osc.belts[0].velocity), float(osc.belts[1].velocity)) == cells.example(name)
-    with pytest.raises(ValueError, match="name must be one of 1, 2a"):
+    with pytest.raises(ValueError, match='name must be "1", "2a"'):
         cells.example("7")
 
 
