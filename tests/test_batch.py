@@ -7,6 +7,9 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from laws import Bump
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 import jaxbelt as jb
 from jaxbelt import Status
@@ -182,6 +185,35 @@ def test_attractors_equal_the_cycles_of_the_oracle():
         np.testing.assert_allclose(here.stick_duration, expected.stick_durations, atol=1e-8)
         assert np.array_equal(here.sticks, np.array(expected.stick_durations) > 0)
         assert here.signature == signature_word(expected.signature)
+
+
+def test_a_cycle_that_attracts_weakly_is_not_the_way_to_it():
+    """A loop, of multiplier 0.994, moves by less than the tolerance long before the cycle is met."""
+    gain = 1e-3
+
+    def make():
+        return jb.Oscillator(0.5, (jb.Belt(1.0, Bump(jnp.asarray(3.0), gain, jnp.asarray(0.0))),))
+
+    dataset = jb.sweep(
+        make, {"x1": np.linspace(1.684, 1.716, 11)}, y0=(0.0, 0.0), observe="attractor"
+    )
+    assert np.all(jb.decoded(dataset).kind == "cycle")
+
+    # By hand, for SciPy: what `Bump` leaves of friction and damping.
+    def field(t, y):
+        return y[1], 1.0 - y[0] + gain * (0.98 * y[1] - 8 / 3 * y[1] ** 3)
+
+    def top(t, y):
+        return y[1]
+
+    top.direction = -1
+
+    def gained_in_a_loop(x1):
+        run = solve_ivp(field, (0.0, 7.0), (x1, 0.0), "DOP853", events=top, rtol=1e-13, atol=1e-13)
+        return run.y_events[0][-1][0] - x1
+
+    cycle = brentq(gained_in_a_loop, 1.6, 1.8, xtol=1e-9)
+    np.testing.assert_allclose(dataset.x1_max, cycle, atol=3e-6)
 
 
 def signature_word(events):

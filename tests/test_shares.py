@@ -78,8 +78,8 @@ def test_near_cycles_are_two_and_a_weak_one_is_one():
         belt = jb.Belt(1.0, Bump(jnp.asarray(3.0), jnp.asarray(gain), jnp.asarray(bump)))
         return jb.Oscillator(0.5, (belt,))
 
-    starts = {"x1": np.linspace(1.68, 1.72, 11)}
-    axes = {"gain": [0.0005, 0.03], "bump": [0.0, 6.0], **starts}
+    starts = {"x1": np.linspace(1.684, 1.716, 11)}
+    axes = {"gain": [0.0002, 0.03], "bump": [0.0, 6.0], **starts}
     runs = jb.sweep(make, axes, y0=(0.0, 0.0), observe="attractor")
     weak, pair = runs.isel(gain=0, bump=0), runs.isel(gain=1, bump=1)
     for doubtful in (weak, pair):
