@@ -188,7 +188,7 @@ def test_attractors_equal_the_cycles_of_the_oracle():
 
 
 def test_a_cycle_that_attracts_weakly_is_not_the_way_to_it():
-    """A loop, of multiplier 0.994, moves by less than the tolerance long before the cycle is met."""
+    """A loop, of multiplier 0.994, moves by less than the tolerance long before the end."""
     gain = 1e-3
 
     def make():
