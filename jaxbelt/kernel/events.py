@@ -47,11 +47,12 @@ def pass_events(
 
     stuck = after.mode.any_stuck & ~captured & ~lanes.done
     phase = stick_phase(osc, after.mode, x1)
+    x2 = jnp.where(stuck, phase.x2, x2)
     left = t1 - lanes.t
     ends = phase.duration >= left
     duration = jnp.where(stuck, jnp.where(ends, left, phase.duration), 0.0)
     released = stuck & ~ends
-    mode = select(released, leave_stick(osc, after.mode, phase, x2), after.mode)
+    mode = select(released, leave_stick(osc, after.mode, phase), after.mode)
     mode = select(captured, lanes.mode, mode)
     new_x1 = jnp.where(stuck, jnp.where(ends, x1 + x2 * left, phase.x1), x1)
     t = jnp.where(stuck & ends | rests, t1, lanes.t + duration)

@@ -96,6 +96,12 @@ def mode_acceleration(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Arra
     return acceleration(osc, mode.signs, x1, x2)
 
 
+def fastest_rate(a_by_x2: Array) -> Array:
+    """How fast disturbances change: the largest |eigenvalue| of ((0, 1), (-1, d x2'/d x2))."""
+    half = 0.5 * jnp.abs(a_by_x2)
+    return jnp.where(half > 1, half + jnp.sqrt(jnp.maximum(half * half - 1, 0.0)), 1.0)
+
+
 def capacity(osc: Oscillator, mode: Mode) -> Array:
     """The largest force that the stuck belts can hold together, the sum of u0_k mus_k."""
     total = jnp.zeros(())
@@ -287,12 +293,14 @@ def _slip_sign(velocity: Array, speed: Array) -> Array:
 class StickPhase(eqx.Module):
     """A stick phase in closed form, from its entry to its end (arrays of the batch shape).
 
-    duration: inf where it never ends (a belt at rest); x1: where it ends; slips: it ends by slip
-    onset; edge: which of `edges` ends it otherwise, one flag each.
+    duration: inf where it never ends (a belt at rest); x1: where it ends; x2: in all of it, that of
+    the belt, of which a start that sticks has it to rounding and without derivatives; slips: it
+    ends by slip onset; edge: which of `edges` ends it otherwise, one flag each.
     """
 
     duration: Array
     x1: Array
+    x2: Array
     slips: Array
     edge: list[Array]
 
@@ -336,25 +344,27 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
     at_edge = [~slips & (distance <= to_edge) for distance in edge_distances]
     x1_end = first_of([slips, *at_edge], [x1_onset, *edges(osc)], x1)
     # Not distance/|v|: x1_end does not depend on x1, and so neither do its derivatives.
-    duration = jnp.where(moves, jnp.maximum((x1_end - x1) / v_or_one, 0.0), jnp.inf)
-    return StickPhase(duration, x1_end, slips, at_edge)
+    duration = (x1_end - x1) / v_or_one
+    # Negative by rounding only; its derivatives are those of the quotient there, too.
+    duration = duration + jax.lax.stop_gradient(jnp.maximum(duration, 0.0) - duration)
+    duration = jnp.where(moves, duration, jnp.inf)
+    return StickPhase(duration, x1_end, v, slips, at_edge)
 
 
-def leave_stick(osc: Oscillator, mode: Mode, phase: StickPhase, x2: Array) -> Mode:
+def leave_stick(osc: Oscillator, mode: Mode, phase: StickPhase) -> Mode:
     """The mode after a stick phase at its end: slip onset, or an edge passed while sticking.
 
     Slip onset is tangent to the boundary; the new sign is -sgn(needed) = sgn(nu_k).
     """
-    velocity = stick_velocity(osc, mode, jnp.zeros(()))
     slipping = Mode(
         tuple(
-            jnp.where(stuck, jnp.sign(velocity), code)
+            jnp.where(stuck, jnp.sign(phase.x2), code)
             for code, stuck in zip(mode.codes, mode.stuck, strict=True)
         )
     )
     if not has_edges(osc):
         return slipping
-    return select(phase.slips, slipping, pass_edge(osc, mode, phase.x1, x2, x2 > 0))
+    return select(phase.slips, slipping, pass_edge(osc, mode, phase.x1, phase.x2, phase.x2 > 0))
 
 
 class Departure(eqx.Module):

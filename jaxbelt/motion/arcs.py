@@ -222,14 +222,14 @@ def after_slip(osc: Oscillator, mode: Mode, signs: Signs, arc: SlipArc) -> ArcEn
 
 def stick_arc(osc: Oscillator, mode: Mode, y: State, longest: Array) -> ArcEnd:
     """The stick arc from y to its end, or, where that is finite, for the time `longest`."""
-    x1, x2 = y
-    n = len(osc.belts)
+    x1, n = y[0], len(osc.belts)
     phase = stick_phase(osc, mode, x1)
     is_cut = (phase.duration >= longest) & (longest < jnp.inf)
     edges = [jnp.asarray(n + i) for i in range(2 * n)]
     fired = first_of(phase.edge, edges, jnp.asarray(Ends(n).onset))
-    y_end = jnp.where(is_cut, x1 + x2 * jnp.where(is_cut, longest, 0.0), phase.x1), x2
-    after = select(is_cut, mode, leave_stick(osc, mode, phase, x2))
+    way = phase.x2 * jnp.where(is_cut, longest, 0.0)
+    y_end = jnp.where(is_cut, x1 + way, phase.x1), phase.x2
+    after = select(is_cut, mode, leave_stick(osc, mode, phase))
     never = jnp.zeros_like(is_cut)
     return ArcEnd(
         duration=jnp.where(is_cut, longest, phase.duration),

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import Mode, mode_acceleration
+from ..model.modes import Mode, fastest_rate, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..numerics.extrapolation import increments, scheme
 
@@ -176,9 +176,13 @@ class Adaptive(AbstractIntegrator):
 def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     """How many steps per unit of time an orbit wants: more where the friction law bends.
 
-    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0.
+    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0. And at least
+    half the rate at which disturbances change in the linearised field: of that, the motion itself
+    tells nothing where it is small.
     """
-    a = mode_acceleration(osc, mode, x1, x2)
+    a, a_by_x2 = jax.jvp(
+        lambda x2: mode_acceleration(osc, mode, x1, x2), (x2,), (jnp.ones_like(x2),)
+    )
     bend = jnp.zeros(())
     for belt, code in zip(osc.belts, mode.codes, strict=True):
         speed = jnp.maximum(jnp.sign(code) * (belt.velocity - osc.omega * x2), 0.0)
@@ -190,7 +194,8 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
         slips = jnp.abs(code) == 1
         bend = bend + jnp.where(slips, jnp.sqrt(jnp.abs(belt.load * curvature)), 0.0)
     near_extremum = jnp.sqrt(bend * jnp.abs(osc.omega * x2))  # where x2' = 0, x2'' = -x2
-    return 1 + 0.4 * bend * jnp.abs(osc.omega * a) + near_extremum
+    wanted = 1 + 0.4 * bend * jnp.abs(osc.omega * a) + near_extremum
+    return jnp.maximum(wanted, 0.5 * fastest_rate(a_by_x2))
 
 
 class Graded(AbstractIntegrator):

@@ -166,9 +166,10 @@ def _refill(program: Program, shared, rtol, limit, block, begun, available, desk
     )
 
 
-def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> Lanes:
-    """ROUNDS_PER_PASS times: past the events, and some steps."""
+def _work(program: Program, derivatives: bool, shared, rows, lanes: Lanes, one, t1, rtol, atol):
+    """The lanes after ROUNDS_PER_PASS times some steps, each time past the events at first."""
     osc, observer = _oscillators(program, shared, rows), program.observer
+    forward = functools.partial(take_step, derivatives=derivatives)
 
     def round_(_, lanes):
         rules = dict(edges=program.edges, captures=program.captures)
@@ -177,7 +178,7 @@ def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol) -> 
         window = window_of(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
 
         def step(_, lanes):
-            return observer.follow(take_step, osc, window, one, lanes, t1, rtol, atol)
+            return observer.follow(forward, osc, window, one, lanes, t1, rtol, atol)
 
         return lax.fori_loop(0, STEPS_PER_ROUND, step, lanes)
 
@@ -188,7 +189,7 @@ def _at_work(stream: Stream) -> Array:
     return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
 
 
-def _fill(program: Program) -> Callable:
+def _fill(program: Program, derivatives: bool = False) -> Callable:
     """The inner loop: works until the block of runs is taken, the desk is full, or in pass `until`.
 
     It closes over no array, so that it can be one piece of machine code.
@@ -202,7 +203,8 @@ def _fill(program: Program) -> Callable:
         def go_on(desk):
             desk = _refill(program, shared, rtol, limit, block, begun, available, desk)
             stream = desk.stream
-            lanes = _work(program, shared, stream.rows, stream.lanes, stream.one, t1, rtol, atol)
+            settings = stream.rows, stream.lanes, stream.one, t1, rtol, atol
+            lanes = _work(program, derivatives, shared, *settings)
             return replace(desk, stream=replace(stream, lanes=lanes))
 
         return lax.while_loop(unfinished, go_on, desk)
@@ -249,7 +251,7 @@ def advance_with_derivatives(program, shared, t1, rtol, atol, limit, queue, call
     stream: a stream and the derivatives of its floats, [directions, ...]; the results have the same
     first axis, behind the values themselves.
     """
-    plain = _fill(program)
+    plain = _fill(program, derivatives=True)
 
     @one_kernel
     def one_piece(given, block, block_slopes, where, desk, slopes):

@@ -178,9 +178,12 @@ def _ask(package, batch, options):
 
 def _has_derivatives(mine, options):
     """Whether derivatives of the engine's run are asked: near grazing always, else of runs that go
-    on until T and come near to no other outcome."""
+    on until T and come near to no other outcome, or are in a corner."""
+    from . import compare
+
     if options.what == "derivatives":
-        return mine.t_end == options.span and 0 == mine.status and mine.margin > 1e-6
+        clear = mine.margin > 1e-6 or mine.margin <= compare.CORNER
+        return mine.t_end == options.span and 0 == mine.status and clear
     return options.what == "grazing"
 
 

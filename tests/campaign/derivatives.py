@@ -56,9 +56,9 @@ def moved(osc, direction, by):
     )
 
 
-def _difference(f, size=1.0):
+def _difference(f, step, size=1.0):
     """The derivative of f at 0, by Richardson; size: of the disturbance by one."""
-    step = _STEP / max(size, 1.0)
+    step = step / max(size, 1.0)
     one, half = ((f(h) - f(-h)) / (2 * h) for h in (step, 0.5 * step))
     return (4 * half - one) / 3
 
@@ -71,8 +71,8 @@ def _onset(osc, mode):
     return np.array([engine.force(osc, mode, 0.0, v) + np.sign(v) * held, v])
 
 
-def derivative(case, run, direction):
-    """d(x1, x2 at T) along a direction; run: the engine's run of the case."""
+def derivative(case, run, direction, step=_STEP):
+    """d(x1, x2 at T) along a direction; run: the engine's run of the case; step: of differences."""
     osc, delta = case.oscillator, np.array(direction[0])
     y, t, shift = np.array(case.y0, float), 0.0, 0.0
     mode = engine.simulate(osc, case.y0, 1e-12).mode_end
@@ -82,16 +82,17 @@ def derivative(case, run, direction):
         pieces = int(np.ceil(duration / 0.1))
         for _ in range(pieces):
             # A fast mass passes the steep part of the law in a short time.
-            step = 0.01 / (1 + 0.1 * abs(engine.force(osc, mode, *y)))
+            pace = 0.01 / (1 + 0.1 * abs(engine.force(osc, mode, *y)))
             delta = _difference(
-                lambda h, y=y, delta=delta, step=step: np.array(
+                lambda h, y=y, delta=delta, pace=pace: np.array(
                     engine.flow(
-                        moved(osc, direction, h), mode, y + h * delta, duration / pieces, step
+                        moved(osc, direction, h), mode, y + h * delta, duration / pieces, pace
                     )
                 ),
+                step,
                 np.max(np.abs(delta)),
             )
-            y = np.array(engine.flow(osc, mode, y, duration / pieces, step))
+            y = np.array(engine.flow(osc, mode, y, duration / pieces, pace))
         return delta
 
     def field(mode, y):
@@ -101,7 +102,7 @@ def derivative(case, run, direction):
     for t_end, kind, belt, y_end, codes in ends:
         y_end, duration = np.array(y_end), t_end - t
         if 0 in mode:
-            d_onset, d_v = _difference(lambda h, m=mode: _onset(moved(osc, direction, h), m))
+            d_onset, d_v = _difference(lambda h, m=mode: _onset(moved(osc, direction, h), m), step)
             v = y[1]
             if kind == 0:
                 return np.array([delta[0] + d_v * duration - v * shift, d_v])
@@ -125,6 +126,12 @@ def derivative(case, run, direction):
     raise AssertionError
 
 
+def beside(case, direction, by):
+    """The case moved along a direction."""
+    y0 = tuple(y + by * d for y, d in zip(case.y0, direction[0]))
+    return replace(case, oscillator=moved(case.oscillator, direction, by), y0=y0)
+
+
 def _edge_shift(osc, direction, x1):
     for b, (_, _, lower, upper) in zip(osc.belts, direction[2]):
         if b.lower == x1:
@@ -134,8 +141,8 @@ def _edge_shift(osc, direction, x1):
     raise ValueError(f"no edge at {x1}")
 
 
-def of_period(case, label, direction):
-    """d(period) of the engine's cycle along a direction of the parameters.
+def of_period(case, label, direction, step=_STEP):
+    """d(period) of the engine's cycle along a direction of the parameters; step: of differences.
 
     The cycle begins at its maximum of x1, (x1, 0). With M and N the derivatives of the state one
     period later by x1 and along the direction, and f the field there, it stays closed where
@@ -144,8 +151,8 @@ def of_period(case, label, direction):
     loop = replace(case, y0=label.y, T=label.period)
     run = engine.simulate(case.oscillator, loop.y0, loop.T)
     resting = tuple((0.0, 0.0, 0.0, 0.0) for _ in case.oscillator.belts)
-    by_start = derivative(loop, run, ((1.0, 0.0), 0.0, resting))
-    by_direction = derivative(loop, run, ((0.0, 0.0), *direction[1:]))
+    by_start = derivative(loop, run, ((1.0, 0.0), 0.0, resting), step)
+    by_direction = derivative(loop, run, ((0.0, 0.0), *direction[1:]), step)
     x1, x2 = run.y_end
     field = np.array([x2, engine.force(case.oscillator, run.mode_end, x1, x2)])
     matrix = np.column_stack([by_start - np.array([1.0, 0.0]), field])

@@ -133,8 +133,9 @@ def simulate(
 ):
     """The run from y0 over [0, T].
 
-    mode: contact codes to go on with, None: those of the state. noise: every step of length h is
-    disturbed by noise h, the state after every event by noise, at random. turns, extrema: record
+    mode: contact codes to go on with, None: those of the state. noise: as an atol and rtol; every
+    step of length h is disturbed by noise (1 + |y|) h, the state after every event by
+    noise (1 + |y|), at random. turns, extrema: record
     the zeros of x2 (belt 0: a maximum of x1, 1: a minimum), the extrema of x2. capture: end, at
     rest, where the run converges to a pseudo-focus.
     """
@@ -747,8 +748,8 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
                     random ^= random << np.uint64(13)
                     random ^= random >> np.uint64(7)
                     random ^= random << np.uint64(17)
-                    x1 += noise * h * (1.0 if random & np.uint64(1) else -1.0)
-                    x2 += noise * h * (1.0 if random & np.uint64(2) else -1.0)
+                    x1 += noise * (1 + abs(x1)) * h * (1.0 if random & np.uint64(1) else -1.0)
+                    x2 += noise * (1 + abs(x2)) * h * (1.0 if random & np.uint64(2) else -1.0)
                     a = _force(z, w, B, s, x1, x2)
                 h *= min(4.0, max(0.3, 0.9 * max(error, 1e-8) ** (-0.125)))
                 h = min(h, _LONGEST)
@@ -845,9 +846,9 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
             _bounds(w, B, s, L)
             if _nearest(L, x1, x2) > 100 * noise:
                 if kind == EDGE:
-                    x2 += 0.0 if stuck else shift
+                    x2 += 0.0 if stuck else shift * (1 + abs(x2))
                 elif kind != TURN:
-                    x1 += shift
+                    x1 += shift * (1 + abs(x1))
     if status == OK or status == STUCK_FOREVER:
         _bounds(w, B, s, L)
         margin = min(margin, _nearest(L, x1, x2) if not stuck else np.inf)
