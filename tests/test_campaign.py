@@ -235,6 +235,7 @@ def test_small_campaign(arguments, capsys):
         "final --runs 20000 --seed 21",
         "attractors --runs 5000 --seed 22",
         "simulate --runs 2000 --seed 23",
+        "derivatives --by sweep --runs 500 --tol 1e-11 --seed 26",
         "grazing --runs 1000 --tol 1e-13 --seed 24",
         "grazing --runs 1000 --seed 25",
         "paths --paths 14 --seed 3",
