@@ -155,3 +155,21 @@ def judge_derivatives(name, by):
         verdicts.append(compare.judge_derivative(case, told, mine, direction, 1e-11)[0])
     # "corner": in that direction there is none, it differs from one side to the other.
     assert set(verdicts) <= {"same", "corner"} and "same" in verdicts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by", ["simulate", "sweep"])
+@pytest.mark.parametrize(
+    "name", ["a loaded and an unloaded belt of one velocity", "onset on an edge without load"]
+)
+def test_the_order_of_belts_changes_no_derivative(name, by):
+    """Though they act at one place: what counts is which of them exerts a force."""
+    osc, y0 = CASES[name]
+    start, damping, belts = derivatives.directions(Case(osc, y0), np.random.default_rng(4))
+    alone = [(velocity, *rest) for velocity, (_, *rest) in zip((0.3, -0.8), belts, strict=True)]
+    found = []
+    for order in (1, -1):
+        case = Case(Oscillator(osc.damping, osc.belts[::order], osc.omega), y0, 50.0)
+        direction = start, damping, tuple(alone[::order])
+        found.append(package.derivatives([case], [direction], 1e-11, by)[0])
+    np.testing.assert_allclose(*found, rtol=1e-7)

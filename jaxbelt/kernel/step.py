@@ -98,7 +98,7 @@ class _Window(eqx.Module):
 def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | None) -> _Window:
     """The bounds of the current modes. Where x1 has to be monotone, x2 = 0 is a bound, too."""
     mode, inf = lanes.mode, jnp.full_like(lanes.t, jnp.inf)
-    # Of boundaries at one place that of the largest load: its derivatives count.
+    # Of bounds at one place that of the largest load: its derivatives count.
     low, high, load_low, load_high = -inf, inf, -inf, -inf
     for belt, code in zip(osc.belts, mode.codes, strict=True):
         boundary = belt.velocity / osc.omega
@@ -108,12 +108,14 @@ def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | No
         low, load_low = select((code == -1) & tighter, (boundary, belt.load), (low, load_low))
     x1, split = None, jnp.zeros_like(lanes.done) if extrema is None else extrema
     if edges:
-        left, right = -inf, inf
+        left, right, load_left, load_right = -inf, inf, -inf, -inf
         for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
-            left = jnp.where(touches, jnp.maximum(left, belt.lower), left)
-            left = jnp.where(code == ABOVE, jnp.maximum(left, belt.upper), left)
-            right = jnp.where(touches, jnp.minimum(right, belt.upper), right)
-            right = jnp.where(code == BELOW, jnp.minimum(right, belt.lower), right)
+            for bounds, edge in ((touches, belt.lower), (code == ABOVE, belt.upper)):
+                tighter = (edge > left) | (edge == left) & (belt.load > load_left)
+                left, load_left = select(bounds & tighter, (edge, belt.load), (left, load_left))
+            for bounds, edge in ((touches, belt.upper), (code == BELOW, belt.lower)):
+                tighter = (edge < right) | (edge == right) & (belt.load > load_right)
+                right, load_right = select(bounds & tighter, (edge, belt.load), (right, load_right))
         x1 = left, right
         # Far from the edges, as measured by the motion, x1 need not be monotone. Steps that ended
         # at every x2 = 0 would become as small as rounding where a lane comes to rest.

@@ -81,6 +81,20 @@ def first_of(flags: Sequence[Array], values: Sequence[Array], default: Array) ->
     return out
 
 
+def foremost(osc: Oscillator, flags: Sequence[Array], values: Sequence[Array], default: Array):
+    """Elementwise the value, of those whose flag is set, of the belt with the largest load.
+
+    For values that are equal, of belts that act at one place: derivatives are those of a belt that
+    exerts a force. flags, values: one a belt, or several times as many. `default` where no flag is
+    set.
+    """
+    out, load = default, jnp.asarray(-jnp.inf)
+    belts = osc.belts * (len(flags) // len(osc.belts))
+    for belt, flag, value in zip(belts, flags, values, strict=True):
+        out, load = select(flag & (belt.load > load), (value, belt.load), (out, load))
+    return out
+
+
 def select(condition: Array, on_true: Tree, on_false: Tree) -> Tree:
     """Elementwise choice between two modes, or two tuples of arrays."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), on_true, on_false)
@@ -143,7 +157,7 @@ def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
 
 def stick_velocity(osc: Oscillator, mode: Mode, default: Array) -> Array:
     """Velocity nu_k of the belts that are stuck, or `default` where none is."""
-    return first_of(mode.stuck, [belt.velocity for belt in osc.belts], default)
+    return foremost(osc, mode.stuck, [belt.velocity for belt in osc.belts], default)
 
 
 # --- guards: positive inside a mode ---------------------------------------------------------------
@@ -252,10 +266,13 @@ def reach_boundary(
     """
     velocities = [belt.velocity for belt in osc.belts]
     velocity = first_of(hit, velocities, velocities[0])
-    x2 = velocity / osc.omega
+    concerned = [
+        touches & (nu == velocity) for nu, touches in zip(velocities, mode.touching, strict=True)
+    ]
+    x2 = foremost(osc, concerned, velocities, velocity) / osc.omega
     codes = tuple(
-        jnp.where(touches & (nu == velocity), STUCK, code)
-        for nu, code, touches in zip(velocities, mode.codes, mode.touching, strict=True)
+        jnp.where(is_concerned, STUCK, code)
+        for is_concerned, code in zip(concerned, mode.codes, strict=True)
     )
     return settle(osc, Mode(codes), x1, x2), x2
 
@@ -342,7 +359,7 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
     rounding = ON_GUARD * (1 + jnp.abs(x1_onset) + capacity(osc, mode))
     slips = (onset_distance + rounding < to_edge) | jnp.isinf(to_edge)
     at_edge = [~slips & (distance <= to_edge) for distance in edge_distances]
-    x1_end = first_of([slips, *at_edge], [x1_onset, *edges(osc)], x1)
+    x1_end = jnp.where(slips, x1_onset, foremost(osc, at_edge, edges(osc), x1))
     # Not distance/|v|: x1_end does not depend on x1, and so neither do its derivatives.
     duration = (x1_end - x1) / v_or_one
     # Negative by rounding only; its derivatives are those of the quotient there, too.
@@ -398,6 +415,7 @@ def leave_slip(osc: Oscillator, mode: Mode, fired: Array, x1: Array, x2: Array) 
         return Departure(after_boundary, x1, x2, at_boundary, at_edge, at_edge)
     edge_hit = [fired == n + i for i in range(2 * n)]
     edge = first_of(edge_hit, edges(osc), x1)
+    edge = foremost(osc, [other == edge for other in edges(osc)], edges(osc), edge)
     flags = zip(edge_hit, bounds_rightward(mode), strict=True)
     rightward = any_of([hit & right for hit, right in flags])
     after_edge = pass_edge(osc, mode, edge, x2, rightward)

@@ -10,7 +10,6 @@ The tangent of a run is its sensitivities times those of its inputs, a product t
 transposes; so both modes, and any number of derivatives by one run, cost about the same.
 """
 
-import functools
 import math
 from dataclasses import replace
 
@@ -24,6 +23,8 @@ from ..model.modes import (
     Mode,
     boundary_guards,
     edge_guards,
+    first_of,
+    foremost,
     leave_slip,
     mode_of,
     select,
@@ -158,9 +159,14 @@ def _passed(osc: Oscillator, arc: Arc, y: State, left: Array) -> tuple[Array, Ar
     end = flown(osc, mode, y, jnp.where(stuck, 0.0, arc.duration), arc.end)
 
     def fired_guard(*y):
+        n = len(osc.belts)
         guards = [*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])]
-        hit = [jnp.where(arc.fired == i, guard, 0.0) for i, guard in enumerate(guards)]
-        return functools.reduce(jnp.add, hit)
+        hit = first_of([arc.fired == i for i in range(3 * n)], guards, jnp.zeros(()))
+        same = [
+            (guard == hit) & ((arc.fired < n) == (i < n)) & (arc.fired >= 0)
+            for i, guard in enumerate(guards)
+        ]
+        return foremost(osc, same, guards, hit)
 
     # By how much later than after `duration` the arc ends: nothing, with the right derivatives.
     slopes = slip_field(osc, mode, end)

@@ -109,7 +109,7 @@ def _parser():
         "--by",
         choices=("simulate", "sweep", "find_cycle"),
         default="simulate",
-        help="who is asked to graze",
+        help="who is asked to graze, or for derivatives",
     )
     parser.add_argument("--programs", type=int, default=9, help="structures of laws and edges")
     parser.add_argument("--structure", type=int, help="only this one of them")
@@ -254,7 +254,8 @@ def _plain(value):
 
 def _rows(verdicts, good, options):
     """The rows of the table in `docs/checked.md`."""
-    what = options.what + (f", {options.by}" if options.what == "grazing" else "")
+    asked = options.what in ("grazing", "derivatives")
+    what = options.what + (f", {options.by}" if asked else "")
     rows = []
     for kind in sorted({kind for kind, _ in verdicts}):
         counts = {v: n for (k, v), n in verdicts.items() if k == kind}
