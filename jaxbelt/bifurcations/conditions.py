@@ -9,9 +9,9 @@ Each kind is one class that carries all that is known of it: its theory; a guess
 equations that Newton's method solves from there, which also judges the solution; what hints at it
 between two values on a path; what to watch along its curve, and where that ends; its names and its
 line in pictures. `refine`, `scan`, `bifurcation_curve`, the diagrams and the pictures ask it and
-know no kind. `AbstractCycleCondition` and `AbstractRestCondition` share what conditions on a cycle
-and on a state of rest have in common; a functional of an attracting cycle that has a given value is
-a `CycleEquation`, for which a class with one method will do.
+know no kind. `AbstractCycleCondition` shares what conditions on a cycle have in common, and so does
+`rests.AbstractRestCondition` for a state of rest; a functional of an attracting cycle that has a
+given value is a `CycleEquation`, for which a class with one method will do.
 
 The numbers in a condition, such as its belt, are data of the compiled programs, so one program
 serves all of them: in `guess` and `system` they are arrays. A field that decides which program runs
@@ -51,10 +51,8 @@ from .systems import (
     NOWHERE,
     AbstractSystem,
     CycleSystem,
-    RestSystem,
     Tests,
     accuracy,
-    small_newton,
     solve_system,
 )
 
@@ -538,51 +536,8 @@ class _Equation(CycleSystem):
         return self.of.watch(osc, self.chain, z, slope), True, jnp.nan
 
 
-# --- conditions on a state of rest ----------------------------------------------------------------
-
-
-class AbstractRestCondition(AbstractCondition):
-    """A condition on a state of rest, at which there is no cycle."""
-
-    #: Why there is none.
-    no_cycle: ClassVar[Status] = Status.EQUILIBRIUM
-
-    @abc.abstractmethod
-    def system(self, osc: Oscillator, guess: Any) -> tuple[RestSystem, Any, Array]:
-        """The system near a guess, its unknowns there, and a status; compiled."""
-
-    def prepared(self, osc, guess):
-        return _prepared_rest(self, osc, guess)
-
-    def solved(self, family, system, x, p, status):
-        why = jnp.asarray(self.no_cycle.value)
-        return _solved_rest(family, system, x, p, status, why)
-
-    def followed(self, point):
-        osc, data = point.oscillator, self.as_data()
-        return data.prepared(osc, data.guess(osc, self.room))[:2]
-
-
-@jit
-def _prepared_rest(condition: AbstractRestCondition, osc: Oscillator, guess):
-    return condition.system(lax.stop_gradient(osc), guess)
-
-
-@jit
-def _solved_rest(family: Family, system: RestSystem, x0, p0, status, why):
-    def equations(family, u):
-        return system.residual(family.at(u[-1:]), u[:-1])
-
-    u, steps, size, error = small_newton(equations, family, jnp.append(x0, p0))
-    x, p = u[:-1], u[-1:]
-    exists = system.exists(family.at(p), x)
-    judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
-    judged = jnp.where(size < HOLDS, judged, Status.NO_CONVERGENCE.value)
-    status = jnp.where(status == Status.OK, judged, status)
-    return _point_without_cycle(family, p, steps, size, error, status, why), (x, p)
-
-
-def _point_without_cycle(family: Family, p, steps, size, error, status, why):
+def point_without_cycle(family: Family, p, steps, size, error, status, why) -> BifurcationPoint:
+    """A point at p where there is no cycle: why not."""
     iterations = jnp.sum(~jnp.isnan(steps))
     known = functools.partial(jnp.where, status == Status.OK)
     at_point = family.at(known(p, jnp.nan))
@@ -612,5 +567,5 @@ def unexplained_point(variation: Variation, value: float, width: float) -> Bifur
     p, error, none = np.array([value]), jnp.asarray(width), jnp.asarray(jnp.nan)
     ok, steps = jnp.asarray(Status.OK.value), jnp.full(NEWTON_STEPS, jnp.nan)
     why = jnp.asarray(Status.UNEXPLAINED.value)
-    point = _point_without_cycle(variation.family(p), jnp.asarray(p), steps, none, error, ok, why)
+    point = point_without_cycle(variation.family(p), jnp.asarray(p), steps, none, error, ok, why)
     return replace(point, status=why)

@@ -16,6 +16,7 @@ and the pseudo-Hopf point are those of M. di Bernardo, C. Budd, A. Champneys, P.
 Piecewise-smooth Dynamical Systems, 2008.
 """
 
+import abc
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -49,9 +50,10 @@ from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status
 from .conditions import (
-    AbstractRestCondition,
+    AbstractCondition,
     Line,
     Trail,
+    point_without_cycle,
 )
 from .guesses import HINT_BUDGET, orbit_after_stick
 from .special import SpecialPoint
@@ -62,6 +64,50 @@ NOTHING = np.zeros(0)
 #: Where sudden sliding is looked for, relative to where the belt is at rest: orbits that settle
 #: soon first; other points may be nearer than where they do.
 BESIDE = (1e-2, -1e-2, 1e-4, -1e-4)
+
+# --- conditions on a state of rest ----------------------------------------------------------------
+
+
+class AbstractRestCondition(AbstractCondition):
+    """A condition on a state of rest, at which there is no cycle."""
+
+    #: Why there is none.
+    no_cycle: ClassVar[Status] = Status.EQUILIBRIUM
+
+    @abc.abstractmethod
+    def system(self, osc: Oscillator, guess: Any) -> tuple[RestSystem, Any, Array]:
+        """The system near a guess, its unknowns there, and a status; compiled."""
+
+    def prepared(self, osc, guess):
+        return _prepared_rest(self, osc, guess)
+
+    def solved(self, family, system, x, p, status):
+        why = jnp.asarray(self.no_cycle.value)
+        return _solved_rest(family, system, x, p, status, why)
+
+    def followed(self, point):
+        osc, data = point.oscillator, self.as_data()
+        return data.prepared(osc, data.guess(osc, self.room))[:2]
+
+
+@jit
+def _prepared_rest(condition: AbstractRestCondition, osc: Oscillator, guess):
+    return condition.system(lax.stop_gradient(osc), guess)
+
+
+@jit
+def _solved_rest(family: Family, system: RestSystem, x0, p0, status, why):
+    def equations(family, u):
+        return system.residual(family.at(u[-1:]), u[:-1])
+
+    u, steps, size, error = small_newton(equations, family, jnp.append(x0, p0))
+    x, p = u[:-1], u[-1:]
+    exists = system.exists(family.at(p), x)
+    judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
+    judged = jnp.where(size < HOLDS, judged, Status.NO_CONVERGENCE.value)
+    status = jnp.where(status == Status.OK, judged, status)
+    return point_without_cycle(family, p, steps, size, error, status, why), (x, p)
+
 
 # --- the Hopf point -------------------------------------------------------------------------------
 
