@@ -7,7 +7,6 @@ sequence of events is kept as one number, its word.
 from dataclasses import replace
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from ..model.events import Signature, event_between
@@ -20,6 +19,7 @@ from ..model.modes import (
     mode_acceleration,
     select,
     stick_phase,
+    without_rounding,
 )
 from ..model.oscillator import Oscillator
 from ..results import EventKind, Status
@@ -97,7 +97,7 @@ def _set_off(edges, osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> tu
     """x2' and the step size with which the lanes go on in a mode."""
     a = mode_acceleration(osc, mode, x1, x2)
     # Slip onset is tangent: x2' = 0 there up to rounding, for a law without a jump.
-    a = jnp.where(jnp.abs(a) < force_rounding(x1), a - lax.stop_gradient(a), a)
+    a = without_rounding(a, x1)
     h = jnp.where(fired, first_step(rtol), jnp.abs(lanes.h))
     if edges:
         # In a corner one event follows the other at once: a lane that stands on the next guard,

@@ -32,7 +32,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import ABOVE, BELOW, ULPS, fastest_rate, select
+from ..model.modes import (
+    ULPS,
+    bounds_leftward,
+    bounds_rightward,
+    fastest_rate,
+    foremost,
+    select,
+)
+from ..model.modes import edges as edge_positions
 from ..model.oscillator import Oscillator
 from .lanes import Lanes, choose, materialise
 
@@ -98,24 +106,20 @@ class _Window(eqx.Module):
 def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | None) -> _Window:
     """The bounds of the current modes. Where x1 has to be monotone, x2 = 0 is a bound, too."""
     mode, inf = lanes.mode, jnp.full_like(lanes.t, jnp.inf)
-    # Of bounds at one place that of the largest load: its derivatives count.
-    low, high, load_low, load_high = -inf, inf, -inf, -inf
-    for belt, code in zip(osc.belts, mode.codes, strict=True):
-        boundary = belt.velocity / osc.omega
-        tighter = (boundary < high) | (boundary == high) & (belt.load > load_high)
-        high, load_high = select((code == 1) & tighter, (boundary, belt.load), (high, load_high))
-        tighter = (boundary > low) | (boundary == low) & (belt.load > load_low)
-        low, load_low = select((code == -1) & tighter, (boundary, belt.load), (low, load_low))
+
+    def innermost(pick, flags, bounds, none):
+        """The largest or smallest of the flagged bounds, as `pick` says, or `none`."""
+        pairs = list(zip(flags, bounds, strict=True))
+        found = functools.reduce(pick, [jnp.where(flag, one, none) for flag, one in pairs])
+        return foremost(osc, [flag & (one == found) for flag, one in pairs], bounds, found)
+
+    boundaries = [belt.velocity / osc.omega for belt in osc.belts]
+    low = innermost(jnp.maximum, [code == -1 for code in mode.codes], boundaries, -inf)
+    high = innermost(jnp.minimum, [code == 1 for code in mode.codes], boundaries, inf)
     x1, split = None, jnp.zeros_like(lanes.done) if extrema is None else extrema
     if edges:
-        left, right, load_left, load_right = -inf, inf, -inf, -inf
-        for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
-            for bounds, edge in ((touches, belt.lower), (code == ABOVE, belt.upper)):
-                tighter = (edge > left) | (edge == left) & (belt.load > load_left)
-                left, load_left = select(bounds & tighter, (edge, belt.load), (left, load_left))
-            for bounds, edge in ((touches, belt.upper), (code == BELOW, belt.lower)):
-                tighter = (edge < right) | (edge == right) & (belt.load > load_right)
-                right, load_right = select(bounds & tighter, (edge, belt.load), (right, load_right))
+        left = innermost(jnp.maximum, bounds_leftward(mode), edge_positions(osc), -inf)
+        right = innermost(jnp.minimum, bounds_rightward(mode), edge_positions(osc), inf)
         x1 = left, right
         # Far from the edges, as measured by the motion, x1 need not be monotone. Steps that ended
         # at every x2 = 0 would become as small as rounding where a lane comes to rest.
@@ -124,7 +128,7 @@ def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | No
     if edges or extrema is not None:
         up = split & ((lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0)))
         down = split & ((lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0)))
-        # Not the larger and the smaller number: where a belt is at rest the boundary is its own.
+        # Of the boundary of a belt at rest the derivatives stay.
         low = jnp.where(up & (low < 0), 0.0, low)
         high = jnp.where(down & (high > 0), 0.0, high)
     signs = mode.signs
@@ -183,7 +187,6 @@ def attempt(
     if derivatives:
         ends = (x1, x2), (y1, y2)
         fastest = functools.reduce(jnp.maximum, [_rate(osc, window, one, *end) for end in ends])
-        # To the power of eight, as _next_size expects.
         error = jnp.maximum(error, _E_LINEAR / rtol * ((h * fastest) ** 2) ** 4)
     integrals = jax.tree.map(lambda i, *s: i + h * _combine(_A[-1], s), lanes.integrals, *slopes)
     return _Attempt(h, y1, y2, stages[-1], lax.stop_gradient(error), integrals)

@@ -24,6 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from ..checks import is_concrete
@@ -81,12 +82,14 @@ def first_of(flags: Sequence[Array], values: Sequence[Array], default: Array) ->
     return out
 
 
-def foremost(osc: Oscillator, flags: Sequence[Array], values: Sequence[Array], default: Array):
-    """Elementwise the value, of those whose flag is set, of the belt with the largest load.
+def foremost(
+    osc: Oscillator, flags: Sequence[Array], values: Sequence[Array], default: Array
+) -> Array:
+    """Elementwise the value of the belt with the largest load of those whose flag is set.
 
-    For values that are equal, of belts that act at one place: derivatives are those of a belt that
-    exerts a force. flags, values: one a belt, or several times as many. `default` where no flag is
-    set.
+    The values of these are equal, for their belts act at one place; the derivatives are then those
+    of a belt that exerts a force. flags, values: one a belt, or one a belt several times over.
+    `default` where no flag is set.
     """
     out, load = default, jnp.asarray(-jnp.inf)
     belts = osc.belts * (len(flags) // len(osc.belts))
@@ -131,6 +134,11 @@ def force_rounding(x1: Array, scale: Array | float = 1.0) -> Array:
     x1 and x2 may come from an integrated arc, whose end is found to about 1e-13.
     """
     return 1e-12 * (scale + jnp.abs(x1))
+
+
+def without_rounding(a: Array, x1: Array) -> Array:
+    """x2' at x1, and 0 where it is 0 up to rounding, as at slip onset; its derivatives stay."""
+    return jnp.where(jnp.abs(a) < force_rounding(x1), a - lax.stop_gradient(a), a)
 
 
 def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
@@ -310,9 +318,10 @@ def _slip_sign(velocity: Array, speed: Array) -> Array:
 class StickPhase(eqx.Module):
     """A stick phase in closed form, from its entry to its end (arrays of the batch shape).
 
-    duration: inf where it never ends (a belt at rest); x1: where it ends; x2: in all of it, that of
-    the belt, of which a start that sticks has it to rounding and without derivatives; slips: it
-    ends by slip onset; edge: which of `edges` ends it otherwise, one flag each.
+    duration: inf where it never ends (a belt at rest); x1: where it ends; x2: of the mass in all of
+    it, which moves with the belt (a start that sticks has the same number, but not its
+    derivatives); slips: it ends by slip onset; edge: which of `edges` ends it otherwise, one flag
+    each.
     """
 
     duration: Array
@@ -363,7 +372,7 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
     # Not distance/|v|: x1_end does not depend on x1, and so neither do its derivatives.
     duration = (x1_end - x1) / v_or_one
     # Negative by rounding only; its derivatives are those of the quotient there, too.
-    duration = duration + jax.lax.stop_gradient(jnp.maximum(duration, 0.0) - duration)
+    duration = duration + lax.stop_gradient(jnp.maximum(duration, 0.0) - duration)
     duration = jnp.where(moves, duration, jnp.inf)
     return StickPhase(duration, x1_end, v, slips, at_edge)
 
@@ -475,7 +484,7 @@ def _sides(osc: Oscillator, x1: Array, x2: Array) -> tuple[Mode, Mode]:
 def _pull_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> Array:
     """x2' at rest, (x1, 0): 0 where a belt holds the mass, and where it is but rounding."""
     a = mode_acceleration(osc, mode, x1, jnp.zeros_like(x1))
-    return jnp.where(mode.any_stuck | (jnp.abs(a) < force_rounding(x1)), 0.0, a)
+    return jnp.where(mode.any_stuck, 0.0, without_rounding(a, x1))
 
 
 def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:

@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import require_callable, require_one_of, require_value
-from ..model.modes import Mode, force_rounding, mode_acceleration
+from ..model.modes import Mode, mode_acceleration, without_rounding
 from ..model.oscillator import Oscillator
 
 
@@ -126,9 +126,8 @@ def _velocity(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 
 
 def _x2_rate(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
-    """x2', and 0 where it is 0 but for rounding, as at slip onset; its derivative stays."""
     a = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
-    return jnp.where(jnp.abs(a) < force_rounding(x1), a - lax.stop_gradient(a), a)
+    return without_rounding(a, x1)
 
 
 def value_and_rate(

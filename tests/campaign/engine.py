@@ -133,11 +133,10 @@ def simulate(
 ):
     """The run from y0 over [0, T].
 
-    mode: contact codes to go on with, None: those of the state. noise: as an atol and rtol; every
-    step of length h is disturbed by noise (1 + |y|) h, the state after every event by
-    noise (1 + |y|), at random. turns, extrema: record
-    the zeros of x2 (belt 0: a maximum of x1, 1: a minimum), the extrema of x2. capture: end, at
-    rest, where the run converges to a pseudo-focus.
+    mode: contact codes to go on with, None: those of the state. noise: a tolerance, as rtol and
+    atol; every step of length h is disturbed by noise (1 + |y|) h, the state after every event by
+    noise (1 + |y|), at random. turns, extrema: record the zeros of x2 (belt 0: a maximum of x1, 1:
+    a minimum), the extrema of x2. capture: end, at rest, where the run converges to a pseudo-focus.
     """
     n = len(osc.belts)
     given = np.full(n, 9, np.int64) if mode is None else np.array(mode, np.int64)
