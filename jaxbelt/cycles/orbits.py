@@ -25,9 +25,9 @@ from ..model.modes import (
     mode_of_state,
     onset_position,
     select,
-    settles,
 )
 from ..model.oscillator import Oscillator
+from ..model.rest import settles
 from ..motion.arcs import ArcEnd, Ends, Signs, after_slip, signs_after, slip_arc, stick_arc
 from ..motion.integrators import STRIDE, Graded
 from ..numerics.compiling import one_kernel

@@ -1,6 +1,6 @@
 """When an orbit has settled: one rule for the orbits behind cycles and for the runs of sweeps.
 
-It has come to rest where it enters a disc that a fixed point attracts (`modes.settling_margin`),
+It has come to rest where it enters a disc that a fixed point attracts (`rest.settling_margin`),
 where a pseudo-focus captures it (`modes.is_captured`), or where its loops shrink and are smaller
 than can be told from rest. It is on a cycle where a loop repeats. One that sticks repeats exactly,
 because slip onset is a function of the parameters alone; so it is on a cycle however small it is.

@@ -12,8 +12,9 @@ from ..cycles.settling import REPEATED, way_left
 from ..kernel.events import append, event_kinds, word_events
 from ..kernel.lanes import Lanes, Observer, Passage, Variable, materialise
 from ..model.events import signature_name
-from ..model.modes import begins_at_rest, select, settling_margin
+from ..model.modes import begins_at_rest, select
 from ..model.oscillator import Oscillator
+from ..model.rest import settling_margin
 from ..results import Status
 from .marks import Mark
 
@@ -73,7 +74,7 @@ class Attractor(Observer):
       the parameters alone, so it does so to the last bits. One that does not stick converges: its
       top (a maximum of x1, where x2 = 0) repeats, see `settling`.
     - An equilibrium: the run begins on one, or the orbit has entered a disc that is attracted by a
-      fixed point, see `modes.settling_margin`. A pseudo-focus is recognised by `modes.is_captured`.
+      fixed point, see `rest.settling_margin`. A pseudo-focus is recognised by `modes.is_captured`.
     - Stuck for ever: on a belt at rest.
 
     The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.

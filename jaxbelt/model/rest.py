@@ -1,0 +1,54 @@
+"""Orbits that come to rest: when it is known that they will."""
+
+import functools
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .modes import Mode, boundary_guards, edge_guards, force_rounding, mode_acceleration
+from .oscillator import Oscillator
+
+#: Radius of the smallest disc that is checked: in smaller ones the rounding of x1 counts.
+SMALLEST_DISC = 1e-6
+#: Speeds, as fractions of the radius, at which an attracting disc is checked.
+DISC = tuple(sign * j / 8 for j in range(1, 9) for sign in (1, -1))
+
+
+def settling_margin(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
+    """Positive where an orbit of a slip mode has entered a disc that its fixed point attracts, or
+    is there up to rounding: a node on an edge, or on the boundary of a belt at rest, has no disc.
+
+    And that fixed point's x1.
+    """
+    zero = jnp.zeros_like(x1)
+    x1_rest = mode_acceleration(osc, mode, zero, zero)
+    radius = jnp.maximum(jnp.hypot(x1 - x1_rest, x2), SMALLEST_DISC)
+    at_rest = jnp.maximum(jnp.abs(x1 - x1_rest), jnp.abs(x2)) < force_rounding(x1)
+    return jnp.where(at_rest, radius, disc_margin(osc, mode, x1_rest, radius)), x1_rest
+
+
+def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """Whether an orbit comes to rest at the fixed point of a slip mode, see `settling_margin`."""
+    return ~mode.any_stuck & (settling_margin(osc, mode, x1, x2)[0] > 0)
+
+
+def disc_margin(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> Array:
+    """Positive where all orbits in the disc around the fixed point (x1_rest, 0) come to rest there.
+
+    In a slip mode x1'' = -(x1 - x1_rest) + f(x2) with f(0) = 0, so E = (x1 - x1_rest)^2 + x2^2
+    obeys E' = 2 x2 f(x2). If v f(v) < 0 for all 0 < |v| <= radius, and the disc lies within the
+    mode's boundaries and edges, E falls until the orbit is at rest. The sign is checked at 16
+    speeds; a law that wiggles on a scale below radius/8 could deceive that.
+    """
+    margins = []
+    for fraction in DISC:
+        v = fraction * radius
+        margins.append(-v * mode_acceleration(osc, mode, x1_rest, v))
+    pulls = [belt.load != 0 for belt in osc.belts]  # no other belt is an obstacle
+    for v in (radius, -radius):
+        bounds = boundary_guards(osc, mode, v) + edge_guards(osc, mode, x1_rest + v)
+        margins += [
+            jnp.where(matters, bound, jnp.inf)
+            for matters, bound in zip(pulls * 3, bounds, strict=True)
+        ]
+    return functools.reduce(jnp.minimum, margins)
