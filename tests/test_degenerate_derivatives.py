@@ -102,6 +102,44 @@ def test_a_start_that_sticks_moves_with_its_belt(by):
     np.testing.assert_allclose(by_x2, [0.0, 0.0], atol=1e-14)
 
 
+def on_an_edge(mud, edge):
+    """At rest on the edge -0.3 the left-hand side pushes back, and so does the right-hand one where
+    mud < 0.5. Where mud = 0.5 that has its equilibrium there."""
+    belts = jb.Belt(0.8, jb.Coulomb(0.5, mud)), jb.Belt(-0.7, jb.Coulomb(1.0, 0.8), lower=edge)
+    return jb.Oscillator(2.0, belts)
+
+
+@jax.jit
+@jax.jacfwd
+def simulated_on_an_edge(row):
+    """Of the state at T = 50 by start, mud and edge, [2, 4]."""
+    return jb.simulate(on_an_edge(*row[2:]), row[:2], 50.0, ts=jnp.array([50.0])).ys[-1]
+
+
+def derivatives_on_an_edge(by, mud, start):
+    """The same of either."""
+    if by == "simulate":
+        return simulated_on_an_edge(jnp.array([*start, mud, -0.3]))
+    axes = {"x1": start[:1], "x2": start[1:], "mud": [mud], "edge": [-0.3]}
+    found = jb.sweep(on_an_edge, axes, t1=50.0, derivatives=tuple(axes)).squeeze()
+    return np.array([[float(found[f"d_{i}_end_d_{j}"]) for j in axes] for i in ("x1", "x2")])
+
+
+@pytest.mark.parametrize("by", ["simulate", "sweep"])
+@pytest.mark.parametrize("mud", [0.4, 0.5])
+def test_a_start_at_a_pseudo_focus_moves_with_its_edge(by, mud):
+    """Its neighbours are pushed back there."""
+    found = derivatives_on_an_edge(by, mud, [-0.3, 0.0])
+    np.testing.assert_array_equal(found, [[0, 0, 0, 1], [0, 0, 0, 0]])
+
+
+@pytest.mark.parametrize("by", ["simulate", "sweep"])
+def test_a_run_that_comes_to_rest_on_an_edge_moves_with_its_equilibrium(by):
+    """That of the side from which it came; a step of it ends on the edge."""
+    found = derivatives_on_an_edge(by, 0.5, [-1.4, 0.8])
+    np.testing.assert_allclose(found, [[0, 0, 1, 0], [0, 0, 0, 0]], atol=1e-9)
+
+
 STEEP = ("conti", 1.0, 0.6, 5.0, 0.0)
 CASES = {
     "starts by sticking": (Oscillator(0.5, (Belt(0.2, PAPER), Belt(0.35, PAPER))), (1.0, 0.2)),

@@ -22,6 +22,7 @@ from ..model.modes import (
     without_rounding,
 )
 from ..model.oscillator import Oscillator
+from ..model.rest import kept_at_rest
 from ..results import EventKind, Status
 from .lanes import Lanes, Passage
 from .step import NO_STEP, STEP_SAFETY, first_step
@@ -46,10 +47,11 @@ def pass_events(
     captured = fired & after.captured & captures
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
 
+    left = t1 - lanes.t
+    x1, x2 = kept_at_rest(osc, lanes.mode, rests, x1, x2, left)
     stuck = after.mode.any_stuck & ~captured & ~lanes.done
     phase = stick_phase(osc, after.mode, x1)
     x2 = jnp.where(stuck, phase.x2, x2)
-    left = t1 - lanes.t
     ends = phase.duration >= left
     duration = jnp.where(stuck, jnp.where(ends, left, phase.duration), 0.0)
     released = stuck & ~ends

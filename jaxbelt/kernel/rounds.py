@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import Mode, at_focus, mode_acceleration, mode_of_state
+from ..model.modes import Mode, at_focus, mode_acceleration, mode_of_state, start_at_focus
 from ..model.oscillator import Oscillator
 from ..results import Status
 from .events import pass_events
@@ -20,6 +20,7 @@ STEPS_PER_ROUND = 4
 
 def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, *, edges: bool) -> Lanes:
     """Lanes at the start of their runs, without what an observer adds; edges: see `window_of`."""
+    x1, x2 = start_at_focus(osc, x1, x2)
     mode = mode_of_state(osc, x1, x2)
     finite = jnp.isfinite(x1) & jnp.isfinite(x2)
     for leaf in jax.tree.leaves(osc):

@@ -37,6 +37,7 @@ from ..model.modes import (
     bounds_leftward,
     bounds_rightward,
     fastest_rate,
+    force_rounding,
     foremost,
     select,
 )
@@ -371,7 +372,9 @@ def take_step(
     bound = at.x2 if window.x1 is None else jnp.where(at.on_edge, at.x1, at.x2)
     x1, x2 = _bridged(lands, at.on_edge, delta, bound, new)
     a_end = _quotient(osc, window, one, x1, x2)
-    delta, x1, x2 = _with_its_derivatives(lands, at.on_edge, delta, bound, new, (x1, x2, a_end))
+    # At rest a lane stays, so that no bound has a say in how its neighbours move.
+    moves = lands & (jnp.maximum(jnp.abs(x2), jnp.abs(a_end)) >= force_rounding(x1))
+    delta, x1, x2 = _with_its_derivatives(moves, at.on_edge, delta, bound, new, (x1, x2, a_end))
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
     pace, proposed = _next_size(lanes, new, going, accepted)
     stands = shortened & (at.theta * h < NO_STEP)

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import as_numbers, check_finite, check_positive, is_concrete, require
-from ..model.modes import contact, has_edges
+from ..model.modes import contact, has_edges, start_at_focus
 from ..model.oscillator import Oscillator, check_oscillator
 from ..numerics.compiling import jit
 from ..results import EventKind, Status, describe, draw
@@ -158,6 +158,7 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
 @jit
 def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution) -> Trajectory:
     grid = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution) if ts is None else ts
+    y0 = jnp.stack(start_at_focus(osc, *y0))
     final, records, samples = arcs_of_run(osc, y0, t0, t1, grid, rtol, atol, rules)
     count = jnp.cumsum(records.kind > 0)
     wanted = jnp.arange(1, max_events + 1)

@@ -46,8 +46,8 @@ def main(arguments=None):
 
             for case, answer, (verdict, mine) in zip(batch, told, pool.map(one, zip(batch, told))):
                 verdicts[case.kind, verdict] += 1
-                if verdict == "same" and _has_derivatives(mine, options):
-                    right.append((case, mine))
+                if verdict == "same" and _has_derivatives(mine, answer, options):
+                    right.append((case, mine, answer))
                 if verdict in ("same", "tolerance") or (
                     verdict == "corner" and not options.corners
                 ):
@@ -176,26 +176,30 @@ def _ask(package, batch, options):
     return package.simulated(batch, options.tol)
 
 
-def _has_derivatives(mine, options):
-    """Whether derivatives of the engine's run are asked: near grazing always, else of runs that go
-    on until T and come near to no other outcome, or are in a corner."""
-    from . import compare
+def _has_derivatives(mine, run, options):
+    """Whether derivatives are asked of a run, `mine` the engine's: near grazing always, else where
+    it goes on until T, or to a pseudo-focus, and comes near to no other outcome, or to a corner."""
+    from . import compare, engine
 
     if options.what == "derivatives":
         clear = mine.margin > 1e-6 or mine.margin <= compare.CORNER
-        return mine.t_end == options.span and 0 == mine.status and clear
+        lasts = mine.t_end == options.span and mine.status == engine.OK
+        return (lasts or run.status == engine.PSEUDO_FOCUS) and clear
     return options.what == "grazing"
 
 
 def _differentiate(runs, verdicts, disagreements, rng, options):
     """Derivatives of the runs that were right, each along a direction of its own."""
-    from . import compare, derivatives, package
+    from . import compare, derivatives, engine, package
 
-    cases = [case for case, _ in runs]
+    cases = [case for case, _, _ in runs]
     along = [derivatives.directions(case, rng) for case in cases]
     told = package.derivatives(cases, along, options.tol, options.by)
-    for (case, mine), direction, answer in zip(runs, along, told):
-        judged = compare.judge_derivative(case, answer, mine, direction, options.tol)
+    for (case, mine, run), direction, answer in zip(runs, along, told):
+        if run.status == engine.PSEUDO_FOCUS:
+            judged = compare.judge_derivative_at_focus(case, answer, run, direction)
+        else:
+            judged = compare.judge_derivative(case, answer, mine, direction, options.tol)
         _count_derivative(case, direction, answer, judged, verdicts, disagreements, options)
 
 
@@ -203,7 +207,7 @@ def _differentiate_cycles(runs, verdicts, disagreements, rng, options):
     """Derivatives of the periods of the cycles that were right."""
     from . import compare, derivatives, package
 
-    runs = [(case, mine) for case, mine in runs if mine.kind == "cycle"]
+    runs = [(case, mine) for case, mine, _ in runs if mine.kind == "cycle"]
     along = [derivatives.directions(case, rng) for case, _ in runs]
     told = package.period_derivatives([case for case, _ in runs], along)
     for (case, mine), direction, answer in zip(runs, along, told):

@@ -309,6 +309,15 @@ def judge_derivative(case, told, mine, direction, tol):
     return ("same" if good else "derivative"), right
 
 
+def judge_derivative_at_focus(case, told, run, direction):
+    """The verdict on the derivative of a run that ends in a pseudo-focus: it lies on an edge, and
+    moves with it, whatever the start; run: what the package told."""
+    bounds = [edge for belt in case.oscillator.belts for edge in (belt.lower, belt.upper)]
+    moves = [edge for belt in direction[2] for edge in belt[2:]]
+    right = np.array([next(d for b, d in zip(bounds, moves) if b == run.x1), 0.0])
+    return ("same" if np.allclose(told, right, atol=1e-9) else "derivative at a focus"), right
+
+
 def _judge_beside(case, told, direction):
     """The verdict on a derivative in a corner, which is there where those on both sides agree."""
     both = []
