@@ -76,6 +76,21 @@ def test_cycle_that_crosses_a_belt_at_rest(load):
         assert getattr(cycle, name) == pytest.approx(getattr(expected, name), abs=1e-10)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("damping", "nu", "load"), [(5.0, 0.1, 12.0), (8.0, 0.05, 20.0)])
+def test_relaxation_cycle_of_a_strongly_damped_oscillator(damping, nu, load):
+    """Its arcs creep: they take more integration steps than others."""
+    osc = jb.Oscillator(damping, (jb.Belt(nu, jb.Conti(1.0, 0.5, 10.0), load),))
+    cycle = jb.find_cycle(osc, (0.0, 0.0))
+    belt = oracle.Belt(nu, *oracle.conti(1.0, 0.5, 10.0), load)
+    expected = oracle_cycles.sticking_cycle(oracle.Oscillator(damping, (belt,)))
+    assert cycle.status == Status.OK
+    assert cycle.period == pytest.approx(expected.period, abs=1e-9 / nu)
+    assert cycle.stick_durations == pytest.approx(expected.stick_durations, abs=1e-9 / nu)
+    for name in EXTREMA:
+        assert getattr(cycle, name) == pytest.approx(getattr(expected, name), abs=1e-9)
+
+
 @pytest.mark.parametrize(
     ("name", "velocities"),
     [

@@ -14,13 +14,9 @@ import numpy as np
 from jaxtyping import Array
 
 from ..model.oscillator import Oscillator
-from ..numerics.compiling import jit
 from ..results import Status
-from .cycle import Cycle, exactly, polish
-from .shooting import Chain, Loop, closure, cut
-
-#: Steps of an arc that is too long for those of `exactly`, which then leave a larger error.
-MANY_STEPS, TOO_COARSE = 128, 1e-10
+from .cycle import Cycle, exactly
+from .shooting import Chain, Loop, cut
 
 
 class BackwardCycle(Cycle):
@@ -49,19 +45,8 @@ def reversed_in_time(osc: Oscillator) -> Oscillator:
 
 
 def solved(osc: Oscillator, loop: Loop) -> Cycle:
-    """The cycle that a known loop nearly is, with as many steps as it takes."""
-    loop, ok = cut([loop])[0], jnp.asarray(np.array(Status.OK.value))
-    cycle = exactly(osc, loop, ok)
-    inexact = int(cycle.status) == Status.NO_CONVERGENCE
-    if int(cycle.status) == Status.OK:
-        inexact = float(_integration_error(cycle)) > TOO_COARSE
-    return polish(osc, loop, ok, steps=MANY_STEPS) if inexact else cycle
-
-
-@jit
-def _integration_error(cycle: Cycle) -> Array:
-    """The largest error in the shooting equations with every integration step halved."""
-    return closure(cycle.oscillator, cycle.chain.halved, cycle.unknowns)[0]
+    """The cycle that a known loop nearly is."""
+    return exactly(osc, cut([loop])[0], jnp.asarray(np.array(Status.OK.value)))
 
 
 def forwards(osc: Oscillator, cycle: Cycle) -> BackwardCycle:

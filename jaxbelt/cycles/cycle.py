@@ -57,6 +57,9 @@ if TYPE_CHECKING:
 #: Integration steps per slip arc where ARC_STEPS leave a larger error in the equations than EXACT,
 #: as halved steps tell it.
 FINE_STEPS, EXACT = 32, 1e-11
+#: And these, for long arcs that creep along a strongly damped oscillator's slow direction, where
+#: nothing is traced.
+FINER_STEPS = (128, 512)
 
 
 class Cycle(eqx.Module):
@@ -275,8 +278,14 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
     cycle, error = _polished(osc, loop, status, ARC_STEPS)
     if not is_concrete((cycle, error, status)):
         return _finer_where_needed(osc, loop, status, cycle, error)
-    inexact = bool(_is_inexact(cycle, error)) and int(status) == Status.OK
-    return polish(osc, loop, status, FINE_STEPS) if inexact else cycle
+    for steps in (FINE_STEPS, *FINER_STEPS):
+        if int(status) != Status.OK or not _is_inexact(cycle, error):
+            break
+        finer, remaining = _polished(osc, loop, status, steps)
+        if int(cycle.status) == Status.OK and remaining > 0.1 * error:
+            break  # the rest is rounding
+        cycle, error = finer, remaining
+    return cycle
 
 
 def _is_inexact(cycle: Cycle, error: Array) -> Array:
