@@ -23,11 +23,13 @@ from ..numerics.compiling import each, jit
 from ..results import Status
 from .systems import velocity_of
 
-#: Arcs for which the orbit from slip onset is followed in search of the signature.
+#: Arcs for which the orbit from slip onset is followed in search of the signature. Of 665 such
+#: orbits (300 oscillators, half of them of round numbers) 84% had settled by then, 87% after 96.
 HINT_BUDGET = 32
-#: Arcs for which each orbit is followed that may lead to a cycle.
+#: Arcs for which each orbit is followed that may lead to a cycle, and how often, from what it
+#: approaches, or on, until it has settled. Of the 1,565 orbits from `starts` of those oscillators
+#: 87% had settled within 96 arcs, 95% within 384 and 97% within 768; the others creep.
 FOLLOWED = 96
-#: How often an orbit is followed, from what it approaches, or on, until it has settled.
 ATTEMPTS = 6
 #: Where some of them start to the right of an equilibrium, so far from it.
 DISTANCES = (0.02, 0.3, 3.0)
