@@ -7,10 +7,11 @@ of an exception.
 """
 
 import inspect
+import operator
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -260,6 +261,50 @@ def _of_other_library(value: Any, field: str, wanted: str) -> np.ndarray:
         name = f"{type(value).__module__.partition('.')[0]}.{type(value).__name__}"
         raise ValueError(f"{field} must be {wanted}, got a {name} of {value.dtype}")
     return array
+
+
+class Rule(NamedTuple):
+    """What a parameter has to be.
+
+    given: the parameter, and what it depends on beside it; judge(*given): whether it holds, an
+    array; expected: in words, {1} being given[1].
+    """
+
+    field: str
+    given: tuple[Any, ...]
+    judge: Callable[..., Any]
+    expected: str
+
+    def enforce(self, owner: str) -> None:
+        """Raise a `ValueError` where it is known not to hold; owner: words after the field."""
+        if any(isinstance(one, Tracer) for one in self.given):
+            return
+        given = tuple(map(np.asarray, self.given))
+        if not np.all(self.judge(*given)):
+            require(False, self.field + owner, self.expected.format(*given), given[0])
+
+    def holds(self) -> Any:
+        """Whether it holds, an array, traced where something given is."""
+        return self.judge(*self.given)
+
+
+def _is_finite(value: Any) -> Any:
+    return abs(value) < np.inf
+
+
+def be_finite(field: str, value: Any) -> list[Rule]:
+    """The rule that a parameter is finite."""
+    return [Rule(field, (value,), _is_finite, "finite")]
+
+
+def be_nonnegative(field: str, value: Any) -> list[Rule]:
+    """The rules that a parameter is finite and >= 0."""
+    return [*be_finite(field, value), Rule(field, (value, 0.0), operator.ge, ">= 0")]
+
+
+def be_positive(field: str, value: Any) -> list[Rule]:
+    """The rules that a parameter is finite and > 0."""
+    return [*be_finite(field, value), Rule(field, (value, 0.0), operator.gt, "> 0")]
 
 
 def check_finite(value: Any, field: str) -> None:

@@ -54,8 +54,9 @@ ADVICE = {
         "given. Loosen rtol and atol, or check the size of the parameters."
     ),
     Status.NOT_FINITE: (
-        "A parameter, the start or the solution is not a finite number; look for NaN in the input, "
-        "and, where damping is negative, for motions that grow beyond all bounds."
+        "A parameter, the start or the solution is not a finite number, or a parameter is "
+        "impossible; look in the input for NaN, for a negative load or a kinetic coefficient above "
+        "the static one, and, where damping is negative, for motions that grow beyond all bounds."
     ),
     Status.EQUILIBRIUM: (
         "The orbit comes to rest at an equilibrium: this start leads to no cycle. Start further "

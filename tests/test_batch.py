@@ -99,6 +99,42 @@ def test_runs_that_are_not_finite_are_told_in_place_and_harm_no_other():
         assert np.array_equal(dataset[name][~hit], good[name][~hit])
 
 
+def test_runs_of_impossible_oscillators_are_told_in_place_in_every_engine():
+    """Outside of a trace they raise; inside they would go on and tell numbers."""
+    rows = np.array(
+        [
+            # nu, static, kinetic, load, lower
+            [0.2, 0.5, 0.4, 1.0, -1.0],
+            [0.2, 0.5, 0.6, 1.0, -1.0],
+            [0.2, -0.1, -0.2, 1.0, -1.0],
+            [0.2, 0.5, 0.4, -1.0, -1.0],
+            [0.2, 0.5, 0.4, 1.0, 2.0],
+            [0.2, 0.5, 0.4, 1.0, np.nan],
+            [np.inf, 0.5, 0.4, 1.0, -1.0],
+        ]
+    )
+
+    def make(nu, static, kinetic, load, lower):
+        return jb.Oscillator(0.1, (jb.Belt(nu, jb.Coulomb(static, kinetic), load, lower, 1.0),))
+
+    def run(row):
+        return jb.simulate(make(*row), (0.9, 0.0), 5.0, ts=jnp.array([5.0]), max_events=64)
+
+    def cycle(row):
+        return jb.find_cycle(make(*row), (0.9, 0.0))
+
+    runs, cycles = jax.vmap(run)(rows), jax.vmap(cycle)(rows)
+    swept = jb.sweep(
+        lambda row: make(*(jnp.asarray(column)[jnp.asarray(row).astype(int)] for column in rows.T)),
+        {"row": np.arange(len(rows), dtype=float)},
+        y0=(0.9, 0.0),
+        t1=5.0,
+    )
+    for status in (runs.status, cycles.status, swept.status):
+        assert status[0] != Status.NOT_FINITE and np.all(status[1:] == Status.NOT_FINITE)
+    assert np.all(np.isnan(runs.ys[1:])) and np.all(np.isnan(cycles.period[1:]))
+
+
 def test_degenerate_velocities():
     """Equal belts (both stick together), belts at rest (the mass stays for ever), opposite ones."""
     cases = np.array([[0.2, 0.2], [0.0, 0.3], [0.3, 0.0], [0.0, 0.0], [0.3, -0.3]]).T

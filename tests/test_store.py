@@ -214,6 +214,29 @@ def test_a_law_and_a_reducer_count_by_type_numbers_and_source(tmp_path):
     assert sweep(make=lambda nu: make(nu)).equals(sweep())
 
 
+SLOPE = [0.1]
+
+
+class LooksUp(Constant):
+    """A law whose numbers are not its own."""
+
+    def mu(self, speed):
+        return self.static - SLOPE[0] * jnp.tanh(speed)
+
+
+def test_a_law_counts_by_what_it_gives(tmp_path, monkeypatch):
+    def sweep():
+        def make(nu):
+            return jb.Oscillator(0.1, (jb.Belt(nu, LooksUp(jnp.asarray(0.5))),))
+
+        return jb.sweep(make, {"nu": [0.1, 0.2]}, t1=5.0, store=tmp_path / "a.zarr")
+
+    sweep()
+    monkeypatch.setitem(globals(), "SLOPE", [0.2])
+    with pytest.raises(ValueError, match="which differs in the law of belt 0"):
+        sweep()
+
+
 def test_places_that_cannot_hold_a_store_are_told_before_the_computing(tmp_path, monkeypatch):
     monkeypatch.delattr("jaxbelt.sweeps.work.run")
     (tmp_path / "full").mkdir()

@@ -8,26 +8,29 @@ continues smoothly a little beyond its boundary. A law of your own is a subclass
 """
 
 import abc
+import operator
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..checks import (
+    Rule,
     as_array,
-    check_finite,
-    check_nonnegative,
-    check_positive,
-    is_concrete,
+    be_finite,
+    be_nonnegative,
+    be_positive,
     number,
     require,
     require_value,
     traceable,
 )
+
+#: What rounding may add to mu(0), over 1 + static.
+ROUNDING = 1e-14
 
 
 def _scalar(name: str) -> Callable[[Any], Array]:
@@ -43,8 +46,8 @@ class AbstractFriction(eqx.Module):
     def mu(self, speed: Array) -> Array:
         """Kinetic friction coefficient at sliding speed |nu_R| (dimensionless, any shape).
 
-        Must be smooth for speed >= 0 and stay finite and smooth slightly below 0. For the exact
-        formulation mu(0) <= static; the two are equal for a law without a jump.
+        Must be smooth for speed >= 0 and stay finite and smooth slightly below 0; mu(0) <= static,
+        and the two are equal for a law without a jump.
         """
 
     def fraction(self, speed: Array) -> tuple[Array, Array]:
@@ -55,9 +58,17 @@ class AbstractFriction(eqx.Module):
         """The same law for speeds that are given in units of `speed`; see `Machine`."""
         return LawInUnits(self, speed)
 
+    def rules(self) -> list[Rule]:
+        """What its parameters have to be; a law of one's own may add to them."""
+        begins = self.mu(jnp.zeros(jnp.shape(self.static)))
+        most = self.static + ROUNDING * (1 + self.static)
+        bound = Rule("mu(0)", (begins, self.static, most), _is_at_most, "<= static = {1}")
+        return [*be_nonnegative("static", self.static), bound]
+
     def check(self, owner: str) -> None:
         """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
-        check_nonnegative(self.static, f"static of {owner}")
+        for rule in type(self).rules(self):
+            rule.enforce(f" of {owner}")
 
     def __repr__(self) -> str:
         values = ", ".join(
@@ -65,6 +76,10 @@ class AbstractFriction(eqx.Module):
             for name, value in vars(self).items()
         )
         return f"{type(self).__name__}({values})"
+
+
+def _is_at_most(value: Any, _: Any, most: Any) -> Any:
+    return value <= most
 
 
 #: Laws of one's own whose `mu` was traced.
@@ -124,8 +139,8 @@ class LawInUnits(AbstractFriction):
     def in_units_of(self, speed: Array) -> AbstractFriction:
         return LawInUnits(self.law, self.unit * speed)
 
-    def check(self, owner: str) -> None:
-        type(self.law).check(self.law, owner)
+    def rules(self) -> list[Rule]:
+        return type(self.law).rules(self.law)
 
 
 class Conti(AbstractFriction):
@@ -145,11 +160,11 @@ class Conti(AbstractFriction):
     def __check_init__(self):
         self.check("Conti")
 
-    def check(self, owner: str) -> None:
-        check_nonnegative(self.static, f"static of {owner}")
-        check_nonnegative(self.residual, f"residual of {owner}")
-        check_nonnegative(self.steepness, f"steepness of {owner}")
-        check_finite(self.quadratic, f"quadratic of {owner}")
+    def rules(self) -> list[Rule]:
+        rules = be_finite("quadratic", self.quadratic)
+        for name in ("static", "residual", "steepness"):
+            rules += be_nonnegative(name, getattr(self, name))
+        return rules
 
     def in_units_of(self, speed: Array) -> AbstractFriction:
         steepness, quadratic = self.steepness * speed, self.quadratic * speed**2
@@ -183,8 +198,8 @@ class Coulomb(AbstractFriction):
     def __check_init__(self):
         self.check("Coulomb")
 
-    def check(self, owner: str) -> None:
-        _check_static_and_kinetic(self.static, self.kinetic, owner)
+    def rules(self) -> list[Rule]:
+        return _of_static_and_kinetic(self.static, self.kinetic)
 
     def in_units_of(self, speed: Array) -> AbstractFriction:
         return self
@@ -210,9 +225,9 @@ class Stribeck(AbstractFriction):
     def __check_init__(self):
         self.check("Stribeck")
 
-    def check(self, owner: str) -> None:
-        _check_static_and_kinetic(self.static, self.kinetic, owner)
-        check_positive(self.velocity, f"velocity of {owner}")
+    def rules(self) -> list[Rule]:
+        both = _of_static_and_kinetic(self.static, self.kinetic)
+        return both + be_positive("velocity", self.velocity)
 
     def in_units_of(self, speed: Array) -> AbstractFriction:
         return Stribeck(self.static, self.kinetic, self.velocity / speed)
@@ -224,13 +239,6 @@ class Stribeck(AbstractFriction):
         return self.kinetic + (self.static - self.kinetic) * decay
 
 
-def _check_static_and_kinetic(static: ArrayLike, kinetic: ArrayLike, owner: str) -> None:
-    check_nonnegative(static, f"static of {owner}")
-    check_nonnegative(kinetic, f"kinetic of {owner}")
-    if is_concrete((static, kinetic)):
-        require(
-            np.all(np.asarray(kinetic) <= np.asarray(static)),
-            f"kinetic of {owner}",
-            f"<= static = {static}",
-            kinetic,
-        )
+def _of_static_and_kinetic(static: ArrayLike, kinetic: ArrayLike) -> list[Rule]:
+    rules = be_nonnegative("static", static) + be_nonnegative("kinetic", kinetic)
+    return [*rules, Rule("kinetic", (kinetic, static), operator.le, "<= static = {1}")]

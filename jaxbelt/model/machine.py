@@ -22,7 +22,7 @@ from ..checks import (
     require,
 )
 from .friction import AbstractFriction, as_friction
-from .oscillator import Belt, Oscillator, check_oscillator
+from .oscillator import Belt, Oscillator, as_belts, check_oscillator
 
 
 class Units(eqx.Module):
@@ -90,7 +90,9 @@ class Machine(eqx.Module):
     mass: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "mass"))
     stiffness: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "stiffness"))
     damping: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "damping"))
-    belts: tuple[PhysicalBelt, ...] = eqx.field(converter=lambda belts: tuple(belts))
+    belts: tuple[PhysicalBelt, ...] = eqx.field(
+        converter=lambda belts: as_belts(belts, "PhysicalBelt")
+    )
 
     def __check_init__(self):
         check_positive(self.mass, "mass")

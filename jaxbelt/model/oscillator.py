@@ -19,6 +19,8 @@ with the relative velocity r_i = nu_i - omega x2 of belt i. The paper's symbols,
 What happens where the field is not smooth is told in `modes`.
 """
 
+import functools
+import operator
 from collections.abc import Iterable
 from typing import Any
 
@@ -29,10 +31,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..checks import (
+    Rule,
     as_array,
-    check_finite,
-    check_nonnegative,
-    check_positive,
+    be_finite,
+    be_nonnegative,
+    be_positive,
     is_concrete,
     number,
     require,
@@ -66,13 +69,19 @@ class Belt(eqx.Module):
 
     def check(self, owner: str) -> None:
         """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
-        check_finite(self.velocity, f"velocity of {owner}")
-        check_nonnegative(self.load, f"load of {owner}")
-        type(self.friction).check(self.friction, f"friction of {owner}")
-        if is_concrete((self.lower, self.upper)):
-            require(not np.isnan(self.lower), f"lower of {owner}", "a number", self.lower)
-            if not np.asarray(self.lower) < np.asarray(self.upper):
-                require(False, f"lower of {owner}", f"< {self.upper}", self.lower)
+        for rule in self.rules():
+            rule.enforce(f" of {owner}")
+
+    def rules(self) -> list[Rule]:
+        """What its parameters have to be, those of its law included."""
+        law = type(self.friction).rules(self.friction)
+        return [
+            *be_finite("velocity", self.velocity),
+            *be_nonnegative("load", self.load),
+            *(rule._replace(field=f"{rule.field} of friction") for rule in law),
+            Rule("lower", (self.lower, self.lower), operator.eq, "a number"),
+            Rule("lower", (self.lower, self.upper), operator.lt, "< {1}"),
+        ]
 
     def __repr__(self) -> str:
         return (
@@ -81,8 +90,9 @@ class Belt(eqx.Module):
         )
 
 
-def _as_belts(belts: Any) -> tuple[Belt, ...]:
-    expected = "a tuple of belts, such as (jb.Belt(...), jb.Belt(...))"
+def as_belts(belts: Any, kind: str = "Belt") -> tuple:
+    """The belts as a tuple; kind: what each of them is called."""
+    expected = f"a tuple of belts, such as (jb.{kind}(...), jb.{kind}(...))"
     fits = isinstance(belts, Iterable) and not isinstance(belts, str | dict)
     require_value(fits, "belts", expected, belts)
     return tuple(belts)
@@ -98,7 +108,7 @@ class Oscillator(eqx.Module):
     """
 
     damping: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "damping"))
-    belts: tuple[Belt, ...] = eqx.field(converter=_as_belts)
+    belts: tuple[Belt, ...] = eqx.field(converter=as_belts)
     omega: Float[Array, ""] = eqx.field(
         converter=lambda value: as_array(value, "omega"), default=1.0
     )
@@ -111,12 +121,16 @@ class Oscillator(eqx.Module):
         # As NumPy's, when they are known: a look at an array of JAX's costs a hundred times more.
         # And checks are taken from their class: Equinox makes a module of a method of an object.
         osc = jax.tree.map(np.asarray, self) if is_concrete(self) else self
-        check_finite(osc.damping, "damping")
-        check_positive(osc.omega, "omega")
+        for rule in Oscillator.rules(osc):
+            rule.enforce("")
         require(len(osc.belts) > 0, "belts", "at least one Belt", "none")
         for i, belt in enumerate(osc.belts):
             require_value(isinstance(belt, Belt), f"belts[{i}]", "a Belt", belt)
             Belt.check(belt, f"belt {i}")
+
+    def rules(self) -> list[Rule]:
+        """What its parameters have to be, but for those of its belts."""
+        return be_finite("damping", self.damping) + be_positive("omega", self.omega)
 
     def __repr__(self) -> str:
         belts = ", ".join(map(repr, self.belts))
@@ -145,6 +159,15 @@ def check_scalars(osc: Oscillator) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(osc):
         if eqx.is_inexact_array(leaf) and (leaf.ndim > 0 or leaf.dtype != jnp.float64):
             as_array(leaf, jax.tree_util.keystr(path, simple=True, separator="."))
+
+
+def is_possible(osc: Oscillator) -> Array:
+    """Whether all parameters are what they have to be: what `check` raises for, as a number.
+
+    Under `jit` and `vmap` nothing raises: a run of an impossible oscillator is NOT_FINITE.
+    """
+    rules = Oscillator.rules(osc) + [rule for belt in osc.belts for rule in Belt.rules(belt)]
+    return functools.reduce(operator.and_, (jnp.asarray(rule.holds()) for rule in rules))
 
 
 @traced_once

@@ -12,6 +12,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..checks import (
@@ -24,6 +25,7 @@ from ..checks import (
     require_value,
 )
 from ..kernel.lanes import Observer, Program
+from ..model.friction import AbstractFriction
 from ..spelling import did_you_mean
 from .along import Along
 from .attractor import Attractor
@@ -147,6 +149,8 @@ class Question:
             shown = _plain(repr(belt.friction))
             kinds = _kinds_in(belt.friction)
             names = " with ".join(f"{kind.__qualname__}, {_source(kind)}" for kind in kinds)
+            if any(not _is_ours(kind) for kind in kinds):
+                names = f"{names}, {_coefficients(belt.friction)}"
             told[f"the law of belt {i}"] = f"{shown} of {names}"
         told |= {name: repr(value) for name, value in self.numbers.items()}
         told["observe"] = repr(self.observe)
@@ -214,9 +218,23 @@ def _hash(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
 
 
+def _is_ours(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
+#: Speeds at which a law of one's own is asked.
+SPEEDS = np.concatenate([[0.0], np.logspace(-4, 3, 57)])
+
+
+def _coefficients(law: AbstractFriction) -> str:
+    """A law by what it gives: its text does not tell the numbers and functions that it looks up."""
+    values = np.asarray(jax.vmap(law.mu)(jnp.asarray(SPEEDS)))
+    return _hash(" ".join(f"{x:.8e}" for x in values.tolist()).encode())
+
+
 def _source(kind: type) -> str:
     """A class by its text, or, where there is none, by its compiled functions."""
-    if kind.__module__.partition(".")[0] == __name__.partition(".")[0]:
+    if _is_ours(kind):
         return "jaxbelt"
     found = []
     for one in kind.__mro__:

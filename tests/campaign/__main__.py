@@ -195,11 +195,15 @@ def _differentiate(runs, verdicts, disagreements, rng, options):
     cases = [case for case, _, _ in runs]
     along = [derivatives.directions(case, rng) for case in cases]
     told = package.derivatives(cases, along, options.tol, options.by)
+
+    def again(case, direction, tol):
+        return package.derivatives([case], [direction], tol, options.by)[0]
+
     for (case, mine, run), direction, answer in zip(runs, along, told):
         if run.status == engine.PSEUDO_FOCUS:
             judged = compare.judge_derivative_at_focus(case, answer, run, direction)
         else:
-            judged = compare.judge_derivative(case, answer, mine, direction, options.tol)
+            judged = compare.judge_derivative(case, answer, mine, direction, options.tol, again)
         _count_derivative(case, direction, answer, judged, verdicts, disagreements, options)
 
 
