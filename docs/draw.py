@@ -74,6 +74,18 @@ def diagram():
     return figure
 
 
+def orbit_diagram():
+    """What two starts lead to, and a part of it computed anew."""
+    osc = jb.presets.class_b(nu0=0.45, nu1=0.35)
+    starts, part = [(3.0, 0.0), (1.36, 0.0)], (-0.6, -0.42)
+    whole = jb.orbit_diagram(osc, nu0, (-0.7, 0.7), y0=starts)
+    figure = journal_figure(6.6, 3.2)
+    left, right = figure.subplots(1, 2)
+    whole.plot(left).axvspan(*part, color="0.9")
+    whole.over(part).plot(right)
+    return figure
+
+
 def basins():
     """Which start leads where, and the unstable cycle between the basins."""
     osc = jb.presets.class_b(nu0=0.45, nu1=0.35)
@@ -135,7 +147,7 @@ def period_map():
     return figure
 
 
-GALLERY = [model, region_map, history, phase_plane, diagram, basins]
+GALLERY = [model, region_map, history, phase_plane, diagram, orbit_diagram, basins]
 GALLERY += [portrait, curve, period_map, vector_field, friction_laws]
 
 # --- bifurcations ---------------------------------------------------------------------------------
