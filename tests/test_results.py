@@ -231,7 +231,7 @@ def dataset() -> xr.Dataset:
 
 def test_sweeps_are_drawn_with_words(dataset):
     ax = jb.plot_sweep(dataset, "kind")
-    assert ax.get_xlabel() == r"velocity of belt 0, $\nu_{0}$"
+    assert ax.get_xlabel() == r"belt velocity $\nu_0$"
     ax = jb.plot_sweep(dataset.isel(nu1=0), "stick_duration")
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["belt 0", "belt 1"]
     assert ax.get_ylabel() == "time stuck"
