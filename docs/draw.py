@@ -70,7 +70,7 @@ def diagram():
     """Equilibria and cycles along a path, with every bifurcation point on it."""
     osc = jb.presets.class_b(nu0=0.3, nu1=0.35)
     figure = journal_figure(6.6, 4.0)
-    jb.bifurcation_diagram(osc, nu0, (-0.7, 0.7)).plot(figure.subplots())
+    jb.bifurcation_diagram(osc, nu0, (-0.7, 0.7), rows=480).plot(figure.subplots())
     return figure
 
 
