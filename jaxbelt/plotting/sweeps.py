@@ -32,7 +32,7 @@ from .style import (
 ATTRACTOR_COLOURS = ("#F0F0F0", "#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#999999")
 
 #: Axes of datasets that are no parameters.
-NUMBERED = ("belt", "attractor")
+COUNTED = ("belt", "attractor")
 
 
 def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Axes:
@@ -50,12 +50,12 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     )
     require(values.ndim in (1, 2), "dataset", "a sweep with one or two axes", f"{values.ndim}")
     names = [
-        dataset[name].attrs.get("long_name", name) if name in NUMBERED else parameter_label(name)
+        dataset[name].attrs.get("long_name", name) if name in COUNTED else parameter_label(name)
         for name in map(str, values.dims)
     ]
     label = dataset[variable].attrs.get("long_name", variable)
     (last,) = values.dims[-1:]
-    if values.ndim == 1 or (last in NUMBERED and variable != "kind"):
+    if values.ndim == 1 or (last in COUNTED and variable != "kind"):
         x, lines = dataset[values.dims[0]], values.values.reshape(values.shape[0], -1).T
         for i, line in enumerate(lines):
             style: dict[str, Any] = {"color": "black", "linewidth": 1.1}

@@ -128,16 +128,15 @@ def orbit_diagram(
 
     osc, where, span: as for `scan`: an oscillator and the parameter of it that varies, or a
     function of the parameter that returns the oscillator. at: the moments at which a cycle has its
-    points, `AtExtrema("x1")` (None) or "x2", `AtSection`, or `AtEvents`; those of one loop. y0:
+    points, in one loop: `AtExtrema` of "x1" (None) or "x2", an `AtSection`, or `AtEvents`. y0:
     start (x1, x2), or several, [starts, 2]: where attractors coexist, each start shows its own.
     rows: how many values of the parameter, evenly spaced. rtol, atol: tolerances of a step.
 
     There is no transient to choose: each run goes on until its attractor is known, or until
     t = 30,000, when it is undecided, with the status NOT_SETTLED and without points. So is a cycle
-    that does not come back to where it began, to a thousand times the tolerance. A loop of more
-    than five hundred moments is cut off, with the status TOO_MANY_STEPS.
-
-    `ValueError` names an impossible argument. Unstable motion is in `bifurcation_diagram` only.
+    that does not come back to where it began, to a thousand times the tolerance. A loop of many
+    hundred moments is cut off, with the status TOO_MANY_STEPS. What is unstable is in
+    `bifurcation_diagram` only. `ValueError` names an impossible argument.
     """
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
@@ -145,15 +144,25 @@ def orbit_diagram(
     at = AtExtrema("x1") if at is None else at
     kinds = AtExtrema | AtSection | AtEvents
     require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
-    starts = np.asarray(as_array(y0, "y0", (None, 2) if np.ndim(y0) == 2 else (2,)))
-    check_finite(starts, "y0")
-    require_value(starts.size, "y0", "one start or more", y0)
+    starts = _starts_of(y0)
     numbers = {name: float(as_array(one, name)) for name, one in (("rtol", rtol), ("atol", atol))}
     for name, number in numbers.items():
         check_positive(number, name)
     variation = varied(osc, where, (first,))
     rows = as_whole(rows, "rows", 2)
-    return Sampling(variation, at, starts.reshape(-1, 2), rows, numbers).diagram((first, last))
+    return Sampling(variation, at, starts, rows, numbers).diagram((first, last))
+
+
+def _starts_of(y0: Any) -> np.ndarray:
+    """The starts, [starts, 2], or a `ValueError`."""
+    try:
+        are_several = np.ndim(y0) == 2
+    except ValueError:  # rows of different lengths, which are told below
+        are_several = False
+    starts = np.asarray(as_array(y0, "y0", (None, 2) if are_several else (2,)))
+    check_finite(starts, "y0")
+    require_value(starts.size, "y0", "one start or more", y0)
+    return starts.reshape(-1, 2)
 
 
 @dataclass(frozen=True, eq=False)
