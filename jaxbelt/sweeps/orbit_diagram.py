@@ -58,8 +58,9 @@ class OrbitDiagram(eqx.Module):
     "cycle", "stuck" (for ever, to a belt at rest) or "undecided", [values, starts]; period: of a
     cycle, else NaN, likewise; status: a `Status` each. x1, x2: the points of the attractors,
     [values, starts, points], NaN where there are fewer: of a cycle one for each of its moments, in
-    their order; of what rests the one at which it does. at: the moments; name: of the parameter, as
-    the path to it, or that of the function's argument. All numbers are dimensionless.
+    their order; of what rests the one at which it does; dimensionless. at: which moments these are;
+    name: of the parameter, as the path to it, or that of the function's argument; sampling: what
+    `over` asks again.
     """
 
     values: np.ndarray
