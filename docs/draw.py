@@ -100,7 +100,6 @@ def portrait():
     osc = jb.presets.class_c(nu0=-0.3, nu1=0.3, sigma=0.1)
     figure = journal_figure(5.2, 3.8)
     jb.portrait(osc).plot(figure.subplots())
-    draw_key(figure, ncols=3)
     return figure
 
 
