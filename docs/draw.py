@@ -70,7 +70,19 @@ def diagram():
     """Equilibria and cycles along a path, with every bifurcation point on it."""
     osc = jb.presets.class_b(nu0=0.3, nu1=0.35)
     figure = journal_figure(6.6, 4.0)
-    jb.bifurcation_diagram(osc, nu0, (-0.7, 0.7)).plot(figure.subplots())
+    jb.bifurcation_diagram(osc, nu0, (-0.7, 0.7), rows=480).plot(figure.subplots())
+    return figure
+
+
+def orbit_diagram():
+    """What two starts lead to, and a part of it computed anew."""
+    osc = jb.presets.class_b(nu0=0.45, nu1=0.35)
+    starts, part = [(3.0, 0.0), (1.36, 0.0)], (-0.6, -0.42)
+    whole = jb.orbit_diagram(osc, nu0, (-0.7, 0.7), y0=starts)
+    figure = journal_figure(6.6, 3.2)
+    left, right = figure.subplots(1, 2)
+    whole.plot(left).axvspan(*part, color="0.9")
+    whole.over(part).plot(right)
     return figure
 
 
@@ -88,7 +100,6 @@ def portrait():
     osc = jb.presets.class_c(nu0=-0.3, nu1=0.3, sigma=0.1)
     figure = journal_figure(5.2, 3.8)
     jb.portrait(osc).plot(figure.subplots())
-    draw_key(figure, ncols=3)
     return figure
 
 
@@ -135,7 +146,7 @@ def period_map():
     return figure
 
 
-GALLERY = [model, region_map, history, phase_plane, diagram, basins]
+GALLERY = [model, region_map, history, phase_plane, diagram, orbit_diagram, basins]
 GALLERY += [portrait, curve, period_map, vector_field, friction_laws]
 
 # --- bifurcations ---------------------------------------------------------------------------------

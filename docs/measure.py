@@ -162,6 +162,13 @@ QUESTIONS = [
         "path",
     ),
     Question(
+        "orbit_diagram",
+        "what a start leads to at 400 values",
+        lambda: jb.orbit_diagram(OSC, nu0, (-0.7, 0.7)),
+        400,
+        "value",
+    ),
+    Question(
         "bifurcation_curve",
         "a point followed in two parameters",
         lambda: jb.bifurcation_curve(_point(), (nu0, nu1), ((-0.7, 0.7), (-0.7, 0.7))),
@@ -196,11 +203,12 @@ def seconds(call: Callable[[], Any]) -> float:
 
 
 def words(span: float) -> str:
-    """A time with two digits, in a unit that suits it."""
+    """A time with two digits, in a unit that suits it, from which no line is broken."""
     units = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
     unit = next((unit for unit, size in units.items() if span >= size), "us")
     value = span / units[unit]
-    return f"{value:.2g} {unit}" if value < 100 else f"{value:.0f} {unit}"
+    digits = f"{value:.2g}" if value < 100 else f"{value:.0f}"
+    return f"{digits}\N{NO-BREAK SPACE}{unit}"
 
 
 def shown(name: str) -> str:

@@ -21,12 +21,13 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     cycles/         backwards returns separatrices portrait
     sweeps/         marks observers moments along reducers attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
+    sweeps/         orbit_diagram
     bifurcations/   special labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   path scan refine curves faces regions diagrams switch_folds
     inverse/        selection record fit design
     si              results in SI units
-    plotting/       style phase histories points diagrams regions sweeps inverse model draw
-    plotting/       si explorer
+    plotting/       style phase histories points diagrams regions sweeps orbits inverse model
+    plotting/       draw si explorer
     paper           the paper's table and figures
     api             the public names
     __init__        the same, imported when the first of them is used

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 #: Seconds before anything is shown that nobody asked for.
 SHOWN_AFTER = 2.0
@@ -40,6 +40,11 @@ def show_progress(wanted: bool | None = None) -> None:
 def is_wanted() -> bool:
     """Whether what takes long is to be shown, though a call does not say so."""
     return (_console.is_terminal or _console.is_jupyter) if _wanted is None else _wanted
+
+
+def progress_line(*columns: ProgressColumn, transient: bool = False) -> Progress:
+    """A line, not shown yet, for what takes long; transient: whether it goes when it ends."""
+    return Progress(*columns, console=_console, transient=transient)
 
 
 class Activity:
@@ -74,7 +79,7 @@ class Activity:
         with self.lock:
             if self in self.under_way:
                 columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
-                self.line = Progress(*columns, console=_console, transient=True)
+                self.line = progress_line(*columns, transient=True)
                 self.task = self.line.add_task(self._words())
                 self.line.start()
 

@@ -46,6 +46,7 @@ from .si import in_si
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.datasets import decoded
 from .sweeps.moments import AtEvents, AtExtrema, AtSection, AtTimes
+from .sweeps.orbit_diagram import OrbitDiagram, orbit_diagram
 from .sweeps.shares import attractors
 from .sweeps.store import Verified, verify
 from .sweeps.sweep import Explanation, explain, sweep
@@ -90,6 +91,7 @@ __all__ = [
     "Hopf",
     "Machine",
     "NonsmoothFold",
+    "OrbitDiagram",
     "Oscillator",
     "PhysicalBelt",
     "Portrait",
@@ -124,6 +126,7 @@ __all__ = [
     "gap",
     "in_si",
     "lyapunov_coefficient",
+    "orbit_diagram",
     "peak",
     "period",
     "plot_basins",

@@ -22,9 +22,9 @@ PAGES = {path.stem: path for path in [*DOCS.glob("api/*.md"), *DOCS.glob("bifurc
 SLOW = """
 AtEvents AtExtrema AtSection AtTimes BasinStability Basins-class BeltAtRest BifurcationCurve
 BifurcationDiagram BoundaryEquilibrium CornerCollision CrossingSliding Design-class Fit-class
-FoldOfCycles GrazingEdge Portrait-class PseudoHopf RegionMap Separatrix SpecialPoint attractors
-basin_stability basins bifurcation_curve bifurcation_diagram design distance_to find_cycle fit
-plot_basins portrait region_map scan
+FoldOfCycles GrazingEdge OrbitDiagram Portrait-class PseudoHopf RegionMap Separatrix SpecialPoint
+attractors basin_stability basins bifurcation_curve bifurcation_diagram design distance_to
+find_cycle fit orbit_diagram plot_basins portrait region_map scan
 """.split()
 
 

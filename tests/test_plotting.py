@@ -139,7 +139,13 @@ def test_phase_portrait_draws_boundaries_over_their_contact_intervals():
 def test_the_sliding_set_is_where_the_contact_holds():
     nu0 = 0.2
     ax = jb.plot_phase_portrait(jb.presets.class_a(nu0), xlim=(-3.0, 3.0))
-    x1, band = states(line(ax, "sliding set")).T
+    # In the key it is black, for it may be that of any belt.
+    key = line(ax, "sliding set")
+    assert key.get_color() == "black" and not len(states(key))
+    bands = [one for one in ax.get_lines() if one.get_linewidth() == key.get_linewidth()]
+    (drawn,) = (one for one in bands if one is not key)
+    assert drawn.get_color() == BELT_COLOURS[0]
+    x1, band = states(drawn).T
     # Eq. (10): |-x1 - zeta nu0| < u0 mus, here with u0 = mus = omega = 1.
     np.testing.assert_array_equal(np.isfinite(band), np.abs(-x1 - 0.5 * nu0) < 1)
 

@@ -71,6 +71,11 @@ def results() -> dict[type, Any]:
             *(zero, zero, two, 1, 1, run.status),
         ),
         jb.Design(osc, cycle, ("damping",), ts[1:2], ts[2:4], ts[2:4], 3, run.status),
+        jb.OrbitDiagram(
+            *(span[1:3], np.array([["cycle"], ["undecided"]]), rows[:2, :1], np.zeros((2, 1), int)),
+            *(np.array([[[1.0, 2.0]], [[np.nan] * 2]]), np.zeros((2, 1, 2)), jb.AtEvents()),
+            *("belts[0].velocity", None),
+        ),
         jb.Explanation(4096, 4, 300_000, 1.5, 0.1),
         jb.Verified((0, 1, 3), (4,), (2,), False),
     ]
@@ -101,6 +106,7 @@ TABLES = {
     jb.Events: (None, "t x1 x2 kind belt"),
     jb.Explanation: (1, "runs blocks bytes compile_seconds seconds"),
     jb.Fit: (3, "name estimate standard_error lower upper"),
+    jb.OrbitDiagram: (3, "value start kind period x1 x2"),
     jb.Portrait: (4, "what number kind stable x1_min period multiplier rate"),
     jb.RegionMap: (6, "curve condition belts nu0 nu1 multiplier residual special"),
     jb.Separatrix: (5, "t x1 x2"),
@@ -225,7 +231,7 @@ def dataset() -> xr.Dataset:
 
 def test_sweeps_are_drawn_with_words(dataset):
     ax = jb.plot_sweep(dataset, "kind")
-    assert ax.get_xlabel() == r"velocity of belt 0, $\nu_{0}$"
+    assert ax.get_xlabel() == r"belt velocity $\nu_0$"
     ax = jb.plot_sweep(dataset.isel(nu1=0), "stick_duration")
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["belt 0", "belt 1"]
     assert ax.get_ylabel() == "time stuck"

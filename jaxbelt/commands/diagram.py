@@ -35,7 +35,7 @@ from .options import (
 #: Arguments of classes that may be varied, other than velocities: an edge of two belts, or of one.
 EDGES = ("sigma", "sigma0", "sigma1")
 #: What a diagram shows.
-QUANTITIES = ("x2", "x1", "period")
+QUANTITIES = ("amplitude", "x1", "x2", "period")
 POINT_COLUMNS = ("value", "kind", "belts", "error", "status")
 #: Short names of parameters that may be varied.
 PARAMETERS = {"nu0": "belts[0].velocity", "nu1": "belts[1].velocity", "zeta": "damping"}
@@ -63,7 +63,13 @@ def diagram(
         tuple[float, float], typer.Option(metavar="FROM TO", help="Its first and last value.")
     ] = (-0.7, 0.7),
     rows: Annotated[int, typer.Option(help="About how many values are computed.")] = 160,
-    quantity: Annotated[str, typer.Option(help="What is drawn: x2, x1 or period.")] = "x2",
+    quantity: Annotated[
+        str | None,
+        typer.Option(
+            help="What is drawn: amplitude, x1, x2 or period.",
+            show_default="amplitude where a cycle sticks, else x2, or x1 where there is no cycle",
+        ),
+    ] = None,
     out: Annotated[
         Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
     ] = Path("diagram"),
@@ -71,8 +77,8 @@ def diagram(
 ) -> None:
     """Equilibria and cycles along a parameter, and every bifurcation point, found by itself.
 
-    - **OUT.png**: the diagram in the manner of the paper's Figs. 3 and 7: stable black, unstable
-      grey, unstable cycles dashed; the regions between the points have the paper's names.
+    - **OUT.png**: the diagram: stable black, unstable grey, unstable cycles dashed; the regions
+      between the points have the paper's names. With --quantity x2 as in the paper's Figs. 3 and 7.
 
     - **OUT.csv**: the branches: branch, kind, value, stable, x1_min, x1_max, x2_min, x2_max,
       period, multiplier, stick_duration of each belt.
@@ -93,7 +99,7 @@ def diagram(
     with plain_errors():
         if rows < 1:
             raise ValueError(f"rows must be at least 1, got {rows}")
-        if quantity not in QUANTITIES:
+        if quantity is not None and quantity not in QUANTITIES:
             raise ValueError(f"quantity must be one of {', '.join(QUANTITIES)}, got {quantity}")
         check_range("span", span)
         written = outputs(out, ".png", ".csv", "_points.csv")

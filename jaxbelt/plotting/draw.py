@@ -18,11 +18,13 @@ from ..inverse.fit import Fit
 from ..model.equilibria import Equilibria
 from ..motion.simulate import Arcs, Events, Trajectory
 from ..sweeps.basins import Basins, BasinStability
+from ..sweeps.orbit_diagram import OrbitDiagram
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
 from .diagrams import plot_curves, plot_diagram, plot_special_point
 from .histories import plot_arcs, plot_events, plot_trajectory
 from .inverse import plot_fit
+from .orbits import plot_orbits
 from .phase import plot_portrait, plot_separatrix
 from .points import plot_cycle, plot_design, plot_equilibria, plot_point
 from .regions import plot_region_map
@@ -47,6 +49,7 @@ PICTURES: dict[type, Callable[..., Axes]] = {
     Events: plot_events,
     Explanation: plot_explanation,
     Fit: plot_fit,
+    OrbitDiagram: plot_orbits,
     Portrait: plot_portrait,
     RegionMap: plot_region_map,
     Separatrix: plot_separatrix,

@@ -32,11 +32,21 @@ from ..model.modes import mode_acceleration, mode_of_state
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
-from .style import belt_colour, figure_of, journal_figure, new_axes, new_figure, spread
+from .style import (
+    belt_colour,
+    figure_of,
+    journal_figure,
+    key_entries,
+    new_axes,
+    new_figure,
+    spread,
+)
 
 #: A second mark of the belts, for print without colour.
 BELT_HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\")
 ORBIT_COLOUR = "0.55"
+#: Where the mass sticks to a belt, in the colour of the belt.
+SLIDING_SET: dict[str, Any] = {"linewidth": 4.5, "alpha": 0.25, "solid_capstyle": "butt"}
 #: How far from its point a separatrix has its arrow, as a fraction of the axes.
 ARROW_DISTANCE = 0.3
 #: Separatrices: reddish purple of Okabe and Ito, and grey.
@@ -84,15 +94,15 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
     upper.tick_params(labelbottom=False)
     lower.set_xlabel(r"time $\tau$")
     figure_of(lower).align_ylabels(ax)
-    handles, labels = upper.get_legend_handles_labels()
-    by_label = dict(sorted(zip(labels, handles, strict=True), key=lambda item: item[0]))
-    if by_label:
+    entries = key_entries([upper])
+    if entries:
+        labels = sorted(entries)
         upper.legend(
-            by_label.values(),
-            by_label.keys(),
+            [entries[label] for label in labels],
+            labels,
             loc="lower right",
             bbox_to_anchor=(1.0, 1.0),
-            ncols=len(by_label),
+            ncols=len(labels),
             frameon=False,
             borderaxespad=0.2,
         )
@@ -255,6 +265,7 @@ def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
     left, right = ax.get_xlim()
     outside: list[tuple[float, int]] = []
     levels: list[float] = []
+    slides = False
     for i, belt in enumerate(osc.belts):
         level = float(belt.velocity / osc.omega)
         ends = np.clip([float(belt.lower), float(belt.upper)], left, right)
@@ -269,12 +280,15 @@ def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
         x1 = np.linspace(ends[0], ends[1], 1201)
         sticks = _sliding_set(osc, jnp.asarray(x1), jnp.full(x1.size, belt.velocity / osc.omega), i)
         band = np.where(sticks, level, np.nan)
-        style = {"linewidth": 4.5, "alpha": 0.25, "solid_capstyle": "butt"}
-        ax.plot(x1, band, color=colour, zorder=1.2, label="sliding set", **style)
+        ax.plot(x1, band, color=colour, zorder=1.2, **SLIDING_SET)
+        slides |= bool(np.any(sticks))
         if ends[1] == right:
             outside.append((level, i))
         else:
             _name_boundary(ax, i, (ends[0], level), (3, 2.5), "left", "bottom")
+    if slides:
+        # In no belt's colour, for the key: it stands for the sets of all.
+        ax.plot([], [], color="black", label="sliding set", **SLIDING_SET)
     _name_boundaries_outside(ax, outside)
     for edge in {float(e) for b in osc.belts for e in (b.lower, b.upper)}:
         if left < edge < right:

@@ -16,9 +16,13 @@ from .style import new_axes
 def plot_cycle(cycle: Cycle, ax: Axes | None = None) -> Axes:
     """A cycle with the boundaries and equilibria of its oscillator."""
     require_single(cycle, cycle.period, 0)
-    status = Status(int(cycle.status))
-    require(status == Status.OK, "cycle", "one with status OK, to be drawn", status.name)
+    _check_found(cycle, "cycle")
     return plot_phase_portrait(cycle.oscillator, cycles=[cycle], ax=ax)
+
+
+def _check_found(result: Cycle | BifurcationPoint, name: str) -> None:
+    status = Status(int(result.status))
+    require(status == Status.OK, name, "one with status OK, to be drawn", status.name)
 
 
 def plot_design(design: Design, ax: Axes | None = None) -> Axes:
@@ -29,8 +33,7 @@ def plot_design(design: Design, ax: Axes | None = None) -> Axes:
 def plot_point(point: BifurcationPoint, ax: Axes | None = None) -> Axes:
     """The phase plane at a bifurcation point, with the cycle where there is one."""
     require_single(point, point.value, 0)
-    status = Status(int(point.status))
-    require(status == Status.OK, "point", "one with status OK, to be drawn", status.name)
+    _check_found(point, "point")
     cycles = [point.cycle] if int(point.cycle.status) == Status.OK else []
     ax = plot_phase_portrait(point.oscillator, cycles=cycles, ax=ax)
     ax.set_title(f"{point.condition.words} at {float(point.value):.6g}", fontsize="medium")

@@ -17,7 +17,14 @@ from ..model.equilibria import equilibria as find_equilibria
 from ..model.oscillator import Oscillator
 from .diagrams import plot_curves
 from .phase import draw_equilibrium
-from .style import BELT_COLOURS, belt_colour, draw_key, new_figure, parameter_label
+from .style import (
+    BELT_COLOURS,
+    belt_colour,
+    draw_key,
+    key_entries,
+    new_figure,
+    parameter_label,
+)
 
 #: Pixels of the coarse raster around the name of a region: half a letter's height.
 ROOM_FOR_NAME = 3
@@ -138,11 +145,10 @@ def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
     plot_region_map(regions, ax)
     if regions.as_paper:
         ax.set_aspect("equal")
-    handles, labels = ax.get_legend_handles_labels()
-    by_label = dict(zip(labels, handles, strict=True))
+    entries = key_entries([ax])
     beside.axis("off")
     key = {"loc": "center left", "borderaxespad": 0.0, "handlelength": 2.4, "frameon": False}
-    beside.legend(by_label.values(), by_label.keys(), **key)
+    beside.legend(entries.values(), entries.keys(), **key)
     lower = whole[1].subgridspec(rows, columns)
     titles = {name: name for name in names}
     if not regions.as_paper:

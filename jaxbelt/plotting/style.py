@@ -50,6 +50,8 @@ PARAMETERS = {
     "nu": ("belt velocity", r"\nu_%"),
     "sigma": ("contact edge", r"\sigma_%"),
     "zeta": ("damping", r"\zeta"),
+    "x1": ("displacement at the start", "x_1"),
+    "x2": ("velocity at the start", "x_2"),
 }
 
 #: Settings for a journal's page, see `journal_style`.
@@ -82,22 +84,28 @@ def journal_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def key_entries(axes: Sequence[Axes]) -> dict[str, Any]:
+    """What axes label, each thing once, with how it is drawn: what a phase portrait holds comes
+    last, in the order of `KEY_ORDER`."""
+    found: dict[str, Any] = {}
+    for one in axes:
+        for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    known = [label for label in KEY_ORDER if label in found]
+    return {label: found[label] for label in [*(x for x in found if x not in known), *known]}
+
+
 def draw_key(
     figure: Figure, note: str = "", *, ncols: int | None = None, leave_out: Axes | None = None
 ) -> None:
     """Below the axes of a figure a note, and one key for all that they label, in so many columns
     (None: as many as there is room for); leave_out: axes that have a key of their own."""
-    by_label: dict[str, Any] = {}
-    for axes in (one for one in figure.axes if one is not leave_out):
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            by_label.setdefault(label, handle)
-    first = [label for label in by_label if label.startswith(("to ", "belt "))]
-    labels = [*first, *(label for label in KEY_ORDER if label in by_label)]
+    entries = key_entries([axes for axes in figure.axes if axes is not leave_out])
     figure.legend(
-        [by_label[label] for label in labels],
-        labels,
+        entries.values(),
+        entries.keys(),
         loc="outside lower center",
-        ncols=ncols or _key_columns(72 * figure.get_size_inches()[0], labels),
+        ncols=ncols or _key_columns(72 * figure.get_size_inches()[0], list(entries)),
         frameon=False,
         handlelength=1.8,
         columnspacing=1.4,
@@ -108,25 +116,21 @@ def draw_key(
 
 def add_key(ax: Axes) -> None:
     """Below the axes a key for all that they label, each thing once."""
-    by_label: dict[str, Any] = {}
-    for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-        by_label.setdefault(label, handle)
-    if not by_label:
+    entries = key_entries([ax])
+    if not entries:
         return
-    known = [label for label in KEY_ORDER if label in by_label]
-    labels = [*(label for label in by_label if label not in known), *known]
     # Below the numbers and the name of the axis, whatever the height of the axes.
     figure, size = figure_of(ax), matplotlib.rcParams["font.size"]
     below = ScaledTranslation(0, -(3.4 * size + 4) / 72, figure.dpi_scale_trans)
     width = ax.get_window_extent().width * 72 / figure.dpi
     ax.legend(
-        [by_label[label] for label in labels],
-        labels,
+        entries.values(),
+        entries.keys(),
         loc="upper center",
         bbox_to_anchor=(0.5, 0.0),
         bbox_transform=ax.transAxes + below,
         borderaxespad=0.0,
-        ncols=_key_columns(width, labels),
+        ncols=_key_columns(width, list(entries)),
         frameon=False,
         handlelength=2.2,
         columnspacing=1.4,

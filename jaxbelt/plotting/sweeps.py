@@ -18,10 +18,21 @@ from ..sweeps.datasets import decoded
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
 from .phase import plot_phase_portrait
-from .style import add_key, belt_colour, draw_key, figure_of, journal_figure, new_axes
+from .style import (
+    add_key,
+    belt_colour,
+    draw_key,
+    figure_of,
+    journal_figure,
+    new_axes,
+    parameter_label,
+)
 
 #: Attractors of a sweep, those with the shortest names first (Okabe and Ito).
 ATTRACTOR_COLOURS = ("#F0F0F0", "#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#999999")
+
+#: Axes of datasets that are no parameters.
+COUNTED = ("belt", "attractor")
 
 
 def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Axes:
@@ -38,10 +49,13 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
         _words_for_kinds(dataset) if variable == "kind" else dataset[variable].squeeze(drop=True)
     )
     require(values.ndim in (1, 2), "dataset", "a sweep with one or two axes", f"{values.ndim}")
-    names = [_axis_label(dataset, name) for name in map(str, values.dims)]
+    names = [
+        dataset[name].attrs.get("long_name", name) if name in COUNTED else parameter_label(name)
+        for name in map(str, values.dims)
+    ]
     label = dataset[variable].attrs.get("long_name", variable)
     (last,) = values.dims[-1:]
-    if values.ndim == 1 or (last in ("belt", "attractor") and variable != "kind"):
+    if values.ndim == 1 or (last in COUNTED and variable != "kind"):
         x, lines = dataset[values.dims[0]], values.values.reshape(values.shape[0], -1).T
         for i, line in enumerate(lines):
             style: dict[str, Any] = {"color": "black", "linewidth": 1.1}
@@ -71,21 +85,6 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
         )
     ax.set(xlabel=names[0], ylabel=names[1])
     return ax
-
-
-def _axis_label(dataset: xr.Dataset, name: str) -> str:
-    """The name of an axis in words, and as a formula where it is an argument of a class."""
-    words = dataset[name].attrs.get("long_name", name)
-    return words if words == name or name == "attractor" else f"{words}, {_math_name(name)}"
-
-
-def _math_name(name: str) -> str:
-    """An argument of a class such as nu0 as a formula."""
-    letters, digits = name.rstrip("0123456789"), name[len(name.rstrip("0123456789")) :]
-    greek = {"nu": r"\nu", "sigma": r"\sigma"}
-    return (
-        f"${greek.get(letters, letters)}_{{{digits}}}$" if digits else f"${greek.get(name, name)}$"
-    )
 
 
 def _words_for_kinds(dataset: xr.Dataset) -> xr.DataArray:

@@ -37,9 +37,8 @@ from ..tables import table_of
 from .attractor import KINDS, Attractor
 from .datasets import decoded, flags
 from .question import LONG_ENOUGH
-from .queue import column_of, layout
 from .sweep import sweep
-from .threads import run
+from .work import results_of
 
 if TYPE_CHECKING:
     import pandas
@@ -323,15 +322,9 @@ def _kinds(osc: Oscillator, starts: np.ndarray, t1, rtol, atol) -> np.ndarray:
     leaves, structure = jax.tree.flatten(osc)
     edges = bool(np.any([np.isfinite([belt.lower, belt.upper]) for belt in osc.belts]))
     program = Program(structure, (False,) * len(leaves), Attractor(), edges)
-    column = column_of(layout(program, leaves), "kind")
-    kinds = np.zeros(starts.shape[1], int)
-
-    def put(runs: np.ndarray, results: np.ndarray) -> None:
-        kinds[runs] = results[0, column]
 
     def rows_of(first: int, last: int) -> np.ndarray:
         return starts[None, :, first:last]
 
     n = starts.shape[1]
-    run(program, leaves, rows_of, n, put, t1=t1, rtol=rtol, atol=atol)
-    return kinds
+    return results_of(program, leaves, rows_of, n, t1=t1, rtol=rtol, atol=atol)["kind"].astype(int)

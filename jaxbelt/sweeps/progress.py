@@ -5,10 +5,9 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from ..activity import SHOWN_AFTER, Activity, is_wanted, tell
+from ..activity import SHOWN_AFTER, Activity, is_wanted, progress_line, tell
 from ..results import Status
 
 
@@ -33,7 +32,7 @@ class SweepProgress:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self.bar = Progress(*columns, console=Console(stderr=True))
+        self.bar = progress_line(*columns)
         self.task = self.bar.add_task("compiling", total=total, completed=done, told="")
         self.patience = threading.Timer(0.0 if wanted else SHOWN_AFTER, self._show)
         self.patience.daemon = True

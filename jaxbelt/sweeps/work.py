@@ -1,13 +1,16 @@
-"""The work of a sweep: runs of blocks through the kernel, into memory or a store."""
+"""The work of a sweep: runs through the kernel, of blocks into memory or a store, or any."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Array
 
+from ..kernel.lanes import Program
 from .datasets import Memory
 from .question import Question
-from .queue import column_of
+from .queue import by_name, column_of, layout
 from .store import Store
 from .threads import run
 
@@ -58,6 +61,28 @@ def do_runs(
         derivatives=len(question.derivatives),
         **options,
     )
+
+
+def results_of(
+    program: Program,
+    shared: list[Array],
+    rows_of: Callable[[int, int], np.ndarray],
+    runs: int,
+    *,
+    t1: float,
+    rtol: float,
+    atol: float,
+) -> dict[str, np.ndarray]:
+    """The results of runs by name, [runs, ...], in the order of the runs; arguments: of
+    `threads.run`."""
+    shapes = layout(program, shared)
+    columns = np.zeros((sum(math.prod(shape) for shape in shapes.values()), runs))
+
+    def put(places: np.ndarray, results: np.ndarray) -> None:
+        columns[:, places] = results[0]
+
+    run(program, shared, rows_of, runs, put, t1=t1, rtol=rtol, atol=atol)
+    return by_name(shapes, columns)
 
 
 def counts(statuses: np.ndarray) -> dict[int, int]:

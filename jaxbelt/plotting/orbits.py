@@ -1,0 +1,110 @@
+"""Orbit diagrams, and how zooming into one computes it anew."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from ..checks import require_one_of, require_value
+from ..sweeps.moments import AtExtrema
+from ..sweeps.orbit_diagram import OrbitDiagram
+from .diagrams import QUANTITIES
+from .style import add_key, figure_of, new_axes, parameter_label
+
+#: What is drawn of each kind of attractor (Okabe and Ito), and what the key calls it. What is
+#: undecided has no place: ticks at the lower edge show for which parameters it is so.
+DOTS: dict[str, dict[str, Any]] = {
+    "equilibrium": {"color": "#0072B2", "marker": ".", "label": "equilibrium"},
+    "cycle": {"color": "black", "marker": ".", "label": "cycle"},
+    "stuck": {"color": "#D55E00", "marker": ".", "label": "stuck for ever"},
+    "undecided": {"color": "#CC79A7", "marker": "|", "label": "undecided"},
+}
+
+
+def plot_orbits(
+    diagram: OrbitDiagram,
+    ax: Axes | None = None,
+    *,
+    quantity: str | None = None,
+    zoom: bool = False,
+) -> Axes:
+    """The points of an orbit diagram over its parameter; see `OrbitDiagram.plot`."""
+    if quantity is None:
+        quantity = diagram.at.of if isinstance(diagram.at, AtExtrema) else "x1"
+    require_one_of(quantity, ("x1", "x2"), "quantity")
+    require_value(isinstance(zoom, bool), "zoom", "True or False", zoom)
+    ax = new_axes() if ax is None else ax
+    lines = {kind: _line(ax, kind) for kind in DOTS}
+    _put(lines, diagram, quantity)
+    ax.relim()
+    ax.autoscale_view()
+    ax.set_xlim(diagram.values[0], diagram.values[-1])
+    ax.set(xlabel=parameter_label(diagram.name), ylabel=QUANTITIES[quantity])
+    if zoom:
+        _Zoom(diagram, ax, lines, quantity)
+    return ax
+
+
+def _line(ax: Axes, kind: str) -> Line2D:
+    place: dict[str, Any] = {"transform": ax.get_xaxis_transform()} if kind == "undecided" else {}
+    size = 7.0 if kind == "undecided" else 2.5
+    (line,) = ax.plot([], [], linestyle="none", markersize=size, **place)
+    line.set(color=DOTS[kind]["color"], marker=DOTS[kind]["marker"])
+    return line
+
+
+def _put(lines: dict[str, Line2D], diagram: OrbitDiagram, quantity: str) -> None:
+    """Give each line the points of its kind; the key names those that have some."""
+    heights = diagram.x1 if quantity == "x1" else diagram.x2
+    values = np.broadcast_to(diagram.values[:, None, None], heights.shape)
+    for kind, line in lines.items():
+        of_kind = np.broadcast_to((diagram.kind == kind)[..., None], heights.shape)
+        if kind == "undecided":
+            x = np.unique(values[of_kind])
+            y = np.zeros_like(x)
+        else:
+            x, y = (one[of_kind & ~np.isnan(heights)] for one in (values, heights))
+        line.set_data(x, y)
+        line.set_label(DOTS[kind]["label"] if len(x) else "_none")
+
+
+class _Zoom:
+    """Computes an orbit diagram anew over the limits of its axes, whenever these change.
+
+    While a button of the mouse is held, as in panning, nothing is done before it is let go.
+    """
+
+    def __init__(self, diagram: OrbitDiagram, ax: Axes, lines: dict[str, Line2D], quantity: str):
+        self.diagram, self.ax, self.lines, self.quantity = diagram, ax, lines, quantity
+        self.shown, self.is_held = ax.get_xlim(), False
+        self.told = ax.text(0.5, 0.5, "", transform=ax.transAxes, ha="center", wrap=True)
+        canvas = figure_of(ax).canvas
+        # Functions: of methods matplotlib would keep weak references, and nobody else has any.
+        ax.callbacks.connect("xlim_changed", lambda _: self.follow())
+        canvas.mpl_connect("button_press_event", lambda _: self.hold(True))
+        canvas.mpl_connect("button_release_event", lambda _: self.hold(False))
+
+    def hold(self, is_held: bool) -> None:
+        """A button of the mouse is held, or let go."""
+        self.is_held = is_held
+        self.follow()
+
+    def follow(self) -> None:
+        """Draw what belongs between the limits, unless it is there."""
+        limits = self.ax.get_xlim()
+        if self.is_held or limits == self.shown:
+            return
+        self.shown = limits
+        try:
+            diagram = self.diagram.over((min(limits), max(limits)))
+        except ValueError as error:
+            # What there was stays, and the reason why there is no more.
+            self.told.set_text(str(error))
+        else:
+            self.told.set_text("")
+            _put(self.lines, diagram, self.quantity)
+            self.ax.relim()
+            self.ax.autoscale_view(scalex=False)
+            add_key(self.ax)
+        figure_of(self.ax).canvas.draw_idle()

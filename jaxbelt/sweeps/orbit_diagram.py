@@ -1,0 +1,321 @@
+"""Orbit diagrams: what orbits come to, along a path in one parameter, by brute force.
+
+At each of many values of the parameter orbits from a few starts are followed to their attractor,
+and the points at which it has some moment (extrema, crossings of a section, events) are kept. Two
+sweeps do it: one as with `observe="attractor"`, so that each run takes the transient that it needs,
+and one that follows each cycle through one loop, from its largest displacement. The values of the
+parameter are data of both: other values compile nothing, and so a picture can be zoomed into.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from ..activity import announced
+from ..checks import (
+    as_array,
+    as_interval,
+    as_whole,
+    check_finite,
+    check_positive,
+    require_value,
+)
+from ..cycles.attractors import RUN
+from ..model.oscillator import Oscillator
+from ..model.parameters import leaf_index
+from ..model.variations import Variation, varied
+from ..results import Status, draw
+from ..tables import table_of
+from .along import Along
+from .attractor import CYCLE, KINDS, UNDECIDED, Attractor
+from .grid import Grid
+from .moments import AtEvents, AtExtrema, AtSection
+from .question import LONG_ENOUGH
+from .work import results_of
+
+if TYPE_CHECKING:
+    import pandas
+
+#: Moments of a loop, extrema of x1 among them, that one run has room for. A loop with more of them
+#: takes several runs, each from the last extremum: a start at an event may have it once more.
+MOMENTS_KEPT = 16
+#: Runs for one loop, at most.
+MOST_RUNS = 64
+#: A run through a loop goes on beyond it by this fraction of the period.
+BEYOND = 1e-4
+
+
+class OrbitDiagram(eqx.Module):
+    """What `orbit_diagram` returns.
+
+    values: of the parameter, increasing, [values]. kind: what each start leads to, "equilibrium",
+    "cycle", "stuck" (for ever, to a belt at rest) or "undecided", [values, starts]; period: of a
+    cycle, else NaN, likewise; status: a `Status` each. x1, x2: the points of the attractors,
+    [values, starts, points], NaN where there are fewer: of a cycle one for each of its moments, in
+    their order; of what rests the one at which it does; dimensionless. at: which moments these are;
+    name: of the parameter, as the path to it, or that of the function's argument; sampling: what
+    `over` asks again.
+    """
+
+    values: np.ndarray
+    kind: np.ndarray
+    period: np.ndarray
+    status: np.ndarray
+    x1: np.ndarray
+    x2: np.ndarray
+    at: Any = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    sampling: "Sampling" = eqx.field(static=True, repr=False)
+
+    def over(self, span: tuple[float, float]) -> "OrbitDiagram":
+        """The same over another span of the parameter, (first, last): with as many values, so that
+        nothing is compiled. `ValueError` where the oscillator at an end is impossible."""
+        return self.sampling.diagram(span)
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each point: value (of the parameter), start (its number), kind, period (NaN of
+        what rests), x1, x2. What is undecided has a row in which they are NaN."""
+        held = ~np.isnan(self.x1)
+        held[..., 0] |= self.kind == KINDS[UNDECIDED]
+        rows, starts, _ = np.nonzero(held)
+        return table_of(
+            {
+                "value": self.values[rows],
+                "start": starts,
+                "kind": self.kind[rows, starts],
+                "period": self.period[rows, starts],
+                "x1": self.x1[held],
+                "x2": self.x2[held],
+            }
+        )
+
+    def plot(self, ax: Any = None, *, quantity: str | None = None, zoom: bool = False) -> Any:
+        """Draw the points over the parameter, into the axes `ax` (None: new ones), which are
+        returned.
+
+        quantity: "x1" or "x2"; None: the one whose extrema the points are, else "x1". zoom: whether
+        the points are computed anew, as by `over`, whenever the limits of the parameter change:
+        with the mouse, where the backend of matplotlib is interactive (in a notebook
+        `%matplotlib widget`, of the package ipympl), or by `ax.set_xlim`.
+        """
+        return draw(self, ax, quantity=quantity, zoom=zoom)
+
+    def __repr__(self) -> str:
+        counts = Counter(self.kind.ravel().tolist())
+        kinds = ", ".join(f"{counts[kind]} {kind}" for kind in KINDS if counts[kind])
+        ends = f"{self.values[0]:.6g} to {self.values[-1]:.6g}"
+        return f"OrbitDiagram({self.name} from {ends}, {self.kind.size} runs: {kinds})"
+
+
+@announced("orbit_diagram")
+def orbit_diagram(
+    osc: Oscillator | Callable[..., Oscillator],
+    where: Callable[[Oscillator], Any] | None = None,
+    span: tuple[float, float] | None = None,
+    *,
+    at: AtExtrema | AtSection | AtEvents | None = None,
+    y0: ArrayLike | Sequence[Any] = (3.0, 0.0),
+    rows: int = 400,
+    rtol: ArrayLike = 1e-8,
+    atol: ArrayLike = 1e-8,
+) -> OrbitDiagram:
+    """The points of attractors against one parameter, from given starts: an orbit diagram.
+
+    osc, where, span: as for `scan`: an oscillator and the parameter of it that varies, or a
+    function of the parameter that returns the oscillator. at: the moments at which a cycle has its
+    points, in one loop: `AtExtrema` of "x1" (None) or "x2", an `AtSection`, or `AtEvents`. y0:
+    start (x1, x2), or several, [starts, 2]: where attractors coexist, each start shows its own.
+    rows: how many values of the parameter, evenly spaced. rtol, atol: tolerances of a step.
+
+    There is no transient to choose: each run goes on until its attractor is known, or until
+    t = 30,000, when it is undecided, with the status NOT_SETTLED and without points. So is a cycle
+    that does not come back to where it began, to a thousand times the tolerance. A loop of many
+    hundred moments is cut off, with the status TOO_MANY_STEPS. What is unstable is in
+    `bifurcation_diagram` only. `ValueError` names an impossible argument.
+    """
+    if isinstance(osc, Oscillator):
+        leaf_index(osc, where)
+    first, last = as_interval(span, "span")
+    at = AtExtrema("x1") if at is None else at
+    kinds = AtExtrema | AtSection | AtEvents
+    require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
+    starts = _starts_of(y0)
+    numbers = {name: float(as_array(one, name)) for name, one in (("rtol", rtol), ("atol", atol))}
+    for name, number in numbers.items():
+        check_positive(number, name)
+    variation = varied(osc, where, (first,))
+    rows = as_whole(rows, "rows", 2)
+    return Sampling(variation, at, starts, rows, numbers).diagram((first, last))
+
+
+def _starts_of(y0: Any) -> np.ndarray:
+    """The starts, [starts, 2], or a `ValueError`."""
+    try:
+        are_several = np.ndim(y0) == 2
+    except ValueError:  # rows of different lengths, which are told below
+        are_several = False
+    starts = np.asarray(as_array(y0, "y0", (None, 2) if are_several else (2,)))
+    check_finite(starts, "y0")
+    require_value(starts.size, "y0", "one start or more", y0)
+    return starts.reshape(-1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Sampling:
+    """How the points of an orbit diagram are found, whatever its span; see `orbit_diagram`."""
+
+    variation: Variation
+    at: Any
+    starts: np.ndarray
+    rows: int
+    numbers: dict[str, float]
+
+    def diagram(self, span: tuple[float, float]) -> OrbitDiagram:
+        """The orbit diagram over a span of the parameter."""
+        first, last = as_interval(span, "span")
+        for value in (first, last):
+            self.variation.check(value)
+        values = np.linspace(first, last, self.rows)
+        grid = Grid(self._make, {"parameter": values}, (0.0, 0.0))
+        shape = len(values), len(self.starts)
+        found = self._results(grid, Attractor(), np.tile(self.starts.T, len(values)), LONG_ENOUGH)
+        # Codes of runs that are not finite are not numbers.
+        kind = np.nan_to_num(found["kind"]).astype(int)
+        status = found["status"].astype(int)
+        x1, x2 = (np.where(kind == UNDECIDED, np.nan, found[name])[:, None] for name in RESTS_AT)
+        cycles = np.flatnonzero(kind == CYCLE)
+        if len(cycles):
+            loops = {name: found[name][cycles] for name in ("x1_min", "x1_max", "period")}
+            told, *points = self._loops(grid, cycles, **loops)
+            status[cycles] = told
+            kind[cycles[told == Status.NOT_SETTLED]] = UNDECIDED
+            missing = ((0, 0), (0, points[0].shape[1] - 1))
+            x1, x2 = (np.pad(x, missing, constant_values=np.nan) for x in (x1, x2))
+            x1[cycles], x2[cycles] = points
+        return OrbitDiagram(
+            values=values,
+            kind=np.array(KINDS)[kind].reshape(shape),
+            period=np.where(kind == CYCLE, found["period"], np.nan).reshape(shape),
+            status=status.reshape(shape),
+            x1=x1.reshape(*shape, -1),
+            x2=x2.reshape(*shape, -1),
+            at=self.at,
+            name=self.variation.names[0],
+            sampling=self,
+        )
+
+    def _make(self, parameter: Any) -> Oscillator:
+        return self.variation.make(parameter)
+
+    def _results(
+        self, grid: Grid, observer: Any, states: np.ndarray, t1: float, which: Any = None
+    ) -> dict[str, np.ndarray]:
+        """What an observer tells of runs from states, [2, runs]; which: their numbers, or all."""
+        which = np.arange(states.shape[1]) if which is None else which
+
+        def rows_of(first: int, last: int) -> np.ndarray:
+            rows = grid.rows(which[first:last] // len(self.starts))
+            return np.concatenate([states[None, :, first:last], rows[:, 2:]], axis=1)
+
+        numbers = {"t1": t1, **self.numbers}
+        return results_of(grid.program(observer), grid.shared, rows_of, len(which), **numbers)
+
+    def _loops(self, grid: Grid, which: np.ndarray, x1_min, x1_max, period):
+        """Status, x1 and x2 of the moments of one loop of cycles, [cycles] and [cycles, points];
+        which: the numbers of the runs that led to them."""
+        period, top = period[:, None], x1_max[:, None]
+        (t, x1, x2, number), cut = self._moments(grid, which, x1_max, (1 + BEYOND) * period[:, 0])
+        # One loop: what is that near to its beginning is met again at its end.
+        inside = (t > BEYOND * period) & (t <= (1 + BEYOND) * period)
+        size = RUN * self.numbers["rtol"] * (top - x1_min[:, None])
+        back = inside & (number == EXTREMUM) & (np.abs(x1 - top) < size)
+        back &= np.abs(t - period) <= BEYOND * period
+        status = np.where(np.any(back, axis=1), Status.OK, Status.NOT_SETTLED)
+        status[cut] = Status.TOO_MANY_STEPS
+        wanted = inside & (status != Status.NOT_SETTLED)[:, None]
+        wanted &= number == (EXTREMUM if self.at == AtExtrema("x1") else OWN)
+        order = np.argsort(~wanted, axis=1, kind="stable")
+        order = order[:, : max(1, np.max(np.sum(wanted, axis=1)))]
+        held = np.take_along_axis(wanted, order, axis=1)
+        points = (np.take_along_axis(x, order, axis=1) for x in (x1, x2))
+        return status, *(np.where(held, x, np.nan) for x in points)
+
+    def _moments(self, grid: Grid, which: np.ndarray, x1_max: np.ndarray, end: np.ndarray):
+        """The moments of loops until a time each, one after another: t, x1, x2 and the number,
+        [4, cycles, moments], NaN where there is none; and which loops are cut off, [cycles]."""
+        at = (AtExtrema("x1"),) if self.at == AtExtrema("x1") else (AtExtrema("x1"), self.at)
+        observer = Along(_LoopPoints(at, MOMENTS_KEPT))
+        moments, cut = np.zeros((4, len(which), 0)), np.zeros(len(which), bool)
+        state, began = np.stack([x1_max, np.zeros_like(x1_max)]), np.zeros_like(x1_max)
+        left = np.arange(len(which))
+        for _ in range(MOST_RUNS):
+            until = float(np.max((end - began)[left])) * (1 + BEYOND)
+            found = self._results(grid, observer, state[:, left], until, which[left])
+            pieces = [f" {i}" for i in range(-(-MOMENTS_KEPT // 8))]
+            columns = ([found[name + piece] for piece in pieces] for name in OF_MOMENTS)
+            new = np.stack([np.concatenate(one, axis=-1) for one in columns])
+            new[0] += began[left, None]
+            # Where the room is used up, on from the last extremum, if there is one.
+            cut[left] = new[0, :, -1] < end[left]
+            turns = new[3] == EXTREMUM
+            last = MOMENTS_KEPT - 1 - np.argmax(turns[:, ::-1], axis=1)
+            on = cut[left] & np.any(turns, axis=1)
+            new[:, on[:, None] & (np.arange(MOMENTS_KEPT) > last[:, None])] = np.nan
+            whole = np.full((4, len(which), MOMENTS_KEPT), np.nan)
+            whole[:, left] = new
+            moments = np.concatenate([moments, whole], axis=2)
+            began[left[on]], state[:, left[on]] = new[0, on, last[on]], new[1:3, on, last[on]]
+            left = left[on]
+            if not len(left):
+                break
+        return moments, cut
+
+
+#: Numbers of the moments of a loop: extrema of x1, and those that are wanted, if they are others.
+EXTREMUM, OWN = 0, 1
+#: Results of `Attractor` that tell where an attractor at rest is.
+RESTS_AT = ("x1_min", "x2_min")
+
+
+@dataclass(frozen=True)
+class _LoopPoints:
+    """The first moments of a run, `room` of them: t, x1, x2 and the number in `at`. A reducer, see
+    `sweep.sweep`.
+
+    They are kept in pieces of eight: what is larger in all lanes makes a slow kernel.
+    """
+
+    at: tuple[Any, ...]
+    room: int
+
+    def init(self, osc, x1, x2):
+        pieces = [jnp.full(min(8, self.room - k), jnp.nan) for k in range(0, self.room, 8)]
+        return (tuple(pieces),) * 4, jnp.zeros((), int)
+
+    def update(self, state, event):
+        kept, count = state
+
+        def put(value, pieces):
+            places = (8 * i + jnp.arange(piece.size) for i, piece in enumerate(pieces))
+            pairs = zip(places, pieces, strict=True)
+            return tuple(jnp.where(place == count, value, piece) for place, piece in pairs)
+
+        new = event.t, event.x1, event.x2, event.moment.astype(event.t.dtype)
+        return tuple(map(put, new, kept)), count + 1
+
+    def finish(self, state, end):
+        return {
+            f"{name} {i}": piece
+            for name, pieces in zip(OF_MOMENTS, state[0], strict=True)
+            for i, piece in enumerate(pieces)
+        }
+
+
+#: What is kept of each moment.
+OF_MOMENTS = ("t", "x1", "x2", "number")

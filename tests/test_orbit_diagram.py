@@ -1,0 +1,243 @@
+"""Orbit diagrams against the independent integrator, and zooming by the events of a mouse."""
+
+from types import SimpleNamespace
+
+import matplotlib.pyplot as plt
+import numpy as np
+import oracle
+import pytest
+from compilations import compilations
+from matplotlib.backend_bases import MouseEvent
+from scipy.optimize import brentq
+
+import jaxbelt as jb
+from jaxbelt.plotting.orbits import plot_orbits
+from jaxbelt.sweeps import orbit_diagram as module
+
+NU1 = 0.35
+#: A sweep at 1e-8 is compared with an oracle at 1e-13: errors of one loop add up.
+CLOSE = dict(rtol=0, atol=1e-6)
+
+
+def nu0(osc):
+    return osc.belts[0].velocity
+
+
+def height(osc, x1, x2):
+    return x2 - 0.1 * (x1 - 0.6)
+
+
+@pytest.fixture(scope="module")
+def diagram():
+    starts = [(3.0, 0.0), (1.362, 0.0)]
+    return jb.orbit_diagram(jb.presets.class_b(0.3, NU1), nu0, (-0.5, 0.45), y0=starts, rows=3)
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+def zeros(run, value, first, last):
+    """Times at which a function of the state passes 0 upwards, and downwards."""
+    ts = np.linspace(first, last, 4001)
+    values = [value(*run.at(t)) for t in ts]
+    for k in np.flatnonzero(np.diff(np.sign(values))):
+        yield brentq(lambda t: value(*run.at(t)), ts[k], ts[k + 1], xtol=1e-12), values[k] < 0
+
+
+def distinct(states):
+    """States without those that are there already, in the order of x1."""
+    kept = []
+    for state in states:
+        if all(np.max(np.abs(state - other)) > 1e-5 for other in kept):
+            kept.append(state)
+    return np.array(sorted(kept, key=lambda state: state[0]))
+
+
+def points(found, row, start=0):
+    """The points of an attractor in the order of x1."""
+    both = np.stack([found.x1[row, start], found.x2[row, start]], axis=1)
+    return distinct(both[~np.isnan(both[:, 0])])
+
+
+def test_extrema_are_those_of_an_independent_integration(diagram):
+    assert diagram.values.tolist() == pytest.approx([-0.5, -0.025, 0.45], abs=1e-15)
+    assert np.all(diagram.status == jb.Status.OK)
+    assert diagram.kind.tolist() == [["cycle"] * 2, ["cycle"] * 2, ["cycle", "equilibrium"]]
+    for row, value in enumerate(diagram.values):
+        # After the first stick phase the motion repeats exactly.
+        run = oracle.simulate(oracle.class_b(value, NU1), (3.0, 0.0), 130.0)
+        told = distinct(run.at(t) for t, _ in zeros(run, lambda x1, x2: x2, 60.0, 130.0))
+        assert len(told) == 2
+        np.testing.assert_allclose(points(diagram, row), told, **CLOSE)
+        # One loop, no more: as many points as there are different ones.
+        assert np.sum(~np.isnan(diagram.x1[row, 0])) == 2
+    rests = jb.equilibria(jb.presets.class_b(0.45, NU1))
+    assert diagram.x1[2, 1, 0] == pytest.approx(float(rests.x1[0]), abs=1e-12)
+    assert diagram.x2[2, 1, 0] == 0 and np.isnan(diagram.period[2, 1])
+
+
+def test_another_span_is_the_same_question_and_compiles_nothing(diagram):
+    with compilations() as compiled:
+        there = diagram.over((-0.2, 0.2))
+        back = there.over((-0.5, 0.45))
+    assert compiled == []
+    np.testing.assert_array_equal(back.x1, diagram.x1)
+    # A belt at rest holds the mass for ever, where it came to rest.
+    assert there.values[1] == 0 and there.kind[1].tolist() == ["stuck", "stuck"]
+    assert np.all(np.isfinite(there.x1[1, :, 0])) and np.all(there.x2[1, :, 0] == 0)
+    # What needs longer than t = 30,000 has no points, and says so.
+    slow = diagram.over((1e-7, 3e-7))
+    assert np.all(slow.kind == "undecided") and np.all(slow.status == jb.Status.NOT_SETTLED)
+    assert np.all(np.isnan(slow.x1)) and np.all(np.isnan(slow.period))
+    table = slow.table()
+    assert len(table) == 6 and set(table.kind) == {"undecided"} and table.x1.isna().all()
+
+
+def test_table_has_a_row_for_each_point(diagram):
+    table = diagram.table()
+    assert table.columns.tolist() == ["value", "start", "kind", "period", "x1", "x2"]
+    assert len(table) == np.sum(~np.isnan(diagram.x1)) == 11
+    last = table[table.value == 0.45]
+    assert last.kind.tolist() == ["cycle", "cycle", "equilibrium"]
+    assert last.start.tolist() == [0, 0, 1] and last.period.isna().tolist() == [False, False, True]
+    assert repr(diagram) == (
+        "OrbitDiagram(belts[0].velocity from -0.5 to 0.45, 6 runs: 1 equilibrium, 5 cycle)"
+    )
+
+
+def test_a_cycle_that_does_not_come_back_is_undecided(diagram, monkeypatch):
+    """Within no distance at all: what is not the same to the last bit is refused."""
+    monkeypatch.setattr(module, "RUN", 0.0)
+    found = diagram.over((-0.5, 0.45))
+    assert np.all(found.kind[:, 0] == "undecided") and np.all(np.isnan(found.x1[:, 0]))
+    assert np.all(found.status[:, 0] == jb.Status.NOT_SETTLED)
+    assert found.kind[2, 1] == "equilibrium"
+
+
+@pytest.mark.slow
+def test_section_of_motions_with_edges():
+    at = jb.AtSection(height, 1)
+
+    def make(sigma1):
+        return jb.presets.class_d(0.35, 0.2, 0.0, sigma1)
+
+    found = jb.orbit_diagram(make, span=(0.4, 1.1), at=at, rows=4)
+    assert np.all(found.kind == "cycle") and np.all(found.status == jb.Status.OK)
+    for row, sigma1 in enumerate(found.values):
+        run = oracle.simulate(oracle.class_d(0.35, 0.2, 0.0, sigma1), (3.0, 0.0), 200.0)
+        crossings = zeros(run, lambda x1, x2: height(None, x1, x2), 150.0, 200.0)
+        told = distinct(run.at(t) for t, rises in crossings if rises)
+        np.testing.assert_allclose(points(found, row), told, **CLOSE)
+
+
+@pytest.mark.slow
+def test_a_loop_with_more_moments_than_there_is_room_for(monkeypatch):
+    arguments = jb.presets.class_b(0.3, NU1), nu0, (-0.3, 0.45)
+    with_room = jb.orbit_diagram(*arguments, at=jb.AtEvents(), rows=4)
+    assert with_room.x1.shape[-1] == 4
+    monkeypatch.setattr(module, "MOMENTS_KEPT", 4)
+    one_by_one = jb.orbit_diagram(*arguments, at=jb.AtEvents(), rows=4)
+    for row in range(4):
+        np.testing.assert_allclose(points(with_room, row), points(one_by_one, row), **CLOSE)
+    monkeypatch.setattr(module, "MOST_RUNS", 1)
+    cut = one_by_one.over((-0.3, 0.45))
+    assert np.all(cut.kind == "cycle")
+    assert set(cut.status.ravel().tolist()) == {jb.Status.TOO_MANY_STEPS}
+    assert 1 <= np.min(np.sum(~np.isnan(cut.x1), axis=-1)) <= 3
+
+
+# --- zooming: of a diagram that is made up, which computes nothing --------------------------------
+
+
+class MadeUp:
+    """Answers as a `Sampling` does, and remembers what it was asked."""
+
+    def __init__(self):
+        self.asked = []
+
+    def diagram(self, span):
+        self.asked.append(span)
+        if span[0] < 0:
+            raise ValueError("load of belt 0 must be >= 0, got -1.0")
+        values = np.linspace(*span, 5)
+        kind = np.full((5, 1), "cycle" if span[0] else "equilibrium", "<U11")
+        kind[0] = "undecided"
+        x1 = np.where(kind == "undecided", np.nan, values[:, None])[..., None]
+        status, at = np.zeros((5, 1), int), jb.AtExtrema("x1")
+        return jb.OrbitDiagram(values, kind, 7 + 0 * x1[..., 0], status, x1, -x1, at, "nu0", self)
+
+
+@pytest.fixture
+def zoomed():
+    sampling = MadeUp()
+    ax = sampling.diagram((0.0, 1.0)).plot(zoom=True)
+    sampling.asked.clear()
+    return SimpleNamespace(ax=ax, asked=sampling.asked, canvas=ax.figure.canvas)
+
+
+def drawn(ax):
+    """The values of the parameter at which there are points."""
+    return np.sort(np.concatenate([line.get_xdata() for line in ax.lines]))
+
+
+def mouse(zoomed, name):
+    event = MouseEvent(f"button_{name}_event", zoomed.canvas, 100, 100, button=1)
+    zoomed.canvas.callbacks.process(event.name, event)
+
+
+def test_new_limits_are_computed_once(zoomed):
+    zoomed.ax.set_xlim(0.25, 0.75)
+    assert zoomed.asked == [(0.25, 0.75)] and zoomed.ax.get_xlim() == (0.25, 0.75)
+    np.testing.assert_array_equal(drawn(zoomed.ax), np.linspace(0.25, 0.75, 5))
+    # The heights follow, and the key.
+    low, high = zoomed.ax.get_ylim()
+    assert 0.3 < low < 0.375 and 0.75 < high < 0.8
+    assert sorted(zoomed.ax.get_legend_handles_labels()[1]) == ["cycle", "undecided"]
+    zoomed.ax.set_ylim(0.4, 0.5)
+    zoomed.ax.set_xlim(0.25, 0.75)
+    assert len(zoomed.asked) == 1
+    # Heights that were chosen stay.
+    zoomed.ax.set_xlim(0.7, 0.3)
+    assert zoomed.asked[1:] == [(0.3, 0.7)] and zoomed.ax.get_ylim() == (0.4, 0.5)
+    zoomed.canvas.draw()
+    assert len(zoomed.asked) == 2
+
+
+def test_nothing_is_computed_while_a_button_is_held(zoomed):
+    mouse(zoomed, "press")
+    for left in (0.1, 0.2, 0.3):
+        zoomed.ax.set_xlim(left, 1.0)
+    assert zoomed.asked == []
+    mouse(zoomed, "release")
+    assert zoomed.asked == [(0.3, 1.0)]
+    # A click that changes nothing.
+    mouse(zoomed, "press")
+    mouse(zoomed, "release")
+    assert len(zoomed.asked) == 1
+
+
+def test_limits_that_cannot_be_are_told_and_the_points_stay(zoomed):
+    before = drawn(zoomed.ax)
+    zoomed.ax.set_xlim(-1.0, 1.0)
+    np.testing.assert_array_equal(drawn(zoomed.ax), before)
+    (told,) = (text for text in zoomed.ax.texts if text.get_text())
+    assert told.get_text() == "load of belt 0 must be >= 0, got -1.0"
+    zoomed.ax.set_xlim(0.5, 1.0)
+    assert not told.get_text() and drawn(zoomed.ax)[0] == 0.5
+
+
+def test_without_zoom_new_limits_are_a_window():
+    sampling = MadeUp()
+    diagram = sampling.diagram((0.0, 1.0))
+    ax = plot_orbits(diagram, quantity="x2")
+    assert ax.get_ylabel() == "velocity $x_2$" and ax.get_xlabel() == r"belt velocity $\nu_0$"
+    ax.set_xlim(0.25, 0.75)
+    assert len(sampling.asked) == 1 and drawn(ax)[0] == 0.0
+
+
+def test_an_impossible_quantity():
+    with pytest.raises(ValueError, match='quantity must be "x1" or "x2", got \'x3\''):
+        MadeUp().diagram((0.0, 1.0)).plot(quantity="x3")
