@@ -102,6 +102,13 @@ MISTAKES = [
     ("jb.equilibria([osc, osc])", OSC + r"\[Oscillator\("),
     ("jb.lyapunov_coefficient(None)", OSC + "None"),
     ("jb.portrait('osc')", OSC + "'osc'"),
+    ("jb.minimal_fatal_shock('osc', (3.0, 0.0))", OSC + "'osc'"),
+    ("jb.minimal_fatal_shock(osc, 3.0)", r"y0 must be of shape \(2\), got shape \(\)"),
+    (
+        "jb.minimal_fatal_shock(osc, (3.0, 0.0), direction='x1')",
+        'direction must be "both" or "x2", got \'x1\'',
+    ),
+    ("jb.distance_to_basin_boundary('x3')", 'direction must be "both" or "x2", got \'x3\''),
     ("jb.amplitude(osc)", CYCLE + r"Oscillator\("),
     ("jb.period(None)", CYCLE + "None"),
     ("jb.peak(cycle, 'x3')", 'coordinate must be "x1" or "x2", got \'x3\''),

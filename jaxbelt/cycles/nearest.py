@@ -211,41 +211,40 @@ def _choices(parts: _Parts, rows: np.ndarray) -> list[tuple[np.ndarray, np.ndarr
 # --- the equations --------------------------------------------------------------------------------
 
 
-def equations_of(
-    osc: Oscillator,
-    pieces: tuple[Pieces, Pieces],
-    fractions: Array,
-    fixed: tuple[Array, Array],
-    along_x2: bool,
-) -> tuple[Array, Array, Array]:
-    """d = P - Q, the two equations of a `Meeting` at fractions, [2], and their derivatives by the
-    fractions, [2, 2].
-
-    pieces: a row each. fixed: (where the fractions are fixed, [2], whether they are, [2]). A
-    fraction that is fixed is an equation by itself, in the place of the second one along x2, and of
-    its own in any direction.
-    """
-    (p, dp, ddp), (q, dq, ddq) = (
-        place_on(osc, piece, fractions[k]) for k, piece in enumerate(pieces)
+def places_on(osc: Oscillator, first: Pieces, second: Pieces, fractions: Array):
+    """`place_on` for a row of each curve, at two fractions, [2]: three arrays [2, 2], of which the
+    first rows are of the first curve."""
+    steps = max(piece.mesh.shape[-1] for piece in (first, second))
+    # Steps that are added are of length zero. One program does both.
+    first, second = (
+        eqx.tree_at(lambda p: p.mesh, one, jnp.pad(one.mesh, (0, steps - one.mesh.shape[-1])))
+        for one in (first, second)
     )
-    d, (places, is_fixed) = p - q, fixed
-    stay, unit = fractions - places, jnp.eye(2)
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), first, second)
+    return lax.map(lambda row: place_on(osc, *row), (both, fractions))
+
+
+def equations_of(places: tuple[Array, Array, Array], stay: Array, fixed: Array, along_x2: bool):
+    """The two equations of a `Meeting`, [2], and their derivatives by the fractions, [2, 2].
+
+    places: what `places_on` gives. A fraction that is fixed is an equation by itself, along x2 in
+    the place of the second one, in any direction in that of its own; fixed: which are, [2]; stay:
+    how far they are from where they are to be, [2].
+    """
+    (p, q), (dp, dq), (ddp, ddq) = places
+    d, unit = p - q, jnp.eye(2)
     if along_x2:
-        first, first_row = d[0], jnp.stack([dp[0], -dq[0]])
         second = dp[0] * dq[1] - dp[1] * dq[0]
         row = jnp.stack([ddp[0] * dq[1] - ddp[1] * dq[0], dp[0] * ddq[1] - dp[1] * ddq[0]])
         for k in (0, 1):
-            second = jnp.where(is_fixed[k], stay[k], second)
-            row = jnp.where(is_fixed[k], unit[k], row)
-        return d, jnp.stack([first, second]), jnp.stack([first_row, row])
-    values = jnp.stack([d @ dp, -(d @ dq)])
-    rows = jnp.stack(
-        [
-            jnp.stack([dp @ dp + d @ ddp, -(dp @ dq)]),
-            jnp.stack([-(dp @ dq), dq @ dq - d @ ddq]),
-        ]
-    )
-    return d, jnp.where(is_fixed, stay, values), jnp.where(is_fixed[:, None], unit, rows)
+            second = jnp.where(fixed[k], stay[k], second)
+            row = jnp.where(fixed[k], unit[k], row)
+        rows = jnp.stack([jnp.stack([dp[0], -dq[0]]), row])
+        return jnp.stack([d[0], second]), rows
+    values, mixed = jnp.stack([d @ dp, -(d @ dq)]), -(dp @ dq)
+    diagonal = dp @ dp + d @ ddp, dq @ dq - d @ ddq
+    rows = jnp.stack([jnp.stack([diagonal[0], mixed]), jnp.stack([mixed, diagonal[1]])])
+    return jnp.where(fixed, stay, values), jnp.where(fixed[:, None], unit, rows)
 
 
 def solved_step(values: Array, rows: Array) -> Array:
@@ -302,8 +301,8 @@ def _newton_in_parts(
     def one(first, second, start, fixed, width):
         def improve(_, state):
             fractions, _ = state
-            place = start, fixed
-            _, values, rows = equations_of(osc, (first, second), fractions, place, along_x2)
+            places = places_on(osc, first, second, fractions)
+            values, rows = equations_of(places, fractions - start, fixed, along_x2)
             step = solved_step(values, rows)
             longest = jnp.max(jnp.abs(step) / jnp.where(width > 0, width, 1.0))
             step = step * jnp.minimum(1.0, LONGEST / jnp.where(longest > 0, longest, 1.0))
@@ -312,8 +311,8 @@ def _newton_in_parts(
             return jnp.where(fixed, start, new), jnp.max(jnp.abs(step))
 
         fractions, last = lax.fori_loop(0, WITHIN, improve, (start, jnp.inf))
-        d, _, _ = equations_of(osc, (first, second), fractions, (start, fixed), along_x2)
-        return fractions, d, last
+        p, q = places_on(osc, first, second, fractions)[0]
+        return fractions, p - q, last
 
     return each(one)(first, second, start, fixed, width)
 
@@ -344,7 +343,9 @@ def _ends_of(osc: Oscillator, way: ShortestWay) -> tuple[Array, Array]:
         for k, outline in enumerate((way.first, way.second))
     )
     known, fixed = lax.stop_gradient((way.meeting.fractions, way.meeting.fixed))
-    _, values, rows = equations_of(osc, (first, second), known, (known, fixed), way.along_x2)
+    places = places_on(osc, first, second, known)
+    values, rows = equations_of(places, jnp.zeros(2), fixed, way.along_x2)
     # The derivative of the implicit function: one step with a matrix that is kept.
-    fractions = known + solved_step(values, lax.stop_gradient(rows))
-    return place_on(osc, first, fractions[0])[0], place_on(osc, second, fractions[1])[0]
+    late = solved_step(values, lax.stop_gradient(rows))
+    begin, end = places[0] + late[:, None] * lax.stop_gradient(places[1])
+    return begin, end

@@ -164,11 +164,14 @@ def _jumps_of(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
     kinetic = jnp.abs(mode_acceleration(osc, slips, zero, v) - middle)
     held = capacity(osc, stuck)
     exists = (jnp.stack(stuck.codes)[belt] == STUCK) & (held - kinetic > force_rounding(middle))
-    lower = jnp.stack([middle - held, middle + kinetic])
-    upper = jnp.stack([middle - kinetic, middle + held])
-    lower, upper = jnp.clip(lower, low, high), jnp.clip(upper, low, high)
-    exists = exists & (lower < upper)
-    return jnp.where(exists, lower, jnp.nan), jnp.where(exists, upper, jnp.nan), v
+    lower = [jnp.clip(x1, low, high) for x1 in (middle - held, middle + kinetic)]
+    upper = [jnp.clip(x1, low, high) for x1 in (middle - kinetic, middle + held)]
+    there = [exists & (first < last) for first, last in zip(lower, upper, strict=True)]
+    lower, upper = (
+        jnp.stack([jnp.where(one, x1, jnp.nan) for one, x1 in zip(there, ends, strict=True)])
+        for ends in (lower, upper)
+    )
+    return lower, upper, v
 
 
 def jumps(osc: Oscillator) -> list[tuple[int, int, bool]]:
@@ -242,7 +245,7 @@ class OpenOutline(Outline):
 def _one_after_another(osc: Oscillator, chain: Chain, durations: Array, y: Array):
     """Entries and durations of the arcs of a chain that is open, from where it begins.
 
-    Known durations are good to rounding. One Newton step gives each its derivative.
+    Known durations are good to rounding. One Newton step gives each its first derivative.
     """
     unused = Ends(len(osc.belts)).unused
 
@@ -256,8 +259,8 @@ def _one_after_another(osc: Oscillator, chain: Chain, durations: Array, y: Array
         _, rate = jax.jvp(lambda y: end_guard(at_end[0], codes, end, y), (at_end[1],), (slope,))
         meets = (end != unused) & (rate != 0)
         late = jnp.where(meets, end_guard(osc, codes, end, last), 0.0)
-        duration = known - late / jnp.where(meets, rate, 1.0)
-        return flow(osc, codes, mesh, y, duration), (y, duration)
+        late = late / jnp.where(meets, rate, 1.0)
+        return last - late * slope, (y, known - late)
 
     return lax.scan(through, y, (chain.codes, chain.ends, chain.mesh, durations))[1]
 

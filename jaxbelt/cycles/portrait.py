@@ -194,9 +194,9 @@ def _named(
 ) -> Separatrix:
     """The separatrix, with where it leads to or comes from; cycles: those that may be that."""
     end, to = _end_of(branch, map_, points, cycles)
-    ts, ys, arcs = jax.device_put((branch.ts, branch.ys, branch.arcs))
+    ts, ys = jax.device_put((branch.ts, branch.ys))
     point = jax.device_put(np.array(branch.point))
-    return Separatrix(point, branch.side, branch.stable, ts, ys, end, to, arcs)
+    return Separatrix(point, branch.side, branch.stable, ts, ys, end, to, branch.arcs)
 
 
 def _end_of(branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles) -> tuple[str, int]:

@@ -299,6 +299,7 @@ def _branch(
     # The last arc was left, unless it came to where the mass sticks.
     known = np.arange(count) < count - (not was_cut)
     ends = np.where(known, orbit.ends[:count], Ends(len(osc.belts)).unused)
-    arcs = Loop(orbit.codes[:count], jax.device_put(ends), orbit.entries[:count], since[:count, -1])
+    columns = orbit.codes[:count], ends, orbit.entries[:count], since[:count, -1]
+    arcs = Loop(*jax.device_put(columns))
     end = tops[~np.isnan(tops)], y, float(rest), Status(int(orbit.status))
     return TracedSeparatrix(point, side, stable, ts, ys, *end, was_cut, arcs)

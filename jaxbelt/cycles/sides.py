@@ -145,9 +145,9 @@ def leads_to(portrait: Portrait, starts: np.ndarray) -> list[End]:
             batch = left[first : first + STARTS_AT_ONCE]
             filled = batch[np.minimum(np.arange(STARTS_AT_ONCE), batch.size - 1)]
             told = _followed(portrait.oscillator, jax.device_put(states[filled]))
-            for i, *one in zip(batch, *map(np.asarray, told)):
-                ends[i] = _end_of(portrait, *one)
-                states[i] = one[-1]
+            for i, status, top, rest, y in zip(batch, *map(np.asarray, told)):
+                ends[i] = _end_of(portrait, int(status), float(top), float(rest), y)
+                states[i] = y
     return [End("undecided", -1) if end is None else end for end in ends]
 
 
