@@ -1,4 +1,4 @@
-"""The shortest way between two curves of the phase plane, in any direction or along x2: `nearest`.
+"""The shortest way between two curves of the phase plane, in any direction or along x2: `shortest_between`.
 
 x1 and x2 are monotone on every piece, for arcs end at extrema. So a part of a piece lies in the box
 between its ends, and two boxes bound the distance between what is in them from below and from
@@ -23,7 +23,7 @@ from .outlines import Outline, Pieces, place_on
 #: Parts of a piece; pairs of parts that are solved for in one batch, and pieces that are sampled.
 PARTS, PAIRS, PIECES = 16, 64, 32
 #: Newton steps within a pair of parts, and the longest, in parts.
-WITHIN, LONGEST = 16, 2.0
+WITHIN, LONGEST_IN_PARTS = 16, 2.0
 #: The last step is no longer, as a fraction of the piece, nor is the error in x1 along x2 larger.
 FOUND = 1e-9
 #: A solution that is so far beyond its parts is taken, too: in parts.
@@ -46,7 +46,7 @@ class Meeting(eqx.Module):
     fixed: Array
 
 
-class _Parts(NamedTuple):
+class _PieceParts(NamedTuple):
     """Parts of pieces: the piece of each, where on it they begin, how long they are, both as
     fractions, and the corners of their boxes, [parts, 2]."""
 
@@ -68,13 +68,13 @@ class _Tries(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """A curve where it is at one oscillator, and the parts of its pieces; see `sampled`."""
+    """A curve where it is at one oscillator, and the parts of its pieces; see `sampled_curve`."""
 
     pieces: Pieces
-    parts: _Parts
+    parts: _PieceParts
 
 
-def nearest(
+def shortest_between(
     osc: Oscillator, first: Sampled, second: Sampled, *, along_x2: bool
 ) -> tuple[float, Meeting | None]:
     """The shortest way from one curve to another, and where it is; inf and None if there is none.
@@ -105,7 +105,7 @@ def nearest(
 # --- parts, and pairs of them that may be nearest -------------------------------------------------
 
 
-def sampled(osc: Oscillator, outline: Outline) -> Sampled:
+def sampled_curve(osc: Oscillator, outline: Outline) -> Sampled:
     """The curve of an outline at a known oscillator."""
     pieces = outline.pieces(osc)
     return Sampled(pieces, _parts_of(osc, pieces))
@@ -114,11 +114,11 @@ def sampled(osc: Oscillator, outline: Outline) -> Sampled:
 def end_of_way(osc: Oscillator, second: Sampled, meeting: Meeting) -> np.ndarray:
     """Where a shortest way ends on its second curve, [2]."""
     piece = jax.tree.map(lambda leaf: leaf[meeting.pieces[1]], second.pieces)
-    return np.asarray(_place_on(osc, piece, meeting.fractions[1]))
+    return np.asarray(_place_of_row(osc, piece, meeting.fractions[1]))
 
 
 @jit
-def _place_on(osc: Oscillator, piece: Pieces, fraction: Array) -> Array:
+def _place_of_row(osc: Oscillator, piece: Pieces, fraction: Array) -> Array:
     return place_on(osc, piece, fraction)[0]
 
 
@@ -127,10 +127,12 @@ def sampled_point(osc: Oscillator, y: np.ndarray) -> Sampled:
     one, belts = jnp.ones(1), len(osc.belts)
     place = jnp.asarray(np.array(y))[None]
     pieces = Pieces(one, jnp.full((1, belts), float(ABOVE)), one[None], place, 0 * one, 0 * one)
-    return Sampled(pieces, _Parts(np.zeros(1, int), np.zeros(1), np.zeros(1), y[None], y[None]))
+    return Sampled(
+        pieces, _PieceParts(np.zeros(1, int), np.zeros(1), np.zeros(1), y[None], y[None])
+    )
 
 
-def _parts_of(osc: Oscillator, pieces: Pieces) -> _Parts:
+def _parts_of(osc: Oscillator, pieces: Pieces) -> _PieceParts:
     durations, lengths = np.asarray(pieces.durations), np.asarray(pieces.lengths)
     is_point = (durations == 0) & (lengths == 0)
     # Of a curve, not of a point, pieces without an extent are none.
@@ -145,8 +147,8 @@ def _parts_of(osc: Oscillator, pieces: Pieces) -> _Parts:
     ends = np.stack([states[:, :-1], states[:, 1:]])
     low, high = ends.min(axis=0), ends.max(axis=0)
     if len(is_point) == 1 and is_point[0]:
-        return _Parts(number, np.zeros(1), np.zeros(1), low[:, 0], high[:, 0])
-    return _Parts(
+        return _PieceParts(number, np.zeros(1), np.zeros(1), low[:, 0], high[:, 0])
+    return _PieceParts(
         number.repeat(PARTS),
         np.tile(grid[:-1], len(number)),
         np.full(len(number) * PARTS, 1 / PARTS),
@@ -166,7 +168,7 @@ def _states_of(osc: Oscillator, pieces: Pieces) -> Array:
     return lax.map(along, pieces)
 
 
-def _tries_of(one: _Parts, other: _Parts, along_x2: bool) -> tuple[_Tries, float]:
+def _tries_of(one: _PieceParts, other: _PieceParts, along_x2: bool) -> tuple[_Tries, float]:
     """What is to be tried, that which is likely to be nearest first, and a length that the shortest
     way does not exceed, inf where there is none."""
     apart = one.low[:, None] - other.high, other.low - one.high[:, None]
@@ -196,7 +198,9 @@ def _tries_of(one: _Parts, other: _Parts, along_x2: bool) -> tuple[_Tries, float
     return _Tries(pairs[rows], fractions[order], fixed[order], bound), limit
 
 
-def _choices(parts: _Parts, rows: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _choices(
+    parts: _PieceParts, rows: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Where on its piece a point of each of these parts may be: somewhere in the part, or at an end
     of the piece. A fraction, whether it is fixed, and whether that is a choice."""
     begin, width = parts.begin[rows], parts.width[rows]
@@ -305,7 +309,7 @@ def _newton_in_parts(
             values, rows = equations_of(places, fractions - start, fixed, along_x2)
             step = solved_step(values, rows)
             longest = jnp.max(jnp.abs(step) / jnp.where(width > 0, width, 1.0))
-            step = step * jnp.minimum(1.0, LONGEST / jnp.where(longest > 0, longest, 1.0))
+            step = step * jnp.minimum(1.0, LONGEST_IN_PARTS / jnp.where(longest > 0, longest, 1.0))
             # Arcs do not go far beyond where they end.
             new = jnp.clip(fractions + step, -0.1, 1.1)
             return jnp.where(fixed, start, new), jnp.max(jnp.abs(step))

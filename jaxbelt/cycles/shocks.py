@@ -22,10 +22,10 @@ from ..checks import as_array, as_whole, check_finite, is_concrete, number, requ
 from ..model.oscillator import Oscillator, check_oscillator
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .nearest import ShortestWay, end_of_way, nearest, sampled, sampled_point
+from .nearest import ShortestWay, end_of_way, sampled_curve, sampled_point, shortest_between
 from .outlines import Outline, outline_of_cycle
 from .portrait import TRACED, Portrait, portrait
-from .sides import Bound, End, bounds, end_of_name, leads_to, rests_of
+from .sides import Bound, Destination, bounds_of, destination_of_name, leads_to, resting_places
 
 if TYPE_CHECKING:
     import pandas
@@ -70,15 +70,15 @@ class FatalShock(eqx.Module):
         (of an equilibrium at its one state): t, the time since the first of them, x1, x2, distance,
         shock_x1, shock_x2; inf and NaN where there is no boundary in that direction."""
         known, along_x2 = self.portrait.oscillator, self.direction == "x2"
-        end = end_of_name(self.attractor)
+        end = destination_of_name(self.attractor)
         ts, states = _phases(self.portrait, end, as_whole(n, "n"))
-        beside = [bound for bound in bounds(self.portrait) if end in bound.sides]
-        curves = [sampled(known, bound.outline) for bound in beside]
+        beside = [bound for bound in bounds_of(self.portrait) if end in bound.sides]
+        curves = [sampled_curve(known, bound.outline) for bound in beside]
         rows = []
         for t, y in zip(ts, states, strict=True):
             point, best, shock = sampled_point(known, y), np.inf, np.full(2, np.nan)
             for curve in curves:
-                length, meeting = nearest(known, point, curve, along_x2=along_x2)
+                length, meeting = shortest_between(known, point, curve, along_x2=along_x2)
                 if meeting is not None and not length >= best:
                     best, shock = length, end_of_way(known, curve, meeting) - y
             rows.append((t, *y, best, *shock))
@@ -178,17 +178,19 @@ def length_of(shock: Array, direction: str) -> Array:
 
 
 def shortest_way_out(
-    told: Portrait, end: End, *, along_x2: bool
+    told: Portrait, end: Destination, *, along_x2: bool
 ) -> tuple[ShortestWay | None, Bound | None, Status]:
     """The shortest way from an attractor to the boundary of its basin, and which that is; None if
     there is none in that direction, or the status is one of FAILED."""
     if end.what not in ("cycle", "equilibrium"):
         return None, None, Status.NOT_SETTLED
     osc, outline = told.oscillator, _outline_of(told, end)
-    first, found = sampled(osc, outline), bounds(told)
+    first, found = sampled_curve(osc, outline), bounds_of(told)
     shortest, way, beside = np.inf, None, None
     for bound in (bound for bound in found if end in bound.sides):
-        length, meeting = nearest(osc, first, sampled(osc, bound.outline), along_x2=along_x2)
+        length, meeting = shortest_between(
+            osc, first, sampled_curve(osc, bound.outline), along_x2=along_x2
+        )
         if np.isnan(length):
             return None, None, Status.NO_CONVERGENCE
         if meeting is not None and length < shortest:
@@ -217,13 +219,13 @@ def _tells_all(told: Portrait, found: list[Bound]) -> bool:
     return int(told.status) == Status.OK and known and traced and not jumps_at_rest
 
 
-def _outline_of(told: Portrait, end: End) -> Outline:
+def _outline_of(told: Portrait, end: Destination) -> Outline:
     if end.what == "cycle":
         return outline_of_cycle(told.cycles[end.number])
-    return next(rest for rest in rests_of(told) if rest.first == end.number)
+    return next(rest for rest in resting_places(told) if rest.first == end.number)
 
 
-def _phases(told: Portrait, end: End, n: int) -> tuple[np.ndarray, np.ndarray]:
+def _phases(told: Portrait, end: Destination, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Times and states of an attractor: n of a cycle, one where the mass rests."""
     if end.what == "cycle":
         cycle = told.cycles[end.number]

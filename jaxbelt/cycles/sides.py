@@ -37,10 +37,10 @@ ON_AXIS = 1e-8
 #: A cycle that attracts weakly is known from as far off, relative to the distance from the origin.
 KNOWN = 1e-3
 #: How far beside a curve that does not cross the axis starts are, and beside a boundary.
-BESIDE = 1e-6
+ASIDE = 1e-6
 
 
-class End(NamedTuple):
+class Destination(NamedTuple):
     """Where a start leads: what ("cycle", "equilibrium", "infinity" or "undecided"), and the number
     in the portrait, of pieces of a segment that of the first, or -1."""
 
@@ -52,10 +52,10 @@ class End(NamedTuple):
         return f"{self.what} {self.number}" if self.number >= 0 else self.what
 
 
-def end_of_name(name: str) -> End:
-    """The `End` with a name."""
+def destination_of_name(name: str) -> Destination:
+    """The `Destination` with a name."""
     what, _, row = name.partition(" ")
-    return End(what, int(row) if row else -1)
+    return Destination(what, int(row) if row else -1)
 
 
 class Bound(NamedTuple):
@@ -64,14 +64,14 @@ class Bound(NamedTuple):
 
     name: str
     outline: Outline
-    sides: tuple[End, End]
+    sides: tuple[Destination, Destination]
 
-    def beyond(self, end: End) -> End:
+    def beyond(self, end: Destination) -> Destination:
         """The other side."""
         return self.sides[1] if self.sides[0] == end else self.sides[0]
 
 
-def bounds(portrait: Portrait) -> list[Bound]:
+def bounds_of(portrait: Portrait) -> list[Bound]:
     """All curves of a portrait that part motions which end differently, or may do so."""
     osc, places = portrait.oscillator, _places(portrait)
     found: list[tuple[str, Outline]] = []
@@ -129,30 +129,30 @@ def _across(osc: Oscillator, outline: Outline) -> np.ndarray:
     piece = jax.tree.map(lambda leaf: leaf[0], outline.pieces(osc))
     place, slope, _ = map(np.asarray, place_on(osc, piece, jnp.asarray(0.5)))
     normal = np.array([-slope[1], slope[0]]) / np.hypot(*slope)
-    return place + BESIDE * (1 + np.abs(place).max()) * np.array([normal, -normal])
+    return place + ASIDE * (1 + np.abs(place).max()) * np.array([normal, -normal])
 
 
 # --- where starts lead ----------------------------------------------------------------------------
 
 
-def leads_to(portrait: Portrait, starts: np.ndarray) -> list[End]:
+def leads_to(portrait: Portrait, starts: np.ndarray) -> list[Destination]:
     """Where starts lead, [n, 2], among what the portrait tells."""
-    ends: list[End | None] = [None] * len(starts)
+    ends: list[Destination | None] = [None] * len(starts)
     states = np.array(starts, float)
     for _ in range(ROUNDS):
         left = np.array([i for i, end in enumerate(ends) if end is None], int)
         for first in range(0, left.size, STARTS_AT_ONCE):
             batch = left[first : first + STARTS_AT_ONCE]
             filled = batch[np.minimum(np.arange(STARTS_AT_ONCE), batch.size - 1)]
-            told = _followed(portrait.oscillator, jax.device_put(states[filled]))
+            told = _followed_on(portrait.oscillator, jax.device_put(states[filled]))
             for i, status, top, rest, y in zip(batch, *map(np.asarray, told)):
-                ends[i] = _end_of(portrait, int(status), float(top), float(rest), y)
+                ends[i] = _destination(portrait, int(status), float(top), float(rest), y)
                 states[i] = y
-    return [End("undecided", -1) if end is None else end for end in ends]
+    return [Destination("undecided", -1) if end is None else end for end in ends]
 
 
 @jit
-def _followed(osc: Oscillator, starts: Array):
+def _followed_on(osc: Oscillator, starts: Array):
     """Of each start, [n, 2]: the status, the last top, where it rests, and where it is left."""
 
     def one(start):
@@ -164,21 +164,23 @@ def _followed(osc: Oscillator, starts: Array):
     return each(one)(lax.stop_gradient(starts))
 
 
-def _end_of(portrait: Portrait, status: int, top: float, rest: float, y: np.ndarray) -> End | None:
+def _destination(
+    portrait: Portrait, status: int, top: float, rest: float, y: np.ndarray
+) -> Destination | None:
     """Where an orbit has come to; None if that is not yet known."""
     if not np.isnan(rest):
-        number = _place_of(portrait, rest)
-        return End("equilibrium", number) if number >= 0 else End("undecided", -1)
+        number = _row_at(portrait, rest)
+        return Destination("equilibrium", number) if number >= 0 else Destination("undecided", -1)
     if status == Status.OK:
         away = [abs(float(cycle.x1_max) - top) for cycle in portrait.cycles]
         near = len(away) and min(away) < KNOWN * (1 + abs(top))
-        return End("cycle", int(np.argmin(away))) if near else End("undecided", -1)
+        return Destination("cycle", int(np.argmin(away))) if near else Destination("undecided", -1)
     if not np.all(np.abs(y) < 10 * portrait.reach):
-        return End("infinity" if portrait.escapes else "undecided", -1)
-    return None if status == Status.NOT_SETTLED else End("undecided", -1)
+        return Destination("infinity" if portrait.escapes else "undecided", -1)
+    return None if status == Status.NOT_SETTLED else Destination("undecided", -1)
 
 
-def _place_of(portrait: Portrait, x1: float) -> int:
+def _row_at(portrait: Portrait, x1: float) -> int:
     """The first row of where the mass rests at x1, or -1."""
     lower, upper = (
         np.asarray(ends) for ends in (portrait.equilibria.x1_lower, portrait.equilibria.x1_upper)
@@ -188,10 +190,10 @@ def _place_of(portrait: Portrait, x1: float) -> int:
     row = int(np.argmin(away)) if away.size else -1
     if row < 0 or not away[row] < KNOWN * (1 + abs(x1)):
         return -1
-    return next(rest.first for rest in rests_of(portrait) if rest.first <= row <= rest.last)
+    return next(rest.first for rest in resting_places(portrait) if rest.first <= row <= rest.last)
 
 
-def rests_of(portrait: Portrait) -> Sequence[Rest]:
+def resting_places(portrait: Portrait) -> Sequence[Rest]:
     """Where the mass can rest: points, and segments with all their pieces."""
     rests = portrait.equilibria
     kinds, lower, upper = map(np.asarray, (rests.kind, rests.x1_lower, rests.x1_upper))
