@@ -1,4 +1,4 @@
-"""The shortest way between two curves of the phase plane, in any direction or along x2: `shortest_between`.
+"""The shortest way between two curves, in any direction or along x2: `shortest_between`.
 
 x1 and x2 are monotone on every piece, for arcs end at extrema. So a part of a piece lies in the box
 between its ends, and two boxes bound the distance between what is in them from below and from
@@ -127,9 +127,8 @@ def sampled_point(osc: Oscillator, y: np.ndarray) -> Sampled:
     one, belts = jnp.ones(1), len(osc.belts)
     place = jnp.asarray(np.array(y))[None]
     pieces = Pieces(one, jnp.full((1, belts), float(ABOVE)), one[None], place, 0 * one, 0 * one)
-    return Sampled(
-        pieces, _PieceParts(np.zeros(1, int), np.zeros(1), np.zeros(1), y[None], y[None])
-    )
+    zero = np.zeros(1)
+    return Sampled(pieces, _PieceParts(np.zeros(1, int), zero, zero, y[None], y[None]))
 
 
 def _parts_of(osc: Oscillator, pieces: Pieces) -> _PieceParts:
@@ -198,9 +197,7 @@ def _tries_of(one: _PieceParts, other: _PieceParts, along_x2: bool) -> tuple[_Tr
     return _Tries(pairs[rows], fractions[order], fixed[order], bound), limit
 
 
-def _choices(
-    parts: _PieceParts, rows: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _choices(parts: _PieceParts, rows: np.ndarray) -> list[tuple[np.ndarray, ...]]:
     """Where on its piece a point of each of these parts may be: somewhere in the part, or at an end
     of the piece. A fraction, whether it is fixed, and whether that is a choice."""
     begin, width = parts.begin[rows], parts.width[rows]

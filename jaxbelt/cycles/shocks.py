@@ -188,9 +188,8 @@ def shortest_way_out(
     first, found = sampled_curve(osc, outline), bounds_of(told)
     shortest, way, beside = np.inf, None, None
     for bound in (bound for bound in found if end in bound.sides):
-        length, meeting = shortest_between(
-            osc, first, sampled_curve(osc, bound.outline), along_x2=along_x2
-        )
+        second = sampled_curve(osc, bound.outline)
+        length, meeting = shortest_between(osc, first, second, along_x2=along_x2)
         if np.isnan(length):
             return None, None, Status.NO_CONVERGENCE
         if meeting is not None and length < shortest:

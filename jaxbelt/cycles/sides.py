@@ -169,7 +169,7 @@ def _destination(
 ) -> Destination | None:
     """Where an orbit has come to; None if that is not yet known."""
     if not np.isnan(rest):
-        number = _row_at(portrait, rest)
+        number = _row_of_rest(portrait, rest)
         return Destination("equilibrium", number) if number >= 0 else Destination("undecided", -1)
     if status == Status.OK:
         away = [abs(float(cycle.x1_max) - top) for cycle in portrait.cycles]
@@ -180,7 +180,7 @@ def _destination(
     return None if status == Status.NOT_SETTLED else Destination("undecided", -1)
 
 
-def _row_at(portrait: Portrait, x1: float) -> int:
+def _row_of_rest(portrait: Portrait, x1: float) -> int:
     """The first row of where the mass rests at x1, or -1."""
     lower, upper = (
         np.asarray(ends) for ends in (portrait.equilibria.x1_lower, portrait.equilibria.x1_upper)
