@@ -33,8 +33,9 @@ LEAST = 1e-3
 PHASES, ANGLES = 12, 8
 #: Runs repeat to this: nearer to an unstable cycle one is not told from it.
 REPEATS = 1e-11
-#: The largest change of parameters for the differences; where that changes what is there, smaller.
-STEPS = (3e-4, 1e-5)
+#: Changes of parameters for the differences: the first with which nothing else becomes the nearest
+#: and the two differences that are extrapolated are as near to one another.
+STEPS, ALIKE = (3e-4, 3e-5, 3e-6), 1e-4
 #: Number of what goes to infinity; of what is told nowhere.
 INFINITY, UNKNOWN = 1000, -1
 
@@ -49,9 +50,21 @@ def label(osc: engine.Oscillator, told: jb.Portrait, y0) -> int:
 
 def bisected(osc: engine.Oscillator, told: jb.FatalShock, end: int) -> float:
     """The distance from the start, along the shock, from where on the engine's runs do not lead to
-    the attractor, the number `end` of the portrait; NaN where they do not around the shock."""
+    the attractor, the number `end` of the portrait; NaN where they do not do so around the shock.
+
+    A shock that leads to a sharp corner misses what is behind it. Then the way leads as near beside
+    the corner as distances are compared, where runs do not lead to the attractor.
+    """
     start, shock = (np.asarray(one, float) for one in (told.start, told.shock))
     inside, outside = 1 - 1e-4, 1 + 1e-4
+    if label(osc, told.portrait, start + outside * shock) == end and told.direction == "both":
+        angles = np.radians(np.arange(360))
+        ways = np.column_stack([np.cos(angles), np.sin(angles)])
+        behind = [
+            way for way in ways if label(osc, told.portrait, start + shock + 1e-6 * way) != end
+        ]
+        if behind:
+            shock, outside = shock + 0.1 * SAME * np.mean(behind, axis=0), 1.0
     ends = [label(osc, told.portrait, start + share * shock) for share in (inside, outside)]
     if ends[0] != end or ends[1] == end:
         return np.nan
@@ -65,7 +78,7 @@ def bisected(osc: engine.Oscillator, told: jb.FatalShock, end: int) -> float:
             inside = middle
         else:
             outside = middle
-    return 0.5 * (inside + outside) * float(told.distance)
+    return 0.5 * (inside + outside) * float(np.linalg.norm(shock))
 
 
 def differences(osc, y0, direction: str, told: jb.FatalShock) -> tuple[list[str], float]:
@@ -131,7 +144,8 @@ def slope_error(osc, y0, direction: str, along) -> tuple[float, float] | None:
             whole = (values[step] - values[-step]) / (2 * step)
             half = (values[0.5 * step] - values[-0.5 * step]) / step
             right = (4 * half - whole) / 3
-            return abs(float(slope) - right), abs(right)
+            if abs(half - whole) < ALIKE * (1 + abs(right)) or step == STEPS[-1]:
+                return abs(float(slope) - right), abs(right)
     return None
 
 
