@@ -19,12 +19,13 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     motion/         integrators arcs sensitivities sampling batches runs smoothing simulate
     cycles/         settling shooting orbits cycle attractors functionals
     cycles/         backwards returns separatrices portrait
+    cycles/         outlines nearest sides shocks
     sweeps/         marks observers moments along reducers attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     sweeps/         orbit_diagram
     bifurcations/   special labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   path scan refine curves faces regions diagrams switch_folds
-    inverse/        selection record fit design
+    inverse/        selection record fit margins design
     si              results in SI units
     plotting/       style phase histories points diagrams regions sweeps orbits inverse model
     plotting/       draw si explorer

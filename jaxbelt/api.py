@@ -34,8 +34,10 @@ from .cycles.functionals import (
 )
 from .cycles.portrait import Portrait, portrait
 from .cycles.separatrices import Separatrix
+from .cycles.shocks import FatalShock, minimal_fatal_shock
 from .inverse.design import Design, design, distance_to
 from .inverse.fit import Fit, fit
+from .inverse.margins import distance_to_basin_boundary
 from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
 from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck
 from .model.machine import Machine, PhysicalBelt, Units
@@ -84,6 +86,7 @@ __all__ = [
     "EventKind",
     "Events",
     "Explanation",
+    "FatalShock",
     "Fit",
     "FoldOfCycles",
     "GrazingEdge",
@@ -116,6 +119,7 @@ __all__ = [
     "describe",
     "design",
     "distance_to",
+    "distance_to_basin_boundary",
     "energy_dissipated",
     "energy_fed",
     "equilibria",
@@ -126,6 +130,7 @@ __all__ = [
     "gap",
     "in_si",
     "lyapunov_coefficient",
+    "minimal_fatal_shock",
     "orbit_diagram",
     "peak",
     "period",

@@ -102,7 +102,8 @@ ADVICE = {
     Status.INCOMPLETE: (
         "Not everything is told: in the gaps there may be cycles (a continuum of closed orbits, "
         "cycles about to merge, orbits that settle too slowly), or a separatrix is missing, of a "
-        "node on a contact edge. Move away from the bifurcation point."
+        "node on a contact edge, or was not followed far enough for the shock asked for. Move away "
+        "from the bifurcation point."
     ),
     Status.UNEXPLAINED: (
         "What the oscillator does changes here, and no condition known to the search explains how. "

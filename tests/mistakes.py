@@ -61,6 +61,7 @@ MISTAKES = [
     ("jb.plot_sweep(dataset, 'knd')", "variable must be \"kind\", got 'knd'"),
     # --- machines
     ("jb.Machine(0.0, 1.0, 0.1, (physical,))", r"mass must be > 0, got 0\.0"),
+    ("jb.Machine(1.0, 1.0, 0.1, physical)", r"belts must be a tuple of belts, .*got PhysicalBelt"),
     ("jb.Machine(1.0, 1.0, 0.1, (belt,))", r"belts\[0\] must be a PhysicalBelt, got Belt"),
     ("jb.PhysicalBelt(0.1, law, -1.0)", r"normal_force must be >= 0, got -1\.0"),
     ("jb.PhysicalBelt(0.1, 0.4, 1.0)", f"friction must be {LAW}.*, got 0.4"),
@@ -102,6 +103,13 @@ MISTAKES = [
     ("jb.equilibria([osc, osc])", OSC + r"\[Oscillator\("),
     ("jb.lyapunov_coefficient(None)", OSC + "None"),
     ("jb.portrait('osc')", OSC + "'osc'"),
+    ("jb.minimal_fatal_shock('osc', (3.0, 0.0))", OSC + "'osc'"),
+    ("jb.minimal_fatal_shock(osc, 3.0)", r"y0 must be of shape \(2\), got shape \(\)"),
+    (
+        "jb.minimal_fatal_shock(osc, (3.0, 0.0), direction='x1')",
+        'direction must be "both" or "x2", got \'x1\'',
+    ),
+    ("jb.distance_to_basin_boundary('x3')", 'direction must be "both" or "x2", got \'x3\''),
     ("jb.amplitude(osc)", CYCLE + r"Oscillator\("),
     ("jb.period(None)", CYCLE + "None"),
     ("jb.peak(cycle, 'x3')", 'coordinate must be "x1" or "x2", got \'x3\''),
@@ -267,6 +275,7 @@ MISTAKES = [
     # --- from data to parameters
     ("jb.fit(osc, row, row)", "missing 1 required keyword-only argument: 'where'"),
     ("jb.fit(row, row, osc, where=nu0)", "oscillator must be an Oscillator, .* got an array"),
+    ("jb.fit(osc, row, 0 * row, where=nu0)", "x1 must be a record that changes, got one number"),
     ("jb.fit(osc, row, where=nu0)", "x1 must be given, or x2, got None"),
     ("jb.fit(osc, row, row[:-1], where=nu0)", r"x1 must be of shape \(200\), got shape \(199,\)"),
     (

@@ -13,6 +13,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 import jaxbelt as jb
+from jaxbelt.cycles.shooting import Loop
 from jaxbelt.numerics.continuation import Stop
 from jaxbelt.plotting.draw import draw_result
 from jaxbelt.plotting.style import parameter_label
@@ -43,7 +44,8 @@ def results() -> dict[type, Any]:
     cycle, inner = jb.find_cycle(osc, (3.0, 0.0)), jb.unstable_cycle(osc)
     point, rests = jb.refine(jb.NonsmoothFold(belt=1), osc, where=nu0), jb.equilibria(osc)
     ts, ys = jnp.asarray(span), jnp.asarray(np.column_stack([np.cos(span), np.sin(span)]))
-    separatrix = jb.Separatrix(ys[-1], "left", True, ts, ys, "outside", -1)
+    arcs = Loop(*(jnp.zeros(shape) for shape in ((1, 2), 1, (1, 2), 1)))
+    separatrix = jb.Separatrix(ys[-1], "left", True, ts, ys, "outside", -1, arcs)
     special, none = jb.SpecialPoint("DoubleSliding", (0,), (0.49, 0.5), 1e-12), jnp.zeros((0, 2))
     rows = np.column_stack([span, span**2])
     curve = jb.BifurcationCurve(
@@ -56,9 +58,15 @@ def results() -> dict[type, Any]:
     regions = ((0.0, 0.5, "2b"), (0.5, 0.6, "1"))
     kinds = {"equilibrium": 0.25, "cycle": 0.75}
     zero, two = jnp.zeros(()), jnp.zeros(2)
+    seen = (cycle,), (inner,), (separatrix,)
+    portrait = jb.Portrait(osc, rests, *seen, False, 3.0, none, run.status)
     found = [
         *(run, run.events, run.arcs, cycle, rests, point, special, curve, separatrix),
-        jb.Portrait(osc, rests, (cycle,), (inner,), (separatrix,), False, 3.0, none, run.status),
+        portrait,
+        jb.FatalShock(
+            *(portrait, "x2", "cycle 0", "unstable cycle 0", "equilibrium 0", jnp.asarray(0.5)),
+            *(ys[0], jnp.array([0.0, 0.5]), run.status),
+        ),
         jb.BifurcationDiagram((point,), (), regions, osc, "belts[0].velocity", True),
         jb.RegionMap(
             *(("nu0", "nu1"), (np.array([0.4, 0.6]), np.array([0.3, 0.5])), label, (curve,)),
@@ -105,6 +113,7 @@ TABLES = {
     jb.Equilibria: (1, "kind stable x1 x1_lower x1_upper rate frequency contact_0"),
     jb.Events: (None, "t x1 x2 kind belt"),
     jb.Explanation: (1, "runs blocks bytes compile_seconds seconds"),
+    jb.FatalShock: (1, "attractor direction distance x1 shock_x2 boundary beyond status"),
     jb.Fit: (3, "name estimate standard_error lower upper"),
     jb.OrbitDiagram: (3, "value start kind period x1 x2"),
     jb.Portrait: (4, "what number kind stable x1_min period multiplier rate"),

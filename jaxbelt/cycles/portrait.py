@@ -196,7 +196,7 @@ def _named(
     end, to = _end_of(branch, map_, points, cycles)
     ts, ys = jax.device_put((branch.ts, branch.ys))
     point = jax.device_put(np.array(branch.point))
-    return Separatrix(point, branch.side, branch.stable, ts, ys, end, to)
+    return Separatrix(point, branch.side, branch.stable, ts, ys, end, to, branch.arcs)
 
 
 def _end_of(branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles) -> tuple[str, int]:

@@ -49,6 +49,7 @@ from ..model.modes import (
     select,
 )
 from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit
 from ..results import Status, draw
 from ..tables import table_of
@@ -81,6 +82,8 @@ class Separatrix(eqx.Module):
       leads to, too slowly).
     - to: the number of that equilibrium, or of that attracting or unstable cycle, in the portrait;
       else -1.
+    - arcs: as it was followed from its point, arc by arc; where it is stable backwards, in the
+      oscillator reversed in time. What ends the last one, if it was left there, is "unused".
     """
 
     point: Array
@@ -90,6 +93,7 @@ class Separatrix(eqx.Module):
     ys: Array
     end: str = eqx.field(static=True)
     to: int = eqx.field(static=True)
+    arcs: Loop
 
     def table(self) -> "pandas.DataFrame":
         """A row for each sample, in the order of time: t, x1, x2."""
@@ -115,7 +119,7 @@ class TracedSeparatrix(NamedTuple):
 
     tops: its maxima of x1 in the order in which it came to them; y: where it was left; rest: x1
     where it came to rest, else NaN; status: of the orbit; cut: whether it came to a piece of a
-    boundary where the mass sticks.
+    boundary where the mass sticks; arcs: see `Separatrix`.
     """
 
     point: tuple[float, float]
@@ -128,6 +132,7 @@ class TracedSeparatrix(NamedTuple):
     rest: float
     status: Status
     cut: bool
+    arcs: Loop
 
 
 def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[TracedSeparatrix]:
@@ -150,7 +155,7 @@ def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[TracedSep
             if x1 not in parting and _repels(osc, *_as_arrays(x1, side == "right")):
                 found.append(_at_rest(osc, x1, side, True, reach))
     for belt in range(len(osc.belts)):
-        points, codes = map(np.asarray, _tangencies(osc, *_as_arrays(belt)))
+        points, codes = map(np.asarray, tangencies(osc, *_as_arrays(belt)))
         for (x1, x2), mode in zip(points.tolist(), codes, strict=True):
             if np.isfinite(x1):
                 side = "left" if x2 > 0 else "right"
@@ -192,7 +197,7 @@ def _leaves(osc: Oscillator, x1: Array, rightward: Array) -> tuple[Array, Array]
 
 
 @jit
-def _tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
+def tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     """Where orbits touch the boundary of a belt whose static limit exceeds mu(0), one point for
     each zone between contact edges, [zones, 2], NaN where there is none; and the modes of these
     orbits, [zones, belts].
@@ -291,5 +296,10 @@ def _branch(
     tops = orbit.tops[:count]
     if stable:
         ts, ys = -ts[::-1], ys[::-1]
-    status, tops = Status(int(orbit.status)), tops[~np.isnan(tops)]
-    return TracedSeparatrix(point, side, stable, ts, ys, tops, y, float(rest), status, was_cut)
+    # The last arc was left, unless it came to where the mass sticks.
+    known = np.arange(count) < count - (not was_cut)
+    ends = np.where(known, orbit.ends[:count], Ends(len(osc.belts)).unused)
+    columns = orbit.codes[:count], ends, orbit.entries[:count], since[:count, -1]
+    arcs = Loop(*jax.device_put(columns))
+    end = tops[~np.isnan(tops)], y, float(rest), Status(int(orbit.status))
+    return TracedSeparatrix(point, side, stable, ts, ys, *end, was_cut, arcs)

@@ -23,6 +23,7 @@ from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
 from ..results import Status, describe, draw
 from ..tables import table_of
+from .margins import BasinMargin
 from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of, told_to
 
 if TYPE_CHECKING:
@@ -123,9 +124,9 @@ def design(
     oscillator: where to begin; it has to have a cycle. targets: pairs of a functional of the
     `Cycle`, such as `jb.amplitude` or `lambda c: jb.stick_duration(c, 1)`, and its value, or an
     interval (lower, upper) that it is to lie in; `distance_to` is the functional that keeps a
-    bifurcation away. where, bounds: the parameters that may be changed, as for `fit`. y0: the
-    start (x1, x2) that leads to the cycle. report: is told of the progress, too, a line at a time,
-    such as `print`.
+    bifurcation away, `distance_to_basin_boundary` the one that lets the cycle withstand shocks.
+    where, bounds: the parameters that may be changed, as for `fit`. y0: the start (x1, x2) that
+    leads to the cycle. report: is told of the progress, too, a line at a time, such as `print`.
 
     Damped Newton steps with exact derivatives; with fewer targets than parameters, the shortest
     ones. What no choice within the bounds reaches ends with the status UNREACHABLE, and so does
@@ -140,7 +141,10 @@ def design(
     selection, u = selection_of(oscillator, where, bounds)
 
     def evaluate(u):
-        return _achieved(functionals, selection, oscillator, y0, jnp.asarray(u))
+        u = jnp.asarray(u)
+        beside = selection.put(oscillator, selection.values(u))
+        ready = tuple(f.at(beside, y0) if isinstance(f, BasinMargin) else f for f in functionals)
+        return _achieved(ready, selection, oscillator, y0, u)
 
     def off(achieved):
         wanted = np.clip(achieved, *intervals.T)

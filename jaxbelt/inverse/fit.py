@@ -419,9 +419,8 @@ def _checked_record(ts, x1, x2, noise):
         require(known >= 8, name, "at least 8 data", known)
     given = [column[np.isfinite(column)] for column in columns]
     moves = any(np.ptp(column) > 0 for column in given if column.size)
-    require(
-        moves, "x1" if x1 is not None else "x2", "a record that changes", "one number throughout"
-    )
+    name = "x1" if x1 is not None else "x2"
+    require(moves, name, "a record that changes", "one number throughout")
     both = x1 is not None and x2 is not None
     if isinstance(noise, tuple):
         sigmas = noise

@@ -13,6 +13,7 @@ from ..bifurcations.special import SpecialPoint
 from ..cycles.cycle import Cycle
 from ..cycles.portrait import Portrait
 from ..cycles.separatrices import Separatrix
+from ..cycles.shocks import FatalShock
 from ..inverse.design import Design
 from ..inverse.fit import Fit
 from ..model.equilibria import Equilibria
@@ -26,7 +27,7 @@ from .histories import plot_arcs, plot_events, plot_trajectory
 from .inverse import plot_fit
 from .orbits import plot_orbits
 from .phase import plot_portrait, plot_separatrix
-from .points import plot_cycle, plot_design, plot_equilibria, plot_point
+from .points import plot_cycle, plot_design, plot_equilibria, plot_point, plot_shock
 from .regions import plot_region_map
 from .style import add_key, figure_of
 from .sweeps import plot_basins, plot_blocks, plot_explanation, plot_stability
@@ -48,6 +49,7 @@ PICTURES: dict[type, Callable[..., Axes]] = {
     Equilibria: plot_equilibria,
     Events: plot_events,
     Explanation: plot_explanation,
+    FatalShock: plot_shock,
     Fit: plot_fit,
     OrbitDiagram: plot_orbits,
     Portrait: plot_portrait,

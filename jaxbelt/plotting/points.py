@@ -1,16 +1,21 @@
 """Single results in the phase plane: a cycle, a bifurcation point, equilibria."""
 
+import numpy as np
 from matplotlib.axes import Axes
 
 from ..bifurcations.conditions import BifurcationPoint
 from ..checks import require
 from ..cycles.cycle import Cycle
+from ..cycles.shocks import FatalShock
 from ..inverse.design import Design
 from ..model.equilibria import Equilibria
 from ..results import Status
 from ..tables import require_single
-from .phase import draw_equilibrium, plot_phase_portrait
-from .style import new_axes
+from .phase import draw_equilibrium, plot_phase_portrait, plot_portrait
+from .style import BELT_COLOURS, new_axes
+
+#: Of the arrow of a shock: that of a fourth belt, which no class has.
+SHOCK = BELT_COLOURS[3]
 
 
 def plot_cycle(cycle: Cycle, ax: Axes | None = None) -> Axes:
@@ -37,6 +42,19 @@ def plot_point(point: BifurcationPoint, ax: Axes | None = None) -> Axes:
     cycles = [point.cycle] if int(point.cycle.status) == Status.OK else []
     ax = plot_phase_portrait(point.oscillator, cycles=cycles, ax=ax)
     ax.set_title(f"{point.condition.words} at {float(point.value):.6g}", fontsize="medium")
+    return ax
+
+
+def plot_shock(shock: FatalShock, ax: Axes | None = None) -> Axes:
+    """The portrait, and in it the smallest fatal shock as an arrow, where there is one."""
+    ax = plot_portrait(shock.portrait, ax)
+    if np.isfinite(float(shock.distance)):
+        start = np.asarray(shock.start)
+        end = start + np.asarray(shock.shock)
+        line = {"color": SHOCK, "linewidth": 1.6, "zorder": 6}
+        ax.plot(*np.stack([start, end], axis=1), label="minimal fatal shock", **line)
+        arrow = {"arrowstyle": "-|>", "color": SHOCK, "shrinkA": 0, "shrinkB": 0}
+        ax.annotate("", tuple(end), tuple(start), arrowprops=arrow, zorder=6)
     return ax
 
 

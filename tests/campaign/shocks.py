@@ -1,0 +1,198 @@
+"""Minimal fatal shocks: what `minimal_fatal_shock` tells against bisection by the engine.
+
+For an oscillator at random, one of its attractors and a direction, four things must hold.
+
+- The start is on the attractor: the engine stays there for a loop.
+- Along the shock, the engine's runs lead to the attractor until the distance told, and elsewhere
+  beyond; bisection finds where this changes.
+- No smaller shock is fatal: from states all along the attractor shocks in many directions, a
+  thousandth smaller than the smallest fatal one, lead back to it.
+- The derivative of the distance along a direction at random in the space of oscillators is that of
+  bisection: a difference of four oscillators beside, extrapolated.
+"""
+
+import time
+from collections import Counter
+from math import inf
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxbelt as jb
+
+from . import derivatives, engine, package
+from .cases import Case
+from .portraits import PATIENCE, _number_of, random_oscillator
+
+#: Errors of distances, and of derivatives relative to 1 and their size.
+SAME, SAME_SLOPE = 1e-8, 1e-6
+#: Smaller distances are set aside: there may be no difference of them.
+LEAST = 1e-3
+#: Phases, and angles of shocks in both directions, from and in which smaller shocks are tried.
+PHASES, ANGLES = 12, 8
+#: Runs repeat to this: nearer to an unstable cycle one is not told from it.
+REPEATS = 1e-11
+#: Changes of parameters for the differences: the first with which nothing else becomes the nearest
+#: and the two differences that are extrapolated are as near to one another.
+STEPS, ALIKE = (3e-4, 3e-5, 3e-6), 1e-4
+#: Number of what goes to infinity; of what is told nowhere.
+INFINITY, UNKNOWN = 1000, -1
+
+
+def label(osc: engine.Oscillator, told: jb.Portrait, y0) -> int:
+    """Where the engine's run from a start leads: a number among the attractors of the portrait."""
+    seen = engine.attractor(osc, tuple(map(float, y0)), t_max=PATIENCE, same=REPEATS)
+    if seen.kind == "undecided":
+        return INFINITY if seen.status == engine.NOT_FINITE and told.escapes else UNKNOWN
+    return _number_of(seen, told)
+
+
+def bisected(osc: engine.Oscillator, told: jb.FatalShock, end: int) -> float:
+    """The distance from the start, along the shock, from where on the engine's runs do not lead to
+    the attractor, the number `end` of the portrait; NaN where they do not do so around the shock.
+
+    A shock that leads to a sharp corner misses what is behind it. Then the way leads as near beside
+    the corner as distances are compared, where runs do not lead to the attractor.
+    """
+    start, shock = (np.asarray(one, float) for one in (told.start, told.shock))
+    inside, outside = 1 - 1e-4, 1 + 1e-4
+    if label(osc, told.portrait, start + outside * shock) == end and told.direction == "both":
+        angles = np.radians(np.arange(360))
+        ways = np.column_stack([np.cos(angles), np.sin(angles)])
+        behind = [
+            way for way in ways if label(osc, told.portrait, start + shock + 1e-6 * way) != end
+        ]
+        if behind:
+            shock, outside = shock + 0.1 * SAME * np.mean(behind, axis=0), 1.0
+    ends = [label(osc, told.portrait, start + share * shock) for share in (inside, outside)]
+    if ends[0] != end or ends[1] == end:
+        return np.nan
+    while outside - inside > 1e-13:
+        middle = 0.5 * (inside + outside)
+        found = label(osc, told.portrait, start + middle * shock)
+        if found == UNKNOWN:
+            # On the boundary, as far as can be told.
+            inside = outside = middle
+        elif found == end:
+            inside = middle
+        else:
+            outside = middle
+    return 0.5 * (inside + outside) * float(np.linalg.norm(shock))
+
+
+def differences(osc, y0, direction: str, told: jb.FatalShock) -> tuple[list[str], float]:
+    """What is wrong with the shock told for an oscillator, and the error of its distance."""
+    end = label(osc, told.portrait, y0)
+    start, wrong = np.asarray(told.start, float), []
+    if label(osc, told.portrait, start) != end:
+        wrong.append(f"start {start} leads elsewhere")
+    what, number = told.attractor.split()
+    if what == "cycle":
+        period = float(told.portrait.cycles[int(number)].period)
+        back = np.array(engine.simulate(osc, tuple(start), period).y_end)
+        if not np.abs(back - start).max() < SAME:
+            wrong.append(f"start {start} is not on the cycle, which comes back to {back}")
+    error = abs(bisected(osc, told, end) - float(told.distance))
+    if not error < SAME:
+        wrong.append(f"distance off by {error}")
+    wrong += _smaller_ones(osc, told, end, direction)
+    return wrong, error
+
+
+def _smaller_ones(osc, told: jb.FatalShock, end: int, direction: str) -> list[str]:
+    what, number = told.attractor.split()
+    rests = told.portrait.equilibria
+    if what == "cycle":
+        cycle = told.portrait.cycles[int(number)]
+        states = np.asarray(cycle.sample(PHASES + 1))[:PHASES]
+    else:
+        states = np.array([[float(rests.x1[int(number)]), 0.0]])
+    angles = np.linspace(0.0, 2 * np.pi, ANGLES, endpoint=False) + 0.1
+    ways = np.array([[0.0, 1.0], [0.0, -1.0]])
+    if direction == "both":
+        ways = np.column_stack([np.cos(angles), np.sin(angles)])
+    wrong = []
+    for y in [*states, np.asarray(told.start)]:
+        for way in ways:
+            to = y + 0.999 * float(told.distance) * way
+            found = label(osc, told.portrait, to)
+            if found not in (end, UNKNOWN):
+                wrong.append(f"a smaller one is fatal: from {y} to {to}, {found}")
+    return wrong
+
+
+def slope_error(osc, y0, direction: str, along) -> tuple[float, float] | None:
+    """The error of the derivative along a direction of the parameters, and that of bisection; None
+    if beside the oscillator, on one side at least, another boundary is the nearest: at round
+    numbers, where things coincide."""
+
+    def shock(by):
+        oscillator = package.oscillator(derivatives.moved(osc, along, by))
+        return jb.minimal_fatal_shock(oscillator, y0, direction=direction)
+
+    def by_bisection(by, told):
+        beside = derivatives.moved(osc, along, by)
+        return bisected(beside, told, label(beside, told.portrait, y0))
+
+    _, slope = jax.jvp(lambda by: shock(by).distance, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
+    for step in STEPS:
+        told = {by: shock(by) for by in (-step, -0.5 * step, 0.5 * step, step)}
+        sorts = {(one.attractor, one.boundary, one.beyond) for one in (*told.values(), shock(0.0))}
+        if len(sorts) == 1:
+            values = {by: by_bisection(by, one) for by, one in told.items()}
+            whole = (values[step] - values[-step]) / (2 * step)
+            half = (values[0.5 * step] - values[-0.5 * step]) / step
+            right = (4 * half - whole) / 3
+            if abs(half - whole) < ALIKE * (1 + abs(right)) or step == STEPS[-1]:
+                return abs(float(slope) - right), abs(right)
+    return None
+
+
+def random_shock(rng: np.random.Generator):
+    """A kind, an oscillator, a start, a direction, and the shock told for them."""
+    while True:
+        kind, osc = random_oscillator(rng)
+        told = jb.portrait(package.oscillator(osc))
+        if not told.unstable and not any(one.stable for one in told.separatrices):
+            continue
+        direction = str(rng.choice(["both", "x2"]))
+        y0 = tuple(rng.uniform([-2.0, -1.0], [2.0, 1.0]).tolist())
+        shock = jb.minimal_fatal_shock(told, y0, direction=direction)
+        if int(shock.status) == jb.Status.OK and LEAST < float(shock.distance) < inf:
+            return kind, osc, y0, direction, shock
+
+
+def run(seed: int, runs: int, *, verbose: bool = False) -> int:
+    """Compare so many random shocks, and print what differs."""
+    rng = np.random.default_rng(seed)
+    began = time.monotonic()
+    counts, bad, largest, steepest = Counter(), 0, 0.0, 0.0
+    for number in range(runs):
+        kind, osc, y0, direction, told = random_shock(rng)
+        along = derivatives.directions(Case(osc, y0), rng)
+        wrong, error = differences(osc, y0, direction, told)
+        slopes = slope_error(osc, y0, direction, along)
+        if slopes is None:
+            counts["another boundary beside"] += 1
+        else:
+            off, size = slopes
+            if not off < SAME_SLOPE * (1 + size):
+                wrong.append(f"derivative off by {off} of {size}")
+            steepest = max(steepest, off / (1 + size))
+        largest = max(largest, error)
+        what = told.boundary.rpartition(" ")[0]
+        counts[f"{told.attractor.split()[0]} to {what}, {direction}"] += 1
+        if verbose:
+            print(
+                f"{number}, {kind}: {told.attractor} to {told.boundary}, {direction}, "
+                f"{float(told.distance):.9f} off by {error:.1e}, slope {slopes}",
+                flush=True,
+            )
+        if wrong:
+            bad += 1
+            print(f"\n{number}, {kind}, from {y0}, along {along}")
+            print(f"{package.oscillator(osc)!r}\n{told}", *wrong[:6], sep="\n", flush=True)
+    print(f"seed {seed}, {time.monotonic() - began:.0f} s, {dict(counts)}")
+    print(f"largest errors: {largest:.1e} of distances, {steepest:.1e} of derivatives; {bad} wrong")
+    return int(bool(bad))
