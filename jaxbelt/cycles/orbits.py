@@ -26,7 +26,7 @@ from ..model.modes import (
     onset_position,
     select,
 )
-from ..model.oscillator import Oscillator, is_possible
+from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.rest import settles
 from ..motion.arcs import ArcEnd, Ends, Signs, after_slip, signs_after, slip_arc, stick_arc
 from ..motion.integrators import STRIDE, Graded
@@ -209,7 +209,7 @@ def _beginning(osc: Oscillator, y0: Array, budget: int) -> Orbit:
     focus = at_focus(osc, y0[0], y0[1])
     status = jnp.where(rests, Status.EQUILIBRIUM.value, Status.OK.value)
     status = jnp.where(focus, Status.PSEUDO_FOCUS.value, status)
-    finite = jnp.all(jnp.isfinite(y0)) & is_possible(osc)
+    finite = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
     return _standing(osc, mode_of_state(osc, y0[0], y0[1]), y0, status, budget)
 

@@ -6,7 +6,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..model.modes import Mode, at_focus, mode_acceleration, mode_of_state, start_at_focus
-from ..model.oscillator import Oscillator, is_possible
+from ..model.oscillator import Oscillator, has_possible_numbers
 from ..results import Status
 from .events import pass_events
 from .lanes import Lanes, code_of
@@ -21,7 +21,7 @@ def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, *, edges: bool) -
     """Lanes at the start of their runs, without what an observer adds; edges: see `window_of`."""
     x1, x2 = start_at_focus(osc, x1, x2)
     mode = mode_of_state(osc, x1, x2)
-    finite = jnp.isfinite(x1) & jnp.isfinite(x2) & is_possible(osc)
+    finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
     rests = at_focus(osc, x1, x2) if edges else jnp.zeros_like(finite)
     status = jnp.where(rests, Status.PSEUDO_FOCUS.value, Status.OK.value)
     status = jnp.where(finite, status, Status.NOT_FINITE.value)

@@ -30,7 +30,7 @@ from ..checks import (
 )
 
 #: What rounding may add to mu(0), over 1 + static.
-ROUNDING = 1e-14
+MU_ROUNDING = 1e-14
 
 
 def _scalar(name: str) -> Callable[[Any], Array]:
@@ -61,7 +61,7 @@ class AbstractFriction(eqx.Module):
     def rules(self) -> list[Rule]:
         """What its parameters have to be; a law of one's own may add to them."""
         begins = self.mu(jnp.zeros(jnp.shape(self.static)))
-        most = self.static + ROUNDING * (1 + self.static)
+        most = self.static + MU_ROUNDING * (1 + self.static)
         bound = Rule("mu(0)", (begins, self.static, most), _is_at_most, "<= static = {1}")
         return [*be_nonnegative("static", self.static), bound]
 

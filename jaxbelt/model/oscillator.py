@@ -161,7 +161,7 @@ def check_scalars(osc: Oscillator) -> None:
             as_array(leaf, jax.tree_util.keystr(path, simple=True, separator="."))
 
 
-def is_possible(osc: Oscillator) -> Array:
+def has_possible_numbers(osc: Oscillator) -> Array:
     """Whether all parameters are what they have to be: what `check` raises for, as a number.
 
     Under `jit` and `vmap` nothing raises: a run of an impossible oscillator is NOT_FINITE.

@@ -29,7 +29,7 @@ from ..model.modes import (
     mode_of_state,
     select,
 )
-from ..model.oscillator import Oscillator, is_possible
+from ..model.oscillator import Oscillator, has_possible_numbers
 from ..numerics.compiling import any_lane, in_turn, of_lane, one_kernel, with_batches
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
@@ -154,7 +154,7 @@ def _followed_arcs(
 ) -> tuple[RunState, ArcRecord]:
     y = (y0[0], y0[1])
     mode = mode_of_state(osc, *y)
-    finite = jnp.all(jnp.isfinite(y0)) & is_possible(osc)
+    finite = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
     status = jnp.where(at_focus(osc, *y), Status.PSEUDO_FOCUS.value, Status.OK.value)
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
     start = RunState(t0, y, mode, signs_after(osc, mode, y), status, status != Status.OK)

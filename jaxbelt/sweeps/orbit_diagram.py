@@ -48,7 +48,7 @@ MOMENTS_KEPT = 16
 #: Runs for one loop, at most.
 MOST_RUNS = 64
 #: A run through a loop goes on beyond it by this fraction of the period.
-BEYOND = 1e-4
+OUTSIDE = 1e-4
 
 
 class OrbitDiagram(eqx.Module):
@@ -230,12 +230,12 @@ class Sampling:
         """Status, x1 and x2 of the moments of one loop of cycles, [cycles] and [cycles, points];
         which: the numbers of the runs that led to them."""
         period, top = period[:, None], x1_max[:, None]
-        (t, x1, x2, number), cut = self._moments(grid, which, x1_max, (1 + BEYOND) * period[:, 0])
+        (t, x1, x2, number), cut = self._moments(grid, which, x1_max, (1 + OUTSIDE) * period[:, 0])
         # One loop: what is that near to its beginning is met again at its end.
-        inside = (t > BEYOND * period) & (t <= (1 + BEYOND) * period)
+        inside = (t > OUTSIDE * period) & (t <= (1 + OUTSIDE) * period)
         size = RUN * self.numbers["rtol"] * (top - x1_min[:, None])
         back = inside & (number == EXTREMUM) & (np.abs(x1 - top) < size)
-        back &= np.abs(t - period) <= BEYOND * period
+        back &= np.abs(t - period) <= OUTSIDE * period
         status = np.where(np.any(back, axis=1), Status.OK, Status.NOT_SETTLED)
         status[cut] = Status.TOO_MANY_STEPS
         wanted = inside & (status != Status.NOT_SETTLED)[:, None]
@@ -255,7 +255,7 @@ class Sampling:
         state, began = np.stack([x1_max, np.zeros_like(x1_max)]), np.zeros_like(x1_max)
         left = np.arange(len(which))
         for _ in range(MOST_RUNS):
-            until = float(np.max((end - began)[left])) * (1 + BEYOND)
+            until = float(np.max((end - began)[left])) * (1 + OUTSIDE)
             found = self._results(grid, observer, state[:, left], until, which[left])
             pieces = [f" {i}" for i in range(-(-MOMENTS_KEPT // 8))]
             columns = ([found[name + piece] for piece in pieces] for name in OF_MOMENTS)
