@@ -17,14 +17,18 @@ import jaxbelt as jb
 
 DOCS = Path(__file__).parents[1] / "docs"
 GIVEN = {"jax": jax, "jnp": jnp, "np": np, "plt": plt, "jb": jb}
-PAGES = {path.stem: path for path in [*DOCS.glob("api/*.md"), *DOCS.glob("bifurcations/*.md")]}
+PAGES = {
+    path.stem: path
+    for path in [*DOCS.glob("api/*.md"), *DOCS.glob("bifurcations/*.md"), DOCS / "laws.md"]
+}
 #: What these compile, few other tests need.
 SLOW = """
 AtEvents AtExtrema AtSection AtTimes BasinStability Basins-class BeltAtRest BifurcationCurve
 BifurcationDiagram BoundaryEquilibrium CornerCollision CrossingSliding Design-class Fit-class
-FoldOfCycles GrazingEdge OrbitDiagram Portrait-class PseudoHopf RegionMap Separatrix SpecialPoint
+FatalShock FoldOfCycles GrazingEdge OrbitDiagram Portrait-class PseudoHopf RegionMap Separatrix SpecialPoint
 attractors basin_stability basins bifurcation_curve bifurcation_diagram design distance_to
-find_cycle fit orbit_diagram plot_basins portrait region_map scan
+distance_to_basin_boundary find_cycle fit minimal_fatal_shock orbit_diagram plot_basins portrait
+region_map scan
 """.split()
 
 

@@ -126,7 +126,7 @@ class LawInUnits(AbstractFriction):
 
     # The law's own: a copy would be a parameter of its own.
     @property
-    def static(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def static(self) -> ArrayLike:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.law.static
 
     def fraction(self, speed: Array) -> tuple[Array, Array]:
