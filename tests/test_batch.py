@@ -123,16 +123,22 @@ def test_runs_of_impossible_oscillators_are_told_in_place_in_every_engine():
     def cycle(row):
         return jb.find_cycle(make(*row), (0.9, 0.0))
 
-    runs, cycles = jax.vmap(run)(rows), jax.vmap(cycle)(rows)
+    def smooth(row):
+        return jb.simulate(make(*row), (0.9, 0.0), 1.0, ts=jnp.array([1.0]), formulation="smooth")
+
+    rests = jax.vmap(lambda row: jb.equilibria(make(*row)))(rows)
+    assert np.any(rests.kind[0] > 0) and np.all(rests.kind[1:] == 0)
+    runs, smoothed, cycles = (jax.vmap(ask)(rows) for ask in (run, smooth, cycle))
     swept = jb.sweep(
         lambda row: make(*(jnp.asarray(column)[jnp.asarray(row).astype(int)] for column in rows.T)),
         {"row": np.arange(len(rows), dtype=float)},
         y0=(0.9, 0.0),
         t1=5.0,
     )
-    for status in (runs.status, cycles.status, swept.status):
+    for status in (runs.status, smoothed.status, cycles.status, swept.status):
         assert status[0] != Status.NOT_FINITE and np.all(status[1:] == Status.NOT_FINITE)
-    assert np.all(np.isnan(runs.ys[1:])) and np.all(np.isnan(cycles.period[1:]))
+    for told in (runs.ys, smoothed.ys, cycles.period):
+        assert np.all(np.isnan(told[1:]))
 
 
 def test_degenerate_velocities():

@@ -42,7 +42,7 @@ from .modes import (
     mode_acceleration,
     settle,
 )
-from .oscillator import Oscillator, check_oscillator
+from .oscillator import Oscillator, check_oscillator, has_possible_numbers
 
 if TYPE_CHECKING:
     import pandas
@@ -202,9 +202,10 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     rest = jnp.zeros_like(lower)
     pull = mode_acceleration(osc, mode, rest, rest)
 
-    is_fixed = (held == 0) & (lower <= pull) & (pull <= upper) & (lower < upper)
+    possible = has_possible_numbers(osc)
+    is_fixed = possible & (held == 0) & (lower <= pull) & (pull <= upper) & (lower < upper)
     first, last = jnp.maximum(pull - held, lower), jnp.minimum(pull + held, upper)
-    is_segment = (held > 0) & (first < last)
+    is_segment = possible & (held > 0) & (first < last)
     exists = is_fixed | is_segment
 
     jacobian = jax.vmap(lambda mode, x1: _field_jacobian(osc, mode, x1))(mode, pull)
@@ -285,7 +286,7 @@ def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equil
     if with_saddles:
         pulls = [mode_acceleration(osc, mode, x1, rest) for mode in (left, right)]
         is_saddle = slips & (pulls[0] < 0) & (pulls[1] > 0)
-    exists = is_focus | is_saddle
+    exists = (is_focus | is_saddle) & has_possible_numbers(osc)
     # A belt at rest brakes on the way out and on the way back: each loop takes off a fraction of
     # the velocity that does not go to 0 with it, so infinitely many loops take a finite time.
     rubs = capacity(osc, on_left) + capacity(osc, on_right) > 0

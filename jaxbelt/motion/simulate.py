@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike
 from ..activity import announced
 from ..checks import as_numbers, check_finite, check_positive, is_concrete, require
 from ..model.modes import contact, has_edges, start_at_focus
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, has_possible_numbers
 from ..numerics.compiling import jit
 from ..results import EventKind, Status, describe, draw
 from ..tables import per_belt, require_single, table_of
@@ -134,7 +134,8 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
     if ts is None:
         ts = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)
     field = switch_field if formulation == "switch" else smooth_field
-    ys = integrate(field, osc, width, y0, t0, ts, rtol, atol)
+    possible = has_possible_numbers(osc)
+    ys = jnp.where(possible, integrate(field, osc, width, y0, t0, ts, rtol, atol), jnp.nan)
 
     def mode_at(y):
         if formulation == "switch":
@@ -142,7 +143,7 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
         return stacked_codes(contact(osc, y[0], y[1], rightward=True))
 
     known = jnp.all(jnp.isfinite(ys))
-    start_known = jnp.all(jnp.isfinite(y0))
+    start_known = jnp.all(jnp.isfinite(y0)) & possible
     failure = jnp.where(start_known, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
     integers, states = jnp.zeros(0, dtype=int), jnp.zeros((0, 2))
     return Trajectory(
