@@ -147,7 +147,7 @@ ENTRIES = {
         point, where=(lambda osc: osc.damping, double), span=((0.0, 1.0), (0.0, 1.0))
     ),
     "fit": lambda point: jb.fit(
-        OSC, np.arange(9.0), np.zeros(9), where=lambda osc: (osc.damping, double(osc))
+        OSC, np.arange(9.0), np.arange(9.0), where=lambda osc: (osc.damping, double(osc))
     ),
     "design": lambda point: jb.design(OSC, [(jb.amplitude, 1.0)], where=double),
     "switch fold": lambda point: switch_fold(point, 1e-4, where=double),

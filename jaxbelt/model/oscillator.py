@@ -98,6 +98,10 @@ def as_belts(belts: Any, kind: str = "Belt") -> tuple:
     return tuple(belts)
 
 
+def _in_numpy(leaf: Any) -> Any:
+    return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
+
+
 class Oscillator(eqx.Module):
     """A mass on a spring and a dashpot, in contact with one belt or more.
 
@@ -120,7 +124,8 @@ class Oscillator(eqx.Module):
         """Raise a `ValueError` that names the first field with an impossible known value."""
         # As NumPy's, when they are known: a look at an array of JAX's costs a hundred times more.
         # And checks are taken from their class: Equinox makes a module of a method of an object.
-        osc = jax.tree.map(np.asarray, self) if is_concrete(self) else self
+        # A law of one's own may have Python's numbers as well.
+        osc = jax.tree.map(_in_numpy, self) if is_concrete(self) else self
         for rule in Oscillator.rules(osc):
             rule.enforce("")
         require(len(osc.belts) > 0, "belts", "at least one Belt", "none")
