@@ -294,6 +294,8 @@ def test_signatures_have_a_key_of_the_most_frequent(dataset):
     assert len(key) == 9 and len(set(key.values())) == 9 and "other" in key
     assert {name.replace("\n", "") for name in key} - {"other"} <= set(names)
     assert len(ax.figure.axes) == 1
+    (line,) = jb.plot_sweep(many.isel(nu0=0), "signature").get_lines()
+    assert np.array_equal(line.get_ydata(), values[0])
 
 
 def test_pictures_of_sweeps_tell_the_unit(dataset):

@@ -15,7 +15,7 @@ from ..checks import require, require_one_of, require_value
 from ..sweeps.basins import Basins, BasinStability
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
-from .categories import draw_categories, words_of_runs
+from .categories import LINE, draw_categories, words_of_runs
 from .phase import plot_phase_portrait
 from .style import (
     add_key,
@@ -37,10 +37,11 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     dataset: what `sweep` or `attractors` returned, also as `in_si` gives it; variable: a name in
     it. "kind" shows equilibria, and cycles by the belts that they stick to, each kind in the same
     colour in every picture. Other categories, such as "signature", have a key of those that most
-    runs have; the rest is "other". Along one axis a variable of each belt, or of each attractor, is
-    as many lines. Of a store whose sweep is not finished, what is not done is left white. Returns
-    the axes. `ValueError` if there is no such variable, or if its axes are not one or two: choose
-    with `dataset.isel(belt=0)` and the like.
+    runs have; the rest is "other" (along one axis, the numbers of the categories where their words
+    are long). Along one axis a variable of each belt, or of each attractor, is as many lines. Of a
+    store whose sweep is not finished, what is not done is left white. Returns the axes.
+    `ValueError` if there is no such variable, or if its axes are not one or two: choose with
+    `dataset.isel(belt=0)` and the like.
     """
     require_one_of(variable, map(str, dataset.data_vars), "variable")
     told = dataset[variable].attrs
@@ -51,11 +52,15 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     values = (words_of_runs if is_category else _numbers_of_runs)(dataset, variable)
     values = values.squeeze(drop=True)
     _check_axes(values)
+    last = values.dims[-1]
+    are_lines = values.ndim == 1 or (last in COUNTED and variable != "kind")
+    if are_lines and is_category and max(map(len, values.values.flat)) > LINE // 2:
+        # There is no room for such words beside an axis; numbers stand for them.
+        values = _numbers_of_runs(dataset, variable).squeeze(drop=True)
     ax = new_axes() if ax is None else ax
     names = [_axis_label(dataset[name]) for name in map(str, values.dims)]
     label = _with_unit(told.get("long_name", variable), told)
-    last = values.dims[-1]
-    if values.ndim == 1 or (last in COUNTED and variable != "kind"):
+    if are_lines:
         x, lines = dataset[values.dims[0]], values.values.reshape(values.shape[0], -1).T
         for i, line in enumerate(lines):
             style: dict[str, Any] = {"color": "black", "linewidth": 1.1}
