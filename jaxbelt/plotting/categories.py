@@ -88,7 +88,8 @@ def _shade(number: int) -> str:
     if number < len(SHADES):
         return SHADES[number]
     hue = 0.618034 * number % 1.0  # the golden section spreads them
-    return matplotlib.colors.to_hex(matplotlib.colors.hsv_to_rgb((hue, 0.55, 0.75)))
+    red, green, blue = matplotlib.colors.hsv_to_rgb((hue, 0.55, 0.75)).tolist()
+    return matplotlib.colors.to_hex((red, green, blue))
 
 
 def _in_lines(word: str) -> str:
