@@ -27,8 +27,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     bifurcations/   path scan refine curves faces regions diagrams switch_folds
     inverse/        selection record fit margins design
     si              results in SI units
-    plotting/       style phase histories points diagrams regions sweeps orbits inverse model
-    plotting/       draw si explorer
+    plotting/       style phase histories points diagrams regions categories sweeps orbits
+    plotting/       inverse model draw si explorer
     paper           the paper's table and figures
     api             the public names
     __init__        the same, imported when the first of them is used

@@ -1,5 +1,7 @@
 """Basins against a published example, the oracle's unstable cycle, and what must come out."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,6 +67,18 @@ def test_one_attractor_alone_is_exact(velocity, exact):
     assert found.fractions["cycle"] == 1 - exact
 
 
+def test_the_bound_is_told_where_all_starts_agree():
+    def stability(cycle, n):
+        fractions = {"equilibrium": 1 - cycle, "cycle": cycle, "stuck": 0.0, "undecided": 0.0}
+        errors = {kind: float(np.sqrt(f * (1 - f) / n)) for kind, f in fractions.items()}
+        return jb.BasinStability(fractions, errors, n)
+
+    assert repr(stability(1.0, 1000)) == (
+        "BasinStability(cycle 1 (above 0.99700 with 95% confidence); 1000 starts)"
+    )
+    assert "equilibrium 0.25000 +- 0.01369, cycle 0.75000" in repr(stability(0.75, 1000))
+
+
 def test_grid_is_split_by_the_unstable_cycle():
     x1, x2 = np.linspace(-1.0, 2.0, 41), np.linspace(-1.3, 1.7, 37)
     found = jb.basins(belt_drive(1.4), x1=x1, x2=x2, progress=False)
@@ -85,6 +99,17 @@ def test_grid_is_split_by_the_unstable_cycle():
     label = np.asarray(found.label).reshape(-1)
     assert np.array_equal(label[surely] == 1, inside[surely])
     assert "41 x 37 starts" in repr(found)
+    call = found.dataset.attrs["call"]
+    (asked,) = eval(
+        call,
+        {
+            "jaxbelt": SimpleNamespace(basins=lambda *a, **k: [k]),
+            "oscillator": 1,
+            "dataset": found.dataset,
+        },
+    )
+    assert np.array_equal(asked["x1"], x1) and np.array_equal(asked["x2"], x2)
+    assert asked["t1"] == found.dataset.attrs["t1"]
 
 
 def test_a_belt_at_rest_holds_what_comes_to_it():

@@ -202,7 +202,14 @@ def test_names_of_regions_stand_in_the_plane_of_the_paper_only(diagram):
     assert not in_plane_of_paper([jb.presets.class_a(0.1), jb.presets.class_a(0.2)])
     assert not in_plane_of_paper([c(0.1, 0.2, sigma=0.5), c(0.2, 0.2, sigma=0.5)])
     damped = dataclasses.replace(b(0.1, 0.35), damping=0.4)
-    assert not in_plane_of_paper([b(0.1, 0.35), damped])
+    assert not in_plane_of_paper([b(0.1, 0.35), damped]) and not in_plane_of_paper([damped])
+    laws = (jb.Conti(1.0, 0.5, 10.0), jb.Coulomb(1.0, 0.6))
+    for belts in ([jb.Belt(nu, law) for nu in (0.1, 0.35)] for law in laws):
+        assert not in_plane_of_paper([jb.Oscillator(0.5, belts)])
+    law = jb.presets.paper_friction()
+    light = [jb.Belt(0.1, law, 0.9), jb.Belt(0.35, law)]
+    assert not in_plane_of_paper([jb.Oscillator(0.5, light)])
+    assert not in_plane_of_paper([jb.Oscillator(0.5, [jb.Belt(v, law) for v in (0.1, 0.2, 0.3)])])
     elsewhere = dataclasses.replace(diagram, as_paper=False)
     assert not {"6", "4a", "2b"} & {text.get_text() for text in elsewhere.plot().texts}
     plt.close("all")

@@ -1,5 +1,7 @@
 """Machines in SI units: the oscillator that they are, and results brought back."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -174,6 +176,14 @@ def test_basins_in_si():
     ours = jb.in_si(basins, m)
     assert ours.x1.values == pytest.approx(np.linspace(-1, 2, 3) * 5.0 / STIFFNESS)
     assert ours.label.identical(basins.label.assign_coords(x1=ours.x1, x2=ours.x2))
+    resting = dataclasses.replace(basins, attractors=("rest at 0.559",), cycles=())
+    keys = [one.get_legend_handles_labels()[1] for one in (jb.plot_basins(resting), resting.plot())]
+    drawn = jb.plot_in_si(resting, m)
+    told = f"to rest at {0.559 * 5.0 / STIFFNESS:.3g} m"
+    assert told in drawn.get_legend_handles_labels()[1]
+    assert all("to rest at 0.559" in labels for labels in keys)
+    assert told in [text.get_text() for text in drawn.get_legend().get_texts()]
+    plt.close("all")
 
 
 def test_pictures_in_si(run):

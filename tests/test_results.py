@@ -11,10 +11,12 @@ import pandas as pd
 import pytest
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 
 import jaxbelt as jb
 from jaxbelt.cycles.shooting import Loop
 from jaxbelt.numerics.continuation import Stop
+from jaxbelt.plotting.categories import COLOURS, _colour_of_kind
 from jaxbelt.plotting.draw import draw_result
 from jaxbelt.plotting.style import parameter_label
 
@@ -247,5 +249,58 @@ def test_sweeps_are_drawn_with_words(dataset):
     assert len(jb.plot_sweep(dataset.isel(belt=0), "stick_duration").collections) == 1
     with pytest.raises(ValueError, match='variable must be "stick_duration", "sticks" or "kind"'):
         jb.plot_sweep(dataset, "nope")
-    with pytest.raises(ValueError, match="dataset must be a sweep with one or two axes, got 3"):
+    with pytest.raises(ValueError, match=r"got 3 \(nu0, nu1, belt\); choose with .*isel\(belt=0\)"):
         jb.plot_sweep(dataset, "stick_duration")
+
+
+def key_of(ax):
+    """The colour of each label in the key of a figure."""
+    (key,) = ax.figure.legends
+    return {
+        text.get_text(): to_hex(patch.get_facecolor())
+        for text, patch in zip(key.get_texts(), key.get_patches(), strict=True)
+    }
+
+
+def test_a_kind_has_one_colour_in_every_picture(dataset):
+    whole = key_of(jb.plot_sweep(dataset, "kind"))
+    assert set(whole) == {"equilibrium", "cycle, sticks to belt 0 and 1"}
+    resting = key_of(jb.plot_sweep(dataset.assign(kind=dataset.kind * 0 + 1), "kind"))
+    assert resting.items() <= whole.items()
+    turned = dataset.assign(sticks=dataset.sticks & (dataset.belt == 0)).transpose()
+    assert key_of(jb.plot_sweep(turned, "kind"))["equilibrium"] == whole["equilibrium"]
+    colours = [_colour_of_kind(f"cycle, sticks to belt {belts}") for belts in ("0", "1", "0 and 1")]
+    assert len({*colours, *COLOURS.values()} - {"#009E73"}) == 3 + 6
+
+
+def test_what_is_not_done_is_left_white(dataset):
+    status = xr.zeros_like(dataset.kind).where(dataset.nu0 > 0.3, -1).drop_attrs()
+    half = dataset.assign(status=status, n_events=dataset.kind.drop_attrs())
+    assert key_of(jb.plot_sweep(half, "kind"))["not done"] == "#ffffff"
+    drawn = np.ma.filled(jb.plot_sweep(half, "n_events").collections[0].get_array(), np.nan)
+    assert np.array_equal(np.isnan(drawn), (status == -1).values.T)
+    with pytest.raises(ValueError, match="dataset must be of a sweep that is done for its sig"):
+        jb.plot_sweep(half.assign(signature=status), "signature")
+
+
+def test_signatures_have_a_key_of_the_most_frequent(dataset):
+    names = ["none", *("-".join(["stick0", "slip0"] * n) for n in range(1, 12))]
+    told = {"flag_values": np.arange(12), "flag_meanings": " ".join(names)}
+    values = np.minimum(np.arange(48), 11).reshape(6, 8) - (np.arange(48) > 30).reshape(6, 8)
+    many = xr.Dataset({"signature": (("nu0", "nu1"), values, told)})
+    many = many.assign_coords(nu0=np.arange(6.0), nu1=np.arange(8.0))
+    ax = jb.plot_sweep(many, "signature")
+    key = key_of(ax)
+    assert len(key) == 9 and len(set(key.values())) == 9 and "other" in key
+    assert {name.replace("\n", "") for name in key} - {"other"} <= set(names)
+    assert len(ax.figure.axes) == 1
+    (line,) = jb.plot_sweep(many.isel(nu0=0), "signature").get_lines()
+    assert np.array_equal(line.get_ydata(), values[0])
+
+
+def test_pictures_of_sweeps_tell_the_unit(dataset):
+    values = dataset.isel(belt=0).assign_coords(nu1=dataset.nu1.assign_attrs(units="m s-1"))
+    values["stick_duration"].attrs["units"] = "s"
+    ax = jb.plot_sweep(values, "stick_duration")
+    assert ax.figure.axes[1].get_ylabel() == "time stuck (s)"
+    assert ax.get_ylabel() == "velocity of belt 1 (m/s)"

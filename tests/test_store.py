@@ -18,6 +18,7 @@ import jaxbelt as jb
 from jaxbelt.sweeps import store as stores
 from jaxbelt.sweeps.grid import Blocks
 from jaxbelt.sweeps.locks import locked
+from jaxbelt.sweeps.question import Question
 from jaxbelt.sweeps.store import CHECKSUM
 
 TESTS = Path(__file__).parent
@@ -130,6 +131,26 @@ def test_only_what_is_not_done_is_done(path, whole):
     assert jb.verify(path, repair=True).bad == (0, 2, 4)
     assert jb.verify(path).to_do == (0, 2, 4) and not jb.verify(path).finished
     assert again(path).equals(whole) and jb.verify(path).finished
+
+
+def test_runs_that_are_not_done_are_told_apart(tmp_path):
+    path = tmp_path / "a.zarr"
+    asked = (jb.presets.class_b, AXES, (3.0, 0.0))
+    stores._create(path, Question.of(*asked, None, 1e-8, 1e-8, "attractor", ()))
+    empty = xr.open_zarr(path)
+    assert np.all(empty.status == -1) and np.all(empty.kind == -1)
+    assert np.all(jb.decoded(empty).status == "not_done")
+    assert np.all(jb.decoded(empty).kind == "not_done")
+    for name in ("status", "kind"):
+        told = empty[name].attrs
+        assert told["flag_values"][0] == -1 and told["flag_meanings"].startswith("not_done ")
+    # A code of the contact may be negative, too.
+    final = Question.of(*asked, 9.0, 1e-8, 1e-8, "final", ()).table
+    told = final.attributes("mode_end")
+    assert final.empty("mode_end") == told["flag_values"][0] < min(told["flag_values"][1:])
+    starts = empty.expand_dims(x1=[1.0, 2.0])
+    with pytest.raises(ValueError, match=r"dataset must be of a sweep that is done, got one .* 30"):
+        jb.attractors(starts)
 
 
 def test_an_audit_of_a_store(path):
@@ -286,7 +307,7 @@ def test_stores_of_other_schemas_and_wrecks_are_refused(path):
     root = zarr.open_group(path, mode="r+", use_consolidated=False)
     root.attrs["jaxbelt_schema"] = 0
     for call in (again, jb.verify):
-        with pytest.raises(ValueError, match=r"store must be of schema 1, .* got schema 0"):
+        with pytest.raises(ValueError, match=r"store must be of schema 2, .* got schema 0"):
             call(path)
     (path / "zarr.json").write_text("{")
     for call in (again, jb.verify):

@@ -112,10 +112,11 @@ class BifurcationDiagram(eqx.Module):
 
     points: the special points in order, as from `scan`, and those at which an unstable cycle
     touches a contact edge; branches: of equilibria, then of cycles; regions: (first, last, name) of
-    every stretch between points of `scan`, see `region_name`; oscillator: the one that was given,
-    of a function that at the first value; name: of the parameter, as the path to it, or that of the
-    function's argument; as_paper: whether the path lies in the plane of the paper's Fig. 6, so that
-    pictures show the names of the regions. `table()` has all rows and points, `plot()` draws it.
+    every stretch between points of `scan`, named as those of `RegionMap`; oscillator: the one that
+    was given, of a function that at the first value; name: of the parameter, as the path to it, or
+    that of the function's argument; as_paper: whether the path lies in the plane of the paper's
+    Fig. 6, so that pictures show the names of the regions. `table()` has all rows and points,
+    `plot()` draws it.
     """
 
     points: tuple[BifurcationPoint, ...]

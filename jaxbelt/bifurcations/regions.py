@@ -33,6 +33,7 @@ from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator
 from ..model.variations import Variation
 from ..numerics.compiling import jit
+from ..presets import class_b
 from ..results import Status, draw
 from ..sweeps.datasets import decoded
 from ..sweeps.sweep import sweep
@@ -78,32 +79,35 @@ def region_of(opposite: bool, belts: int, rests: bool, cycles: Sequence[Collecti
 
 
 def in_plane_of_paper(oscillators: Sequence[Oscillator]) -> bool:
-    """Whether oscillators differ in the velocities of two belts only that both always touch, class
-    (b): those of the plane of the paper's Fig. 6, where the regions have their names."""
-    still = [
-        tuple(replace(belt, velocity=jnp.zeros(())) for belt in osc.belts) for osc in oscillators
-    ]
-    leaves = [jax.tree.leaves(replace(o, belts=b)) for o, b in zip(oscillators, still, strict=True)]
-    same = all(
-        len(one) == len(leaves[0])
-        and all(np.array_equal(x, y) for x, y in zip(one, leaves[0], strict=True))
-        for one in leaves
-    )
-    edges = [float(edge) for belt in oscillators[0].belts for edge in (belt.lower, belt.upper)]
-    return same and len(oscillators[0].belts) == 2 and edges == [-np.inf, np.inf] * 2
+    """Whether oscillators are those of the plane of the paper's Fig. 6, where regions have their
+    names: class (b) with its friction, loads and damping, and any velocities of the belts."""
+
+    def is_there(osc: Oscillator) -> bool:
+        paper = class_b(*([belt.velocity for belt in osc.belts] * 2)[:2])
+        same = jax.tree.structure(osc) == jax.tree.structure(paper)
+        pairs = zip(jax.tree.leaves(osc), jax.tree.leaves(paper), strict=True) if same else ()
+        return same and all(np.array_equal(one, other) for one, other in pairs)
+
+    return all(map(is_there, oscillators))
 
 
 class RegionMap(eqx.Module):
     """What `region_map` returns.
 
     names: of the two parameters, as arguments of `make`; values: of each, [n] and [m]; label: name
-    of the region, [n, m], as from `region_name`, "" where the runs were undecided; curves: what
-    bounds the regions, see `BifurcationCurve`; cycles: by the name of a region, the cycles in its
-    example, attracting ones and the unstable one; on_line: cells where a belt is at rest, or two
-    run at one velocity, [n, m]: what is so on that line only is the name of these; between: (p, q,
-    name) in each part of the plane between curves in which there is no other cell; make: as given.
+    of the region, [n, m], see below, "" where the runs were undecided; curves: what bounds the
+    regions, see `BifurcationCurve`; cycles: by the name of a region, the cycles in its example,
+    attracting ones and the unstable one; on_line: cells where a belt is at rest, or two run at one
+    velocity, [n, m]: what is so on that line only is the name of these; between: (p, q, name) in
+    each part of the plane between curves in which there is no other cell; make: as given.
     `example(name)` is a cell well inside a region; `table()` has the curves as rows; `plot()` draws
     the map, with a portrait of each region.
+
+    In the name of a region a digit says what attracts: 1 an equilibrium only, 2 a cycle, too, 3
+    cycles only; 6, 5 and 4 are the same where belts run in opposite directions. With several belts
+    a letter for each cycle says what it sticks to: a belt 0, b belt 1, c both (d belt 2, and on as
+    binary digits); s, with one belt too, is a cycle that never sticks. These are the names of the
+    paper's Fig. 6; pictures show them in its plane only, as notebook 03 does.
     """
 
     names: tuple[str, str] = eqx.field(static=True)
@@ -131,8 +135,8 @@ class RegionMap(eqx.Module):
 
     @property
     def as_paper(self) -> bool:
-        """Whether the plane is that of the paper's Fig. 6, the velocities of class (b): pictures
-        show the names of the regions there only."""
+        """Whether the plane is that of the paper's Fig. 6, the velocities of the paper's class (b):
+        pictures show the names of the regions there only."""
         corners = [(p, q) for p in self.values[0][[0, -1]] for q in self.values[1][[0, -1]]]
         return in_plane_of_paper([_at(self.make, self.names, corner) for corner in corners])
 

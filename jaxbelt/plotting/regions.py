@@ -97,7 +97,7 @@ def _colours_of(names: Sequence[str]) -> list[tuple[float, float, float]]:
 
 
 def _words_of_regions(regions: RegionMap) -> dict[str, str]:
-    """What the name of each region says, see `region_name`: what attracts, and which belts each
+    """What the name of each region says, see `RegionMap`: what attracts, and which belts each
     cycle sticks to; whether belts run in opposite directions where that differs."""
     names = sorted({*regions.regions, *(name for *_, name in regions.between)})
     opposite = {name: name[0] in "456" for name in names}

@@ -1,5 +1,6 @@
 """Pictures in SI units: the axes of any picture of this package, relabelled."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from matplotlib.ticker import AutoLocator, FuncFormatter
 from ..checks import require
 from ..model.machine import Machine
 from .draw import draw_result
+from .style import figure_of
 
 #: By the beginning of its label, what an axis shows, and its label in SI units.
 LABELS = {
@@ -21,6 +23,10 @@ LABELS = {
     "velocity $x_2$": ("velocity", r"velocity $\dot X$ (m/s)"),
     "relative velocity": ("velocity", r"relative velocity $R$ (m/s)"),
 }
+
+
+#: A displacement in a key: where the mass rests, see `basins`.
+REST = re.compile(r"(?<=rest at )-?\d+\.\d+$")
 
 
 class _RoundInUnits(AutoLocator):
@@ -35,7 +41,7 @@ class _RoundInUnits(AutoLocator):
 
 
 def plot_in_si(result: Any, machine: Machine, ax: Axes | None = None, **options: Any) -> Any:
-    """A picture with times in s, displacements in m and velocities in m/s.
+    """A picture with times in s, displacements in m and velocities in m/s, also in its key.
 
     result: of the machine's oscillator, anything that has a `.plot()`, drawn into the axes (None:
     new ones); or the axes, one or several, that another function of this package has drawn into.
@@ -49,7 +55,24 @@ def plot_in_si(result: Any, machine: Machine, ax: Axes | None = None, **options:
     for one in [axes] if isinstance(axes, Axes) else axes:
         _relabel(one.xaxis, machine)
         _relabel(one.yaxis, machine)
+        _relabel_key(one, machine)
     return axes
+
+
+def _relabel_key(ax: Axes, machine: Machine) -> None:
+    unit = float(machine.units.length)
+
+    def in_m(found: re.Match) -> str:
+        # With the digits that are known.
+        digits = len(found[0].replace(".", "").lstrip("-0"))
+        return f"{float(found[0]) * unit:.{max(1, digits)}g} m"
+
+    for artist in ax.get_children():
+        if REST.search(label := str(artist.get_label())):
+            artist.set_label(REST.sub(in_m, label))
+    for key in [ax.get_legend(), *figure_of(ax).legends]:
+        for text in key.get_texts() if key else ():
+            text.set_text(REST.sub(in_m, text.get_text()))
 
 
 def _relabel(axis: Axis, machine: Machine) -> None:

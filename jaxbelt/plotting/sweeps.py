@@ -1,6 +1,5 @@
 """Sweeps, and basins of attraction."""
 
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,14 +8,14 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from ..checks import require, require_one_of, require_value
 from ..sweeps.basins import Basins, BasinStability
-from ..sweeps.datasets import decoded
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
+from .categories import LINE, draw_categories, words_of_runs
 from .phase import plot_phase_portrait
 from .style import (
     add_key,
@@ -28,9 +27,6 @@ from .style import (
     parameter_label,
 )
 
-#: Attractors of a sweep, those with the shortest names first (Okabe and Ito).
-ATTRACTOR_COLOURS = ("#F0F0F0", "#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#999999")
-
 #: Axes of datasets that are no parameters.
 COUNTED = ("belt", "attractor")
 
@@ -38,28 +34,37 @@ COUNTED = ("belt", "attractor")
 def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Axes:
     """A variable of a sweep over its two axes longer than one, or along its one.
 
-    dataset: what `sweep` or `attractors` returned; variable: a name in it. "kind" shows
-    equilibria, and cycles by the belts that they stick to. Along one axis a variable of each belt,
-    or of each attractor, is as many lines. Returns the axes. `ValueError` if there is no such
-    variable, or if its axes are not one or two: choose with `dataset.isel(belt=0)` and the like.
+    dataset: what `sweep` or `attractors` returned, also as `in_si` gives it; variable: a name in
+    it. "kind" shows equilibria, and cycles by the belts that they stick to, each kind in the same
+    colour in every picture. Other categories, such as "signature", have a key of those that most
+    runs have; the rest is "other" (along one axis, the numbers of the categories where their words
+    are long). Along one axis a variable of each belt, or of each attractor, is as many lines. Of a
+    store whose sweep is not finished, what is not done is left white. Returns the axes.
+    `ValueError` if there is no such variable, or if its axes are not one or two: choose with
+    `dataset.isel(belt=0)` and the like.
     """
     require_one_of(variable, map(str, dataset.data_vars), "variable")
+    told = dataset[variable].attrs
+    is_category = variable == "kind" or "flag_meanings" in told
+    # Signatures get their numbers when all are known.
+    fits = is_category or variable != "signature"
+    require(fits, "dataset", "of a sweep that is done for its signatures", "one that is not")
+    values = (words_of_runs if is_category else _numbers_of_runs)(dataset, variable)
+    values = values.squeeze(drop=True)
+    _check_axes(values)
+    last = values.dims[-1]
+    are_lines = values.ndim == 1 or (last in COUNTED and variable != "kind")
+    if are_lines and is_category and max(map(len, values.values.flat)) > LINE // 2:
+        # There is no room for such words beside an axis; numbers stand for them.
+        values = _numbers_of_runs(dataset, variable).squeeze(drop=True)
     ax = new_axes() if ax is None else ax
-    values = (
-        _words_for_kinds(dataset) if variable == "kind" else dataset[variable].squeeze(drop=True)
-    )
-    require(values.ndim in (1, 2), "dataset", "a sweep with one or two axes", f"{values.ndim}")
-    names = [
-        dataset[name].attrs.get("long_name", name) if name in COUNTED else parameter_label(name)
-        for name in map(str, values.dims)
-    ]
-    label = dataset[variable].attrs.get("long_name", variable)
-    (last,) = values.dims[-1:]
-    if values.ndim == 1 or (last in COUNTED and variable != "kind"):
+    names = [_axis_label(dataset[name]) for name in map(str, values.dims)]
+    label = _with_unit(told.get("long_name", variable), told)
+    if are_lines:
         x, lines = dataset[values.dims[0]], values.values.reshape(values.shape[0], -1).T
         for i, line in enumerate(lines):
             style: dict[str, Any] = {"color": "black", "linewidth": 1.1}
-            style["drawstyle"] = "steps-mid" if variable == "kind" else "default"
+            style["drawstyle"] = "steps-mid" if is_category else "default"
             if len(lines) > 1:
                 style |= {"color": belt_colour(i), "label": f"{last} {i}"}
             ax.plot(x, line, linestyle=("-", "--", ":", "-.")[i % 4], **style)
@@ -67,38 +72,40 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
         add_key(ax)
         return ax
     x, y = (dataset[name].values for name in values.dims)
-    if variable != "kind":
-        mesh = ax.pcolormesh(x, y, values.T, cmap="viridis", rasterized=True)
-        figure_of(ax).colorbar(mesh, ax=ax, label=label)
+    if is_category:
+        draw_categories(ax, x, y, values.values)
     else:
-        present, codes = np.unique(values.values.astype(str), return_inverse=True)
-        order = sorted(range(len(present)), key=lambda i: (len(present[i]), present[i]))
-        colours = [ATTRACTOR_COLOURS[rank % len(ATTRACTOR_COLOURS)] for rank in range(len(order))]
-        rank = np.argsort(order)
-        shades = matplotlib.colors.ListedColormap(colours)
-        codes = rank[codes].reshape(values.shape)
-        top = len(order) - 0.5
-        ax.pcolormesh(x, y, codes.T, cmap=shades, rasterized=True, vmin=-0.5, vmax=top)
-        keys = [Patch(color=colour) for colour in colours]
-        figure_of(ax).legend(
-            keys, [present[i] for i in order], loc="outside lower center", ncols=2, fontsize="small"
-        )
+        mesh = ax.pcolormesh(x, y, values.values.T, cmap="viridis", rasterized=True)
+        figure_of(ax).colorbar(mesh, ax=ax, label=label)
     ax.set(xlabel=names[0], ylabel=names[1])
     return ax
 
 
-def _words_for_kinds(dataset: xr.Dataset) -> xr.DataArray:
-    """What each run leads to, in words."""
-    kind = decoded(dataset[["kind"]]).kind
-    words = kind.astype(object)
-    for belts in itertools.product((False, True), repeat=dataset.sizes["belt"]):
-        stuck = [str(i) for i, sticks in enumerate(belts) if sticks]
-        where = (
-            f"cycle, sticks to belt {' and '.join(stuck)}" if stuck else "cycle without sticking"
-        )
-        same = (dataset.sticks == np.array(belts)).all("belt") & (kind == "cycle")
-        words = words.where(~same, where)
-    return words.squeeze(drop=True)
+def _numbers_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
+    """A variable as floats, NaN where the run is yet to be done."""
+    values = dataset[variable].astype(float)
+    return values if "status" not in dataset else values.where(dataset.status >= 0)
+
+
+def _check_axes(values: xr.DataArray) -> None:
+    """Raise unless there are one or two axes, and say how to choose."""
+    axes = list(map(str, values.dims))
+    one = next((name for name in axes if name in COUNTED), axes[-1] if axes else "")
+    expected = "a sweep with one or two axes longer than one"
+    advice = f"; choose with dataset.isel({one}=0), say" if axes else ""
+    require(len(axes) in (1, 2), "dataset", expected, f"{len(axes)} ({', '.join(axes)}){advice}")
+
+
+def _axis_label(axis: xr.DataArray) -> str:
+    """What an axis is called, with its unit if it has one."""
+    name = str(axis.name)
+    if name in COUNTED or "units" in axis.attrs:
+        return _with_unit(axis.attrs.get("long_name", name), axis.attrs)
+    return parameter_label(name)
+
+
+def _with_unit(words: str, told: dict[str, Any]) -> str:
+    return f"{words} ({told['units'].replace('m s-1', 'm/s')})" if "units" in told else words
 
 
 def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:

@@ -140,7 +140,13 @@ class BasinStability(eqx.Module):
         parts = [
             f"{kind} {fraction:.5f} +- {self.standard_errors[kind]:.5f}"
             for kind, fraction in self.fractions.items()
-            if fraction > 0
+            if 0 < fraction < 1
+        ]
+        # All starts agree: the standard error is 0, and tells nothing of the others.
+        parts += [
+            f"{kind} 1 (above {max(0.0, 1 - 3 / self.n):.5f} with 95% confidence)"
+            for kind, fraction in self.fractions.items()
+            if fraction == 1
         ]
         return f"BasinStability({', '.join(parts)}; {self.n} starts)"
 
@@ -180,6 +186,10 @@ def basins(
         labels,
         {"long_name": "number of the attractor"}
         | flags({-1: "undecided", **dict(enumerate(attractors))}, "int32"),
+    )
+    settings = ", ".join(f"{name}={dataset.attrs[name]!r}" for name in ("t1", "rtol", "atol"))
+    dataset.attrs["call"] = (
+        f'jaxbelt.basins(oscillator, x1=dataset["x1"], x2=dataset["x2"], {settings})'
     )
     return Basins(oscillator, dataset, attractors, cycles, boundary)
 

@@ -34,8 +34,9 @@ STATUS = Variable(
     "int8",
     meanings={status.value: status.name.lower() for status in Status},
 )
-#: Status of runs that are yet to be done.
+#: Status of runs that are yet to be done, and the word for them in every category.
 NOT_RUN = -1
+NOT_DONE = "not_done"
 
 
 def decoded(dataset: "xarray.Dataset") -> "xarray.Dataset":
@@ -43,7 +44,8 @@ def decoded(dataset: "xarray.Dataset") -> "xarray.Dataset":
 
     dataset: of `sweep`, or `Basins.dataset`, also as read from a file. Every variable with the
     attributes `flag_values` and `flag_meanings` becomes one of strings, so that
-    `decoded(dataset).kind == "cycle"` is what it says; what has no meaning becomes "".
+    `decoded(dataset).kind == "cycle"` is what it says; what has no meaning becomes "". In a store
+    whose sweep is not finished, runs that are yet to be done are "not_done".
     """
     check_dataset(dataset)
     return dataset.assign(
@@ -78,6 +80,11 @@ def flags(meanings: Mapping[int, str], dtype: str) -> dict[str, Any]:
     }
 
 
+def _not_done(meanings: Mapping[int, str]) -> int:
+    """The value of a category in runs that are yet to be done: below all others, and below 0."""
+    return min(0, *meanings) + NOT_RUN
+
+
 class Table:
     """The variables of a sweep: their order, shapes, types and attributes.
 
@@ -110,8 +117,9 @@ class Table:
 
     def empty(self, name: str) -> Any:
         """What stands for results that are yet to come."""
-        dtype = np.dtype(self.variable(name).dtype)
-        return dtype.type(NOT_RUN if name == "status" else 0)
+        variable = self.variable(name)
+        dtype = np.dtype(variable.dtype)
+        return dtype.type(_not_done(variable.meanings) if variable.meanings else 0)
 
     def parts(self, results: np.ndarray) -> dict[str, np.ndarray]:
         """The variables of runs, [runs, ...], from results [1 + derivatives, columns, runs]."""
@@ -141,8 +149,11 @@ class Table:
     def attributes(self, name: str) -> dict[str, Any]:
         """The attributes of a variable, but for the flags of categories that are numbered."""
         variable = self.variable(name)
-        told = {"long_name": variable.long_name}
-        return told | (flags(variable.meanings, variable.dtype) if variable.meanings else {})
+        told: dict[str, Any] = {"long_name": variable.long_name}
+        if variable.meanings:
+            meanings = {_not_done(variable.meanings): NOT_DONE, **variable.meanings}
+            told |= flags(meanings, variable.dtype)
+        return told
 
     def coordinates(self) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
         """The coordinates of the dataset."""

@@ -1,5 +1,6 @@
 """What a sweep is asked: its arguments, checked once, and what makes two sweeps the same."""
 
+import ast
 import functools
 import hashlib
 import importlib.metadata
@@ -119,11 +120,12 @@ class Question:
         )
 
     def call(self) -> str:
-        """How to ask it again, as a line of Python; `dataset` is that of the results."""
+        """How to ask it again, as a line of Python; `dataset` is that of the results, and a local
+        function goes by its own name, or by `make`."""
         settings = ", ".join(f"{name}={value!r}" for name, value in self.numbers.items())
         start, axes = tuple(self.grid.y0.values()), list(self.grid.axes)
         return (
-            f"jaxbelt.sweep({_name_of_function(self.grid.make)}, "
+            f"jaxbelt.sweep({_expression(self.grid.make)}, "
             f"{{name: dataset[name] for name in {axes}}}, y0={start}, {settings}, "
             f"observe={_plain(repr(self.observe))}, derivatives={self.derivatives!r})"
         )
@@ -190,9 +192,41 @@ def _name_of_function(make: Callable) -> str:
     if "<" not in name and make.__module__ != "__main__":
         return f"{make.__module__}.{name}"
     try:
-        return inspect.getsource(make).strip()
+        text = inspect.getsource(make).strip()
     except (OSError, TypeError):
         return name
+    lambdas = _lambdas_in(text) if make.__name__ == "<lambda>" else []
+    return lambdas[0] if len(lambdas) == 1 else text
+
+
+def _lambdas_in(text: str) -> list[str]:
+    """The lambda expressions in a piece of source, which may begin and end anywhere."""
+    found = []
+    for begin in re.finditer(r"\blambda\b", text):
+        for end in range(len(text), begin.start(), -1):
+            try:
+                body = ast.parse(f"({text[begin.start() : end]}\n)", mode="eval").body
+            except SyntaxError:
+                continue
+            if isinstance(body, ast.Lambda):
+                found.append(ast.unparse(body))
+                break
+    return list(dict.fromkeys(found))
+
+
+def _expression(make: Callable) -> str:
+    """The function as a call has it."""
+    text = _name_of_function(make)
+    name = getattr(make, "__name__", "")
+    try:
+        body = ast.parse(text, mode="eval").body
+    except SyntaxError:
+        body = None
+    # Of a function that is written in place this may be more than the function.
+    plain = isinstance(body, ast.Lambda | ast.Name | ast.Attribute)
+    if plain or (body is not None and not name):
+        return text
+    return name if name.isidentifier() else "make"
 
 
 def _value(value: Any) -> str:

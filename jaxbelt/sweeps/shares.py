@@ -52,6 +52,8 @@ def attractors(
     """
     check_dataset(dataset)
     require("kind" in dataset, "dataset", 'that of sweep(..., observe="attractor")', "one without")
+    left = int(np.sum(dataset["kind"].values < UNDECIDED))
+    require(not left, "dataset", "of a sweep that is done", f"one with {left:,} runs not done")
     if make is not None:
         require_callable(make, "make", "the function of the sweep")
     starts = [name for name in ("x1", "x2") if name in dataset.kind.dims]

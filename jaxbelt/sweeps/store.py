@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     import xarray
 
 #: Version of the layout described above.
-SCHEMA = 1
+SCHEMA = 2
 #: Runs in a block: enough that writing them takes little beside doing them, and few enough that not
 #: much is lost with one.
 BLOCK_RUNS = 2**17

@@ -90,10 +90,11 @@ def sweep(
     do the blocks of the store, in a folder that all of them see; a worker that dies costs the block
     that it was at. blocks: (first, last), which blocks of the store to do, `last` not among them,
     for processes that share one store, such as those of a job array; who ends last finishes the
-    store, in which until then runs that are not done have the status -1. progress: whether to show
-    a bar; None: on a terminal, when it takes long. audit: share of the runs that are done once more
-    without any shortcut and compared, see `audit` for what is left out; the attributes audited and
-    audit_differed say how many, and a warning says so where one differed.
+    store, in which until then runs that are not done have the status and the kind -1, "not_done".
+    progress: whether to show a bar; None: on a terminal, when it takes long. audit: share of the
+    runs that are done once more without any shortcut and compared, see `audit` for what is left
+    out; the attributes audited and audit_differed say how many, and a warning says so where one
+    differed.
 
     Uses every core (every device, if JAX has others). `ValueError` names the argument that is
     impossible, a store of another sweep among them, and says what differs. `KeyboardInterrupt` ends
