@@ -52,7 +52,7 @@ def test_every_public_function_and_class_that_takes_arguments_is_among_the_mista
     #: What a user gets from a call, and does not call; and what takes no argument.
     results = {"Arcs", "BasinStability", "Basins", "BifurcationCurve", "BifurcationDiagram"}
     results |= {"BifurcationPoint", "Cycle", "Design", "Equilibria", "Events", "Explanation", "Fit"}
-    results |= {"OrbitDiagram", "Portrait", "RegionMap", "Separatrix", "SpecialPoint"}
+    results |= {"FatalShock", "OrbitDiagram", "Portrait", "RegionMap", "Separatrix", "SpecialPoint"}
     results |= {"Trajectory", "Verified"}
     results |= {"AbstractFriction", "AtEvents", "EquilibriumKind", "EventKind", "Status"}
     results |= {"presets"}

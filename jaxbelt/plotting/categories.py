@@ -12,10 +12,10 @@ from matplotlib.patches import Patch
 from ..sweeps.datasets import decoded
 from .style import figure_of
 
-NOT_DONE, OTHER = "not done", "other"
+BLANK, OTHER = "not done", "other"
 #: What has the same colour in every picture; cycles that stick: see `_colour_of_kind`.
 COLOURS = {
-    NOT_DONE: "#FFFFFF",
+    BLANK: "#FFFFFF",
     OTHER: "#4D4D4D",
     "undecided": "#000000",
     "equilibrium": "#E6E6E6",
@@ -42,8 +42,8 @@ def words_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
         names = [STICKS + belts if belts else "cycle without sticking" for belts in stuck]
         named = np.array(names, object)[place.ravel()].reshape(words.shape)
         words = words.where(words != "cycle", words.copy(data=named))
-    words = words.where(words != "not_done", NOT_DONE)
-    return words if "status" not in dataset else words.where(dataset.status >= 0, NOT_DONE)
+    words = words.where(words != "not_done", BLANK)
+    return words if "status" not in dataset else words.where(dataset.status >= 0, BLANK)
 
 
 def draw_categories(ax: Axes, x: np.ndarray, y: np.ndarray, words: np.ndarray) -> None:
@@ -51,7 +51,7 @@ def draw_categories(ax: Axes, x: np.ndarray, y: np.ndarray, words: np.ndarray) -
     counts = Counter(words.ravel().tolist())
     shown = [word for word, _ in counts.most_common(KEY_ROOM)]
     words = np.where(np.isin(words, shown), words, OTHER)
-    present = sorted(np.unique(words.astype(str)).tolist(), key=_rank)
+    present = sorted(np.unique(words.astype(str)).tolist(), key=_in_key)
     colours = _colours_of_words(present)
     codes = np.vectorize(present.index, otypes=[int])(words)
     shades = matplotlib.colors.ListedColormap(colours)
@@ -63,9 +63,9 @@ def draw_categories(ax: Axes, x: np.ndarray, y: np.ndarray, words: np.ndarray) -
     figure_of(ax).legend(keys, labels, loc="outside lower center", ncols=columns, fontsize="small")
 
 
-def _rank(word: str) -> tuple[bool, bool, int, str]:
+def _in_key(word: str) -> tuple[bool, bool, int, str]:
     """Short names first, and last what is not told."""
-    return word == NOT_DONE, word == OTHER, len(word), word
+    return word == BLANK, word == OTHER, len(word), word
 
 
 def _colours_of_words(words: list[str]) -> list[str]:
