@@ -140,6 +140,8 @@ def worker_campaign(client, folder: Path, kills: int, seed: int, t1=4000.0) -> d
                 # At work: Dask gives up a worker that dies before it has registered.
                 busy = {address for address, keys in client.processing().items() if keys}
                 nannies = client.cluster.workers.values()
+                given_up = [one.status.name in ("closed", "failed") for one in nannies]
+                assert not all(given_up), "Dask has given up all workers"
                 alive = [one.pid for one in nannies if one.pid and one.worker_address in busy]
                 if alive and not sweeping.done():
                     os.kill(rng.choice(alive), signal.SIGKILL)
