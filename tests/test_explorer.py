@@ -25,7 +25,9 @@ def test_sliders_move_the_oscillator_and_the_picture():
     explorer.sliders["belts[0].load"].value = 1.0
     explorer.sliders["x1"].value = 2.5
     portrait = explorer.figure.axes[0]
-    assert portrait.lines and max(line.get_xdata()[0] for line in portrait.lines) == 2.5
+    # Entries of the key are lines without data.
+    begins = [line.get_xdata()[0] for line in portrait.lines if len(line.get_xdata())]
+    assert max(begins) == 2.5
 
 
 @pytest.mark.parametrize(

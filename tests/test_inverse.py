@@ -183,7 +183,7 @@ def test_local_cubics_are_exact_for_cubics():
     ],
 )
 def test_impossible_arguments_are_named(change, message):
-    arguments = {"ts": TS, "x1": np.zeros(400), "where": lambda o: o.damping, "noise": 0.1}
+    arguments = {"ts": TS, "x1": np.sin(TS), "where": lambda o: o.damping, "noise": 0.1}
     with pytest.raises(ValueError, match=message):
         jb.fit(oscillator(TRUTH), **{**arguments, **change})
 
