@@ -124,6 +124,7 @@ def test_integrals_are_those_of_the_oracle(name):
     np.testing.assert_allclose(found.fed - found.lost, found.gained, **CLOSE)
 
 
+@pytest.mark.slow(first=True)
 @each
 def test_points_of_a_section_are_those_of_the_oracle(name):
     found = swept(CASES[name], Points())
@@ -175,6 +176,7 @@ class Everything:
         return asked | {"low": low, "high": high, "rise": rise, "way": way}
 
 
+@pytest.mark.slow(first=True)
 @each
 def test_extrema_of_the_velocity_last_through_stick_phases(name):
     found = swept(CASES[name], Everything())
@@ -214,6 +216,7 @@ class Passages:
         return {"counts": counts, "sums": sums, "ordered": ordered}
 
 
+@pytest.mark.slow(first=True)
 @each
 def test_a_section_is_passed_twice_in_a_stick_phase_and_in_a_step(name):
     found = swept(CASES[name], Passages())

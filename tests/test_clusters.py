@@ -101,6 +101,7 @@ def test_a_block_is_done_once_however_often_it_is_asked_for(tmp_path, whole, mon
         clusters.do_block(other, str(path), 1)
 
 
+@pytest.mark.slow(first=True)
 def test_killed_workers_cost_their_blocks_and_nothing_else(client, tmp_path, monkeypatch):
     monkeypatch.setattr(stores, "BLOCK_RUNS", kills.BLOCK)
     told = kills.worker_campaign(client, tmp_path, kills=3, seed=1, t1=1500.0)

@@ -101,6 +101,7 @@ def test_curves_in_other_parameters(points, number, where, span, step):
     assert max(found) < 1e-9
 
 
+@pytest.mark.slow(first=True)
 def test_a_closed_curve_ends_where_it_began():
     """A trace of zero, -mu'(nu0) - mu'(nu1) = zeta: a closed curve, for -mu' has a maximum."""
     osc = jb.Oscillator(1.2, (jb.Belt(0.2, BELL), jb.Belt(0.2, BELL)))

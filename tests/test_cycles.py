@@ -211,6 +211,7 @@ def both_ways(function, x):
     return jax.jit(lambda x: (jax.jacfwd(function)(x), jax.jacrev(function)(x)))(x)
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_of_functionals():
     """Forward and reverse, against Richardson differences of the oracle, 1e-8 relative."""
 

@@ -51,6 +51,7 @@ def test_derivatives_of_a_mass_at_rest_by_sweep():
         np.testing.assert_allclose(found, linearised(damping)[1], atol=3e-8, err_msg=str(damping))
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_of_a_mass_at_rest_by_simulate():
     rest, _ = linearised(0.0)
 
@@ -125,6 +126,7 @@ def derivatives_on_an_edge(by, mud, start):
     return np.array([[float(found[f"d_{i}_end_d_{j}"]) for j in axes] for i in ("x1", "x2")])
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("by", ["simulate", "sweep"])
 @pytest.mark.parametrize("mud", [0.4, 0.5])
 def test_a_start_at_a_pseudo_focus_moves_with_its_edge(by, mud):
@@ -133,6 +135,7 @@ def test_a_start_at_a_pseudo_focus_moves_with_its_edge(by, mud):
     np.testing.assert_array_equal(found, [[0, 0, 0, 1], [0, 0, 0, 0]])
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("by", ["simulate", "sweep"])
 def test_a_run_that_comes_to_rest_on_an_edge_moves_with_its_equilibrium(by):
     """That of the side from which it came; a step of it ends on the edge."""

@@ -203,6 +203,7 @@ KINDS = ("boundary", "edge", pytest.param("jump", marks=SLOW))
 SIZES = (FEW, pytest.param(MANY, marks=SLOW))
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("n", SIZES)
 def test_simulate_tells_a_miss_from_a_hit(kind, n):

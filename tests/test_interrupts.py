@@ -112,6 +112,7 @@ def test_an_interrupt_beside_the_runs_says_what_became_of_them(
         jb.sweep(jb.presets.class_b, {"nu0": [0.1, 0.2, 0.3], "nu1": [0.35]}, t1=5.0, **options)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_interrupts_of_a_session_lose_nothing(tmp_path, monkeypatch):
     """At random moments, of the compilation too; the same store goes on."""

@@ -123,6 +123,7 @@ def test_velocities_with_gaps_and_unknown_noise(motion):
     assert np.sum(np.isnan(result.residuals[:, 1])) == 20
 
 
+@pytest.mark.slow(first=True)
 def test_a_record_of_something_else_is_a_misfit(motion):
     x1, sigma = noisy(motion[:, 0], 2)
     shaken = x1 + 5 * sigma * np.sin(2.7 * TS)
@@ -199,6 +200,7 @@ def nu0(osc):
     return osc.belts[0].velocity
 
 
+@pytest.mark.slow(first=True)
 def test_design_meets_a_stick_duration():
     told = []
     plan = jb.design(jb.presets.class_b(0.45, 0.35), [(stick, 0.5)], where=nu0, report=told.append)

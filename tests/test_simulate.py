@@ -217,6 +217,7 @@ def test_reverse_mode_equals_forward_mode():
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_second_derivatives_agree_with_differences_of_the_oracle():
     def final(z):
         run = jb.simulate(jb.presets.class_b(z[0], 0.35), z[1:], 9.0, ts=jnp.array([6.0, 9.0]))
