@@ -143,6 +143,40 @@ def test_a_run_that_comes_to_rest_on_an_edge_moves_with_its_equilibrium(by):
     np.testing.assert_allclose(found, [[0, 0, 1, 0], [0, 0, 0, 0]], atol=1e-9)
 
 
+def around_an_edge(damping, mud, edge):
+    """Turns around the equilibrium 0.5, past the edge of a belt that exerts no force."""
+    idle = jb.Belt(0.9, jb.Coulomb(0.7, 0.7), 0.0, lower=edge)
+    return jb.Oscillator(damping, (jb.Belt(0.8, jb.Coulomb(0.6, mud)), idle))
+
+
+#: Damping and time: the motion is one of 2e-11, and at rest up to rounding.
+TURNS = (0.5, 100.0), (1.0, 60.0), (0.5, 200.0)
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("by", ["simulate", "sweep"])
+def test_an_edge_without_force_at_an_equilibrium(by):
+    """However small a loop is that passes it. At its end the equilibrium alone counts."""
+    row = jnp.array([0.5, 0.5])
+
+    @jax.jit
+    def simulated(row, damping, t1):
+        osc = around_an_edge(damping, *row)
+        return jb.simulate(osc, (-1.3, 0.3), t1, ts=t1[None]).ys[-1]
+
+    for damping, t1 in TURNS:
+        if by == "simulate":
+            found = jax.jacfwd(simulated)(row, damping, jnp.asarray(t1))
+        else:
+            axes = {"damping": [damping], "mud": [0.5], "edge": [0.5]}
+            question = dict(y0=(-1.3, 0.3), t1=t1, derivatives=("mud", "edge"))
+            data = jb.sweep(around_an_edge, axes, **question).squeeze()
+            found = [
+                [float(data[f"d_{i}_end_d_{j}"]) for j in ("mud", "edge")] for i in ("x1", "x2")
+            ]
+        np.testing.assert_allclose(found, [[1, 0], [0, 0]], atol=1e-8, err_msg=f"{damping}, {t1}")
+
+
 STEEP = ("conti", 1.0, 0.6, 5.0, 0.0)
 CASES = {
     "starts by sticking": (Oscillator(0.5, (Belt(0.2, PAPER), Belt(0.35, PAPER))), (1.0, 0.2)),

@@ -6,13 +6,13 @@ sequence of events is kept as one number, its word.
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..model.events import Signature, event_between
 from ..model.modes import (
     Mode,
-    force_rounding,
     guard_passed,
     leave_slip,
     leave_stick,
@@ -22,33 +22,40 @@ from ..model.modes import (
     without_rounding,
 )
 from ..model.oscillator import Oscillator
-from ..model.rest import kept_at_rest
+from ..model.rest import is_at_rest, is_slow
 from ..results import EventKind, Status
 from .lanes import Lanes, Passage
 from .step import NO_STEP, STEP_SAFETY, first_step
 
 
 def pass_events(
-    osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array, *, edges: bool, captures: bool
+    osc: Oscillator,
+    lanes: Lanes,
+    t1: Array,
+    rtol: Array,
+    *,
+    edges: bool,
+    captures: bool,
+    derivatives: bool,
 ) -> tuple[Lanes, Passage]:
     """Lanes that stand on a guard go on; stick phases are passed to their end, or to t1.
 
     edges: whether a contact edge may be met; captures: whether a run ends where a pseudo-focus
-    captures it.
+    captures it; derivatives: see `step.take_step`, lanes at rest go on then.
     """
     landed = (lanes.h < 0) & ~lanes.done
     # A lane may also have landed where x2 = 0, which is no guard.
     number = guard_passed(osc, lanes.mode, lanes.x1, lanes.x2)
     # At rest a lane stays, even on a guard.
-    at_rest = jnp.maximum(jnp.abs(lanes.x2), jnp.abs(lanes.a)) < force_rounding(lanes.x1)
+    at_rest = is_at_rest(lanes.x1, lanes.x2, lanes.a)
     fired = landed & (number >= 0) & ~at_rest
-    rests = landed & at_rest & ((number >= 0) | (lanes.h >= -NO_STEP))
+    stands = (number >= 0) | (lanes.h >= -NO_STEP)
+    rests = jnp.zeros_like(landed) if derivatives else landed & at_rest & stands
     after = leave_slip(osc, lanes.mode, jnp.where(fired, number, -1), lanes.x1, lanes.x2)
     captured = fired & after.captured & captures
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
 
     left = t1 - lanes.t
-    x1, x2 = kept_at_rest(osc, lanes.mode, rests, x1, x2, left)
     stuck = after.mode.any_stuck & ~captured & ~lanes.done
     phase = stick_phase(osc, after.mode, x1)
     x2 = jnp.where(stuck, phase.x2, x2)
@@ -59,6 +66,10 @@ def pass_events(
     mode = select(captured, lanes.mode, mode)
     new_x1 = jnp.where(stuck, jnp.where(ends, x1 + x2 * left, phase.x1), x1)
     t = jnp.where(stuck & ends | rests, t1, lanes.t + duration)
+    if derivatives:
+        a = mode_acceleration(osc, mode, new_x1, x2)
+        creeps = (landed | released) & ~mode.any_stuck & is_slow(x2, a)
+        t, new_x1, x2 = _at_fixed_time(creeps, t, new_x1, x2, a)
     a, h = _set_off(edges, osc, lanes, mode, new_x1, x2, fired, released, rtol)
     forever = stuck & jnp.isinf(phase.duration)
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
@@ -93,6 +104,20 @@ def pass_events(
         done=lanes.done | captured | (t >= t1),
     )
     return lanes, passage
+
+
+@jax.custom_jvp
+def _at_fixed_time(creeps: Array, t: Array, x1: Array, x2: Array, a: Array):
+    """t, x1, x2, with their derivatives at a fixed time where a lane creeps."""
+    return t, x1, x2
+
+
+@_at_fixed_time.defjvp
+def _(primals, tangents):
+    creeps, t, x1, x2, a = primals
+    _, d_t, d_x1, d_x2, _ = tangents
+    away = jnp.where(creeps, d_t, 0.0)
+    return (t, x1, x2), (d_t - away, d_x1 - x2 * away, d_x2 - a * away)
 
 
 def _set_off(edges, osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> tuple[Array, Array]:

@@ -180,7 +180,7 @@ class Program(eqx.Module):
 
     structure: of the oscillator's tree; mapped: which of its leaves differ from run to run; edges:
     whether a contact edge may be met; captures: whether a run ends where a pseudo-focus captures
-    it.
+    it; derivatives: whether those of the results are wanted, too.
     """
 
     structure: Any = eqx.field(static=True)
@@ -188,3 +188,4 @@ class Program(eqx.Module):
     observer: Observer = eqx.field(static=True)
     edges: bool = eqx.field(static=True)
     captures: bool = eqx.field(static=True, default=True)
+    derivatives: bool = eqx.field(static=True, default=False)

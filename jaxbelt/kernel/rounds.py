@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import Mode, at_focus, mode_acceleration, mode_of_state, start_at_focus
+from ..model.modes import Mode, at_focus, mode_acceleration, mode_of_state
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..results import Status
 from .events import pass_events
@@ -19,7 +19,6 @@ STEPS_PER_ROUND = 4
 
 def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, *, edges: bool) -> Lanes:
     """Lanes at the start of their runs, without what an observer adds; edges: see `window_of`."""
-    x1, x2 = start_at_focus(osc, x1, x2)
     mode = mode_of_state(osc, x1, x2)
     finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
     rests = at_focus(osc, x1, x2) if edges else jnp.zeros_like(finite)
@@ -72,7 +71,9 @@ class Round(eqx.Module):
 
 def one_round(osc: Oscillator, lanes: Lanes, one, t1, rtol, atol, *, edges: bool):
     """The lanes past the events and STEPS_PER_ROUND steps further, and the `Round`."""
-    lanes, passage = pass_events(osc, lanes, t1, rtol, edges=edges, captures=True)
+    lanes, passage = pass_events(
+        osc, lanes, t1, rtol, edges=edges, captures=True, derivatives=False
+    )
     window = window_of(osc, lanes, edges=edges, extrema=None)
 
     def step(lanes, _):

@@ -37,12 +37,12 @@ from ..model.modes import (
     bounds_leftward,
     bounds_rightward,
     fastest_rate,
-    force_rounding,
     foremost,
     select,
 )
 from ..model.modes import edges as edge_positions
 from ..model.oscillator import Oscillator
+from ..model.rest import is_at_rest
 from .lanes import Lanes, choose, materialise
 
 #: First step of a run and after each event, at a tolerance of 1e-8: about what the tolerance allows
@@ -359,12 +359,17 @@ def take_step(
     new = attempt(osc, window, one, lanes, h, rtol, atol, rates, derivatives)
     path = _interpolate(one, lanes, new)
     at = _landing(window, one, lanes, new, path, rtol)
+    blocked, reached = at.blocked, at.reached
+    if derivatives:
+        # At rest no bound has a say in how the neighbours of a lane move.
+        rests = is_at_rest(lanes.x1, lanes.x2, lanes.a)
+        blocked, reached = blocked & ~rests, reached & ~rests
 
     last = h >= left
     accepted = going & (new.error <= 1)
-    lands = accepted & ~at.blocked & at.reached & ~(last & (at.delta > 0))
+    lands = accepted & ~blocked & reached & ~(last & (at.delta > 0))
     # One number, because many results depend on it.
-    outcome = jnp.where(accepted, jnp.where(at.blocked, -1.0, 1.0), 0.0)
+    outcome = jnp.where(accepted, jnp.where(blocked, -1.0, 1.0), 0.0)
     outcome = materialise(jnp.where(lands, 2.0, outcome), one)
     shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
     delta = materialise(jnp.where(lands, at.delta, 0.0), one)
@@ -372,8 +377,7 @@ def take_step(
     bound = at.x2 if window.x1 is None else jnp.where(at.on_edge, at.x1, at.x2)
     x1, x2 = _bridged(lands, at.on_edge, delta, bound, new)
     a_end = _quotient(osc, window, one, x1, x2)
-    # At rest a lane stays, so that no bound has a say in how its neighbours move.
-    moves = lands & (jnp.maximum(jnp.abs(x2), jnp.abs(a_end)) >= force_rounding(x1))
+    moves = lands & ~is_at_rest(x1, x2, a_end)
     delta, x1, x2 = _with_its_derivatives(moves, at.on_edge, delta, bound, new, (x1, x2, a_end))
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
     pace, proposed = _next_size(lanes, new, going, accepted)

@@ -1,10 +1,8 @@
-"""Orbits that come to rest: when it is known that they will, and how neighbours of one move."""
+"""Orbits that come to rest: which states are at rest, or nearly, and which will be."""
 
 import functools
 
-import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from .modes import Mode, boundary_guards, edge_guards, force_rounding, mode_acceleration
@@ -14,6 +12,20 @@ from .oscillator import Oscillator
 SMALLEST_DISC = 1e-6
 #: Speeds, as fractions of the radius, at which an attracting disc is checked.
 DISC = tuple(sign * j / 8 for j in range(1, 9) for sign in (1, -1))
+
+
+def is_at_rest(x1: Array, x2: Array, a: Array) -> Array:
+    """Whether x2 and x2' = a vanish, up to rounding."""
+    return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < force_rounding(x1)
+
+
+def is_slow(x2: Array, a: Array) -> Array:
+    """Whether a state moves so slowly that its derivatives are better taken at a fixed time.
+
+    The times at which it passes a place depend on everything without bounds where x2 and x2' = a
+    vanish. Elsewhere what does not depend on the start is to have derivatives that are exactly 0.
+    """
+    return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < 1e-4
 
 
 def settling_margin(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
@@ -54,50 +66,3 @@ def disc_margin(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> A
             for matters, bound in zip(pulls * 3, bounds, strict=True)
         ]
     return functools.reduce(jnp.minimum, margins)
-
-
-@jax.custom_jvp
-def kept_at_rest(
-    osc: Oscillator, mode: Mode, rests: Array, x1: Array, x2: Array, time: Array
-) -> tuple[Array, Array]:
-    """The state (x1, x2) at which a mass rests in a slip mode, after a time: the same numbers.
-
-    Where `rests` is set, their derivatives are those of the linearised motion over that time.
-    """
-    return x1, x2
-
-
-@kept_at_rest.defjvp
-def _(primals, tangents):
-    osc, mode, rests, x1, x2, time = primals
-    d_osc, _, _, d_x1, d_x2, _ = tangents
-
-    def moved():
-        _, rate = jax.jvp(
-            lambda x2: mode_acceleration(osc, mode, x1, x2), (x2,), (jnp.ones_like(x2),)
-        )
-        # The equilibrium moves as x2' does at a fixed state, for d x2'/d x1 = -1.
-        _, away = jax.jvp(lambda osc: mode_acceleration(osc, mode, x1, x2), (osc,), (d_osc,))
-        cosine, sine = _linear_flow(0.5 * rate, jnp.where(rests, time, 0.0))
-        y1, y2 = d_x1 - away, d_x2
-        z1 = away + cosine * y1 + sine * (y2 - 0.5 * rate * y1)
-        z2 = cosine * y2 + sine * (0.5 * rate * y2 - y1)
-        return jnp.where(rests, z1, d_x1), jnp.where(rests, z2, d_x2)
-
-    return (x1, x2), lax.cond(jnp.any(rests), moved, lambda: (d_x1, d_x2))
-
-
-def _linear_flow(half: Array, time: Array) -> tuple[Array, Array]:
-    """c and s with exp(A t) = c I + s (A - half I), of A = ((0, 1), (-1, 2 half))."""
-    square = half * half - 1
-    is_node, w = square > 0, jnp.sqrt(jnp.abs(square))
-    # The eigenvalues of a node are half +- w, of which the smaller one would be lost in rounding.
-    larger = jnp.where(is_node, half + jnp.copysign(w, half), 1.0)
-    one, other = jnp.exp(larger * time), jnp.exp(time / larger)
-    grown, angle = jnp.exp(half * time), w * time
-    cosine = jnp.where(is_node, 0.5 * (one + other), grown * jnp.cos(angle))
-    sine = jnp.where(is_node, 0.5 * jnp.abs(one - other), grown * jnp.sin(angle))
-    # Where they are nearly one, by the series.
-    close = angle < 1e-2
-    series = grown * time * (1 + square * time * time / 6)
-    return cosine, jnp.where(close, series, sine / jnp.where(close, 1.0, w))

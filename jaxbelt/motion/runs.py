@@ -24,12 +24,12 @@ from ..model.events import event_between
 from ..model.modes import (
     Mode,
     at_focus,
-    force_rounding,
     mode_acceleration,
     mode_of_state,
     select,
 )
 from ..model.oscillator import Oscillator, has_possible_numbers
+from ..model.rest import is_at_rest
 from ..numerics.compiling import any_lane, in_turn, of_lane, one_kernel, with_batches
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
@@ -70,18 +70,12 @@ def _slip_segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[Arc
     integrator = Adaptive(span, SAFETY * rtol, SAFETY * atol)
     arc = _adaptive_slip_arc(osc, state.mode, state.signs, state.y, integrator)
     # At rest up to rounding the mass stays, even on a guard.
-    rests = (arc.fired >= 0) & _is_at_rest(osc, state.mode, *arc.y)
+    rests = (arc.fired >= 0) & is_at_rest(*arc.y, mode_acceleration(osc, state.mode, *arc.y))
     stays = replace(
         arc, duration=jnp.maximum(arc.duration, span), fired=jnp.full_like(arc.fired, -1)
     )
     end = after_slip(osc, state.mode, state.signs, select(rests, stays, arc))
     return end, end.captured | (end.fired < 0) & (left <= MAX_ARC)
-
-
-def _is_at_rest(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
-    """Whether x2 and x2' vanish in a slip mode, up to rounding."""
-    a = mode_acceleration(osc, mode, x1, x2)
-    return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < force_rounding(x1)
 
 
 def _stick_segment(osc: Oscillator, state: RunState, t1) -> tuple[ArcEnd, Array]:

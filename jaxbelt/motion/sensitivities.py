@@ -31,6 +31,7 @@ from ..model.modes import (
     stick_velocity,
 )
 from ..model.oscillator import Oscillator
+from ..model.rest import is_slow
 from ..numerics.compiling import any_lane, in_turn, one_kernel
 from ..numerics.extrapolation import increments, scheme
 from .arcs import stick_arc
@@ -157,6 +158,11 @@ def _passed(osc: Oscillator, arc: Arc, y: State, left: Array) -> tuple[Array, Ar
     mode = arc.mode
     stuck = mode.any_stuck
     end = flown(osc, mode, y, jnp.where(stuck, 0.0, arc.duration), arc.end)
+    # The numbers of the run itself, so that the field is the same here and at the next entry.
+    end = tuple(
+        lax.stop_gradient(known) + (new - lax.stop_gradient(new))
+        for known, new in zip(arc.end, end, strict=True)
+    )
 
     def fired_guard(*y):
         n = len(osc.belts)
@@ -196,8 +202,13 @@ def _sensitivities_at_ends(varied, rest, arcs: Arc, left: Array, entry: Sensitiv
 
     is_t1 = jnp.where(jnp.arange(entry.t.size) == 3, 1.0, 0.0)
 
+    def creep(arc):
+        return _creep(eqx.combine(varied, rest), arc.mode, *arc.entry)
+
     def advance(before, row):
-        jacobian, used = row
+        jacobian, used, (creeps, x2, a) = row
+        fixed = Sensitivity(before.x1 - x2 * before.t, before.x2 - a * before.t, 0.0 * before.t)
+        before = select(creeps, fixed, before)
 
         def through(slopes):
             by_entry = slopes[0] * before.x1 + slopes[1] * before.x2
@@ -209,7 +220,14 @@ def _sensitivities_at_ends(varied, rest, arcs: Arc, left: Array, entry: Sensitiv
         return after, after
 
     # One arc after another, for they need different numbers of steps.
-    return lax.scan(advance, entry, (lax.map(jacobian, (arcs, left)), arcs.used))[1]
+    rows = lax.map(jacobian, (arcs, left)), arcs.used, jax.vmap(creep)(arcs)
+    return lax.scan(advance, entry, rows)[1]
+
+
+def _creep(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array, Array]:
+    """Whether the mass slips but hardly moves, see `modes.is_slow`; and the field, (x2, x2')."""
+    _, a = slip_field(osc, mode, (x1, x2))
+    return ~mode.any_stuck & is_slow(x2, a), x2, a
 
 
 def _slopes_of(function, varied, *numbers):
@@ -326,6 +344,13 @@ def _(primals, tangents):
     rows = entries, since, codes, lax.stop_gradient(states)
     slopes = in_turn(_slopes_of_samples)(varied, rest, *rows)
     by_x1, by_x2, by_time, *by_parameters = jnp.moveaxis(slopes, -1, 0)
+    if since_along is not None:
+        modes = mode_of(jnp.moveaxis(codes.astype(float), -1, 0))
+        creeps, *field = _creep(osc, modes, entries[:, 0], entries[:, 1])
+        earlier = jnp.where(creeps, since_along, 0.0)
+        field = jnp.stack(field, axis=1) * earlier[:, None]
+        entries_along = field if entries_along is None else entries_along + field
+        since_along = since_along - earlier
     moved = jnp.zeros(states.shape)
     if entries_along is not None:
         moved = moved + by_x1 * entries_along[:, :1] + by_x2 * entries_along[:, 1:]

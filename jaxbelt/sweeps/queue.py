@@ -25,6 +25,7 @@ from ..kernel.events import pass_events
 from ..kernel.lanes import Lanes, Program, are_finite, choose
 from ..kernel.rounds import STEPS_PER_ROUND, lanes_at_start
 from ..kernel.step import take_step, window_of
+from ..model.modes import start_at_focus
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import one_kernel
 from ..results import Status
@@ -58,6 +59,8 @@ def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> Oscillato
 
 def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
     """Lanes at the start of their runs."""
+    if program.derivatives:
+        x1, x2 = start_at_focus(osc, x1, x2)
     lanes = lanes_at_start(osc, run, x1, x2, passes, rtol, edges=program.edges)
     memory, integrals = program.observer.start(osc, lanes), program.observer.integrals(osc, lanes)
     return replace(lanes, memory=memory, integrals=integrals)
@@ -166,13 +169,14 @@ def _refill(program: Program, shared, rtol, limit, block, begun, available, desk
     )
 
 
-def _work(program: Program, derivatives: bool, shared, rows, lanes: Lanes, one, t1, rtol, atol):
+def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol):
     """The lanes after ROUNDS_PER_PASS times some steps, each time past the events at first."""
     osc, observer = _oscillators(program, shared, rows), program.observer
-    forward = functools.partial(take_step, derivatives=derivatives)
+    forward = functools.partial(take_step, derivatives=program.derivatives)
+
+    rules = dict(edges=program.edges, captures=program.captures, derivatives=program.derivatives)
 
     def round_(_, lanes):
-        rules = dict(edges=program.edges, captures=program.captures)
         lanes, passage = pass_events(osc, lanes, t1, rtol, **rules)
         lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
         window = window_of(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
@@ -189,7 +193,7 @@ def _at_work(stream: Stream) -> Array:
     return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
 
 
-def _fill(program: Program, derivatives: bool = False) -> Callable:
+def _fill(program: Program) -> Callable:
     """The inner loop: works until the block of runs is taken, the desk is full, or in pass `until`.
 
     It closes over no array, so that it can be one piece of machine code.
@@ -204,7 +208,7 @@ def _fill(program: Program, derivatives: bool = False) -> Callable:
             desk = _refill(program, shared, rtol, limit, block, begun, available, desk)
             stream = desk.stream
             settings = stream.rows, stream.lanes, stream.one, t1, rtol, atol
-            lanes = _work(program, derivatives, shared, *settings)
+            lanes = _work(program, shared, *settings)
             return replace(desk, stream=replace(stream, lanes=lanes))
 
         return lax.while_loop(unfinished, go_on, desk)
@@ -251,7 +255,8 @@ def advance_with_derivatives(program, shared, t1, rtol, atol, limit, queue, call
     stream: a stream and the derivatives of its floats, [directions, ...]; the results have the same
     first axis, behind the values themselves.
     """
-    plain = _fill(program, derivatives=True)
+    program = replace(program, derivatives=True)
+    plain = _fill(program)
 
     @one_kernel
     def one_piece(given, block, block_slopes, where, desk, slopes):
