@@ -70,7 +70,8 @@ def _slip_segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[Arc
     integrator = Adaptive(span, SAFETY * rtol, SAFETY * atol)
     arc = _adaptive_slip_arc(osc, state.mode, state.signs, state.y, integrator)
     # At rest up to rounding the mass stays, even on a guard.
-    rests = (arc.fired >= 0) & is_at_rest(*arc.y, mode_acceleration(osc, state.mode, *arc.y))
+    a = mode_acceleration(osc, state.mode, *arc.y)
+    rests = (arc.fired >= 0) & is_at_rest(arc.y[0], arc.y[1], a)
     stays = replace(
         arc, duration=jnp.maximum(arc.duration, span), fired=jnp.full_like(arc.fired, -1)
     )

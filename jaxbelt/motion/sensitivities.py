@@ -159,10 +159,7 @@ def _passed(osc: Oscillator, arc: Arc, y: State, left: Array) -> tuple[Array, Ar
     stuck = mode.any_stuck
     end = flown(osc, mode, y, jnp.where(stuck, 0.0, arc.duration), arc.end)
     # The numbers of the run itself, so that the field is the same here and at the next entry.
-    end = tuple(
-        lax.stop_gradient(known) + (new - lax.stop_gradient(new))
-        for known, new in zip(arc.end, end, strict=True)
-    )
+    end = _with_numbers_of(arc.end[0], end[0]), _with_numbers_of(arc.end[1], end[1])
 
     def fired_guard(*y):
         n = len(osc.belts)
@@ -183,6 +180,11 @@ def _passed(osc: Oscillator, arc: Arc, y: State, left: Array) -> tuple[Array, Ar
     slipped = after.x1, jnp.where(arc.captured, 0.0, after.x2), arc.duration + late
     phase = stick_arc(osc, mode, y, left)
     return select(stuck, (*phase.y, phase.duration), slipped)
+
+
+def _with_numbers_of(known: Array, found: Array) -> Array:
+    """The known number, with the derivatives of the one that was found."""
+    return lax.stop_gradient(known) + (found - lax.stop_gradient(found))
 
 
 @one_kernel
