@@ -24,7 +24,13 @@ CASES = {
     ),
 }
 #: Each takes a compilation a case.
-each = pytest.mark.parametrize("name", ["class_c", pytest.param("class_b", marks=pytest.mark.slow)])
+in_turn = pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("class_c", marks=pytest.mark.slow(first=True)),
+        pytest.param("class_b", marks=pytest.mark.slow),
+    ],
+)
 #: No events: the belts are faster than the mass ever is.
 FAST = (jb.presets.class_b, {"nu0": [4.0, 5.0], "nu1": [6.0]})
 #: A sweep at 1e-11 is compared with an oracle at 1e-13: errors add up over a run.
@@ -100,8 +106,7 @@ Largest, Energy, Points, Samples = (PAGE[n] for n in ("Largest", "Energy", "Poin
 height = PAGE["height"]
 
 
-@pytest.mark.slow(first=True)
-@each
+@in_turn
 def test_extrema_are_those_of_the_oracle(name):
     found = swept(CASES[name], Largest(10.0))
     for i, run in enumerate(runs(name)):
@@ -111,7 +116,7 @@ def test_extrema_are_those_of_the_oracle(name):
         np.testing.assert_allclose(found.largest[i, 0], late, **CLOSE)
 
 
-@each
+@in_turn
 def test_integrals_are_those_of_the_oracle(name):
     found = swept(CASES[name], Energy())
     for i, run in enumerate(runs(name)):
@@ -124,8 +129,7 @@ def test_integrals_are_those_of_the_oracle(name):
     np.testing.assert_allclose(found.fed - found.lost, found.gained, **CLOSE)
 
 
-@pytest.mark.slow(first=True)
-@each
+@in_turn
 def test_points_of_a_section_are_those_of_the_oracle(name):
     found = swept(CASES[name], Points())
     for i, motion in enumerate(map(along, runs(name))):
@@ -140,8 +144,7 @@ def test_points_of_a_section_are_those_of_the_oracle(name):
         np.testing.assert_allclose(found.above[i, 0], above, rtol=0, atol=1e-7)
 
 
-@pytest.mark.slow(first=True)
-@each
+@in_turn
 def test_states_at_fixed_times_are_those_of_the_oracle(name):
     found = swept(CASES[name], Samples())
     assert np.all(found["count"] == 33)
@@ -176,8 +179,7 @@ class Everything:
         return asked | {"low": low, "high": high, "rise": rise, "way": way}
 
 
-@pytest.mark.slow(first=True)
-@each
+@in_turn
 def test_extrema_of_the_velocity_last_through_stick_phases(name):
     found = swept(CASES[name], Everything())
     assert np.all(found.times == 2)
@@ -216,8 +218,7 @@ class Passages:
         return {"counts": counts, "sums": sums, "ordered": ordered}
 
 
-@pytest.mark.slow(first=True)
-@each
+@in_turn
 def test_a_section_is_passed_twice_in_a_stick_phase_and_in_a_step(name):
     found = swept(CASES[name], Passages())
     assert np.all(found.ordered == 1)
@@ -253,8 +254,7 @@ class Moments:
         return {"sums": state, "square": end.integrals[0], "force": end.integrals[1]}
 
 
-@pytest.mark.slow(first=True)
-@each
+@in_turn
 def test_derivatives_are_differences_of_the_oracle(name):
     """Of sections, extrema, fixed times, events and integrals, through stick phases and edges."""
     make, axes = CASES[name]

@@ -76,6 +76,7 @@ def test_final_states_and_events_equal_those_of_simulate(kind, record_property):
     assert np.max(error) < AGREES
 
 
+@pytest.mark.slow(first=True)
 def test_slow_passages_of_an_edge_keep_the_time():
     """Some 900 and 200 in a run: errors in the times of landings would add up."""
     table = lanes("c", 10_000, seed=7)[:, [153, 41]]
@@ -99,6 +100,7 @@ def test_runs_that_are_not_finite_are_told_in_place_and_harm_no_other():
         assert np.array_equal(dataset[name][~hit], good[name][~hit])
 
 
+@pytest.mark.slow(first=True)
 def test_runs_of_impossible_oscillators_are_told_in_place_in_every_engine():
     """Outside of a trace they raise; inside they would go on and tell numbers."""
     rows = np.array(
@@ -316,6 +318,7 @@ def test_early_labels_equal_those_of_long_runs(kind):
     assert np.array_equal(early.x1_min[at_rest], early.x1_max[at_rest])
 
 
+@pytest.mark.slow(first=True)
 def test_a_cycle_that_crosses_without_sticking():
     """Negative damping drives it, dry friction of two belts limits it: it converges, slowly."""
     law = jb.Coulomb(static=0.1, kinetic=0.1)

@@ -34,7 +34,7 @@ TABLE = [
 ]
 
 
-@pytest.mark.parametrize("offset", [-0.02, 0.02])
+@pytest.mark.parametrize("offset", [pytest.param(-0.02, marks=pytest.mark.slow(first=True)), 0.02])
 @pytest.mark.parametrize(("make", "condition", "exact"), TABLE)
 def test_the_papers_table(make, condition, exact, offset):
     point = jb.refine(condition, make(exact + offset), where=nu0)
@@ -216,6 +216,7 @@ def test_fold_of_small_cycles(short):
         assert point.cycle.x1_max - point.cycle.x1_min == pytest.approx(2 * amplitude, rel=0.05)
 
 
+@pytest.mark.slow(first=True)
 def test_a_hopf_point_is_no_fold_of_cycles():
     # More damping than at the degenerate Hopf point of the test above.
     point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.55, (jb.Belt(0.35, BELL),)), where=nu0)

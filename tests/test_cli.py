@@ -304,6 +304,7 @@ def test_reproduce_tells_in_one_sentence_where_it_cannot_write(tmp_path):
     assert result.stderr.count("\n") == 1
 
 
+@pytest.mark.slow(first=True)
 def test_portraits_show_what_the_paper_says_of_the_regions(values):
     """Which panels have a steady cycle, and on which belts it sticks."""
     panels = {name: figure.panels(values) for name, figure in reproduce.PORTRAITS.items()}

@@ -62,6 +62,7 @@ def test_workers_do_what_the_sweep_does(client, tmp_path, whole, capsys):
     assert not [left for left in (tmp_path / ".a.zarr.locks").iterdir() if left.name != "door"]
 
 
+@pytest.mark.slow(first=True)
 def test_workers_take_functions_and_classes_of_ones_own(client, tmp_path):
     class Count:  # nothing that a worker could import
         def init(self, osc, x1, x2):
@@ -171,6 +172,7 @@ def test_parts_of_a_store_are_done_apart_and_the_last_finishes_it(tmp_path, whol
     assert again(path, blocks=(1, 2)).equals(whole)
 
 
+@pytest.mark.slow(first=True)
 def test_processes_with_blocks_of_their_own_share_a_store(tmp_path):
     """As a job array starts them: at once, and by the command."""
     path = tmp_path / "plane.zarr"
@@ -198,6 +200,7 @@ def test_processes_with_blocks_of_their_own_share_a_store(tmp_path):
 # --- several devices ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_several_devices_of_one_process_give_the_same():
     program = """
 import jax, numpy as np

@@ -111,6 +111,7 @@ def test_its_name_stands_in_diagrams(points):
     plt.close("all")
 
 
+@pytest.mark.slow(first=True)
 def test_numbers_in_conditions_are_data():
     """Another period, another belt, the other kind of tangency: nothing is compiled anew."""
 

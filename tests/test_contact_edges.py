@@ -94,6 +94,7 @@ def test_branches_go_on_beyond_them(diagram):
     assert {"edge grazing, belt 0", "corner, belt 0", "pseudo-Hopf, belt 0"} <= texts
 
 
+@pytest.mark.slow(first=True)
 def test_an_unstable_cycle_touches_the_edge_on_one_side_and_the_other():
     """The edge comes into it from the left and goes out to the right; one branch all along."""
     osc = jb.presets.class_d(0.4, 0.25, 0.0, 0.6)
@@ -124,6 +125,7 @@ def test_an_unstable_cycle_touches_the_edge_on_one_side_and_the_other():
     assert branch.multiplier[row] == pytest.approx(passing.multiplier, rel=1e-7)
 
 
+@pytest.mark.slow(first=True)
 def test_points_of_sequential_belts():
     """Class (c); beyond the corner there is no cycle, as the phase of sticking vanished there."""
     points = jb.scan(jb.presets.class_c(0.35, -0.25, 0.4), nu0, (-0.7, 0.7))
@@ -390,6 +392,7 @@ def test_curves(diagram):
     assert fold.values[1] == pytest.approx(0.267134534361, abs=1e-11)
 
 
+@pytest.mark.slow(first=True)
 def test_curve_of_an_unstable_cycle_that_touches_the_edge(diagram):
     """Up to the nonsmooth fold of belt 1 alone, and down to its Hopf point, which it shrinks to."""
     where, span = (sigma1, nu1), ((0.05, 2.5), (0.1, 0.3))

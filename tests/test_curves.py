@@ -118,6 +118,7 @@ def test_a_closed_curve_ends_where_it_began():
     assert [special.kind for special in curve.special] == ["EqualVelocities"] * 2
 
 
+@pytest.mark.slow(first=True)
 def test_folds_of_cycles_end_at_a_degenerate_hopf_point():
     """Where -mu' = zeta and the third derivative is 0: for this law at nu = 0.4 and zeta = 1/2."""
     point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.4, (jb.Belt(0.483, BELL),)), where=nu0)

@@ -65,6 +65,7 @@ def test_derivatives_of_a_mass_at_rest_by_simulate():
         np.testing.assert_allclose(jacobian, linearised(damping)[1], atol=1e-10)
 
 
+@pytest.mark.slow(first=True)
 def test_an_edge_without_force_where_x2_is_extreme():
     """At the event x2' = 0, as at slip onset; what is left of the motion is a rotation."""
     law, angle = jb.Conti(1.0, 0.6, 10.0), 2.0
@@ -82,7 +83,9 @@ def test_an_edge_without_force_where_x2_is_extreme():
     np.testing.assert_allclose(found, [[cos, sin], [-sin, cos]], atol=1e-10)
 
 
-@pytest.mark.parametrize("by", ["simulate", "sweep"])
+@pytest.mark.parametrize(
+    "by", [pytest.param("simulate", marks=pytest.mark.slow(first=True)), "sweep"]
+)
 def test_a_start_that_sticks_moves_with_its_belt(by):
     """x2 of the start is a number, but the mass has the belt's velocity at once."""
     t1, y0 = 2.0, (1.0, 0.2)  # slip onset is at 3.3

@@ -155,6 +155,7 @@ def test_crossing_sliding(crossing):
         assert Counter(jb.find_cycle(held_by(load)[0], (3.0, 0.0)).signature) == events
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("number", [0, 1])
 @pytest.mark.parametrize("offset", [-0.01, 0.01])
 def test_crossing_sliding_from_either_side(crossing, number, offset):

@@ -1,6 +1,7 @@
 """Orbits that miss a boundary or an edge, or meet it, by next to nothing: see `grazing`."""
 
 import functools
+import itertools
 from dataclasses import fields
 
 import grazing
@@ -198,21 +199,24 @@ def some(engine, kind, n):
                 yield case, kind, tolerance
 
 
-SLOW = pytest.mark.slow
+SLOW, FIRST = pytest.mark.slow, pytest.mark.slow(first=True)
 KINDS = ("boundary", "edge", pytest.param("jump", marks=SLOW))
-SIZES = (FEW, pytest.param(MANY, marks=SLOW))
 
 
-@pytest.mark.slow(first=True)
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("n", SIZES)
+def in_turn(*first):
+    """Every kind, few and many of each; the first ones belong to CI."""
+    pairs = itertools.product((FEW, MANY), ("boundary", "edge", "jump"))
+    rows = [pytest.param(*pair, marks=FIRST if pair in first else SLOW) for pair in pairs]
+    return pytest.mark.parametrize(("n", "kind"), rows)
+
+
+@in_turn((FEW, "boundary"), (FEW, "edge"))
 def test_simulate_tells_a_miss_from_a_hit(kind, n):
     for case in some("simulate", kind, n):
         check_answers(simulate, *case)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("n", SIZES)
+@in_turn((FEW, "boundary"), (FEW, "edge"))
 def test_sweep_tells_a_miss_from_a_hit(kind, n):
     for case in some("sweep", kind, n):
         check_answers(sweep, *case)

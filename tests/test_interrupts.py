@@ -68,7 +68,14 @@ def interrupted(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-@pytest.mark.parametrize("when, delay", [("many", 3.0), ("long", 3.0), ("compiling", 3.0)])
+@pytest.mark.parametrize(
+    "when, delay",
+    [
+        pytest.param("many", 3.0, marks=pytest.mark.slow(first=True)),
+        pytest.param("long", 3.0, marks=pytest.mark.slow(first=True)),
+        ("compiling", 3.0),
+    ],
+)
 def test_an_interrupt_ends_a_sweep_and_says_what_became_of_it(when, delay):
     command, cache = [sys.executable, "-c", SWEEP, when], when != "compiling"
     seconds, code, errors = interrupted(command, delay, ready=True, cache=cache)

@@ -211,6 +211,7 @@ def test_design_meets_a_stick_duration():
     assert exact.stick_durations[1] == pytest.approx(0.5, abs=1e-8)
 
 
+@pytest.mark.slow(first=True)
 def test_design_says_so_when_a_target_is_out_of_reach():
     """Between the bounds the duration is largest at the lower one, 1.386."""
     plan = jb.design(

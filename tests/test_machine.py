@@ -156,6 +156,7 @@ def test_sweeps_in_si():
         )
 
 
+@pytest.mark.slow(first=True)
 def test_units_may_differ_from_run_to_run():
     axes = {"N": np.array([5.0, 1.0, 10.0])}
     loads = swept(axes, lambda N: machine(0.02, N).oscillator)

@@ -169,6 +169,7 @@ def test_every_entry_refuses_before_it_computes(entry, fold):
     assert time.process_time() - begin < 1.0  # much less than compiling takes
 
 
+@pytest.mark.slow(first=True)
 def test_the_distance_to_a_point_is_that_of_the_parameter():
     cycle = jb.find_cycle(OSC, (3.0, 0.0))
     distance = jb.distance_to(jb.Hopf(), where=velocity)(cycle)

@@ -25,7 +25,13 @@ MORE = (
 )
 
 
-@pytest.mark.parametrize("part", [PART, pytest.param(MORE, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "part",
+    [
+        pytest.param(PART, marks=pytest.mark.slow(first=True)),
+        pytest.param(MORE, marks=pytest.mark.slow),
+    ],
+)
 def test_a_part_of_the_tests_passes_plainly(part):
     tests = Path(__file__).parent
     inherited = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")}

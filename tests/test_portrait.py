@@ -56,6 +56,7 @@ def test_saddles_and_their_separatrices(class_d):
         assert np.all(np.diff(one.ts) >= 0)
 
 
+@pytest.mark.slow(first=True)
 def test_separatrices_are_orbits_to_1e_9(class_d):
     """The engine, from samples some loops before the saddle, comes to it; forwards it follows."""
     osc = engine_class_d(*TWO_CYCLES)

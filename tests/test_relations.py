@@ -334,6 +334,7 @@ def test_at_rest_on_an_edge_a_reflected_run_is_the_same():
         same(a, b)
 
 
+@pytest.mark.slow(first=True)
 def test_a_belt_without_load_holds_nothing():
     law = jb.Conti(1.0, 0.6, 5.0)
     osc = jb.Oscillator(0.5, (jb.Belt(0.2, law, 0.5), jb.Belt(0.0, law, 0.0)))
@@ -344,6 +345,7 @@ def test_a_belt_without_load_holds_nothing():
     assert np.all(jb.decoded(dataset).kind == "equilibrium") and not np.any(dataset.sticks)
 
 
+@pytest.mark.slow(first=True)
 def test_an_orbit_comes_to_a_focus_beside_a_belt_without_load():
     osc, y0 = cases(4)[20]
     image = with_idle_belt_at_rest(osc)

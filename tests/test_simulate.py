@@ -320,6 +320,7 @@ def mixed_lanes():
     return nu, y0, edges.at[:8].set(jnp.array([-jnp.inf, jnp.inf]))
 
 
+@pytest.mark.slow(first=True)
 def test_vmap_equals_a_loop():
     """A batch is integrated in another way; both keep the tolerance, 1e-10, and some runs magnify
     what they are off by a hundred times."""
@@ -606,6 +607,7 @@ def test_a_pseudo_focus_with_a_belt_at_rest_is_reached_in_finite_time(x2):
     assert float(run.arcs.t[-1]) < 0.8724
 
 
+@pytest.mark.slow(first=True)
 def test_a_used_up_budget_gives_what_there_is():
     run = simulate(jb.presets.class_b(-0.2, 0.35), (3.0, 0.0), 1e5)
     assert run.status == Status.TOO_MANY_SEGMENTS

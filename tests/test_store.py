@@ -103,7 +103,13 @@ def test_a_store_is_what_the_sweep_gives(path, whole):
     assert jb.verify(path) == stores.Verified((0, 1, 2, 3, 4), (), (), True)
 
 
-@pytest.mark.parametrize("observe", [pytest.param("final", marks=pytest.mark.slow), "attractor"])
+@pytest.mark.parametrize(
+    "observe",
+    [
+        pytest.param("final", marks=pytest.mark.slow),
+        pytest.param("attractor", marks=pytest.mark.slow(first=True)),
+    ],
+)
 def test_derivatives_and_vectors_are_kept(tmp_path, observe):
     options = dict(t1=20.0, observe=observe, derivatives=("nu0",), progress=False)
     expected = jb.sweep(jb.presets.class_b, AXES, **options)
@@ -379,6 +385,7 @@ print(*told)
 """
 
 
+@pytest.mark.slow(first=True)
 def test_a_disk_that_is_full_harms_nothing(tmp_path):
     """A real one, where this system lets a process have one of its own."""
 
@@ -417,8 +424,8 @@ def test_an_interrupt_keeps_what_is_done(tmp_path, whole, monkeypatch):
     assert again(path).equals(whole)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.skipif(sys.platform == "win32", reason="processes of POSIX")
-@pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.slow(first=True))])
-def test_kills_at_random_moments_do_no_harm(tmp_path, count):
-    told = kills.campaign(tmp_path, "final", kills=count, seed=1)
+def test_kills_at_random_moments_do_no_harm(tmp_path):
+    told = kills.campaign(tmp_path, "final", kills=20, seed=1)
     assert told["blocks seen done"] > 0

@@ -222,6 +222,7 @@ def test_its_diagram_is_named_by_its_argument():
 # --- curves ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_a_curve_in_what_a_function_makes():
     """Class (b) has its Hopf points where the slopes of both laws add up to the damping."""
 
@@ -269,6 +270,7 @@ def test_a_map_over_both_edges_has_its_curves():
 # --- one program for all of them ------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_another_function_compiles_nothing():
     def look(make, at):
         jb.refine(jb.Hopf(), make, at=at)

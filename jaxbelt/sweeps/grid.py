@@ -60,7 +60,8 @@ class Grid:
         check_scalars(self.example)
         leaves, self.structure = jax.tree.flatten(self.example)
         self.mapped = traceable(self._varying, "make", returns)
-        self.shared = [leaf for leaf, mapped in zip(leaves, self.mapped, strict=True) if not mapped]
+        pairs = zip(leaves, self.mapped, strict=True)
+        self.shared = [jnp.asarray(leaf) for leaf, mapped in pairs if not mapped]
 
     def _varying(self) -> tuple[bool, ...]:
         """For each leaf of the oscillator whether it depends on an axis."""
