@@ -35,10 +35,11 @@ if TYPE_CHECKING:
 
 #: After so many points the steps of integration are spread anew.
 REMESH = 10
-#: How often the points on both sides of a singular one are brought nearer to it by half; much
-#: nearer Newton's method fails.
+#: How often, at most, the points on both sides of a singular one are brought nearer to it by half.
+#: Newton's method fails before: after four times in the cases known, where twice leave 5e-9.
 SHRINKS = 8
-#: A cycle changes by less in a step, relative to its size; a fixed point by less.
+#: A cycle changes by less in a step, relative to its size; a fixed point by less. Along curves of
+#: classes (b), (c) and (d) it was 0.15 at most.
 FAR = 0.2
 
 
