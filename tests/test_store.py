@@ -200,7 +200,10 @@ class Count:
             dict(observe="final", t1=30_000.0),
             r"which differs in observe: 'attractor' there, 'final'",
         ),
-        (dict(axes={**AXES, "nu1": AXES["nu1"] + 1e-9}), r"which differs in axis nu1"),
+        (
+            dict(axes={**AXES, "nu1": AXES["nu1"] + 1e-9}),
+            r"which differs in axis nu1: \S+ there, \S+ here and \d+ more",
+        ),
         (dict(axes={**AXES, "x1": [1.0]}), r"which differs in axes"),
         (dict(make=lambda nu0, nu1: jb.presets.class_b(nu0, nu1 * 2)), r"which differs in "),
         (dict(derivatives="nu0"), r"which differs in derivatives"),
@@ -232,7 +235,7 @@ def test_a_law_and_a_reducer_count_by_type_numbers_and_source(tmp_path):
     sweep()
     for change, word in (
         (dict(make=lambda nu: make(nu, law=Other)), "the law of belt 0"),
-        (dict(make=lambda nu: make(nu, mu=0.6)), "oscillator"),
+        (dict(make=lambda nu: make(nu, mu=0.6)), "oscillator: .*friction.*=0.5 there, .*=0.6 here"),
         (dict(unit=2.0), "observe"),
         (dict(kind=Twice), "observe"),
     ):

@@ -21,7 +21,7 @@ import threading
 import time
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,7 +116,7 @@ class Store:
         self.root = _open(path)
         self.hash = self.root.attrs["jaxbelt_hash"]
         if known is None:
-            _check_question(path, self.root, _identity(question, blocks_of(question.grid)))
+            _check_question(path, self.root, question)
         elif known != self.hash:
             raise ValueError(f"store must be that of this very sweep, got another one in {path}")
         self.ledger = self.root["ledger"]
@@ -366,17 +366,34 @@ def _identity(question: Question, blocks: Blocks) -> dict[str, str]:
     return question.identity() | {"the size of a block": repr(blocks.box)}
 
 
-def _check_question(path: Path, root: Any, here: dict[str, str]) -> None:
+def _check_question(path: Path, root: Any, question: Question) -> None:
     """Raise unless the store is of this very sweep, and name what differs."""
     there = json.loads(root.attrs["jaxbelt_question"])
+    here = _identity(question, blocks_of(question.grid))
     for name in dict.fromkeys([*there, *here]):
         if here.get(name) != there.get(name):
-            short = max(len(str(part.get(name))) for part in (here, there)) < 80
-            told = f": {there.get(name)} there, {here.get(name)} here" if short else ""
+            axis = name.removeprefix("axis ")
+            if axis != name and axis in question.grid.axes and axis in root:
+                pair = root[axis][:].tolist(), question.grid.axes[axis].tolist()
+            else:
+                pair = [str(there.get(name))], [str(here.get(name))]
+                if max(map(len, pair[0] + pair[1])) > 80:  # the leaves of an oscillator, say
+                    pair = pair[0][0].split(", "), pair[1][0].split(", ")
             raise ValueError(
                 f"store must be an empty folder or the store of this very sweep, got that of "
-                f"another one in {path}, which differs in {name}{told}"
+                f"another one in {path}, which differs in {name}{_first_difference(*pair)}"
             )
+
+
+def _first_difference(there: Sequence[Any], here: Sequence[Any]) -> str:
+    """Where two rows differ first, and how many entries do, if that can be told in short."""
+    if len(there) != len(here):
+        pair = f"{len(there)} entries there", f"{len(here)} here"
+    else:
+        different = [i for i, (old, new) in enumerate(zip(there, here, strict=True)) if old != new]
+        more = f" and {len(different) - 1} more" if len(different) > 1 else ""
+        pair = f"{there[different[0]]} there", f"{here[different[0]]} here{more}"
+    return f": {', '.join(pair)}" if max(map(len, pair)) < 90 else ""
 
 
 def _as_json(attributes: dict[str, Any]) -> dict[str, Any]:
