@@ -74,7 +74,8 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     from . import api
 
-    return [*globals(), *api.__all__]
+    # What completion offers: the public names, without what this file imports.
+    return [*api.__all__, *(name for name in globals() if name.startswith("__"))]
 
 
 def _with_matplotlib(result: Any, ax: Any, **options: Any) -> Any:

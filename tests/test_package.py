@@ -219,6 +219,10 @@ def test_ci_runs_the_test_commands_of_the_readme(mark):
     assert "pytest" not in ci
 
 
+def test_completion_offers_the_public_names_alone():
+    assert sorted(n for n in dir(jaxbelt) if not n.startswith("__")) == sorted(jaxbelt.__all__)
+
+
 def test_every_public_name_has_its_place_in_the_reference():
     pages = [*(ROOT / "docs" / "api").glob("*.md"), *(ROOT / "docs" / "bifurcations").glob("*.md")]
     shown = Counter(
