@@ -144,7 +144,20 @@ def _quotient(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array
         top, bottom = belt.friction.fraction(sign * (belt.velocity - osc.omega * x2))
         numerator = numerator * bottom + pull * top * denominator
         denominator = denominator * bottom
+    return _ratio(numerator, denominator)
+
+
+@jax.custom_jvp
+def _ratio(numerator: Array, denominator: Array) -> Array:
+    """The quotient; its derivative is one, too."""
     return numerator / denominator
+
+
+@_ratio.defjvp
+def _(primals, tangents):
+    (_, denominator), (d_numerator, d_denominator) = primals, tangents
+    ratio = _ratio(*primals)
+    return ratio, (d_numerator - ratio * d_denominator) / denominator
 
 
 def _combine(weights: np.ndarray, arrays: Sequence[Array]) -> Array:
