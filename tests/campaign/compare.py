@@ -343,6 +343,8 @@ def judge_derivative_at_focus(case, told, run, direction):
 
 def _judge_beside(case, told, direction):
     """The verdict on a derivative in a corner, which is there where those on both sides agree."""
+    if _rests_unstably(case):
+        return "corner", np.full(2, np.nan)
     both = []
     for by in (NEIGHBOUR, -NEIGHBOUR):
         other = derivatives.beside(case, direction, by)
