@@ -2,9 +2,9 @@
 
 An integrator is a class with two methods: `march` goes from a state until it has left the mode, and
 `step` makes one step of a given size, with which `arcs` then finds the place where the mode ends.
-`Adaptive`, on diffrax, controls the error of each step; `simulate` uses it. `Graded` makes steps
-that are short where the friction law bends; orbits that are followed in search of a cycle use it,
-because shooting solves for the cycle afterwards.
+`Adaptive`, on diffrax, controls the error of each step; `simulate` uses it for a run by itself.
+`Graded` makes steps that are short where the friction law bends; orbits that are followed in search
+of a cycle use it, because shooting solves for the cycle afterwards.
 
 A state is a tuple of scalars, (x1, x2), and a field a function of it.
 """

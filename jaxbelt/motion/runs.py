@@ -1,10 +1,16 @@
 """A run: the chain of arcs from its start to t1, or to where it ends before.
 
 In a slip arc the orbit runs in the smooth field of its mode until a guard of the mode vanishes; a
-stick arc is known in closed form. The chain is a `lax.scan` of segments, an arc each, so that it
-works under `jit`, `vmap`, and derivatives forward and reverse.
+stick arc is known in closed form. Who follows it depends on what is asked:
 
-Slip arcs are those of `arcs`, integrated by diffrax. The arcs end at extrema where a boundary or an
+- a run by itself (`_alone`): a `lax.scan` of segments, an arc each, those of `arcs`, with slip arcs
+  integrated by diffrax (`integrators.Adaptive`);
+- a batch, under `vmap` (`_together`): lanes of the kernel, see `batches` and `kernel.step`, at one
+  tolerance for all, the smallest;
+- derivatives (the rule of `arcs_of_run`): the arcs that are known, flown once more, see
+  `sensitivities`.
+
+The arcs of a run by itself end at extrema where a boundary or an
 edge is within reach, and else after the time MAX_ARC. So no root hides within a step: between two
 zeros of x2' lies a zero of x2, since x2'' = -x2 there, and two extrema of x2 in one step would take
 half a loop around a focus within it, which `MAX_ARC` and `MAX_FRACTION` exclude.

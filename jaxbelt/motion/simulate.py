@@ -206,7 +206,8 @@ def simulate(
 
     osc: `Oscillator`. y0: start (x1, x2), shape [2]. t0 < t1: time span (dimensionless time
     tau = omega t). ts: the times wanted, increasing, shape [n]; None gives an even grid with the
-    ends of all arcs in it. rtol, atol: tolerances of the integrator per step.
+    ends of all arcs in it. rtol, atol: tolerances of the integrator per step; in a batch the
+    smallest ones hold for all.
 
     formulation: "filippov", the exact event-driven motion; "switch", the paper's switch model,
     eqs. (21)-(23), with a band of half-width v_star around each boundary; "smooth", with

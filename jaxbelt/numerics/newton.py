@@ -1,8 +1,11 @@
-"""Newton's method, as one loop, and the implicit derivative of what it finds, once.
+"""Newton's method, as one loop, and the implicit derivative of what it finds.
 
-For shooting, for conditions on an oscillator, and for the points of a curve. Optimistix's Newton,
-handed the same matrices through a derivative rule, takes a sixth longer, and gives back neither the
-lengths of its steps nor its last matrix, by which points judge convergence and bound their errors.
+For shooting, for conditions on an oscillator, and for the points of a curve; conditions of a few
+unknowns have a derivative of their own, in `bifurcations.systems.small_newton`.
+
+Optimistix's Newton, handed the same matrices through a derivative rule, takes a sixth longer, and
+gives back neither the lengths of its steps nor its last matrix, by which points judge convergence
+and bound their errors.
 """
 
 from collections.abc import Callable
