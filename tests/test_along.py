@@ -304,6 +304,7 @@ def test_rest_and_a_mass_that_is_stuck_for_ever_are_integrated():
     np.testing.assert_allclose(held.rms, 0.25, rtol=1e-15)
 
 
+@pytest.mark.slow(first=True)
 def test_a_store_knows_moments_apart(tmp_path):
     def count(moment):
         class Count(Largest):

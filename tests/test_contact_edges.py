@@ -51,6 +51,7 @@ def diagram():
     return jb.bifurcation_diagram(overlapping(0.6), sigma1, (0.05, 2.5))
 
 
+@pytest.mark.slow(first=True)
 def test_points_of_overlapping_belts(diagram):
     """All that happens as the edge moves from the left of all motion to the right of it."""
     alone = oracle_cycles.sticking_cycle(its_oracle(0.3))

@@ -164,6 +164,7 @@ def test_crossing_sliding_from_either_side(crossing, number, offset):
     assert point.value == pytest.approx(float(exact), abs=1e-12) and point.iterations <= 6
 
 
+@pytest.mark.slow(first=True)
 def test_a_curve_of_crossing_sliding(crossing):
     """Rows of it are what is refined near them."""
     where, span = (load1, lambda osc: osc.belts[1].velocity), ((0.1, 0.5), (0.02, 0.06))

@@ -136,6 +136,7 @@ def swept(axes, make):
     return found.assign(d_x2_end_d_x1=found.x2_end, d_x1_end_d_V=found.x1_end)
 
 
+@pytest.mark.slow(first=True)
 def test_sweeps_in_si():
     axes = {"V": np.array([0.01, 0.02]), "x1": np.array([1.0, 2.0])}
     dataset = swept(axes, lambda V: machine(V).oscillator)
@@ -171,6 +172,7 @@ def test_units_may_differ_from_run_to_run():
         jb.in_si(loads, lambda N: machine(0.02, N))
 
 
+@pytest.mark.slow(first=True)
 def test_basins_in_si():
     m = machine()
     basins = jb.basins(m.oscillator, x1=np.linspace(-1, 2, 3), x2=np.linspace(-1, 1, 3))

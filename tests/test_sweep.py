@@ -22,7 +22,7 @@ import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.cli import app
 from jaxbelt.kernel.lanes import Observer, Variable
-from jaxbelt.sweeps import store
+from jaxbelt.sweeps import store, threads
 from jaxbelt.sweeps.question import Question
 from jaxbelt.sweeps.threads import CHUNK
 
@@ -322,3 +322,18 @@ def test_one_start_is_told_not_to_show_every_attractor():
     assert "x1 = 3.0, x2 = 0.0: of several attractors the one" in alone
     several = Question.of(jb.presets.class_a, {"nu0": [0.1], "x1": [1.0, 2.0]}, *arguments[1:])
     assert several.attributes()["start"] == "x2 = 0.0"
+
+
+def test_several_derivatives_are_each_by_itself(monkeypatch):
+    """Also where the runs are in many chunks, and a long one ends in a later chunk."""
+    monkeypatch.setattr(threads, "CHUNK", 96)
+    axes = {"nu0": np.linspace(-0.6, 0.6, 20), "nu1": np.linspace(-0.5, 0.5, 15)}
+
+    def sweep(*names):
+        return jb.sweep(jb.presets.class_b, axes, t1=30.0, derivatives=names)
+
+    both = sweep("nu0", "nu1")
+    for name in ("nu0", "nu1"):
+        one = sweep(name)
+        for variable in one.variables:
+            np.testing.assert_array_equal(both[variable], one[variable])

@@ -133,6 +133,7 @@ def test_hopf_points_in_closed_form(make, at, expected):
     np.testing.assert_allclose(jax.tree.leaves(point.oscillator), jax.tree.leaves(made), atol=2e-14)
 
 
+@pytest.mark.slow(first=True)
 def test_its_derivatives_and_its_batches():
     """Of class (a), 1 + p3 s^2 = sqrt(p3 (mus - p1)/zeta)."""
 

@@ -250,10 +250,10 @@ def advance(program: Program, shared, t1, rtol, atol, limit, queue, call: Call, 
 
 
 def advance_with_derivatives(program, shared, t1, rtol, atol, limit, queue, call: Call, stream):
-    """`advance`, with derivatives in the directions queue[1:] of the rows queue[0].
+    """`advance`, with the derivatives in the direction queue[1] of the rows queue[0].
 
-    stream: a stream and the derivatives of its floats, [directions, ...]; the results have the same
-    first axis, behind the values themselves.
+    stream: a stream and the derivatives of its floats. Results [2, columns, runs + 3 lanes]: the
+    values and their derivatives.
     """
     program = replace(program, derivatives=True)
     plain = _fill(program)
@@ -265,27 +265,24 @@ def advance_with_derivatives(program, shared, t1, rtol, atol, limit, queue, call
         def of_floats(block, floats):
             return _floats_of(plain(*given, block, *where, eqx.combine(floats, others)))
 
-        def column(*slopes):
-            return jax.jvp(of_floats, (block, floats), slopes, has_aux=True)
-
-        floats, slopes, others = jax.vmap(column, out_axes=(None, 0, None))(block_slopes, slopes)
+        primals, tangents = (block, floats), (block_slopes, slopes)
+        floats, slopes, others = jax.jvp(of_floats, primals, tangents, has_aux=True)
         return eqx.combine(floats, others), slopes
 
     def fill(block, block_slopes, *where, desk, slopes):
         given = shared, t1, rtol, atol, limit
         return one_piece(given, block, block_slopes, where, desk, slopes)
 
-    queues = tuple(queue[0]), tuple(jnp.moveaxis(queue[1:], 0, 1))
+    queues = tuple(queue[0]), tuple(queue[1])
     stream, *rest, results, slopes = _worked_off(program, shared, fill, call, queues, stream)
-    both = [jnp.concatenate([one[None], more]) for one, more in zip(results, slopes, strict=True)]
-    return stream, *rest, jnp.stack(both, axis=1)
+    return stream, *rest, jnp.stack([jnp.stack(results), jnp.stack(slopes)])
 
 
 def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, streams):
     """What `advance` does, by a function for the inner loop; of derivatives, too.
 
-    queues: the columns, and their derivatives, [directions, runs + lanes]; streams: the stream, and
-    the derivatives of its floats; None where there are none.
+    queues: the columns, and their derivatives; streams: the stream, and the derivatives of its
+    floats; None where there are none.
 
     Two loops, because on the CPU only loops on small arrays can be one kernel. The inner loop sees
     small ones only: as many new runs, and as many results, as there are lanes.
@@ -294,7 +291,6 @@ def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, st
     stream, slopes = streams
     width, columns = stream.one.size, _columns_of(program, shared)
     size = queue[0].size + 2 * width
-    directions = () if queue_slopes is None else queue_slopes[0].shape[:1]
     # Differences of pass numbers stay right where they overflow.
     until = stream.passes + call.passes
 
@@ -315,8 +311,7 @@ def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, st
         block_slopes, desk_slopes = None, None
         if queue_slopes is not None:
             block_slopes = blocks(taken, queue_slopes)
-            nothing = [jnp.zeros((*directions, width))] * columns
-            parts = slopes, nothing
+            parts = slopes, [jnp.zeros(width)] * columns
             desk_slopes = eqx.tree_at(lambda d: (d.stream, d.columns), _floats_of(desk)[0], parts)
         where = call.first + taken, available, last, until
         desk, desk_slopes = fill(block, block_slopes, *where, desk=desk, slopes=desk_slopes)
@@ -339,9 +334,7 @@ def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, st
 
     numbers = jnp.full(size, -1, dtype=jnp.int32)
     results = [jnp.full(size, jnp.nan) for _ in range(columns)]
-    result_slopes = (
-        [jnp.full((*directions, size), jnp.nan) for _ in range(columns)] if directions else []
-    )
+    result_slopes = results if queue_slopes is not None else []
     start = streams, call.taken, jnp.zeros((), jnp.int32), numbers, results, result_slopes
     streams, taken, _, numbers, results, slopes = lax.while_loop(unfinished, outer, start)
     return streams, taken, more(streams[0], taken), numbers, results, slopes

@@ -46,14 +46,9 @@ PATIENCE = 0.5
 FIRST_PASSES = {"cpu": 2000}
 
 
-def _kernel(program: Program, derivatives: int) -> Callable:
-    """The compiled kernel of a program, one for all threads and all sweeps."""
-    return compiled(program, derivatives > 0)
-
-
 @functools.lru_cache(maxsize=32)
-def compiled(program, derivatives):
-    """The kernel, compiled when it is first called."""
+def compiled(program: Program, derivatives: bool) -> Callable:
+    """The kernel of a program, one for all threads and all sweeps, compiled when first called."""
     function = advance_with_derivatives if derivatives else advance
     return wide(functools.partial(function, program))
 
@@ -98,15 +93,16 @@ def run(
     limit = min(limit, np.iinfo(np.int32).max)
     threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
-    kernel = _kernel(program, derivatives)
+    kernel = compiled(program, derivatives > 0)
     team = _Team(
         functools.partial(kernel, shared, t1, rtol, atol, np.int32(limit)),
-        functools.partial(_first_stream, program, shared, columns, derivatives),
+        functools.partial(_first_stream, program, shared, columns, derivatives > 0),
         rows_of,
         put,
-        (1 + derivatives, columns) if derivatives else (columns,),
-        _Chunks(runs, threads),
-        FIRST_PASSES.get(jax.default_backend(), 100) // (1 + derivatives),
+        columns,
+        derivatives,
+        _Chunks(runs, threads, CHUNK // max(1, derivatives)),
+        FIRST_PASSES.get(jax.default_backend(), 100) // (2 if derivatives else 1),
     )
     devices = jax.local_devices()
     # Compiled once, before the threads that would each do it again, and like all else not on the
@@ -120,13 +116,13 @@ def run(
         wait(at_work, timeout=10 * PATIENCE)
 
 
-def _first_stream(program: Program, shared, columns: int, derivatives: int) -> Any:
-    """The stream that a kernel with so many derivatives starts from."""
+def _first_stream(program: Program, shared, columns: int, derivatives: bool) -> Any:
+    """The stream that a kernel starts from."""
     stream = idle(program, shared, WIDTH.get(jax.default_backend(), 2**17), columns)
     if not derivatives:
         return stream
     floats = differentiable(stream)
-    return stream, jax.tree.map(lambda x: jnp.zeros((derivatives, *x.shape), x.dtype), floats)
+    return stream, jax.tree.map(jnp.zeros_like, floats)
 
 
 class _Chunks:
@@ -135,8 +131,8 @@ class _Chunks:
     Short work is shared out evenly.
     """
 
-    def __init__(self, runs: int, threads: int):
-        share = min(CHUNK, -(-runs // threads))
+    def __init__(self, runs: int, threads: int, most: int):
+        share = min(most, -(-runs // threads))
         self.spans = iter([(i, min(i + share, runs)) for i in range(0, runs, share)])
         self.lock = threading.Lock()
 
@@ -145,15 +141,47 @@ class _Chunks:
             return next(self.spans, None)
 
 
+class _Directions:
+    """Runs with several derivatives: a run goes through the kernel once for each of them.
+
+    XLA computes the values again for each direction of a batch of them, and takes longer for that.
+    """
+
+    def __init__(self, count: int):
+        self.count = count
+        self.waiting: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def rows(self, rows: np.ndarray) -> np.ndarray:
+        """Rows [1 + directions, columns, runs], as [2, columns, runs x directions]."""
+        slopes = np.moveaxis(rows[1:], 0, -1).reshape(rows.shape[1], -1)
+        return np.stack([np.repeat(rows[0], self.count, axis=-1), slopes])
+
+    def whole(self, numbers: np.ndarray, results: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The runs whose results are now known in every direction, [1 + directions, columns, runs].
+
+        Those of the others wait.
+        """
+        parts = zip(*self.waiting, (numbers, results), strict=True)
+        numbers, results = (np.concatenate(some, axis=-1) for some in parts)
+        order = np.argsort(numbers)
+        runs, counts = np.unique(numbers // self.count, return_counts=True)
+        known = np.repeat(counts == self.count, counts)
+        rest, done = order[~known], order[known].reshape(-1, self.count)
+        self.waiting = [(numbers[rest], results[:, :, rest])]
+        values, slopes = results[:1][:, :, done[:, 0]], np.moveaxis(results[1][:, done], -1, 0)
+        return runs[counts == self.count], np.concatenate([values, slopes])
+
+
 @dataclass
 class _Team:
-    """What the threads of one call of `run` share: see there; shape: of the queue but for runs."""
+    """What the threads of one call of `run` share: see there; columns: of the queue."""
 
     kernel: Callable
     idle: Callable[[], Any]
     rows_of: Callable[[int, int], np.ndarray]
     put: Callable[[np.ndarray, np.ndarray], None]
-    shape: tuple[int, ...]
+    columns: int
+    derivatives: int
     chunks: _Chunks
     first_passes: int
     stop: threading.Event = field(default_factory=threading.Event)
@@ -170,20 +198,23 @@ class _Team:
         with _settings(device):
             passes = self.first_passes
             stream, todo = self.idle(), self.chunks.take()
+            several = _Directions(self.derivatives) if self.derivatives > 1 else None
             while todo is not None and not self.stop.is_set():
                 (first, last), todo = todo, self.chunks.take()
-                queue = self._queue()
-                queue[..., : last - first] = np.reshape(
-                    self.rows_of(first, last), (*self.shape, -1)
-                )
-                stream, passes = self._chunk(queue, first, last, todo is None, stream, passes)
+                rows, queue = self.rows_of(first, last), self._queue()
+                if several:
+                    rows = several.rows(np.reshape(rows, (1 + several.count, self.columns, -1)))
+                    first, last = several.count * first, several.count * last
+                queue[..., : last - first] = np.reshape(rows, (*queue.shape[:-1], -1))
+                drain = todo is None
+                stream, passes = self._chunk(queue, first, last, drain, stream, passes, several)
 
     def _queue(self) -> np.ndarray:
         """Room for a chunk: of one size, for one compiled kernel."""
         width = WIDTH.get(jax.default_backend(), 2**17)
-        return np.zeros((*self.shape, CHUNK + width))
+        return np.zeros((*((2,) if self.derivatives else ()), self.columns, CHUNK + width))
 
-    def _chunk(self, queue, first: int, last: int, drain: bool, stream, passes: int):
+    def _chunk(self, queue, first: int, last: int, drain: bool, stream, passes: int, several):
         """Call the kernel until a chunk is taken (with `drain`: done); calls take half of PATIENCE
         or so. Returns the stream, and how many passes a call may make."""
         taken, more = np.int32(0), True
@@ -198,8 +229,11 @@ class _Team:
                 passes = int(np.clip(passes * 0.5 * PATIENCE / seconds, 1, 4 * passes))
             done = np.flatnonzero(numbers >= 0)
             results = np.asarray(results).reshape(-1, *np.shape(results)[-2:])
-            if done.size:
-                self.put(numbers[done], results[:, :, done])
+            numbers, results = numbers[done], results[:, :, done]
+            if several and numbers.size:
+                numbers, results = several.whole(numbers, results)
+            if numbers.size:
+                self.put(numbers, results)
         return stream, passes
 
 
