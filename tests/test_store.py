@@ -205,6 +205,7 @@ class Count:
             r"which differs in axis nu1: \S+ there, \S+ here and \d+ more",
         ),
         (dict(axes={**AXES, "x1": [1.0]}), r"which differs in axes"),
+        (dict(axes={**AXES, "nu1": AXES["nu1"][:1]}), r"axis nu1: \d+ entries there, 1 here"),
         (dict(make=lambda nu0, nu1: jb.presets.class_b(nu0, nu1 * 2)), r"which differs in "),
         (dict(derivatives="nu0"), r"which differs in derivatives"),
     ],
@@ -214,6 +215,18 @@ def test_a_store_of_another_sweep_is_refused_by_what_differs(path, change, messa
     with pytest.raises(ValueError, match="store must be .* " + message):
         jb.sweep(asked.pop("make"), asked.pop("axes"), **asked, store=path)
     assert jb.verify(path).finished
+
+
+def test_a_zero_of_the_other_sign_is_refused_too(tmp_path):
+    def sweep(zero):
+        axes = {"nu0": [zero, 0.3]}
+        return jb.sweep(
+            jb.presets.class_a, axes, t1=5.0, observe="final", store=tmp_path / "a.zarr"
+        )
+
+    sweep(0.0)
+    with pytest.raises(ValueError, match=r"which differs in axis nu0$"):
+        sweep(-0.0)
 
 
 def test_a_law_and_a_reducer_count_by_type_numbers_and_source(tmp_path):

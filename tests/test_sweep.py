@@ -324,6 +324,16 @@ def test_one_start_is_told_not_to_show_every_attractor():
     assert several.attributes()["start"] == "x2 = 0.0"
 
 
+def test_more_runs_than_are_counted_are_refused_at_once():
+    axes = {"nu0": np.array([0.1, 0.2])}
+    program = Question.of(
+        jb.presets.class_a, axes, (3.0, 0.0), 1.0, 1e-8, 1e-8, "final", ()
+    ).program
+    settings = dict(t1=1.0, rtol=1e-8, atol=1e-8, derivatives=2)
+    with pytest.raises(ValueError, match=r"axes must be .* or fewer .*, got 2147483648"):
+        threads.run(program, [], np.zeros, 2**30, print, **settings)
+
+
 def test_several_derivatives_are_each_by_itself(monkeypatch):
     """Also where the runs are in many chunks, and a long one ends in a later chunk."""
     monkeypatch.setattr(threads, "CHUNK", 96)

@@ -149,7 +149,7 @@ def _quotient(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array
 
 @jax.custom_jvp
 def _ratio(numerator: Array, denominator: Array) -> Array:
-    """The quotient; its derivative is one, too."""
+    """The quotient; its derivative ends with a division, too, so that XLA keeps it as well."""
     return numerator / denominator
 
 

@@ -14,6 +14,11 @@ SMALLEST_DISC = 1e-6
 DISC = tuple(sign * j / 8 for j in range(1, 9) for sign in (1, -1))
 
 
+#: Below this speed and force derivatives are taken at a fixed time: the time at which such a slow
+#: state passes a place is good to some 1e-16 over its speed, here 1e-12.
+SLOW_MOTION = 1e-4
+
+
 def is_at_rest(x1: Array, x2: Array, a: Array) -> Array:
     """Whether x2 and x2' = a vanish, up to rounding."""
     return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < force_rounding(x1)
@@ -22,10 +27,11 @@ def is_at_rest(x1: Array, x2: Array, a: Array) -> Array:
 def is_slow(x2: Array, a: Array) -> Array:
     """Whether a state moves so slowly that its derivatives are better taken at a fixed time.
 
-    The times at which it passes a place depend on everything without bounds where x2 and x2' = a
-    vanish. Elsewhere what does not depend on the start is to have derivatives that are exactly 0.
+    Where x2 and x2' = a vanish, the time at which it passes a place has derivatives without bounds.
+    Faster states keep those of their events' times, by which all that no longer depends on the
+    start has derivatives that are exactly 0.
     """
-    return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < 1e-4
+    return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < SLOW_MOTION
 
 
 def settling_margin(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:

@@ -209,7 +209,8 @@ def _sensitivities_at_ends(varied, rest, arcs: Arc, left: Array, entry: Sensitiv
 
     def advance(before, row):
         jacobian, used, (creeps, x2, a) = row
-        fixed = Sensitivity(before.x1 - x2 * before.t, before.x2 - a * before.t, 0.0 * before.t)
+        moved = before.x1 - x2 * before.t, before.x2 - a * before.t
+        fixed = Sensitivity(*moved, jnp.zeros_like(before.t))
         before = select(creeps, fixed, before)
 
         def through(slopes):
@@ -227,7 +228,7 @@ def _sensitivities_at_ends(varied, rest, arcs: Arc, left: Array, entry: Sensitiv
 
 
 def _creep(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array, Array]:
-    """Whether the mass slips but hardly moves, see `modes.is_slow`; and the field, (x2, x2')."""
+    """Whether the mass slips but hardly moves, see `rest.is_slow`; and the field, (x2, x2')."""
     _, a = slip_field(osc, mode, (x1, x2))
     return ~mode.any_stuck & is_slow(x2, a), x2, a
 

@@ -387,10 +387,12 @@ def _check_question(path: Path, root: Any, question: Question) -> None:
 
 def _first_difference(there: Sequence[Any], here: Sequence[Any]) -> str:
     """Where two rows differ first, and how many entries do, if that can be told in short."""
+    different = [i for i, (old, new) in enumerate(zip(there, here)) if old != new]
     if len(there) != len(here):
         pair = f"{len(there)} entries there", f"{len(here)} here"
+    elif not different:  # but for the sign of a zero, say
+        return ""
     else:
-        different = [i for i, (old, new) in enumerate(zip(there, here, strict=True)) if old != new]
         more = f" and {len(different) - 1} more" if len(different) > 1 else ""
         pair = f"{there[different[0]]} there", f"{here[different[0]]} here{more}"
     return f": {', '.join(pair)}" if max(map(len, pair)) < 90 else ""

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..checks import require
 from ..kernel.lanes import Program
 from ..kernel.rounds import STEPS_PER_ROUND
 from ..numerics.compiling import wide
@@ -89,8 +90,10 @@ def run(
     """
     if not runs:
         return
+    most, work = np.iinfo(np.int32).max, runs * max(1, derivatives)
+    require(work <= most, "axes", f"{most} runs, times derivatives, or fewer in one call", work)
     limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
-    limit = min(limit, np.iinfo(np.int32).max)
+    limit = min(limit, most)
     threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
     kernel = compiled(program, derivatives > 0)
