@@ -14,30 +14,38 @@ class Status(enum.IntEnum):
     """How a computation ended; 0 is the ordinary end."""
 
     OK = 0
+    # A run: `simulate`, `sweep`.
     STUCK_FOREVER = 1
     PSEUDO_FOCUS = 2
     TOO_MANY_SEGMENTS = 3
     TOO_MANY_STEPS = 4
+    # All of them.
     NOT_FINITE = 5
+    # A cycle: `find_cycle`, `unstable_cycle`.
     EQUILIBRIUM = 6
     NOT_SETTLED = 7
     TOO_MANY_ARCS = 8
-    NO_CONVERGENCE = 9
-    NOT_ADMISSIBLE = 10
+    NO_CONVERGENCE = 9  # and whatever else Newton's method solves for
+    NOT_ADMISSIBLE = 10  # the same
     NO_UNSTABLE_CYCLE = 11
+    # A bifurcation point: `refine`, `scan`.
     NOT_TOUCHED = 12
     OTHER_KIND = 13
     NO_FIXED_POINT = 14
     UNEXPLAINED = 15
+    # A record: `fit`.
     NOT_IDENTIFIED = 16
     MISFIT = 17
+    # Targets: `design`.
     UNREACHABLE = 18
+    # A bifurcation point.
     NO_FOLD = 19
+    # A portrait, and shocks in it.
     INCOMPLETE = 20
 
 
 ADVICE = {
-    Status.OK: "Reached the end of the time span.",
+    Status.OK: "Computed to the end.",
     Status.STUCK_FOREVER: (
         "The mass sticks to a belt at rest and stays there: the state holds from then on."
     ),

@@ -143,7 +143,7 @@ class Extent(Observer):
     def start(self, osc, lanes):
         return jnp.abs(lanes.x1)
 
-    def watch(self, osc, lanes, passage, one, t1, tol):
+    def watch(self, osc, lanes, passage, ones, t1, tol):
         return replace(lanes, memory=jnp.maximum(lanes.memory, jnp.abs(lanes.x1)))
 
     def finish(self, osc, lanes):

@@ -41,7 +41,7 @@ from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.continuation import Stop
-from ..numerics.newton import HOLDS, NEWTON_STEPS, STEP_ROUNDING
+from ..numerics.newton import HOLDS, NEWTON_STEPS, STEP_ROUNDING, is_settled
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
 from .guesses import nearest, settled_loops
@@ -126,7 +126,8 @@ def check_conditions(conditions: Any, field: str = "conditions") -> tuple["Abstr
 class AbstractCondition(eqx.Module):
     """What is to happen at a bifurcation point."""
 
-    #: What is said of a point in a diagram, with {belt} for the number of the belt.
+    #: What is said of a point in a diagram, with {belt} for the number of the belt. A kind that
+    #: points are named by has this and a line; what is `sought` for a family needs neither.
     caption: ClassVar[str]
     #: How its curves are drawn.
     line: ClassVar[Line]
@@ -192,18 +193,30 @@ class AbstractCondition(eqx.Module):
 
     @abc.abstractmethod
     def guess(self, osc: Oscillator, size: int) -> Any:
-        """What its system of equations begins from; `size`: room for the arcs of a loop."""
+        """What its system of equations begins from, any tree; size: room for the arcs of a loop.
+
+        It is asked of the condition as data, see `as_data`, and may be a loop of a cycle, a state
+        of rest, or what else `prepared` takes. Where there is nothing to begin from, the status of
+        `prepared` says so.
+        """
 
     @abc.abstractmethod
     def prepared(self, osc: Oscillator, guess: Any) -> tuple[AbstractSystem, Any, Array]:
-        """The system near a guess, its unknowns there, and a status."""
+        """The system near a guess, its unknowns there, and a status.
+
+        guess: what `guess` returned; osc: the oscillator there. The unknowns are what the system
+        takes as x; the status is OK, or says why there is no guess.
+        """
 
     @abc.abstractmethod
     def solved(
         self, family: Family, system: Any, x: Any, p: Any, status: Array
     ) -> tuple["BifurcationPoint", tuple[Any, Array]]:
-        """The point near a guess (x, p) in a family of oscillators, without a name; and (x, p)
-        there."""
+        """The point near a guess (x, p) in a family of oscillators, and (x, p) there.
+
+        system, x, status: of `prepared`; p: the parameter, [1]. The condition of the point is
+        `UNNAMED`; its status is that of `prepared` where that was not OK.
+        """
 
     def solve(
         self, variation: Variation, osc: Oscillator, value: Any, guess: Any
@@ -456,8 +469,7 @@ def solved_point(family: Family, system: CycleSystem, z0, p0, status):
     at_point = family.at(p)
     # By the last steps: the residual costs an integration more, and who asks for it gets it.
     last, before = steps[jnp.maximum(iterations - 1, 0)], steps[jnp.maximum(iterations - 2, 0)]
-    converged = (status != Status.OK) | (last * jnp.minimum(last / before, 1.0) < HOLDS)
-    converged = converged | (last < STEP_ROUNDING)
+    converged = is_settled(last, before, HOLDS) | (last < STEP_ROUNDING) | (status != Status.OK)
     status = jnp.where(converged, status, Status.NO_CONVERGENCE.value)
     size, error = accuracy(*lax.stop_gradient((at_point, system, z, matrix)))
     cycle, slope = cycle_of(at_point, system.ordinary, z, iterations, status, size)

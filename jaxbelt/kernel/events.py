@@ -5,6 +5,7 @@ sequence of events is kept as one number, its word.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -55,23 +56,17 @@ def pass_events(
     captured = fired & after.captured & captures
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
 
-    left = t1 - lanes.t
     stuck = after.mode.any_stuck & ~captured & ~lanes.done
-    phase = stick_phase(osc, after.mode, x1)
-    x2 = jnp.where(stuck, phase.x2, x2)
-    ends = phase.duration >= left
-    duration = jnp.where(stuck, jnp.where(ends, left, phase.duration), 0.0)
-    released = stuck & ~ends
-    mode = select(released, leave_stick(osc, after.mode, phase), after.mode)
-    mode = select(captured, lanes.mode, mode)
-    new_x1 = jnp.where(stuck, jnp.where(ends, x1 + x2 * left, phase.x1), x1)
-    t = jnp.where(stuck & ends | rests, t1, lanes.t + duration)
+    hold = _held(osc, after.mode, stuck, x1, x2, t1 - lanes.t)
+    x2, released = hold.x2, hold.released
+    mode = select(captured, lanes.mode, hold.mode)
+    new_x1 = hold.x1
+    t = jnp.where(stuck & ~released | rests, t1, lanes.t + hold.duration)
     if derivatives:
         a = mode_acceleration(osc, mode, new_x1, x2)
         creeps = (landed | released) & ~mode.any_stuck & is_slow(x2, a)
         t, new_x1, x2 = _at_fixed_time(creeps, t, new_x1, x2, a)
     a, h = _set_off(edges, osc, lanes, mode, new_x1, x2, fired, released, rtol)
-    forever = stuck & jnp.isinf(phase.duration)
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
     passage = Passage(
         landed=landed,
@@ -85,9 +80,9 @@ def pass_events(
         captured=captured,
         rests=rests,
         stuck=stuck,
-        duration=duration,
+        duration=hold.duration,
         released=released,
-        forever=forever,
+        forever=hold.forever,
     )
     lanes = replace(
         lanes,
@@ -100,10 +95,39 @@ def pass_events(
         pace=jnp.where(fired, STEP_SAFETY / first_step(rtol), lanes.pace),
         mode=mode,
         events=lanes.events + jnp.where(fired, 1, 0) + jnp.where(released, 1, 0),
-        status=jnp.where(forever, Status.STUCK_FOREVER.value, status),
+        status=jnp.where(hold.forever, Status.STUCK_FOREVER.value, status),
         done=lanes.done | captured | (t >= t1),
     )
     return lanes, passage
+
+
+class _Hold(NamedTuple):
+    """What a stick phase does to the lanes that are stuck, see `Passage`; mode, x1, x2: after it,
+    for lanes that are not stuck as they were."""
+
+    mode: Mode
+    x1: Array
+    x2: Array
+    duration: Array
+    released: Array
+    forever: Array
+
+
+def _held(osc: Oscillator, mode: Mode, stuck, x1, x2, remaining) -> _Hold:
+    """The stick phases of the lanes that are stuck, to their end or for the remaining time."""
+    phase = stick_phase(osc, mode, x1)
+    x2 = jnp.where(stuck, phase.x2, x2)
+    outlasts = phase.duration >= remaining
+    released = stuck & ~outlasts
+    x1_after = jnp.where(outlasts, x1 + x2 * remaining, phase.x1)
+    return _Hold(
+        mode=select(released, leave_stick(osc, mode, phase), mode),
+        x1=jnp.where(stuck, x1_after, x1),
+        x2=x2,
+        duration=jnp.where(stuck, jnp.where(outlasts, remaining, phase.duration), 0.0),
+        released=released,
+        forever=stuck & jnp.isinf(phase.duration),
+    )
 
 
 @jax.custom_jvp

@@ -21,16 +21,17 @@ from ..model.oscillator import Oscillator
 class Lanes(eqx.Module):
     """The state of all lanes, arrays [lanes].
 
-    run: number of the run, -1 for none; begun: the pass of the kernel's loop in which it began; t,
-    x1, x2, a: time, state and x2'; h: next step size, negative where the lane has landed on a bound
-    of its mode and waits for `events.pass_events`; pace: inverse of the largest step that the last
-    error would have allowed; mode; events: how many there were; status; done. lower, upper:
-    extrema of x2 since the observer reset them, where it asks for extrema. memory: the observer's.
-    integrals: of the rates that it gives to the steps, see `Observer.follow`, from 0 to t.
+    run: number of the run, -1 for none; first_pass: the pass of the kernel's loop in which it
+    began; t, x1, x2, a: time, state and x2'; h: next step size, negative where the lane has landed
+    on a bound of its mode and waits for `events.pass_events`; pace: inverse of the largest step
+    that the last error would have allowed; mode; events: how many there were; status; done. lower,
+    upper: extrema of x2 since the observer reset them, where it asks for extrema. memory: the
+    observer's. integrals: of the rates that it gives to the steps, see `Observer.follow`, from 0
+    to t.
     """
 
     run: Array
-    begun: Array
+    first_pass: Array
     t: Array
     x1: Array
     x2: Array
@@ -104,16 +105,16 @@ def codes_in(number: Array, belts: int) -> list[Array]:
     return codes
 
 
-def materialise(value: Array, one: Array) -> Array:
-    """The value, computed once; one: an array of ones, an argument of the kernel.
+def materialise(value: Array, ones: Array) -> Array:
+    """The value, computed once; ones: an array of ones, an argument of the kernel.
 
     XLA on the CPU computes cheap values again in each place that uses them, and so what they depend
     on. It holds a division to be expensive and keeps its result; dividing by ones that it cannot
     see through changes no bit.
     """
     if value.dtype == bool:
-        return jnp.where(value, 1.0, 0.0) / one > 0
-    return value / one
+        return jnp.where(value, 1.0, 0.0) / ones > 0
+    return value / ones
 
 
 @dataclass(frozen=True)
@@ -145,34 +146,42 @@ class Observer(eqx.Module):
 
     @abc.abstractmethod
     def start(self, osc: Oscillator, lanes: Lanes) -> Any:
-        """The memory of runs that begin, a tree of arrays [lanes]."""
+        """The memory of runs that begin, a tree of arrays [lanes].
+
+        lanes: at their starts, memory None.
+        """
 
     def integrals(self, osc: Oscillator, lanes: Lanes) -> Any:
         """The integrals of runs that begin, a tree of zeros [lanes]; None: no integrals."""
         return None
 
     def follow(
-        self, take_step: Callable, osc, window, one: Array, lanes: Lanes, t1, rtol, atol
+        self, take_step: Callable, osc, window, ones: Array, lanes: Lanes, t1, rtol, atol
     ) -> Lanes:
         """The lanes after `step.take_step`: for who looks at what is between the events."""
-        return take_step(osc, window, one, lanes, t1, rtol, atol)
+        return take_step(osc, window, ones, lanes, t1, rtol, atol)
 
     @abc.abstractmethod
     def watch(
-        self, osc: Oscillator, lanes: Lanes, passage: Passage, one: Array, t1: Array, tol: Array
+        self, osc: Oscillator, lanes: Lanes, passage: Passage, ones: Array, t1: Array, tol: Array
     ) -> Lanes:
-        """The lanes after `events.pass_events`, with `memory`, and `done` where a run may end.
+        """The lanes after `events.pass_events`, before the next steps.
 
-        one: an array of ones, for `materialise`; tol: the relative tolerance of a step.
+        lanes: after the call; passage: what it did. ones: for `materialise`; t1: the runs' end;
+        tol: the relative tolerance of a step; scalars. Returns `lanes` with a new `memory`, and
+        with `done` where a run may end; lanes whose run is -1, or that are done, may hold anything.
         """
 
-    def watch_rarely(self, osc: Oscillator, lanes: Lanes, one: Array) -> Lanes:
+    def watch_rarely(self, osc: Oscillator, lanes: Lanes, ones: Array) -> Lanes:
         """The lanes before each refill, every dozen steps or so: for what is costly to find out."""
         return lanes
 
     @abc.abstractmethod
     def finish(self, osc: Oscillator, lanes: Lanes) -> dict[str, Any]:
-        """The results of runs that ended, arrays [lanes, ...] or tuples of arrays [lanes]."""
+        """The results of runs that ended, by the names in `variables`.
+
+        Arrays [lanes, ...], or tuples of arrays [lanes]; of the other lanes they are not used.
+        """
 
 
 class Program(eqx.Module):

@@ -27,7 +27,7 @@ def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, *, edges: bool) -
     zero = jnp.zeros_like(x1)
     return Lanes(
         run=run,
-        begun=jnp.full_like(run, passes),
+        first_pass=jnp.full_like(run, passes),
         t=zero,
         x1=x1,
         x2=x2,
@@ -69,7 +69,7 @@ class Round(eqx.Module):
     mode_after: Array
 
 
-def one_round(osc: Oscillator, lanes: Lanes, one, t1, rtol, atol, *, edges: bool):
+def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol, *, edges: bool):
     """The lanes past the events and STEPS_PER_ROUND steps further, and the `Round`."""
     lanes, passage = pass_events(
         osc, lanes, t1, rtol, edges=edges, captures=True, derivatives=False
@@ -77,7 +77,7 @@ def one_round(osc: Oscillator, lanes: Lanes, one, t1, rtol, atol, *, edges: bool
     window = window_of(osc, lanes, edges=edges, extrema=None)
 
     def step(lanes, _):
-        lanes = take_step(osc, window, one, lanes, t1, rtol, atol)
+        lanes = take_step(osc, window, ones, lanes, t1, rtol, atol)
         return lanes, (lanes.t, lanes.x1, lanes.x2)
 
     first = lanes.t, lanes.x1, lanes.x2
@@ -102,12 +102,12 @@ def one_round(osc: Oscillator, lanes: Lanes, one, t1, rtol, atol, *, edges: bool
     return after, kept
 
 
-def flown_on(osc: Oscillator, one, mode: Mode, x1, x2, h, *, edges: bool) -> tuple[Array, Array]:
+def flown_on(osc: Oscillator, ones, mode: Mode, x1, x2, h, *, edges: bool) -> tuple[Array, Array]:
     """The states (x1, x2) one step of size h later, in the field of a slip mode, arrays [lanes]."""
     run = jnp.zeros(x1.shape, jnp.int32)
     lanes = lanes_at_start(osc, run, x1, x2, jnp.zeros((), jnp.int32), jnp.ones(()), edges=edges)
     a = mode_acceleration(osc, mode, x1, x2)
     lanes = eqx.tree_at(lambda n: (n.mode, n.a), lanes, (mode, a))
     window = window_of(osc, lanes, edges=edges, extrema=None)
-    new = attempt(osc, window, one, lanes, h, jnp.ones(()), jnp.ones(()), None)
+    new = attempt(osc, window, ones, lanes, h, jnp.ones(()), jnp.ones(()), None)
     return new.x1, new.x2

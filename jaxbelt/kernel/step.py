@@ -111,8 +111,8 @@ def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | No
     def innermost(pick, flags, bounds, none):
         """The largest or smallest of the flagged bounds, as `pick` says, or `none`."""
         pairs = list(zip(flags, bounds, strict=True))
-        found = functools.reduce(pick, [jnp.where(flag, one, none) for flag, one in pairs])
-        return foremost(osc, [flag & (one == found) for flag, one in pairs], bounds, found)
+        found = functools.reduce(pick, [jnp.where(flag, bound, none) for flag, bound in pairs])
+        return foremost(osc, [flag & (bound == found) for flag, bound in pairs], bounds, found)
 
     boundaries = [belt.velocity / osc.omega for belt in osc.belts]
     low = innermost(jnp.maximum, [code == -1 for code in mode.codes], boundaries, -inf)
@@ -137,9 +137,9 @@ def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | No
     return _Window(x1, (low, high), extrema, signs, pulls, ~lanes.done & ~mode.any_stuck)
 
 
-def _quotient(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array) -> Array:
-    """`oscillator.acceleration` as a single quotient; one: see `lanes.materialise`."""
-    numerator, denominator = -x1 - osc.damping * x2, one
+def _quotient(osc: Oscillator, window: _Window, ones: Array, x1: Array, x2: Array) -> Array:
+    """`oscillator.acceleration` as a single quotient; ones: see `lanes.materialise`."""
+    numerator, denominator = -x1 - osc.damping * x2, ones
     for belt, sign, pull in zip(osc.belts, window.signs, window.pulls, strict=True):
         top, bottom = belt.friction.fraction(sign * (belt.velocity - osc.omega * x2))
         numerator = numerator * bottom + pull * top * denominator
@@ -179,7 +179,7 @@ class _Attempt(eqx.Module):
 
 
 def attempt(
-    osc, window: _Window, one: Array, lanes: Lanes, h, rtol, atol, rates, derivatives=False
+    osc, window: _Window, ones: Array, lanes: Lanes, h, rtol, atol, rates, derivatives=False
 ) -> _Attempt:
     """One Runge-Kutta step of all lanes; rates, derivatives: see `take_step`."""
     x1, x2, stages = lanes.x1, lanes.x2, [lanes.a]
@@ -187,30 +187,30 @@ def attempt(
     for row, row1, c in zip(_A[1:-1], _AA[1:-1], _C[1:-1].tolist(), strict=True):
         drift = c * x2 + h * _combine(row1, stages) if np.any(row1) else c * x2
         x2_stage = x2 + h * _combine(row, stages)
-        stages.append(_quotient(osc, window, one, x1 + h * drift, x2_stage))
+        stages.append(_quotient(osc, window, ones, x1 + h * drift, x2_stage))
         if rates:
             slopes.append(rates(osc, lanes.mode, lanes.t + c * h, x1 + h * drift, x2_stage))
     # The weights of the solution are those of the last stage, which is the next step's first.
-    y1 = materialise(x1 + h * (x2 + h * _combine(_AA[-1], stages)), one)
-    y2 = materialise(x2 + h * _combine(_A[-1], stages), one)
-    stages.append(_quotient(osc, window, one, y1, y2))
+    y1 = materialise(x1 + h * (x2 + h * _combine(_AA[-1], stages)), ones)
+    y2 = materialise(x2 + h * _combine(_A[-1], stages), ones)
+    stages.append(_quotient(osc, window, ones, y1, y2))
     scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
     scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
     error1, error2 = jnp.abs(h * h * _combine(_EA, stages)), jnp.abs(h * _combine(_E, stages))
     error = jnp.maximum(error1 * scale2, error2 * scale1) / (scale1 * scale2)
     if derivatives:
         ends = (x1, x2), (y1, y2)
-        fastest = functools.reduce(jnp.maximum, [_rate(osc, window, one, *end) for end in ends])
+        fastest = functools.reduce(jnp.maximum, [_rate(osc, window, ones, *end) for end in ends])
         error = jnp.maximum(error, _E_LINEAR / rtol * ((h * fastest) ** 2) ** 4)
     integrals = jax.tree.map(lambda i, *s: i + h * _combine(_A[-1], s), lanes.integrals, *slopes)
     return _Attempt(h, y1, y2, stages[-1], lax.stop_gradient(error), integrals)
 
 
-def _rate(osc: Oscillator, window: _Window, one: Array, x1: Array, x2: Array) -> Array:
+def _rate(osc: Oscillator, window: _Window, ones: Array, x1: Array, x2: Array) -> Array:
     """The `fastest_rate` at a state; it has no derivatives."""
     osc, window, x1, x2 = lax.stop_gradient((osc, window, x1, x2))
     along = (x2,), (jnp.ones_like(x2),)
-    return fastest_rate(jax.jvp(lambda x2: _quotient(osc, window, one, x1, x2), *along)[1])
+    return fastest_rate(jax.jvp(lambda x2: _quotient(osc, window, ones, x1, x2), *along)[1])
 
 
 class _Interpolant(eqx.Module):
@@ -226,7 +226,7 @@ class _Interpolant(eqx.Module):
     x2_extremum: Array
 
 
-def _interpolate(one: Array, lanes: Lanes, new: _Attempt) -> _Interpolant:
+def _interpolate(ones: Array, lanes: Lanes, new: _Attempt) -> _Interpolant:
     """Hermite's cubic and the term that makes the integral of x2 the change of x1."""
     h, x2, m0, m1 = new.h, lanes.x2, new.h * lanes.a, new.h * new.a
     rise, mean = new.x2 - x2, 0.5 * (x2 + new.x2) + (m0 - m1) / 12
@@ -239,7 +239,7 @@ def _interpolate(one: Array, lanes: Lanes, new: _Attempt) -> _Interpolant:
     safe = has_extremum & (divisor != 0)
     extremum = lax.stop_gradient(jnp.where(safe, m0, 1.0) / jnp.where(safe, divisor, 1.0))
     x2_extremum = x2 + extremum * (k[0] + extremum * (k[1] + extremum * (k[2] + extremum * k[3])))
-    x2_extremum = materialise(jnp.where(has_extremum, x2_extremum, new.x2), one)
+    x2_extremum = materialise(jnp.where(has_extremum, x2_extremum, new.x2), ones)
     return _Interpolant(k, has_extremum, extremum, x2_extremum)
 
 
@@ -261,7 +261,7 @@ class _Landing(eqx.Module):
 
 
 def _landing(
-    window: _Window, one, lanes: Lanes, new: _Attempt, path: _Interpolant, rtol
+    window: _Window, ones, lanes: Lanes, new: _Attempt, path: _Interpolant, rtol
 ) -> _Landing:
     low, high = window.x2
     beyond_extremum = path.has_extremum & ((path.x2_extremum > high) | (path.x2_extremum < low))
@@ -301,7 +301,7 @@ def _landing(
         x2=bound,
         on_edge=on_edge,
         blocked=blocked | grazes,
-        theta=materialise(jnp.where(blocked, theta, path.extremum), one),
+        theta=materialise(jnp.where(blocked, theta, path.extremum), ones),
     )
 
 
@@ -352,7 +352,7 @@ def _grazes(window: _Window, lanes: Lanes, new: _Attempt, path: _Interpolant, re
 def take_step(
     osc,
     window: _Window,
-    one: Array,
+    ones: Array,
     lanes: Lanes,
     t1,
     rtol,
@@ -366,30 +366,30 @@ def take_step(
     rates(osc, mode, t, x1, x2), a tree of arrays [lanes], is integrated with the motion.
     derivatives: whether those of the result are to be as good as the tolerance, too.
     """
-    left = t1 - lanes.t
-    going = window.active & (lanes.h > 0) & (left > 0)
-    h = jnp.where(going, jnp.minimum(lanes.h, left), 0.0)
-    new = attempt(osc, window, one, lanes, h, rtol, atol, rates, derivatives)
-    path = _interpolate(one, lanes, new)
-    at = _landing(window, one, lanes, new, path, rtol)
+    remaining = t1 - lanes.t
+    going = window.active & (lanes.h > 0) & (remaining > 0)
+    h = jnp.where(going, jnp.minimum(lanes.h, remaining), 0.0)
+    new = attempt(osc, window, ones, lanes, h, rtol, atol, rates, derivatives)
+    path = _interpolate(ones, lanes, new)
+    at = _landing(window, ones, lanes, new, path, rtol)
     blocked, reached = at.blocked, at.reached
     if derivatives:
         # At rest no bound has a say in how the neighbours of a lane move.
         rests = is_at_rest(lanes.x1, lanes.x2, lanes.a)
         blocked, reached = blocked & ~rests, reached & ~rests
 
-    last = h >= left
+    last = h >= remaining
     accepted = going & (new.error <= 1)
     lands = accepted & ~blocked & reached & ~(last & (at.delta > 0))
     # One number, because many results depend on it.
     outcome = jnp.where(accepted, jnp.where(blocked, -1.0, 1.0), 0.0)
-    outcome = materialise(jnp.where(lands, 2.0, outcome), one)
+    outcome = materialise(jnp.where(lands, 2.0, outcome), ones)
     shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
-    delta = materialise(jnp.where(lands, at.delta, 0.0), one)
+    delta = materialise(jnp.where(lands, at.delta, 0.0), ones)
 
     bound = at.x2 if window.x1 is None else jnp.where(at.on_edge, at.x1, at.x2)
     x1, x2 = _bridged(lands, at.on_edge, delta, bound, new)
-    a_end = _quotient(osc, window, one, x1, x2)
+    a_end = _quotient(osc, window, ones, x1, x2)
     moves = lands & ~is_at_rest(x1, x2, a_end)
     delta, x1, x2 = _with_its_derivatives(moves, at.on_edge, delta, bound, new, (x1, x2, a_end))
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)

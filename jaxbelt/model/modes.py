@@ -408,21 +408,21 @@ class Departure(eqx.Module):
     captured: Array
 
 
-def leave_slip(osc: Oscillator, mode: Mode, fired: Array, x1: Array, x2: Array) -> Departure:
-    """What follows where the guard number `fired` of a slip mode vanishes at (x1, x2).
+def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) -> Departure:
+    """What follows where the guard of that number of a slip mode vanishes at (x1, x2).
 
     The n `boundary_guards` come first, then the 2n `edge_guards`; any other number is no
     transition.
     """
     n = len(osc.belts)
-    at_boundary, at_edge = (fired >= 0) & (fired < n), (fired >= n) & (fired < 3 * n)
-    hit = [fired == i for i in range(n)]
+    at_boundary, at_edge = (guard >= 0) & (guard < n), (guard >= n) & (guard < 3 * n)
+    hit = [guard == i for i in range(n)]
     after_boundary, x2_boundary = reach_boundary(osc, mode, hit, x1)
     if not has_edges(osc):
         x2 = jnp.where(at_boundary, x2_boundary, x2)
         after_boundary = select(at_boundary, after_boundary, mode)
         return Departure(after_boundary, x1, x2, at_boundary, at_edge, at_edge)
-    edge_hit = [fired == n + i for i in range(2 * n)]
+    edge_hit = [guard == n + i for i in range(2 * n)]
     edge = first_of(edge_hit, edges(osc), x1)
     edge = foremost(osc, [other == edge for other in edges(osc)], edges(osc), edge)
     flags = zip(edge_hit, bounds_rightward(mode), strict=True)

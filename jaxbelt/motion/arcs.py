@@ -61,8 +61,8 @@ class Ends:
 class ArcEnd(eqx.Module):
     """How an arc ends, and how the orbit goes on.
 
-    duration: of the arc; fired: what ended it, a number of `Ends`, or -1: nothing; y, mode, signs:
-    from there on. captured: by a pseudo-focus; forever: the mass stays stuck; failed: the
+    duration: of the arc; ended_by: a number of `Ends`, or -1: nothing; y, mode, signs: from there
+    on. captured: by a pseudo-focus; forever: the mass stays stuck; failed: the
     integrator gave up.
     """
 
@@ -70,7 +70,7 @@ class ArcEnd(eqx.Module):
     y: State
     mode: Mode
     signs: Signs
-    fired: Array
+    ended_by: Array
     captured: Array
     forever: Array
     failed: Array
@@ -97,7 +97,7 @@ def _all_guards(osc: Oscillator, mode: Mode, signs: Signs, y: State) -> Array:
 def _that_count(
     osc: Oscillator, mode: Mode, signs: Signs, guards: Array, every_extremum: bool
 ) -> Array:
-    """The same, larger where they do not count.
+    """The guards of `_all_guards`, larger where they do not count.
 
     A boundary or edge from which the orbit moves away until its next extremum does not; nor, unless
     every extremum is to end an arc, does an extremum while what it protects is out of reach of one
@@ -117,11 +117,11 @@ def _that_count(
 
 
 class SlipArc(eqx.Module):
-    """End of a slip arc: its duration and state, the guard that fired (-1: none), failure."""
+    """End of a slip arc: its duration and state, what ended it (as in `ArcEnd`), failure."""
 
     duration: Array
     y: State
-    fired: Array
+    ended_by: Array
     failed: Array
 
 
@@ -143,20 +143,21 @@ def slip_arc(
     def count(osc, mode, signs, guards):
         return _that_count(osc, mode, signs, guards, every_extremum)
 
-    def left(y):
+    def is_outside(y):
         return jnp.min(count(osc, mode, signs, _all_guards(osc, mode, signs, y))) < 0
 
-    last = integrator.march(functools.partial(slip_field, osc, mode), y, left)
-    root, fired = _first_guard(osc, mode, signs, last, integrator, count)
+    last = integrator.march(functools.partial(slip_field, osc, mode), y, is_outside)
+    root, ended_by = _first_guard(osc, mode, signs, last, integrator, count)
     # Where not every extremum ends an arc nothing depends on where exactly one does.
-    is_sharp = last.left & (every_extremum | (fired < 3 * len(osc.belts)))
+    is_sharp = last.outside & (every_extremum | (ended_by < 3 * len(osc.belts)))
     length = lax.stop_gradient(last.length)
 
     def guard_fired(*y):
         guards = _all_guards(osc, mode, signs, y)
-        return jnp.sum(jnp.where(jnp.arange(guards.size) == fired, guards, 0.0))
+        return jnp.sum(jnp.where(jnp.arange(guards.size) == ended_by, guards, 0.0))
 
-    # Two Newton steps, small ones: the digits that are left, and derivatives to second order.
+    # Newton steps from the root, small ones, for its last digits and for derivatives: two to second
+    # order. The third pass makes the state at the length that the second one found.
     def polish(carry, _):
         h = carry[0]
         y = integrator.step(functools.partial(slip_field, osc, mode), last.start, h)
@@ -165,9 +166,9 @@ def slip_arc(
         shift = jnp.where(regular, guard / jnp.where(regular, slope, 1.0), 0.0)
         return (h - jnp.where(is_sharp, shift, 0.0), h, y), None
 
-    h = jnp.where(last.left, root, last.length)
+    h = jnp.where(last.outside, root, last.length)
     (_, h, y), _ = lax.scan(polish, (h, h, last.start), length=3)
-    return SlipArc(last.t + h, y, jnp.where(last.left, fired, -1), ~last.finished)
+    return SlipArc(last.t + h, y, jnp.where(last.outside, ended_by, -1), ~last.finished)
 
 
 def _first_guard(osc, mode, signs, last, integrator, count) -> tuple[Array, Array]:
@@ -187,7 +188,7 @@ def _first_guard(osc, mode, signs, last, integrator, count) -> tuple[Array, Arra
         lambda h: guards_at(integrator.step(field, last.start, h)),
         guards_at(last.start),
         last.length,
-        (jnp.where(last.left, values, jnp.inf), slopes),
+        (jnp.where(last.outside, values, jnp.inf), slopes),
         extrema=2,
     )
 
@@ -198,11 +199,11 @@ def after_slip(osc: Oscillator, mode: Mode, signs: Signs, arc: SlipArc) -> ArcEn
     Where the arc ends at an extremum, or for want of time, the mode stays.
     """
     ends = Ends(len(osc.belts))
-    after = leave_slip(osc, mode, arc.fired, *arc.y)
+    after = leave_slip(osc, mode, arc.ended_by, *arc.y)
     y = after.x1, jnp.where(after.captured, 0.0, after.x2)
     flipped = (
-        jnp.where(arc.fired == ends.extremum_x2, -signs[0], signs[0]),
-        jnp.where(arc.fired == ends.extremum_x1, -signs[1], signs[1]),
+        jnp.where(arc.ended_by == ends.extremum_x2, -signs[0], signs[0]),
+        jnp.where(arc.ended_by == ends.extremum_x1, -signs[1], signs[1]),
     )
     at_event = after.at_boundary | after.at_edge
     return ArcEnd(
@@ -210,7 +211,7 @@ def after_slip(osc: Oscillator, mode: Mode, signs: Signs, arc: SlipArc) -> ArcEn
         y=y,
         mode=after.mode,
         signs=select(at_event, signs_after(osc, after.mode, y), flipped),
-        fired=arc.fired,
+        ended_by=arc.ended_by,
         captured=after.captured,
         forever=jnp.zeros_like(arc.failed),
         failed=arc.failed,
@@ -226,7 +227,7 @@ def stick_arc(osc: Oscillator, mode: Mode, y: State, longest: Array) -> ArcEnd:
     phase = stick_phase(osc, mode, x1)
     is_cut = (phase.duration >= longest) & (longest < jnp.inf)
     edges = [jnp.asarray(n + i) for i in range(2 * n)]
-    fired = first_of(phase.edge, edges, jnp.asarray(Ends(n).onset))
+    ended_by = first_of(phase.edge, edges, jnp.asarray(Ends(n).onset))
     way = phase.x2 * jnp.where(is_cut, longest, 0.0)
     y_end = jnp.where(is_cut, x1 + way, phase.x1), phase.x2
     after = select(is_cut, mode, leave_stick(osc, mode, phase))
@@ -236,7 +237,7 @@ def stick_arc(osc: Oscillator, mode: Mode, y: State, longest: Array) -> ArcEnd:
         y=y_end,
         mode=after,
         signs=signs_after(osc, after, y_end),
-        fired=jnp.where(is_cut, -1, fired),
+        ended_by=jnp.where(is_cut, -1, ended_by),
         captured=never,
         forever=jnp.isinf(phase.duration),
         failed=never,

@@ -67,11 +67,11 @@ class Group(NamedTuple):
 
 def blank_book(osc, batch: Batch) -> Round:
     """Room for the rounds of a group, [rounds, ..]; osc: an oscillator of the lanes."""
-    one = jnp.ones(batch.width)
+    ones = jnp.ones(batch.width)
 
     def kept(osc):
-        lanes = _first_lanes(osc, (one, one), one[0], batch)
-        return one_round(osc, lanes, one, one, one[0], one[0], edges=batch.edges)[1]
+        lanes = _first_lanes(osc, (ones, ones), ones[0], batch)
+        return one_round(osc, lanes, ones, ones, ones[0], ones[0], edges=batch.edges)[1]
 
     shapes = jax.eval_shape(kept, osc)
     return jax.tree.map(lambda s: jnp.zeros((batch.rounds, *s.shape), s.dtype), shapes)
@@ -90,26 +90,26 @@ def followed_together(
     osc: leaves are scalars or [lanes]; y0: (x1, x2), [lanes] each; span: t1 - t0, [lanes]; ts:
     times since t0, [samples, lanes].
     """
-    one = jnp.ones(batch.width)
+    ones = jnp.ones(batch.width)
     tolerances = [jnp.maximum(SHARE * tol, LEAST_TOLERANCE) for tol in (rtol, atol)]
     lanes = _first_lanes(osc, y0, tolerances[0], batch)
-    lanes, book, rounds = _written(osc, lanes, one, span, tolerances, batch, book)
+    lanes, book, rounds = _written(osc, lanes, ones, span, tolerances, batch, book)
     inside = (jnp.arange(batch.rounds) < rounds)[:, None]
     arcs, used, fits = _arcs(book, inside, batch)
-    samples = _samples(osc, book, inside, one, ts, batch)
+    samples = _samples(osc, book, inside, ones, ts, batch)
     begins_nowhere = lanes.status == Status.NOT_FINITE.value
     known = lanes.done & fits & ~jnp.any(book.rests & inside, axis=0) & are_finite(lanes)
     return Group(lanes, arcs, used, samples, ~known & ~begins_nowhere), book
 
 
-def _written(osc, lanes, one, span, tolerances, batch: Batch, book) -> tuple[Lanes, Round, Array]:
+def _written(osc, lanes, ones, span, tolerances, batch: Batch, book) -> tuple[Lanes, Round, Array]:
     """Rounds until the lanes are done, or there is no more room: the lanes at the end, the book,
     and how many rounds there were."""
 
     @one_kernel
-    def page(osc, lanes, one, span, rtol, atol):
+    def page(osc, lanes, ones, span, rtol, atol):
         def advance(lanes, _):
-            return one_round(osc, lanes, one, span, rtol, atol, edges=batch.edges)
+            return one_round(osc, lanes, ones, span, rtol, atol, edges=batch.edges)
 
         return lax.scan(advance, lanes, length=PAGE)
 
@@ -119,7 +119,7 @@ def _written(osc, lanes, one, span, tolerances, batch: Batch, book) -> tuple[Lan
 
     def turn(state):
         lanes, book, number = state
-        lanes, new = page(osc, lanes, one, span, *tolerances)
+        lanes, new = page(osc, lanes, ones, span, *tolerances)
         put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=number, axis=0)
         return lanes, jax.tree.map(put, book, new), number + PAGE
 
@@ -169,7 +169,7 @@ def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Arr
             either(at(book.x1s[-1]), at(book.x1s[0])),
             jnp.where(fires, at(book.x2, after), x2_end),
         ),
-        fired=jnp.where(fires, at(book.number, after), -1),
+        ended_by=jnp.where(fires, at(book.number, after), -1),
         in_time=(wanted[:, None] == total[None]) & ~happens,
         captured=fires & at(book.captured, after),
     )
@@ -183,7 +183,7 @@ def _searched(columns: Array, values: Array, side: str) -> Array:
     return jax.vmap(find, (1, 1), 1)(columns, values)
 
 
-def _samples(osc, book: Round, inside: Array, one, ts, batch: Batch) -> Array:
+def _samples(osc, book: Round, inside: Array, ones, ts, batch: Batch) -> Array:
     """The states of the lanes at some times, each from the step that it lies in."""
 
     def rows(*columns):
@@ -203,12 +203,12 @@ def _samples(osc, book: Round, inside: Array, one, ts, batch: Batch) -> Array:
     mode = at(book.mode_after, row)
 
     @one_kernel
-    def sample(osc, one, x1, x2, since, mode, is_first):
+    def sample(osc, ones, x1, x2, since, mode, is_first):
         slip = Mode(tuple(jnp.where(is_first, 1.0, c) for c in codes_in(mode, batch.belts)))
-        flown = flown_on(osc, one, slip, x1, x2, since, edges=batch.edges)
+        flown = flown_on(osc, ones, slip, x1, x2, since, edges=batch.edges)
         # In the first place a lane is stuck.
         carried = x1 + x2 * since, x2
         return tuple(jnp.where(is_first, a, b) for a, b in zip(carried, flown, strict=True))
 
     each = x1, x2, since, mode, is_first
-    return lax.map(lambda row: jnp.stack(sample(osc, one, *row)), each)
+    return lax.map(lambda row: jnp.stack(sample(osc, ones, *row)), each)

@@ -42,15 +42,14 @@ _ORDER_8 = scheme((2, 4, 6, 8))
 class LastStep(NamedTuple):
     """The last step of a march: when and where it began, its length, and the state at its end.
 
-    left: whether the orbit is outside of its mode there; finished: whether it is, or its time is
-    over.
+    outside: whether that is outside of its mode; finished: whether it is, or the time is over.
     """
 
     t: Array
     start: State
     length: Array
     end: State
-    left: Array
+    outside: Array
     finished: Array
 
 
@@ -58,8 +57,13 @@ class AbstractIntegrator(eqx.Module):
     """Integrates the smooth field of a mode; its fields are arrays, or modules of arrays."""
 
     @abc.abstractmethod
-    def march(self, field: Field, y: State, left: Callable[[State], Array]) -> LastStep:
-        """Go from y until left(y) holds after a step."""
+    def march(self, field: Field, y: State, is_outside: Callable[[State], Array]) -> LastStep:
+        """Go from y until a step ends outside of the mode, or the integrator's time is over.
+
+        field: of the mode, also beyond its bounds. y: a state in the mode, or on a bound of it that
+        the orbit moves away from. is_outside(y): a scalar, true beyond a bound of the mode. Returns
+        the last step, of which no end before was outside; with derivatives of its start by y.
+        """
 
     def step(self, field: Field, y: State, h: Array) -> State:
         """The state one step of size h after y, as accurate as a step of `march`."""
@@ -113,12 +117,12 @@ class Adaptive(AbstractIntegrator):
     rtol: Array
     atol: Array
 
-    def march(self, field, y, left):
-        def outside(t, y, args, **kwargs):
+    def march(self, field, y, is_outside):
+        def ends_outside(t, y, args, **kwargs):
             # A rejected first step leaves t = 0, where a guard may vanish.
-            return (t > 0) & left(y)
+            return (t > 0) & is_outside(y)
 
-        started, reached, hit = self._integrate(field, y, outside)
+        started, reached, hit = self._integrate(field, y, ends_outside)
         (t_start, *start), (t_end, *end) = started, reached
         hit = jnp.asarray(hit)
         finished = hit | (t_end >= 1)
@@ -132,7 +136,7 @@ class Adaptive(AbstractIntegrator):
         _, (_, x1, x2), _ = self._integrate(field, y, None)
         return x1, x2
 
-    def _integrate(self, field, y, outside):
+    def _integrate(self, field, y, ends_outside):
         """The last step's beginning and end, (t, x1, x2) each, t as a fraction of the span, and
         whether it ended outside.
 
@@ -149,7 +153,7 @@ class Adaptive(AbstractIntegrator):
             return jnp.where(self.span > 0, jnp.maximum(*(jnp.abs(part) for part in y)), 0.0)
 
         # Where no event is looked for, a step may be as long as its error allows.
-        first, longest = (1.0, 1.0) if outside is None else (FIRST_FRACTION, MAX_FRACTION)
+        first, longest = (1.0, 1.0) if ends_outside is None else (FIRST_FRACTION, MAX_FRACTION)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(scaled),
             _Extrapolation(),
@@ -161,7 +165,7 @@ class Adaptive(AbstractIntegrator):
             stepsize_controller=diffrax.PIDController(
                 rtol=self.rtol, atol=self.atol, dtmax=longest, norm=norm
             ),
-            event=None if outside is None else diffrax.Event(outside),
+            event=None if ends_outside is None else diffrax.Event(ends_outside),
             adjoint=diffrax.ForwardMode(),
             max_steps=MAX_ADAPTIVE_STEPS,
             throw=False,
@@ -205,7 +209,7 @@ class Graded(AbstractIntegrator):
     mode: Mode
     stride: float = STRIDE
 
-    def march(self, field, y, left):
+    def march(self, field, y, is_outside):
         # A stuck lane of a batch has no slip arc to follow; it must not keep the others waiting.
         active = ~self.mode.any_stuck
 
@@ -213,7 +217,7 @@ class Graded(AbstractIntegrator):
             _, _, _, y, steps = state
             finite = jnp.isfinite(y[0]) & jnp.isfinite(y[1])
             going = (steps * self.stride < MAX_GRADED) & active & finite
-            return ((steps == 0) | ~left(y)) & going
+            return ((steps == 0) | ~is_outside(y)) & going
 
         def advance(state):
             t, _, h, y, steps = state
@@ -223,5 +227,5 @@ class Graded(AbstractIntegrator):
         zero = jnp.zeros(())
         start = zero, y, zero, y, jnp.asarray(0)
         t, y_start, h, y_end, _ = lax.while_loop(unfinished, advance, start)
-        outside = active & left(y_end)
+        outside = active & is_outside(y_end)
         return LastStep(t, y_start, h, y_end, outside, outside)

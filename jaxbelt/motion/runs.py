@@ -71,29 +71,29 @@ class RunState(eqx.Module):
 
 def _slip_segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[ArcEnd, Array]:
     """A slip arc; and whether the run ends at its end."""
-    left = t1 - state.t
-    span = jnp.minimum(left, MAX_ARC)
+    remaining = t1 - state.t
+    span = jnp.minimum(remaining, MAX_ARC)
     integrator = Adaptive(span, SAFETY * rtol, SAFETY * atol)
     arc = _adaptive_slip_arc(osc, state.mode, state.signs, state.y, integrator)
     # At rest up to rounding the mass stays, even on a guard.
     a = mode_acceleration(osc, state.mode, *arc.y)
-    rests = (arc.fired >= 0) & is_at_rest(arc.y[0], arc.y[1], a)
+    rests = (arc.ended_by >= 0) & is_at_rest(arc.y[0], arc.y[1], a)
     stays = replace(
-        arc, duration=jnp.maximum(arc.duration, span), fired=jnp.full_like(arc.fired, -1)
+        arc, duration=jnp.maximum(arc.duration, span), ended_by=jnp.full_like(arc.ended_by, -1)
     )
     end = after_slip(osc, state.mode, state.signs, select(rests, stays, arc))
-    return end, end.captured | (end.fired < 0) & (left <= MAX_ARC)
+    return end, end.captured | (end.ended_by < 0) & (remaining <= MAX_ARC)
 
 
 def _stick_segment(osc: Oscillator, state: RunState, t1) -> tuple[ArcEnd, Array]:
     end = stick_arc(osc, state.mode, state.y, t1 - state.t)
-    return end, end.fired < 0
+    return end, end.ended_by < 0
 
 
 class ArcRecord(eqx.Module):
     """What a segment leaves behind: its arc, the event at its end, and what ended it.
 
-    fired, in_time, captured: as in `sensitivities.Arc`.
+    ended_by, in_time, captured: as in `sensitivities.Arc`.
     """
 
     t: Array
@@ -104,7 +104,7 @@ class ArcRecord(eqx.Module):
     belt: Array
     event_t: Array
     event_y: Array
-    fired: Array
+    ended_by: Array
     in_time: Array
     captured: Array
 
@@ -135,7 +135,7 @@ def _segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[RunState
         belt=belt,
         event_t=t,
         event_y=jnp.stack(end.y),
-        fired=end.fired,
+        ended_by=end.ended_by,
         in_time=done & ~end.captured,
         captured=end.captured,
     )
@@ -324,7 +324,7 @@ def _(primals, tangents):
         end=(records.event_y[:, 0], records.event_y[:, 1]),
         codes=records.mode,
         duration=records.duration,
-        fired=records.fired,
+        ended_by=records.ended_by,
         in_time=records.in_time,
         captured=records.captured,
         used=used,
@@ -370,7 +370,7 @@ def _unused(belts: int) -> ArcRecord:
         belt=none,
         event_t=nan,
         event_y=pair,
-        fired=none - 1,
+        ended_by=none - 1,
         in_time=none > 0,
         captured=none > 0,
     )

@@ -57,16 +57,16 @@ _ORDER_12 = scheme((2, 4, 6, 8, 10, 12))
 class Arc(eqx.Module):
     """An arc that is known: its entry and end, contact codes [belts], and duration.
 
-    The end helps to place the steps. fired: a number of `arcs.Ends`, -1 for none; in_time: whether
-    the run ended with it, in time; captured: whether the mass came to rest in a pseudo-focus at its
-    end; used: whether there was such an arc at all.
+    The end helps to place the steps. ended_by: a number of `arcs.Ends`, -1 for none; in_time:
+    whether the run ended with it, in time; captured: whether the mass came to rest in a
+    pseudo-focus at its end; used: whether there was such an arc at all.
     """
 
     entry: State
     end: State
     codes: Array
     duration: Array
-    fired: Array
+    ended_by: Array
     in_time: Array
     captured: Array
     used: Array
@@ -150,7 +150,7 @@ def _carried(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State)
     return select(stuck, (y[0] + v * duration, v), slipped)
 
 
-def _passed(osc: Oscillator, arc: Arc, y: State, left: Array) -> tuple[Array, Array, Array]:
+def _passed(osc: Oscillator, arc: Arc, y: State, remaining: Array) -> tuple[Array, Array, Array]:
     """Where the orbit goes on after an arc that is known, x1 and x2, and the arc's duration.
 
     As functions of the oscillator, of the entry y, and of the time left, near those of the arc.
@@ -164,9 +164,9 @@ def _passed(osc: Oscillator, arc: Arc, y: State, left: Array) -> tuple[Array, Ar
     def fired_guard(*y):
         n = len(osc.belts)
         guards = [*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])]
-        hit = first_of([arc.fired == i for i in range(3 * n)], guards, jnp.zeros(()))
+        hit = first_of([arc.ended_by == i for i in range(3 * n)], guards, jnp.zeros(()))
         same = [
-            (guard == hit) & ((arc.fired < n) == (i < n)) & (arc.fired >= 0)
+            (guard == hit) & ((arc.ended_by < n) == (i < n)) & (arc.ended_by >= 0)
             for i, guard in enumerate(guards)
         ]
         return foremost(osc, same, guards, hit)
@@ -175,10 +175,12 @@ def _passed(osc: Oscillator, arc: Arc, y: State, left: Array) -> tuple[Array, Ar
     slopes = slip_field(osc, mode, end)
     guard, slope = jax.jvp(fired_guard, end, slopes)
     late = (lax.stop_gradient(guard) - guard) / jnp.where(slope == 0, 1.0, slope)
-    late = jnp.where(arc.in_time, left - arc.duration, late)
-    after = leave_slip(osc, mode, arc.fired, end[0] + late * slopes[0], end[1] + late * slopes[1])
+    late = jnp.where(arc.in_time, remaining - arc.duration, late)
+    after = leave_slip(
+        osc, mode, arc.ended_by, end[0] + late * slopes[0], end[1] + late * slopes[1]
+    )
     slipped = after.x1, jnp.where(arc.captured, 0.0, after.x2), arc.duration + late
-    phase = stick_arc(osc, mode, y, left)
+    phase = stick_arc(osc, mode, y, remaining)
     return select(stuck, (*phase.y, phase.duration), slipped)
 
 
@@ -188,19 +190,21 @@ def _with_numbers_of(known: Array, found: Array) -> Array:
 
 
 @one_kernel
-def _sensitivities_at_ends(varied, rest, arcs: Arc, left: Array, entry: Sensitivity) -> Sensitivity:
+def _sensitivities_at_ends(
+    varied, rest, arcs: Arc, remaining: Array, entry: Sensitivity
+) -> Sensitivity:
     """Sensitivities at the ends of some arcs, [arcs, inputs], from that at the entry of the first.
 
     varied, rest: leaves of the oscillator.
     """
 
     def jacobian(row):
-        arc, left = row
+        arc, remaining = row
 
-        def passed(varied, x1, x2, left):
-            return _passed(eqx.combine(varied, rest), arc, (x1, x2), left)
+        def passed(varied, x1, x2, remaining):
+            return _passed(eqx.combine(varied, rest), arc, (x1, x2), remaining)
 
-        return _slopes_of(passed, varied, *arc.entry, left)
+        return _slopes_of(passed, varied, *arc.entry, remaining)
 
     is_t1 = jnp.where(jnp.arange(entry.t.size) == 3, 1.0, 0.0)
 
@@ -223,7 +227,7 @@ def _sensitivities_at_ends(varied, rest, arcs: Arc, left: Array, entry: Sensitiv
         return after, after
 
     # One arc after another, for they need different numbers of steps.
-    rows = lax.map(jacobian, (arcs, left)), arcs.used, jax.vmap(creep)(arcs)
+    rows = lax.map(jacobian, (arcs, remaining)), arcs.used, jax.vmap(creep)(arcs)
     return lax.scan(advance, entry, rows)[1]
 
 
@@ -292,7 +296,7 @@ def _in_rows(blocks, count: int):
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], blocks)
 
 
-def sensitivities(varied, rest, arcs: Arc, left: Array) -> tuple[Sensitivity, Sensitivity]:
+def sensitivities(varied, rest, arcs: Arc, remaining: Array) -> tuple[Sensitivity, Sensitivity]:
     """Sensitivities of a run at the entries and at the ends of its arcs, [arcs, inputs].
 
     varied, rest: leaves of the oscillator, see `split`; left: the time from each entry to t1.
@@ -301,10 +305,10 @@ def sensitivities(varied, rest, arcs: Arc, left: Array) -> tuple[Sensitivity, Se
     start = Sensitivity(first[0], first[1], first[2])
 
     def advance(entry, block):
-        arcs, left = block
+        arcs, remaining = block
 
         def work():
-            return _sensitivities_at_ends(varied, rest, arcs, left, entry)
+            return _sensitivities_at_ends(varied, rest, arcs, remaining, entry)
 
         def nothing():
             return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (ROWS, *leaf.shape)), entry)
@@ -312,8 +316,8 @@ def sensitivities(varied, rest, arcs: Arc, left: Array) -> tuple[Sensitivity, Se
         ends = lax.cond(any_lane(jnp.any(arcs.used)), work, nothing)
         return jax.tree.map(lambda leaf: leaf[-1], ends), ends
 
-    _, ends = lax.scan(advance, start, _in_blocks((_made_safe(arcs), left)))
-    ends = _in_rows(ends, left.size)
+    _, ends = lax.scan(advance, start, _in_blocks((_made_safe(arcs), remaining)))
+    ends = _in_rows(ends, remaining.size)
     entries = jax.tree.map(lambda one, rows: jnp.concatenate([one[None], rows[:-1]]), start, ends)
     return entries, ends
 

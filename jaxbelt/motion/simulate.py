@@ -235,12 +235,7 @@ def simulate(
     check_positive(rtol, "rtol")
     check_positive(atol, "atol")
     if ts is not None:
-        ts = as_numbers(ts, "ts", (None,))
-        check_finite(ts, "ts")
-        if is_concrete((ts, t0, t1)):
-            if np.any(np.asarray(ts) < t0) or np.any(np.asarray(ts) > t1):
-                require(False, "ts", f"within [t0, t1] = [{t0}, {t1}]", ts)
-            require(np.all(np.diff(ts) >= 0), "ts", "increasing", ts)
+        ts = _checked_times(ts, t0, t1)
     require(
         formulation in ("filippov", "switch", "smooth"),
         "formulation",
@@ -265,32 +260,33 @@ def simulate(
             formulation=formulation,
             resolution=resolution,
         )
+    edges, expected = has_edges(osc), "a positive integer"
     if max_segments is None:
         # Around a pseudo-focus at a contact edge a run has many short arcs.
-        max_segments = _power_of_two((64 if has_edges(osc) else 8) * span, 512)
-    require(
-        isinstance(max_segments, int) and max_segments > 0,
-        "max_segments",
-        "a positive integer",
-        max_segments,
-    )
+        max_segments = _power_of_two((64 if edges else 8) * span, 512)
+    is_count = isinstance(max_segments, int) and max_segments > 0
+    require(is_count, "max_segments", expected, max_segments)
     if max_events is None:
-        per_time = 16 if has_edges(osc) else 4
-        is_known = is_concrete((osc, y0, t0, t1, ts, rtol, atol))
-        max_events = (
-            max_segments if is_known else min(max_segments, _power_of_two(per_time * span, 64))
-        )
-    require(
-        isinstance(max_events, int) and max_events > 0,
-        "max_events",
-        "a positive integer",
-        max_events,
-    )
-    rules = Rules(max_segments, has_edges(osc))
+        padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
+        room = _power_of_two((16 if edges else 4) * span, 64) if padded else max_segments
+        max_events = min(max_segments, room)
+    require(isinstance(max_events, int) and max_events > 0, "max_events", expected, max_events)
+    rules = Rules(max_segments, edges)
     trajectory = _filippov(
         osc, y0, t0, t1, ts, rtol, atol, rules=rules, max_events=max_events, resolution=resolution
     )
     return _without_padding(trajectory, trim_samples=ts is None)
+
+
+def _checked_times(ts: ArrayLike, t0: ArrayLike, t1: ArrayLike) -> ArrayLike:
+    """The wanted times, or a `ValueError`."""
+    ts = as_numbers(ts, "ts", (None,))
+    check_finite(ts, "ts")
+    if is_concrete((ts, t0, t1)):
+        if np.any(np.asarray(ts) < t0) or np.any(np.asarray(ts) > t1):
+            require(False, "ts", f"within [t0, t1] = [{t0}, {t1}]", ts)
+        require(np.all(np.diff(ts) >= 0), "ts", "increasing", ts)
+    return ts
 
 
 def _power_of_two(value: float, least: int) -> int:

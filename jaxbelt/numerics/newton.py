@@ -1,13 +1,15 @@
 """Newton's method, as one loop, and the implicit derivative of what it finds.
 
-For shooting, for conditions on an oscillator, and for the points of a curve; conditions of a few
-unknowns have a derivative of their own, in `bifurcations.systems.small_newton`.
+For shooting, for conditions on an oscillator, and for the points of a curve. Where there are a few
+unknowns only, one step more costs nothing, gives the last digit, and carries the derivative: see
+`bifurcations.systems.small_newton`.
 
 Optimistix's Newton, handed the same matrices through a derivative rule, takes a sixth longer, and
 gives back neither the lengths of its steps nor its last matrix, by which points judge convergence
 and bound their errors.
 """
 
+import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -43,12 +45,12 @@ class Newton(eqx.Module):
     matrix: Array
 
 
-def is_settled(last: Array, before: Array) -> Array:
+def is_settled(last: Array, before: Array, bound: float = STEP_ROUNDING) -> Array:
     """Whether the next Newton step would be rounding, by the lengths of the last two.
 
-    It is shorter by the same factor at least.
+    It is shorter by the same factor at least. bound: of steps that count as rounding.
     """
-    return last * jnp.minimum(last / before, 1.0) < STEP_ROUNDING
+    return last * jnp.minimum(last / before, 1.0) < bound
 
 
 def newton(
@@ -90,9 +92,9 @@ def newton(
 class Equations(eqx.Module):
     """As many equations as unknowns, for `solve`; what it is made of has no derivatives."""
 
+    @abc.abstractmethod
     def residual(self, given: Any, z: Any) -> Array:
         """The equations at the unknowns z, [n]."""
-        raise NotImplementedError
 
     def linearized(self, given: Any, z: Any) -> tuple[Array, Array]:
         """The equations, and their derivatives with respect to the n unknowns, [n, n]."""

@@ -78,13 +78,17 @@ class Along(Observer):
     def _sections(self) -> list[tuple[int, int, Callable]]:
         """Number, direction and function of the moments that are sections."""
         return [
-            (i, getattr(one, "direction", 0), section_of(one))
-            for i, one in enumerate(self.at)
-            if not isinstance(one, AtEvents | AtTimes)
+            (i, getattr(moment, "direction", 0), section_of(moment))
+            for i, moment in enumerate(self.at)
+            if not isinstance(moment, AtEvents | AtTimes)
         ]
 
     def _times(self) -> list[tuple[int, tuple[float, ...]]]:
-        return [(i, tuple(one.times)) for i, one in enumerate(self.at) if isinstance(one, AtTimes)]
+        return [
+            (i, tuple(moment.times))
+            for i, moment in enumerate(self.at)
+            if isinstance(moment, AtTimes)
+        ]
 
     # --- integrals
 
@@ -119,33 +123,33 @@ class Along(Observer):
 
     # --- steps
 
-    def follow(self, take_step, osc, window, one, lanes, t1, rtol, atol):
+    def follow(self, take_step, osc, window, ones, lanes, t1, rtol, atol):
         seen: _Watched = lanes.memory
         until = t1
         for (_, times), passed in zip(self._times(), seen.passed, strict=True):
             until = jnp.minimum(until, _next(times, passed))
         rates = self.rates if hasattr(self.reducer, "rates") else None
-        new = take_step(osc, window, one, lanes, until, rtol, atol, rates)
+        new = take_step(osc, window, ones, lanes, until, rtol, atol, rates)
         h, reach = lax.stop_gradient(new.t - lanes.t), LANDING * jnp.sqrt(rtol)
         starts, ends = (
-            tuple(materialise(x, one) for x in _state_and_rate(osc, end)) for end in (lanes, new)
+            tuple(materialise(x, ones) for x in _state_and_rate(osc, end)) for end in (lanes, new)
         )
-        course = Course.of_step(starts, ends, materialise(h, one))
+        course = Course.of_step(starts, ends, materialise(h, ones))
         cuts = []
         for (_, _, function), side in zip(self._sections(), seen.sides, strict=True):
             looks = [
                 course.look(function, osc, lanes.mode, jnp.full_like(h, k / PARTS_OF_STEP))
                 for k in range(PARTS_OF_STEP + 1)
             ]
-            looks = [(materialise(v, one), materialise(r, one)) for v, r in looks]
+            looks = [(materialise(v, ones), materialise(r, ones)) for v, r in looks]
             cuts.append(cut_of_step(side, looks, h, reach))
         theta = functools.reduce(jnp.minimum, [cut.theta for cut in cuts], jnp.ones_like(h))
-        theta = lax.stop_gradient(materialise(theta, one))
+        theta = lax.stop_gradient(materialise(theta, ones))
         cut = (h > 0) & (theta < 1)
         new = choose(cut, replace(lanes, h=theta * h), new)
-        return self._asked_in_step(osc, one, lanes, new, (h > 0) & ~cut, cuts)
+        return self._asked_in_step(osc, ones, lanes, new, (h > 0) & ~cut, cuts)
 
-    def _asked_in_step(self, osc, one, lanes: Lanes, new: Lanes, kept, cuts: list[Cut]) -> Lanes:
+    def _asked_in_step(self, osc, ones, lanes: Lanes, new: Lanes, kept, cuts: list[Cut]) -> Lanes:
         seen, sides = new.memory, []
         parts = zip(self._sections(), seen.sides, cuts, strict=True)
         for (number, direction, function), side, cut in parts:
@@ -156,7 +160,7 @@ class Along(Observer):
             delta = jnp.zeros_like(near.t)
             for _ in range(2):
                 delta = _to_section(function, osc, near, delta, lanes.t - near.t, new.t - near.t)
-                delta = materialise(delta, one)
+                delta = materialise(delta, ones)
             wanted = (now != side) & (now * direction >= 0)
             seen = self._ask(seen, osc, near, delta, wanted, number)
             sides.append(now)
@@ -189,9 +193,9 @@ class Along(Observer):
 
     # --- events and stick phases
 
-    def watch(self, osc, lanes, passage, one, t1, tol):
+    def watch(self, osc, lanes, passage, ones, t1, tol):
         busy = lanes.run >= 0
-        events = [i for i, one in enumerate(self.at) if isinstance(one, AtEvents)]
+        events = [i for i, moment in enumerate(self.at) if isinstance(moment, AtEvents)]
         (fired, *first), (released, *second) = event_kinds(lanes, passage)
         before = replace(lanes, t=passage.t, x1=passage.x1, x2=passage.x2, mode=passage.mode)
         seen = lanes.memory
@@ -199,7 +203,7 @@ class Along(Observer):
             place = passage.t, passage.x1, passage.x2, *first
             seen = self._update(seen, place, number, lanes.integrals, fired & busy)
         holds = busy & (lanes.t > passage.t)
-        seen = self._held(seen, osc, one, before, lanes, holds)
+        seen = self._held(seen, osc, ones, before, lanes, holds)
         totals = self._over_hold(osc, before, lanes, holds)
         for number in events:
             place = lanes.t, lanes.x1, lanes.x2, *second
@@ -227,7 +231,7 @@ class Along(Observer):
             )
         return totals
 
-    def _held(self, seen: _Watched, osc, one, before: Lanes, after: Lanes, holds) -> _Watched:
+    def _held(self, seen: _Watched, osc, ones, before: Lanes, after: Lanes, holds) -> _Watched:
         """Moments within a stick phase, or rest, in their order: x1 moves evenly."""
         frozen, start, end = lax.stop_gradient((osc, before, after))
         course = Course((start.x1, end.x1 - start.x1), start.x2, end.t - start.t)
@@ -236,7 +240,7 @@ class Along(Observer):
 
             def look(theta, function=function):
                 told = course.look(function, frozen, start.mode, theta)
-                return materialise(told[0], one), materialise(told[1], one)
+                return materialise(told[0], ones), materialise(told[1], ones)
 
             side, *table = crossings_held(look, side, direction, holds)
             sides.append(side)
@@ -267,36 +271,38 @@ class Along(Observer):
         duration = after.t - before.t
         safe = jnp.where(duration > 0, duration, 1.0)
         theta, number = jnp.full_like(duration, jnp.inf), jnp.zeros(duration.shape, int)
-        for (one, _, _), table in zip(self._sections(), tables, strict=True):
+        for (moment, _, _), table in zip(self._sections(), tables, strict=True):
             first = _first(table)
-            number = jnp.where(first < theta, one, number)
+            number = jnp.where(first < theta, moment, number)
             theta = jnp.minimum(theta, first)
         exact, passed = before.t + jnp.where(jnp.isfinite(theta), theta, 0.0) * duration, []
-        for (one, times), count in zip(self._times(), seen.passed, strict=True):
+        for (moment, times), count in zip(self._times(), seen.passed, strict=True):
             time = _next(times, count)
             due = (after.run >= 0) & (time <= after.t)
             time = jnp.where(due, time, after.t)
             earlier = due & ((time - before.t) / safe <= lax.stop_gradient(theta))
             theta = jnp.where(earlier, (time - before.t) / safe, theta)
-            exact, number = jnp.where(earlier, time, exact), jnp.where(earlier, one, number)
-            passed.append((due, one))
+            exact, number = jnp.where(earlier, time, exact), jnp.where(earlier, moment, number)
+            passed.append((due, moment))
         wanted = jnp.isfinite(theta)
         theta = jnp.where(wanted, theta, 0.0)
 
         part = replace(before, t=exact, x1=before.x1 + theta * (after.x1 - before.x1))
         part = replace(part, integrals=self._over_hold(osc, before, part, holds))
         delta = jnp.zeros_like(theta)
-        for one, _, function in self._sections():
+        for moment, _, function in self._sections():
             way = _to_section(function, osc, part, delta, delta, delta)
-            delta = jnp.where(number == one, way, delta)
+            delta = jnp.where(number == moment, way, delta)
         seen = self._ask(seen, osc, part, delta, wanted, number)
         counts = tuple(
-            count + jnp.where(due & (number == one), 1, 0)
-            for count, (due, one) in zip(seen.passed, passed, strict=True)
+            count + jnp.where(due & (number == moment), 1, 0)
+            for count, (due, moment) in zip(seen.passed, passed, strict=True)
         )
         tables = [
-            tuple(jnp.where((number == one)[None] & (t <= theta[None]), jnp.inf, t) for t in table)
-            for (one, _, _), table in zip(self._sections(), tables, strict=True)
+            tuple(
+                jnp.where((number == moment)[None] & (t <= theta[None]), jnp.inf, t) for t in table
+            )
+            for (moment, _, _), table in zip(self._sections(), tables, strict=True)
         ]
         return replace(seen, passed=counts), tables
 

@@ -129,24 +129,24 @@ class Attractor(Observer):
             loop_events=count,
         )
 
-    def watch(self, osc, lanes, passage, one, t1, tol):
+    def watch(self, osc, lanes, passage, ones, t1, tol):
         loop: _LoopSoFar = lanes.memory
         seen = _extended(osc, loop, lanes, passage)
         # x1 is extreme where x2 = 0, and a step ends there.
-        top = materialise(passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done, one)
-        released = materialise(passage.released & ~lanes.mode.any_stuck & ~lanes.done, one)
+        top = materialise(passage.landed & (lanes.x2 == 0) & (lanes.a < 0) & ~lanes.done, ones)
+        released = materialise(passage.released & ~lanes.mode.any_stuck & ~lanes.done, ones)
         tops = jnp.where(released, 0, loop.tops + jnp.where(top, 1, 0))
         section = released | (top & (tops > self.SMOOTH))
         change = lanes.x1 - loop.previous
         met, kind = self._kind(seen, lanes, passage, section, released, change, tol)
         going_on = (loop.kind == UNDECIDED) & (lanes.run >= 0)
-        kind = materialise(jnp.where(going_on, kind, UNDECIDED), one).astype(loop.kind.dtype)
+        kind = materialise(jnp.where(going_on, kind, UNDECIDED), ones).astype(loop.kind.dtype)
         found = kind != UNDECIDED
         resting = found & (kind != CYCLE)
         cycle = found & ~resting
         mark = loop.mark
         # Where it comes back and has not settled, the next loop is compared with this one.
-        renewed, new = mark.renewed(lanes, section & ~found, one, met)
+        renewed, new = mark.renewed(lanes, section & ~found, ones, met)
         # An attractor at rest is a point; a new mark begins a new loop.
         fresh = new | resting
         memory = _LoopSoFar(
@@ -205,10 +205,10 @@ class Attractor(Observer):
         kind = jnp.where(passage.captured | passage.rests, EQUILIBRIUM, kind)
         return met, jnp.where(passage.forever, STUCK_FOR_EVER, kind)
 
-    def watch_rarely(self, osc, lanes, one):
+    def watch_rarely(self, osc, lanes, ones):
         loop: _LoopSoFar = lanes.memory
         margin, x1_rest = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
-        found = materialise(jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin), one) > 0
+        found = materialise(jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin), ones) > 0
         memory = replace(
             loop,
             kind=jnp.where(found, EQUILIBRIUM, loop.kind).astype(loop.kind.dtype),

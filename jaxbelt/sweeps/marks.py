@@ -38,7 +38,7 @@ class Mark(eqx.Module):
         return same & (jnp.abs(lanes.x1 - self.x1) <= close)
 
     def renewed(
-        self, lanes: Lanes, at: Array, one: Array, met: Array | bool = False
+        self, lanes: Lanes, at: Array, ones: Array, met: Array | bool = False
     ) -> tuple["Mark", Array]:
         """The marks when the lanes `at` are in a state to compare, and which of them are new.
 
@@ -46,7 +46,7 @@ class Mark(eqx.Module):
         """
         age = self.age + jnp.where(at, 1, 0)
         old = age >= self.limit
-        new = materialise(at & (old | met), one)
+        new = materialise(at & (old | met), ones)
         here = Mark(
             lanes.x1,
             lanes.x2,

@@ -45,7 +45,7 @@ class Final(Observer):
     def start(self, osc, lanes):
         return Mark.none(lanes)
 
-    def watch(self, osc, lanes, passage, one, t1, tol):
+    def watch(self, osc, lanes, passage, ones, t1, tol):
         if not self.skip:
             return lanes
         mark: Mark = lanes.memory
@@ -58,7 +58,7 @@ class Final(Observer):
         t = jnp.where(repeats, lanes.t + loops * period, lanes.t)
         events = lanes.events + jnp.where(repeats, loops.astype(per_loop.dtype) * per_loop, 0)
         lanes = replace(lanes, t=t, events=events)
-        return replace(lanes, memory=mark.renewed(lanes, released, one)[0])
+        return replace(lanes, memory=mark.renewed(lanes, released, ones)[0])
 
     def finish(self, osc, lanes):
         return {
@@ -105,7 +105,7 @@ class Reduce(Observer):
         axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
         return jax.vmap(self.reducer.init, in_axes=(axes, 0, 0))(osc, lanes.x1, lanes.x2)
 
-    def watch(self, osc, lanes, passage, one, t1, tol):
+    def watch(self, osc, lanes, passage, ones, t1, tol):
         memory, busy = lanes.memory, lanes.run >= 0
         (fired, kind, belt), (released, *release) = event_kinds(lanes, passage)
         event = RunEvent(passage.t, passage.x1, passage.x2, kind, belt)

@@ -73,7 +73,7 @@ class Stream(eqx.Module):
     lanes: Lanes
     rows: tuple[Array, ...]
     passes: Array
-    one: Array
+    ones: Array
 
 
 @functools.partial(jax.jit, static_argnums=(0, 2, 3))
@@ -91,7 +91,7 @@ def differentiable(stream: Stream) -> Stream:
     """The numbers of a stream that may have derivatives; None in place of all others."""
 
     def constants(stream):
-        return [stream.one, stream.lanes.h, stream.lanes.pace, *stream.lanes.mode.codes]
+        return [stream.ones, stream.lanes.h, stream.lanes.pace, *stream.lanes.mode.codes]
 
     floats = eqx.filter(stream, eqx.is_inexact_array)
     return eqx.tree_at(constants, floats, replace_fn=lambda _: None)
@@ -111,15 +111,44 @@ def _columns(values: dict[str, Any]) -> list[Array]:
     return columns
 
 
+class Common(eqx.Module):
+    """What all runs of a call have in common.
+
+    shared: the leaves of the oscillator that do not differ from run to run; t1; rtol, atol; limit:
+    how many passes a run may take.
+    """
+
+    shared: list[Array]
+    t1: Any
+    rtol: Any
+    atol: Any
+    limit: Any
+
+
+class _Block(eqx.Module):
+    """Runs that lie ready: no more than there are lanes.
+
+    rows: their columns [lanes] of the queue; first: the number of the first one; available: how
+    many they are. until: the pass before which work on them ends; drain: whether it goes on until
+    all lanes are idle, and not only until these runs are taken.
+    """
+
+    rows: tuple[Array, ...]
+    first: Array
+    available: Array
+    until: Array
+    drain: Array
+
+
 class _Desk(eqx.Module):
     """The stream, and what its lanes have handed in: no more than there are lanes.
 
-    begun: runs taken from the block that lies ready; filled: how many numbers of runs, and rows of
-    the columns of results, were handed in.
+    taken: how many runs, from the block that lies ready; filled: how many numbers of runs, and rows
+    of the columns of results, were handed in.
     """
 
     stream: Stream
-    begun: Array
+    taken: Array
     filled: Array
     numbers: Array
     columns: list[Array]
@@ -133,15 +162,15 @@ def _floats_of(desk: _Desk) -> tuple[_Desk, _Desk]:
     return eqx.partition(desk, kept)
 
 
-def _refill(program: Program, shared, rtol, limit, block, begun, available, desk: _Desk) -> _Desk:
-    """Hand in what is done and take new runs, numbered from `begun`."""
-    observer, one = program.observer, desk.stream.one
-    slots = jnp.arange(one.size, dtype=jnp.int32)
+def _refill(program: Program, common: Common, block: _Block, desk: _Desk) -> _Desk:
+    """Hand in what is done and take new runs."""
+    observer, ones = program.observer, desk.stream.ones
+    slots = jnp.arange(ones.size, dtype=jnp.int32)
     lanes, passes = desk.stream.lanes, desk.stream.passes
-    osc = _oscillators(program, shared, desk.stream.rows)
-    lanes = _give_up(observer.watch_rarely(osc, lanes, one), passes, limit)
+    osc = _oscillators(program, common.shared, desk.stream.rows)
+    lanes = _give_up(observer.watch_rarely(osc, lanes, ones), passes, common.limit)
     finished = lanes.done & (lanes.run >= 0)
-    finished = finished & (_rank(finished) < one.size - desk.filled)
+    finished = finished & (_rank(finished) < ones.size - desk.filled)
     # In order, behind what is there.
     source = jnp.searchsorted(_rank(finished), slots - desk.filled)
     new = [lanes.run, *_columns(observer.finish(osc, lanes))]
@@ -152,68 +181,62 @@ def _refill(program: Program, shared, rtol, limit, block, begun, available, desk
     ]
 
     free = lanes.done & (finished | (lanes.run < 0))
-    place = desk.begun + _rank(free)
-    takes = free & (place < available)
+    place = desk.taken + _rank(free)
+    takes = free & (place < block.available)
     place = jnp.where(takes, place, 0)
-    pairs = zip(block, desk.stream.rows, strict=True)
+    pairs = zip(block.rows, desk.stream.rows, strict=True)
     rows = tuple(jnp.where(takes, column[place], row) for column, row in pairs)
-    osc = _oscillators(program, shared, rows)
-    fresh = _begin(program, osc, begun + place, rows[0], rows[1], passes, rtol)
+    osc = _oscillators(program, common.shared, rows)
+    fresh = _begin(program, osc, block.first + place, rows[0], rows[1], passes, common.rtol)
     lanes = choose(takes, fresh, replace(lanes, run=jnp.where(free, -1, lanes.run)))
     return _Desk(
-        Stream(lanes, rows, passes + 1, one),
-        desk.begun + jnp.sum(takes, dtype=jnp.int32),
+        Stream(lanes, rows, passes + 1, ones),
+        desk.taken + jnp.sum(takes, dtype=jnp.int32),
         desk.filled + jnp.sum(finished, dtype=jnp.int32),
         handed[0],
         handed[1:],
     )
 
 
-def _work(program: Program, shared, rows, lanes: Lanes, one, t1, rtol, atol):
-    """The lanes after ROUNDS_PER_PASS times some steps, each time past the events at first."""
-    osc, observer = _oscillators(program, shared, rows), program.observer
+def _work(program: Program, common: Common, stream: Stream) -> Stream:
+    """The stream after ROUNDS_PER_PASS times some steps, each time past the events at first."""
+    osc, observer = _oscillators(program, common.shared, stream.rows), program.observer
+    t1, rtol, atol, ones = common.t1, common.rtol, common.atol, stream.ones
     forward = functools.partial(take_step, derivatives=program.derivatives)
-
     rules = dict(edges=program.edges, captures=program.captures, derivatives=program.derivatives)
 
     def round_(_, lanes):
         lanes, passage = pass_events(osc, lanes, t1, rtol, **rules)
-        lanes = observer.watch(osc, lanes, passage, one, t1, rtol)
+        lanes = observer.watch(osc, lanes, passage, ones, t1, rtol)
         window = window_of(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
 
         def step(_, lanes):
-            return observer.follow(forward, osc, window, one, lanes, t1, rtol, atol)
+            return observer.follow(forward, osc, window, ones, lanes, t1, rtol, atol)
 
         return lax.fori_loop(0, STEPS_PER_ROUND, step, lanes)
 
-    return lax.fori_loop(0, ROUNDS_PER_PASS, round_, lanes)
+    return replace(stream, lanes=lax.fori_loop(0, ROUNDS_PER_PASS, round_, stream.lanes))
 
 
 def _at_work(stream: Stream) -> Array:
     return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
 
 
-def _fill(program: Program) -> Callable:
-    """The inner loop: works until the block of runs is taken, the desk is full, or in pass `until`.
+def _fill(program: Program, common: Common, block: _Block, desk: _Desk) -> _Desk:
+    """The inner loop: works until the block of runs is taken, the desk is full, or the last pass.
 
     It closes over no array, so that it can be one piece of machine code.
     """
 
-    def fill(shared, t1, rtol, atol, limit, block, begun, available, last, until, desk):
-        def unfinished(desk):
-            left = (desk.begun < available) | (last & _at_work(desk.stream))
-            return left & (desk.filled < desk.numbers.size) & (desk.stream.passes - until < 0)
+    def unfinished(desk):
+        more = (desk.taken < block.available) | (block.drain & _at_work(desk.stream))
+        return more & (desk.filled < desk.numbers.size) & (desk.stream.passes - block.until < 0)
 
-        def go_on(desk):
-            desk = _refill(program, shared, rtol, limit, block, begun, available, desk)
-            stream = desk.stream
-            settings = stream.rows, stream.lanes, stream.one, t1, rtol, atol
-            lanes = _work(program, shared, *settings)
-            return replace(desk, stream=replace(stream, lanes=lanes))
+    def go_on(desk):
+        desk = _refill(program, common, block, desk)
+        return replace(desk, stream=_work(program, common, desk.stream))
 
-        return lax.while_loop(unfinished, go_on, desk)
-
-    return fill
+    return lax.while_loop(unfinished, go_on, desk)
 
 
 class Call(eqx.Module):
@@ -231,50 +254,47 @@ class Call(eqx.Module):
     drain: Any
 
 
-def advance(program: Program, shared, t1, rtol, atol, limit, queue, call: Call, stream: Stream):
+def advance(program: Program, common: Common, queue, call: Call, stream: Stream):
     """Work through the queue, or as far as the call's passes go.
 
     queue: columns [runs + lanes], the starts and the parameters that differ. Returns the stream,
     the number of runs taken, whether there is more to do, and, in order of completion, numbers of
     runs (-1 where there is none) and results [columns, runs + 3 lanes].
     """
-    one_piece = one_kernel(_fill(program))
+    one_piece = one_kernel(functools.partial(_fill, program))
 
-    def fill(block, block_slopes, *where, desk, slopes):
-        return one_piece(shared, t1, rtol, atol, limit, block, *where, desk), None
+    def fill(block, desk, rows_slopes, slopes):
+        return one_piece(common, block, desk), None
 
     (stream, _), *rest, results, _ = _worked_off(
-        program, shared, fill, call, (queue, None), (stream, None)
+        program, common.shared, fill, call, (queue, None), (stream, None)
     )
     return stream, *rest, jnp.stack(results)
 
 
-def advance_with_derivatives(program, shared, t1, rtol, atol, limit, queue, call: Call, stream):
+def advance_with_derivatives(program: Program, common: Common, queue, call: Call, stream):
     """`advance`, with the derivatives in the direction queue[1] of the rows queue[0].
 
     stream: a stream and the derivatives of its floats. Results [2, columns, runs + 3 lanes]: the
     values and their derivatives.
     """
     program = replace(program, derivatives=True)
-    plain = _fill(program)
 
     @one_kernel
-    def one_piece(given, block, block_slopes, where, desk, slopes):
+    def one_piece(common, block, desk, rows_slopes, slopes):
         floats, others = _floats_of(desk)
 
-        def of_floats(block, floats):
-            return _floats_of(plain(*given, block, *where, eqx.combine(floats, others)))
+        def of_floats(rows, floats):
+            filled = _fill(program, common, replace(block, rows=rows), eqx.combine(floats, others))
+            return _floats_of(filled)
 
-        primals, tangents = (block, floats), (block_slopes, slopes)
+        primals, tangents = (block.rows, floats), (rows_slopes, slopes)
         floats, slopes, others = jax.jvp(of_floats, primals, tangents, has_aux=True)
         return eqx.combine(floats, others), slopes
 
-    def fill(block, block_slopes, *where, desk, slopes):
-        given = shared, t1, rtol, atol, limit
-        return one_piece(given, block, block_slopes, where, desk, slopes)
-
+    fill = functools.partial(one_piece, common)
     queues = tuple(queue[0]), tuple(queue[1])
-    stream, *rest, results, slopes = _worked_off(program, shared, fill, call, queues, stream)
+    stream, *rest, results, slopes = _worked_off(program, common.shared, fill, call, queues, stream)
     return stream, *rest, jnp.stack([jnp.stack(results), jnp.stack(slopes)])
 
 
@@ -289,13 +309,13 @@ def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, st
     """
     queue, queue_slopes = queues
     stream, slopes = streams
-    width, columns = stream.one.size, _columns_of(program, shared)
+    width, columns = stream.ones.size, _columns_of(program, shared)
     size = queue[0].size + 2 * width
     # Differences of pass numbers stay right where they overflow.
     until = stream.passes + call.passes
 
-    def blocks(taken, columns):
-        return tuple(lax.dynamic_slice_in_dim(one, taken, width, axis=-1) for one in columns)
+    def rows_at(taken, columns):
+        return tuple(lax.dynamic_slice_in_dim(column, taken, width, axis=-1) for column in columns)
 
     def put(wholes, parts, written):
         pairs = zip(wholes, parts, strict=True)
@@ -304,17 +324,17 @@ def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, st
     def outer(state):
         (stream, slopes), taken, written, numbers, results, result_slopes = state
         zero, none = jnp.zeros_like(taken), jnp.full(width, -1, dtype=jnp.int32)
-        block = blocks(taken, queue)
         available = jnp.minimum(call.count - taken, width)
-        last = call.drain & (taken + available >= call.count)
+        drain = call.drain & (taken + available >= call.count)
+        rows = rows_at(taken, queue)
+        block = _Block(rows, call.first + taken, available, until, drain)
         desk = _Desk(stream, zero, zero, none, [jnp.zeros(width)] * columns)
-        block_slopes, desk_slopes = None, None
+        rows_slopes, desk_slopes = None, None
         if queue_slopes is not None:
-            block_slopes = blocks(taken, queue_slopes)
+            rows_slopes = rows_at(taken, queue_slopes)
             parts = slopes, [jnp.zeros(width)] * columns
             desk_slopes = eqx.tree_at(lambda d: (d.stream, d.columns), _floats_of(desk)[0], parts)
-        where = call.first + taken, available, last, until
-        desk, desk_slopes = fill(block, block_slopes, *where, desk=desk, slopes=desk_slopes)
+        desk, desk_slopes = fill(block, desk, rows_slopes, desk_slopes)
         numbers = lax.dynamic_update_slice(numbers, desk.numbers, (written,))
         results = put(results, desk.columns, written)
         if desk_slopes is not None:
@@ -322,7 +342,7 @@ def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, st
                 desk_slopes.stream,
                 put(result_slopes, desk_slopes.columns, written),
             )
-        taken, written = taken + desk.begun, written + desk.filled
+        taken, written = taken + desk.taken, written + desk.filled
         return (desk.stream, slopes), taken, written, numbers, results, result_slopes
 
     def more(stream, taken):
@@ -353,7 +373,7 @@ def _rank(flags: Array) -> Array:
 def _give_up(lanes: Lanes, passes, limit) -> Lanes:
     """End runs that took too many steps, or whose state is not finite."""
     finite = are_finite(lanes)
-    lost = ~lanes.done & (~finite | (passes - lanes.begun > limit))
+    lost = ~lanes.done & (~finite | (passes - lanes.first_pass > limit))
     reason = jnp.where(finite, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
     status = jnp.where(lost, reason.astype(lanes.status.dtype), lanes.status)
     return eqx.tree_at(lambda n: (n.status, n.done), lanes, (status, lanes.done | lost))

@@ -25,6 +25,7 @@ from ..numerics.compiling import wide
 from .queue import (
     ROUNDS_PER_PASS,
     Call,
+    Common,
     advance,
     advance_with_derivatives,
     differentiable,
@@ -98,7 +99,7 @@ def run(
     columns = 2 + sum(program.mapped)
     kernel = compiled(program, derivatives > 0)
     team = _Team(
-        functools.partial(kernel, shared, t1, rtol, atol, np.int32(limit)),
+        functools.partial(kernel, Common(shared, t1, rtol, atol, np.int32(limit))),
         functools.partial(_first_stream, program, shared, columns, derivatives > 0),
         rows_of,
         put,
