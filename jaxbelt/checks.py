@@ -210,7 +210,7 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
 
 
 def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array | np.ndarray:
-    """The same, but left in NumPy if it is known: for what goes into a compiled function anyway."""
+    """As `as_array`, but left in NumPy if it is known, for what goes into a compiled function."""
     require_usable_jax()
     given, wanted = value, "a number" if shape == () else "numbers"
     dtype = getattr(value, "dtype", None)
@@ -309,22 +309,22 @@ def be_positive(field: str, value: Any) -> list[Rule]:
 
 def check_finite(value: Any, field: str) -> None:
     """Raise unless every known number of the array `value` is finite."""
-    if not isinstance(value, Tracer):
-        require(np.isfinite(value).all(), field, "finite", value)
+    _enforce(be_finite(field, value))
 
 
 def check_nonnegative(value: Any, field: str) -> None:
     """Raise unless every known number of `value` is finite and >= 0."""
-    check_finite(value, field)
-    if not isinstance(value, Tracer):
-        require((np.asarray(value) >= 0).all(), field, ">= 0", value)
+    _enforce(be_nonnegative(field, value))
 
 
 def check_positive(value: Any, field: str) -> None:
     """Raise unless every known number of `value` is finite and > 0."""
-    check_finite(value, field)
-    if not isinstance(value, Tracer):
-        require((np.asarray(value) > 0).all(), field, "> 0", value)
+    _enforce(be_positive(field, value))
+
+
+def _enforce(rules: Sequence[Rule]) -> None:
+    for rule in rules:
+        rule.enforce("")
 
 
 def number(value: Any) -> str:

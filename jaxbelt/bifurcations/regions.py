@@ -67,8 +67,11 @@ def region_name(osc: Oscillator, label: Label) -> str:
 
 
 def region_of(opposite: bool, belts: int, rests: bool, cycles: Sequence[Collection[int]]) -> str:
-    """The same, where it is known whether belts run in opposite directions, how many there are,
-    whether an equilibrium is stable, and to which belts each of the cycles sticks."""
+    """The name of a region, see `region_name`, by what is known of it.
+
+    opposite: whether belts run in opposite directions; belts: how many there are; rests: whether an
+    equilibrium is stable; cycles: the belts to which each of them sticks.
+    """
     number = 2 if rests and cycles else 3 if cycles else 1
     letters = []
     for stuck in cycles:

@@ -164,7 +164,7 @@ def _row_of_point(point: "jb.BifurcationPoint") -> list[Any]:
 
 
 def _as_data(points) -> list[dict[str, Any]]:
-    """The same rows for JSON."""
+    """The rows of `write_points`, for JSON."""
     rows = [dict(zip(POINT_COLUMNS, _row_of_point(point), strict=True)) for point in points]
     return [row | {name: plain(row[name]) for name in ("value", "error")} for row in rows]
 

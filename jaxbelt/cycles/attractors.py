@@ -76,7 +76,7 @@ def place_of(cycle: Cycle | Loop) -> np.ndarray:
 
 
 def extent(rows: np.ndarray) -> np.ndarray:
-    """The same of (x1, x2, T) of the arcs that are used, [arcs, 3]."""
+    """What `place_of` tells, by (x1, x2, T) of the arcs that are used, [arcs, 3]."""
     x1, x2, durations = rows.T
     return np.array([x1.min(), x1.max(), x2.min(), x2.max(), durations.sum()])
 

@@ -29,8 +29,10 @@ class BasinMargin(eqx.Module):
     otherwise: Array | None = None
 
     def at(self, osc: Oscillator, y0: Array) -> "BasinMargin":
-        """The same for oscillators beside a known one, and its cycle that a start leads to: there
-        it is a function that JAX can trace."""
+        """The margin of the cycle that a start of a known oscillator leads to.
+
+        For oscillators beside that one it is a function that JAX can trace.
+        """
         told = portrait(osc)
         (end,) = leads_to(told, np.asarray(y0)[None])
         way, _, status = shortest_way_out(told, end, along_x2=self.direction == "x2")

@@ -178,7 +178,7 @@ def candidates(osc: Oscillator) -> Equilibria:
 
 @jit
 def _all_candidates(osc: Oscillator) -> Equilibria:
-    """The same with saddles."""
+    """Where the mass can rest, saddles included, as `candidates`."""
     return _rows_of(osc, with_saddles=True)
 
 

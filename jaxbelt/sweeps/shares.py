@@ -121,13 +121,15 @@ def _labels_of_starts(
 
 
 def _labels_of(kinds: np.ndarray, sticks: np.ndarray, runs: Runs) -> np.ndarray:
-    """The same of points by starts: the first start that has no number yet is compared with all."""
+    """Numbers of the attractors, [points, starts], or -1.
+
+    The first start that has no number yet is compared with all others.
+    """
     labels, number = np.full(kinds.shape, -1), 0
-    left = kinds != UNDECIDED
+    untold = kinds != UNDECIDED
     rows = np.arange(len(kinds))
-    while np.any(left):
-        one = np.argmax(left, axis=1)
-        there = rows[:, None], one[:, None]
+    while np.any(untold):
+        there = rows[:, None], np.argmax(untold, axis=1)[:, None]
         same = kinds == kinds[there]
         first = runs.at(there)
         middle = np.abs(runs.places[..., 0] - first.places[..., 0])
@@ -135,8 +137,8 @@ def _labels_of(kinds: np.ndarray, sticks: np.ndarray, runs: Runs) -> np.ndarray:
         stuck = np.all(sticks == sticks[there], axis=-1)
         rests = np.where(kinds == EQUILIBRIUM, rests, stuck)
         same &= np.where(kinds == CYCLE, runs.same(first)[0], rests)
-        labels[same & left & left[there]] = number
-        left &= ~same
+        labels[same & untold & untold[there]] = number
+        untold &= ~same
         number += 1
     return labels
 
@@ -151,7 +153,7 @@ def _without_doubt(
     starts: list[str],
     labels: np.ndarray,
 ) -> np.ndarray:
-    """The same numbers where shooting has told which of them are of one cycle."""
+    """The numbers of `_labels_of_starts`, where shooting has told which are of one cycle."""
     runs = _runs_by_points(dataset, others, starts)
     flat = labels.reshape(runs.signatures.shape).copy()
     kinds = dataset["kind"].transpose(*others, *starts).values.reshape(flat.shape)
