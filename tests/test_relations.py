@@ -439,13 +439,27 @@ def numbers_of(cycle: jb.Cycle, image: Image | None = None) -> list[float]:
     return [float(cycle.status), float(cycle.period), float(cycle.multiplier), *sticks, *extrema]
 
 
+two_belts_by_day = pytest.mark.parametrize(
+    "image_of",
+    [
+        pytest.param(
+            image_of,
+            id=name,
+            # A program for three belts takes as long to compile as all the rest.
+            marks=[] if len(image_of(cases(0)[0][0]).order) == 2 else pytest.mark.slow,
+        )
+        for name, image_of in IMAGES.items()
+    ],
+)
+
+
 @functools.cache
 def original_cycle(seed: int, number: int) -> list[float]:
     return numbers_of(jb.find_cycle(*cases(seed)[number]))
 
 
 @seeds
-@of_images
+@two_belts_by_day
 def test_an_image_has_the_same_cycle(image_of, seed):
     for number, (osc, y0) in enumerate(cases(seed)):
         if image_of is reflected and rests_on_an_edge(osc, y0):
@@ -474,20 +488,6 @@ def swept(oscillators, observe: str, **axes):
 @functools.cache
 def original_sweep(observe: str, seed: int):
     return swept([osc for osc, _ in cases(seed)], observe)
-
-
-two_belts_by_day = pytest.mark.parametrize(
-    "image_of",
-    [
-        pytest.param(
-            image_of,
-            id=name,
-            # A program for three belts takes as long to compile as all the rest.
-            marks=[] if len(image_of(cases(0)[0][0]).order) == 2 else pytest.mark.slow,
-        )
-        for name, image_of in IMAGES.items()
-    ],
-)
 
 
 def sweeps_of(image_of, observe: str, seed: int):

@@ -339,6 +339,7 @@ def test_vmap_equals_a_loop():
     assert seen >= {1, 2, 3, 4}
 
 
+@pytest.mark.slow(first=True)
 def test_a_lane_that_is_not_finite_harms_no_other():
     nu, y0, edges = mixed_lanes()
     sound = all_of_class_d(nu, y0, edges)
