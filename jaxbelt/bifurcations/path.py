@@ -82,7 +82,8 @@ class ParameterPath:
         # stick; None where there is none.
         self._goes_on: dict[tuple[float, float], dict[int, int | None]] = {}
         self._coincidences = self.variation.coincidences(self.first, self.last)
-        self.breaks = sorted(self._coincidences)
+        self._meetings = self.variation.meetings(self.first, self.last)
+        self.breaks = sorted(self._coincidences.keys() | self._meetings.keys())
 
     def at(self, value: float) -> Oscillator:
         """The oscillator there."""
@@ -118,7 +119,11 @@ class ParameterPath:
     def coinciding(self, value: float) -> list[tuple[int, ...]]:
         """The pairs of belts that come to run at one velocity there, and those that come to rest
         alone."""
-        return self._coincidences[value]
+        return self._coincidences.get(value, [])
+
+    def meeting(self, value: float) -> list[tuple[int, ...]]:
+        """The pairs of belts of which contact edges meet there."""
+        return self._meetings.get(value, [])
 
     def look(self, values: Sequence[float] | np.ndarray) -> None:
         """Find the labels there, in batches."""
