@@ -8,7 +8,7 @@ in the other order, and the contacts between them are others again.
   there, so the arc between them has the duration distance/velocity. It vanishes at the point like
   the distance itself, and with the signature fixed the cycle goes smoothly through, as at a sliding
   exchange. The orbit changes continuously; its modes, and the order of its events, at once.
-- `MeetingEdges`: the mass can rest there, and no cycle passes. By the accelerations at rest to the
+- `MeetingEdges`: the mass can rest there, whether a cycle passes, too, or not. By the accelerations at rest to the
   left of both edges, between them and to the right of both, there is a pseudo-focus on one of the
   edges, a segment between them, or nothing. Beyond, that between them is another one: what rests
   there may come to the other edge, change its stability, begin or cease to be.

@@ -218,14 +218,14 @@ def _at_break(path: ParameterPath, value: float) -> list[BifurcationPoint]:
     for belts in path.coinciding(value):
         conditions = [condition for kind in LOOKED_FOR for condition in kind.at_coincidence(belts)]
         found.append(_first_found(path, *interval, conditions))
-    # Of edges that meet one thing is told: a cycle that passes them, or what rests there.
-    meeting = [
-        condition
-        for kind in LOOKED_FOR
-        for belts in path.meeting(value)
-        for condition in kind.at_meeting(belts, *labels)
-    ]
-    found.append(_first_found(path, *interval, meeting))
+    # Where more than two edges meet one pair is told of each kind.
+    for kind in LOOKED_FOR:
+        conditions = [
+            condition
+            for belts in path.meeting(value)
+            for condition in kind.at_meeting(belts, *labels)
+        ]
+        found.append(_first_found(path, *interval, conditions))
     points = [point for point in found if point is not None]
     if not points and labels[0] != labels[1]:
         # Something else may happen just there.
