@@ -270,7 +270,7 @@ class AbstractCondition(eqx.Module):
 
     @classmethod
     def at_meeting(
-        cls, belts: tuple[int, int], before: Label, after: Label
+        cls, belts: tuple[int, ...], before: Label, after: Label
     ) -> Sequence["AbstractCondition"]:
         """Those that could make the difference where contact edges of two belts meet."""
         return ()

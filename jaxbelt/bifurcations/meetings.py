@@ -8,13 +8,13 @@ in the other order, and the contacts between them are others again.
   there, so the arc between them has the duration distance/velocity. It vanishes at the point like
   the distance itself, and with the signature fixed the cycle goes smoothly through, as at a sliding
   exchange. The orbit changes continuously; its modes, and the order of its events, at once.
-- `MeetingEdges`: the mass can rest there, whether a cycle passes, too, or not. By the accelerations at rest to the
-  left of both edges, between them and to the right of both, there is a pseudo-focus on one of the
-  edges, a segment between them, or nothing. Beyond, that between them is another one: what rests
-  there may come to the other edge, change its stability, begin or cease to be.
+- `MeetingEdges`: the mass can rest there, whether a cycle passes or not. By the accelerations at
+  rest to the left of both edges, between them and to the right of both, there is a pseudo-focus on
+  one of the edges, a segment between them, or nothing. Beyond, that between them is another one:
+  what rests there may come to the other edge, change its stability, begin or cease to be.
 """
 
-from itertools import product
+from itertools import pairwise, product
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -128,7 +128,7 @@ class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
 
     @classmethod
     def at_meeting(cls, belts, before, after):
-        return [cls(belts)] if before.cycles != after.cycles else []
+        return [cls((belts[0], belts[1]))] if before.cycles != after.cycles else []
 
 
 def _passage(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array, TwoEdges]:
@@ -136,16 +136,19 @@ def _passage(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array, TwoEdges
     that at which these are nearest: how far apart they are, inf if there is none; the row that ends
     on the first one; the edges."""
     n, positions, pairs = len(osc.belts), jnp.stack(edges(osc)), _pairs(osc, belts)
-    first, second = positions[pairs.first], positions[pairs.second]
     passes = (loop.ends >= n) & (loop.ends < 3 * n)
     last = jnp.arange(loop.ends.size) == jnp.sum(loop.used) - 1
     at = jnp.where(passes, positions[jnp.clip(loop.ends - n, 0, 2 * n - 1)], jnp.nan)
-    then = jnp.where(last, at[0], jnp.roll(at, -1))
-    # Where they are in one place both are passed at once.
-    then = jnp.where(first[:, None] == second[:, None], at, then)
-    onward = (at == first[:, None]) & (then == second[:, None])
-    back = (at == second[:, None]) & (then == first[:, None])
-    found = jnp.where(onward | back, _size(first - second)[:, None], jnp.inf)
+    following = jnp.where(last, at[0], jnp.roll(at, -1))
+
+    def distances(pair):
+        first, second = positions[pair.first], positions[pair.second]
+        # Where they are in one place both are passed at once.
+        then = jnp.where(first == second, at, following)
+        passed = (at == first) & (then == second) | (at == second) & (then == first)
+        return jnp.where(passed, _size(pair.gap(osc)), jnp.inf)
+
+    found = jax.vmap(distances)(pairs)
     which, row = jnp.divmod(jnp.argmin(found), loop.ends.size)
     return found[which, row], row, jax.tree.map(lambda leaf: leaf[which], pairs)
 
@@ -181,7 +184,7 @@ class EdgesAtRest(RestSystem):
                 for number, (before, after) in enumerate(zip(left.codes, right.codes, strict=True))
             ]
             pushes = [_push(osc, mode, ends[0]) for mode in (left, Mode(tuple(codes)), right)]
-            focus = [(a > 0) & (b < 0) for a, b in zip(pushes, pushes[1:], strict=False)]
+            focus = [(a > 0) & (b < 0) for a, b in pairwise(pushes)]
             found += [*focus, pushes[1] == 0]
         return any_of(found) & _both_rub(osc, self.belts)
 
@@ -215,4 +218,4 @@ class MeetingEdges(AbstractRestCondition, _BetweenEdges):
 
     @classmethod
     def at_meeting(cls, belts, before, after):
-        return [cls(belts)] if before.equilibria != after.equilibria else []
+        return [cls((belts[0], belts[1]))] if before.equilibria != after.equilibria else []

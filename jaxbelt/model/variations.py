@@ -34,7 +34,8 @@ SAME_NUMBER = 1e-9
 #: How often a nonlinear function is linearised anew. The distance is squared every time: 1e-1,
 #: 1e-2, 1e-4, 1e-8, 1e-16. Inside of a trace, where nobody looks, it is done so often in any case.
 PASSES, TRACED_PASSES = 12, 5
-#: Values between which zeros of velocities and of gaps between edges are looked for, and how near two are taken for one.
+#: Values between which zeros of velocities, and gaps between edges, are looked for, and how near
+#: two are taken for one.
 VALUES_SEEN, MERGED = 257, 1e-7
 #: Guesses along each side of a plane for where an oscillator lies in it.
 GUESSES = 9
