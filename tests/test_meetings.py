@@ -87,6 +87,7 @@ def test_what_rests_there_begins_or_ceases_to_be(nu, edge, before, after):
         assert point.status == Status.OK and point.value == pytest.approx(edge, abs=1e-15)
 
 
+@pytest.mark.slow
 def test_a_segment_between_the_edges():
     """Belt 1 is at rest: where both touch it holds what belt 0 pulls, to the right it does not."""
     osc = jb.Oscillator(
