@@ -193,6 +193,13 @@ def overlapping(sigma1):
     return jb.presets.class_d(0.35, 0.2, 0.0, sigma1)
 
 
+def beside(sigma1, sigma0, damping, *nu):
+    """Belt 0 touches up to sigma1, belt 1 from sigma0 on: both, or none, in between."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+    belts = (jb.Belt(nu[0], law, upper=sigma1), jb.Belt(nu[1], law, lower=sigma0))
+    return jb.Oscillator(damping, belts)
+
+
 def both(nu):
     """The paper's class (b) with nu1 = 0.35."""
     return jb.presets.class_b(nu, 0.35)
@@ -220,6 +227,22 @@ CASES = {
         jb.BoundaryEquilibrium(0), overlapping, r"\sigma_1", 0.73, 0.66, 0.82
     ),
     "PseudoHopf": Case(jb.PseudoHopf(0), overlapping, r"\sigma_1", 0.91, 0.87, 1.0),
+    "EdgeExchange": Case(
+        jb.EdgeExchange((0, 1)),
+        lambda sigma1: beside(sigma1, 0.3, 0.1, 0.4, -0.3),
+        r"\sigma_1",
+        0.31,
+        0.26,
+        0.34,
+    ),
+    "MeetingEdges": Case(
+        jb.MeetingEdges((0, 1)),
+        lambda sigma1: beside(sigma1, 0.75, 0.5, 0.35, 0.6),
+        r"\sigma_1",
+        0.76,
+        0.72,
+        0.79,
+    ),
 }
 
 

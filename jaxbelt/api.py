@@ -14,6 +14,7 @@ from .bifurcations.curves import BifurcationCurve, bifurcation_curve
 from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
 from .bifurcations.edges import CornerCollision, GrazingEdge
 from .bifurcations.folds import FoldOfCycles
+from .bifurcations.meetings import EdgeExchange, MeetingEdges
 from .bifurcations.refine import refine
 from .bifurcations.regions import RegionMap, region_map
 from .bifurcations.rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
@@ -81,6 +82,7 @@ __all__ = [
     "CrossingSliding",
     "Cycle",
     "Design",
+    "EdgeExchange",
     "Equilibria",
     "EquilibriumKind",
     "EventKind",
@@ -93,6 +95,7 @@ __all__ = [
     "GrazingSliding",
     "Hopf",
     "Machine",
+    "MeetingEdges",
     "NonsmoothFold",
     "OrbitDiagram",
     "Oscillator",

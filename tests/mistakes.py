@@ -146,6 +146,11 @@ MISTAKES = [
     ("jb.refine(jb.SuddenSliding(-1), osc, where=nu0)", "belt must be 0 to 1, got -1"),
     ("jb.refine(jb.BeltAtRest(None), osc, where=nu0)", "belt must be 0 to 1, got None"),
     ("jb.refine(jb.SlidingExchange(0), osc, where=nu0)", "belts must be two different .*, got 0"),
+    ("jb.refine(jb.EdgeExchange(0), osc, where=nu0)", "belts must be two different .*, got 0"),
+    (
+        "jb.refine(jb.MeetingEdges((0, 1)), osc, where=nu0)",
+        r"belts must be two with a finite edge, got \(0, 1\)",
+    ),
     ("jb.refine(jb.GrazingEdge(0), osc, where=nu0)", "belt must be one with a finite edge, got 0"),
     ("jb.refine(jb.CornerCollision(0), osc, where=nu0)", "belt must be one with a finite edge"),
     ("jb.refine(jb.PseudoHopf(1), osc, where=nu0)", "belt must be one with a finite edge, got 1"),

@@ -11,6 +11,7 @@ import oracle
 import oracle_cycles
 import pytest
 from laws import BELL, NESTED, bell, nested
+from scipy.optimize import brentq, minimize_scalar
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
@@ -317,6 +318,49 @@ def test_a_fold_of_cycles_is_found_once():
     assert [point.condition for point in points] == [jb.Hopf(), jb.FoldOfCycles()]
     expected = oracle_cycles.fold_of_cycles(bell_oracle, (0.49, 0.503), (0.2, 0.8))
     assert points[1].value == pytest.approx(expected, abs=1e-11)
+
+
+@pytest.mark.slow
+def test_a_fold_of_cycles_beyond_which_there_is_nothing():
+    """Negative damping: a cycle that crosses the boundary meets an unstable one, and beyond all
+    orbits grow without bounds. It begins at a crossing-sliding point, and not before: where it
+    would cross the boundary on the stretch that holds the mass, it is none."""
+
+    def make(damping):
+        return oracle.class_a(0.3, damping=damping)
+
+    path = ParameterPath(jb.presets.class_a(0.3), lambda osc: osc.damping, (-0.605, -0.59))
+    fold, crossing = search(path, 12)
+    assert (fold.condition, crossing.condition) == (jb.FoldOfCycles(), jb.CrossingSliding(0))
+
+    def least_growth(damping):
+        """Of a loop from (x1, 0), which crosses the boundary twice; 0 on a cycle."""
+
+        def growth(x1):
+            tops = []
+
+            def until(item):
+                tops.extend([item.x1] if isinstance(item, oracle.Loop) and item.axis == 0 else [])
+                return len(tops) == 2
+
+            mode, *_ = oracle.start_mode(make(damping), x1, 0.0)
+            oracle.advance(make(damping), (x1, 0.0), mode, 100.0, until=until)
+            return tops[-1] - x1
+
+        best = minimize_scalar(
+            growth, bounds=(1.3719, 1.3728), method="bounded", options={"xatol": 1e-8}
+        )
+        assert 1.372 < best.x < 1.3727
+        return best.fun
+
+    expected = brentq(least_growth, -0.59596, -0.5959, xtol=1e-14)
+    assert fold.value == pytest.approx(expected, abs=1e-10)
+    expected = oracle_cycles.crossing_sliding(make, (-0.596, -0.595), 0, 0, 2)
+    assert crossing.value == pytest.approx(expected, abs=1e-11)
+    for value, cycles in path.cycles.items():
+        assert len(cycles) == 1
+        sticks = any(0 in mode for mode in cycles[0].path)
+        assert sticks == (value > crossing.value)
 
 
 def test_a_change_that_no_condition_explains_is_reported():

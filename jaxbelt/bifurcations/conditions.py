@@ -282,6 +282,13 @@ class AbstractCondition(eqx.Module):
         return ()
 
     @classmethod
+    def at_meeting(
+        cls, belts: tuple[int, ...], before: Label, after: Label
+    ) -> Sequence["AbstractCondition"]:
+        """Those that could make the difference where contact edges of two belts meet."""
+        return ()
+
+    @classmethod
     def of_unstable_cycles(cls, edged: Sequence[int]) -> Sequence["AbstractCondition"]:
         """Those that could make the difference between the modes of two unstable cycles."""
         return ()

@@ -12,7 +12,7 @@ back on the same side, from stable to unstable.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import combinations, groupby, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -188,7 +188,9 @@ def bifurcation_diagram(
     points = search(path, resolution)
     # A point on an end of the span has one side only.
     inner = [point for point in points if path.first < float(point.value) < path.last]
-    ends = [path.first, *(float(point.value) for point in inner), path.last]
+    by_place = groupby(inner, key=lambda point: float(point.value))
+    special = {value: list(here) for value, here in by_place}
+    ends = [path.first, *special, path.last]
     stretches = list(pairwise(ends))
     nodes = [_nodes(path, a, b, rows) for a, b in stretches]
     path.look(np.concatenate(nodes))
@@ -205,7 +207,7 @@ def bifurcation_diagram(
     names = [region_name(path.at(v), label) for v, label in zip(middles, labels, strict=True)]
     return BifurcationDiagram(
         points=points,
-        branches=tuple(_joined(pieces, inner)),
+        branches=tuple(_joined(pieces, list(special.values()))),
         regions=tuple((a, b, name) for (a, b), name in zip(stretches, names, strict=True)),
         oscillator=path.osc,
         name=path.name,
@@ -390,11 +392,12 @@ class _End(NamedTuple):
     place: tuple[str, float, float]
 
 
-def _joined(pieces: Sequence[_Piece], points: Sequence[BifurcationPoint]) -> list[Branch]:
-    """Branches through the points: two ends of pieces that are one place there belong together."""
+def _joined(pieces: Sequence[_Piece], special: Sequence[list[BifurcationPoint]]) -> list[Branch]:
+    """Branches through the points, those at one value together: two ends of pieces that are one
+    place there belong together."""
     partner: dict[tuple[int, bool], tuple[int, bool]] = {}
-    for at, point in enumerate(points):
-        if not point.condition.joins:
+    for at, points in enumerate(special):
+        if not all(point.condition.joins for point in points):
             continue
         ends = [
             _end(i, piece, right=piece.stretch == at)

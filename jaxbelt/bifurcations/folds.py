@@ -88,7 +88,7 @@ class FoldOfCycles(AbstractCycleCondition):
         return [cls()] if before.smooth != after.smooth else []
 
     def beginnings(self, cycles):
-        return [*(one.loop for one in cycles if not sticks(one.path)), None]
+        return [*(one.loop for one in cycles if one.path and not sticks(one.path)), None]
 
     def limit(self, trail):
         """Where the cycle has shrunk to an equilibrium, at a degenerate Hopf point."""

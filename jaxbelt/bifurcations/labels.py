@@ -33,8 +33,8 @@ class Label(NamedTuple):
 
     @property
     def smooth(self) -> int:
-        """How many cycles stick to no belt."""
-        return sum(not sticks(path) for path in self.cycles)
+        """How many cycles stick to no belt; one that is only taken to be there is none."""
+        return sum(bool(path) and not sticks(path) for path in self.cycles)
 
 
 class AttractingCycle(NamedTuple):

@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..checks import as_interval
 from ..cycles.attractors import (
@@ -32,12 +33,14 @@ from ..cycles.attractors import (
 )
 from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
 from ..cycles.settling import AT_REST
-from ..cycles.shooting import SIZES, Loop, cut
+from ..cycles.shooting import SIZES, Loop, cut, following_codes
 from ..model.equilibria import candidates
+from ..model.modes import STUCK, capacity, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import varied
 from ..numerics.compiling import each, jit
+from ..numerics.newton import HOLDS
 from ..results import Status
 from .conditions import AbstractCondition, check_conditions
 from .guesses import settled_loops
@@ -82,7 +85,8 @@ class ParameterPath:
         # stick; None where there is none.
         self._goes_on: dict[tuple[float, float], dict[int, int | None]] = {}
         self._coincidences = self.variation.coincidences(self.first, self.last)
-        self.breaks = sorted(self._coincidences)
+        self._meetings = self.variation.meetings(self.first, self.last)
+        self.breaks = sorted(self._coincidences.keys() | self._meetings.keys())
 
     def at(self, value: float) -> Oscillator:
         """The oscillator there."""
@@ -118,7 +122,11 @@ class ParameterPath:
     def coinciding(self, value: float) -> list[tuple[int, ...]]:
         """The pairs of belts that come to run at one velocity there, and those that come to rest
         alone."""
-        return self._coincidences[value]
+        return self._coincidences.get(value, [])
+
+    def meeting(self, value: float) -> list[tuple[int, ...]]:
+        """The pairs of belts of which contact edges meet there."""
+        return self._meetings.get(value, [])
 
     def look(self, values: Sequence[float] | np.ndarray) -> None:
         """Find the labels there, in batches."""
@@ -182,9 +190,10 @@ class ParameterPath:
         for cycle in (way() for way in ways[0 if closes else 1 :]):
             if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
                 # Not the equilibrium, to which a cycle may shrink.
-                if np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST:
-                    loop = jax.tree.map(np.asarray, as_loop(cycle, ROOM))
-                    return AttractingCycle(itinerary(osc, loop), loop)
+                found = jax.tree.map(np.asarray, as_loop(cycle, ROOM))
+                is_cycle = np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST
+                if is_cycle and bool(_crosses(osc, found)):
+                    return AttractingCycle(itinerary(osc, found), found)
         return None
 
     def _share(self) -> None:
@@ -283,6 +292,24 @@ def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> i
             if sticks(cycle.path) or apart(place_of(cycle.loop), place_of(other.loop)) < SOLVED:
                 return number
     return None
+
+
+@jit
+def _crosses(osc: Oscillator, loop: Loop) -> Array:
+    """Whether a loop crosses no boundary where the mass would stick to it: its equations, which
+    hold the signature, do not ask for that."""
+    velocities = jnp.stack([belt.velocity for belt in osc.belts])
+
+    def would_stick(codes, end, exit_x1, after):
+        velocity = velocities[jnp.clip(end, 0, len(osc.belts) - 1)]
+        held = jnp.where((velocities == velocity) & (jnp.abs(codes) < 1.5), STUCK, codes)
+        mode = mode_of(held)
+        needed = mode_acceleration(osc, mode, exit_x1, velocity / osc.omega)
+        crosses = (end < len(osc.belts)) & ~jnp.any(after == STUCK)
+        return crosses & (jnp.abs(needed) < capacity(osc, mode) - HOLDS)
+
+    rows = loop.codes, loop.ends, loop.exits[:, 0], following_codes(loop)
+    return ~jnp.any(jax.vmap(would_stick)(*rows))
 
 
 def _fits(loop: Loop, other: Loop) -> bool:

@@ -30,6 +30,7 @@ from .conditions import AbstractCondition, BifurcationPoint, unexplained_point
 from .crossings import CrossingSliding, SlidingExchange
 from .edges import GrazingEdge
 from .folds import FoldOfCycles
+from .meetings import EdgeExchange, MeetingEdges
 from .path import ROOM, ParameterPath
 from .rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
 from .tangencies import GrazingSliding
@@ -44,6 +45,8 @@ LOOKED_FOR: tuple[type[AbstractCondition], ...] = (
     BeltAtRest,
     BoundaryEquilibrium,
     PseudoHopf,
+    EdgeExchange,
+    MeetingEdges,
     GrazingEdge,
     FoldOfCycles,
 )
@@ -207,15 +210,24 @@ def _first_found(
 
 
 def _at_break(path: ParameterPath, value: float) -> list[BifurcationPoint]:
-    """The points where the varied belt is at rest or runs with another one."""
+    """The points where the varied belt is at rest or runs with another one, or edges meet."""
     interval = path.beside(value)
     path.look(interval)
+    labels = [path.label(side) for side in interval]
     found = []
     for belts in path.coinciding(value):
         conditions = [condition for kind in LOOKED_FOR for condition in kind.at_coincidence(belts)]
         found.append(_first_found(path, *interval, conditions))
+    # Where more than two edges meet one pair is told of each kind.
+    for kind in LOOKED_FOR:
+        conditions = [
+            condition
+            for belts in path.meeting(value)
+            for condition in kind.at_meeting(belts, *labels)
+        ]
+        found.append(_first_found(path, *interval, conditions))
     points = [point for point in found if point is not None]
-    if not points and path.label(interval[0]) != path.label(interval[1]):
+    if not points and labels[0] != labels[1]:
         # Something else may happen just there.
         point = _explained(path, *interval)
         points = [point or unexplained_point(path.variation, value, 0.0)]

@@ -34,7 +34,8 @@ SAME_NUMBER = 1e-9
 #: How often a nonlinear function is linearised anew. The distance is squared every time: 1e-1,
 #: 1e-2, 1e-4, 1e-8, 1e-16. Inside of a trace, where nobody looks, it is done so often in any case.
 PASSES, TRACED_PASSES = 12, 5
-#: Values between which zeros of velocities are looked for, and how near two are taken for one.
+#: Values between which zeros of velocities, and gaps between edges, are looked for, and how near
+#: two are taken for one.
 VALUES_SEEN, MERGED = 257, 1e-7
 #: Guesses along each side of a plane for where an oscillator lies in it.
 GUESSES = 9
@@ -73,12 +74,12 @@ class Family(eqx.Module):
         slopes = jax.tree.unflatten(jax.tree.structure(self.oscillator), self.slopes)
         return [belt.velocity for belt in slopes.belts]
 
-    def zeros(self, which: tuple[int, ...]) -> list[float]:
-        """The value of the one parameter at which a belt is at rest, or two run at one velocity;
-        none where that does not change."""
-        at = [*(float(self.oscillator.belts[belt].velocity) for belt in which), 0.0]
-        slopes = self.velocity_slopes()
-        along = [*(float(slopes[belt][0]) for belt in which), 0.0]
+    def zeros(self, which: Sequence[tuple[int, str]]) -> list[float]:
+        """The value of the one parameter at which a number of a belt, (belt, name), is zero, or two
+        of them are equal; none where that does not change."""
+        slopes = jax.tree.unflatten(jax.tree.structure(self.oscillator), self.slopes)
+        at = [*(float(getattr(self.oscillator.belts[belt], name)) for belt, name in which), 0.0]
+        along = [*(float(getattr(slopes.belts[belt], name)[0]) for belt, name in which), 0.0]
         if along[0] == along[1]:
             return []
         return [float(self.origin[0]) + (at[1] - at[0]) / (along[0] - along[1])]
@@ -211,28 +212,52 @@ class Variation:
     def coincidences(self, first: float, last: float) -> dict[float, list[tuple[int, ...]]]:
         """Where, between two values of the one parameter, belts come to run at one velocity, two
         numbers each, and then where a belt comes to rest, its number; all of them with a load."""
-        found: dict[float, list[tuple[int, ...]]] = {}
         belts = range(len(self.oscillator(np.array([first])).belts))
-        for which in [*combinations(belts, 2), *((belt,) for belt in belts)]:
-            line = self.line
-            zeros = self._zeros(which, first, last) if line is None else line.zeros(which)
+        which = [*combinations(belts, 2), *((belt,) for belt in belts)]
+        velocities = [[(belt, "velocity") for belt in some] for some in which]
+        return self._zeros_of(velocities, first, last)
+
+    def meetings(self, first: float, last: float) -> dict[float, list[tuple[int, ...]]]:
+        """Where, between two values of the one parameter, contact edges of two belts meet, both
+        with a load, their numbers. Not at these values themselves: an edge may have come there from
+        where it cannot be."""
+        belts = self.oscillator(np.array([first])).belts
+        ends = [
+            [(number, name) for name in ("lower", "upper") if np.isfinite(getattr(belt, name))]
+            for number, belt in enumerate(belts)
+        ]
+        which = [pair for two in combinations(ends, 2) for pair in product(*two)]
+        found = self._zeros_of(which, first, last)
+        return {value: belts for value, belts in found.items() if first < value < last}
+
+    def _zeros_of(
+        self, which: Sequence[Sequence[tuple[int, str]]], first: float, last: float
+    ) -> dict[float, list[tuple[int, ...]]]:
+        """Where, between two values of the one parameter, numbers of belts, (belt, name) each, are
+        equal, or one is zero, if the belts have a load: these."""
+        found: dict[float, list[tuple[int, ...]]] = {}
+        for some in which:
+            line, belts = self.line, tuple(belt for belt, _ in some)
+            zeros = self._zeros(some, first, last) if line is None else line.zeros(some)
             for value in zeros:
                 if not first <= value <= last:
                     continue
                 osc = self.oscillator(np.array([value]))
-                if not all(float(osc.belts[belt].load) for belt in which):
+                if not all(float(osc.belts[belt].load) for belt in belts):
                     continue
                 near = (one for one in found if self.line is None and abs(one - value) < MERGED)
-                found.setdefault(next(near, value), []).append(which)
+                here = found.setdefault(next(near, value), [])
+                if belts not in here:
+                    here.append(belts)
         return found
 
-    def _zeros(self, which: tuple[int, ...], first: float, last: float) -> list[float]:
+    def _zeros(self, which: Sequence[tuple[int, str]], first: float, last: float) -> list[float]:
         """As `Family.zeros`, between two values."""
         from scipy.optimize import brentq, minimize_scalar  # late, as only functions need them
 
         def difference(osc):
-            velocities = [np.asarray(osc.belts[belt].velocity) for belt in which]
-            return velocities[0] - velocities[1] if len(which) == 2 else velocities[0]
+            numbers = [np.asarray(getattr(osc.belts[belt], name)) for belt, name in which]
+            return numbers[0] - numbers[1] if len(which) == 2 else numbers[0]
 
         def at(value):
             return float(difference(self.oscillator(np.array([value]))))

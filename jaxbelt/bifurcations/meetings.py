@@ -1,0 +1,221 @@
+"""Contact edges of two belts that meet: `EdgeExchange` and `MeetingEdges`.
+
+Beside such a point the two edges lie close together, and between them the contacts are others than
+to the left and to the right of both. At the point there is nothing between; beyond, the edges come
+in the other order, and the contacts between them are others again.
+
+- `EdgeExchange`: a cycle passes both edges, one right after the other. Its velocity is not zero
+  there, so the arc between them has the duration distance/velocity. It vanishes at the point like
+  the distance itself, and with the signature fixed the cycle goes smoothly through, as at a sliding
+  exchange. The orbit changes continuously; its modes, and the order of its events, at once.
+- `MeetingEdges`: the mass can rest there, whether a cycle passes or not. By the accelerations at
+  rest to the left of both edges, between them and to the right of both, there is a pseudo-focus on
+  one of the edges, a segment between them, or nothing. Beyond, that between them is another one:
+  what rests there may come to the other edge, change its stability, begin or cease to be.
+"""
+
+from itertools import pairwise, product
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..checks import is_concrete, require_value
+from ..cycles.shooting import SIZES, Chain, Loop, meshed
+from ..model.equilibria import candidates
+from ..model.modes import Mode, any_of, capacity, contact, edges, mode_acceleration
+from ..model.oscillator import Oscillator
+from ..results import Status
+from .conditions import AbstractCondition, AbstractCycleCondition, Line
+from .crossings import arrival_tests
+from .guesses import nearest, settled_loops
+from .rests import NOTHING, AbstractRestCondition
+from .systems import CycleSystem, RestSystem
+
+
+class TwoEdges(eqx.Module):
+    """Two edges by their numbers in `modes.edges`, the first one of the first belt."""
+
+    first: Array
+    second: Array
+
+    def gap(self, osc: Oscillator) -> Array:
+        """How far the first one is to the right of the second one."""
+        positions = jnp.stack(edges(osc))
+        return positions[self.first] - positions[self.second]
+
+
+class _BetweenEdges(AbstractCondition):
+    """A condition on contact edges of two belts, of which any two may meet."""
+
+    belts: tuple[int, int]
+
+    def check(self, osc):
+        two = isinstance(self.belts, tuple | list) and len(set(self.belts)) == len(self.belts) == 2
+        require_value(two, "belts", "two different numbers, such as (0, 1)", self.belts)
+        super().check(osc)
+        if is_concrete(osc):
+            ends = [(osc.belts[belt].lower, osc.belts[belt].upper) for belt in self.belts]
+            have = np.all(np.any(np.isfinite(ends), axis=1))
+            require_value(have, "belts", "two with a finite edge", self.belts)
+
+
+def _pairs(osc: Oscillator, belts: tuple[int | Array, int | Array]) -> TwoEdges:
+    """The four pairs of an edge of one belt and one of the other one, [4]."""
+    n = len(osc.belts)
+    pairs = [(belts[0] + i * n, belts[1] + j * n) for i, j in product((0, 1), repeat=2)]
+    return TwoEdges(*(jnp.stack([jnp.asarray(one) for one in ends]) for ends in zip(*pairs)))
+
+
+def _size(gap: Array) -> Array:
+    """The size of a gap between edges, inf where one of them is infinite, or both are."""
+    return jnp.where(jnp.isfinite(gap), jnp.abs(gap), jnp.inf)
+
+
+def _both_rub(osc: Oscillator, belts: tuple[int | Array, int | Array]) -> Array:
+    """Whether both belts have a load: the edge of one without does nothing."""
+    loads = jnp.stack([belt.load for belt in osc.belts])
+    return (loads[belts[0]] > 0) & (loads[belts[1]] > 0)
+
+
+# --- a cycle passes both --------------------------------------------------------------------------
+
+
+class EdgesPassed(CycleSystem):
+    """A cycle that passes two edges, one right after the other, at the end of `row` and of the arc
+    that follows."""
+
+    chain: Chain
+    row: Array
+    pair: TwoEdges
+
+    def condition(self, osc, z, miss):
+        return self.pair.gap(osc)
+
+    def watch(self, osc, z, slope):
+        return arrival_tests(osc, self.chain, z, self.row), True, jnp.nan
+
+
+class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
+    """Contact edges of two belts meet and change places where a cycle passes them.
+
+    Beyond, it passes them in the other order; between them it slips, or sticks, otherwise.
+    """
+
+    caption: ClassVar[str] = "edge exchange, belts {belt}"
+    line: ClassVar[Line] = Line("edge exchange", "#56B4E9", (0, (1, 1.2)))
+
+    @property
+    def room(self):
+        return SIZES[1]  # passing edges takes more of them
+
+    def guess(self, osc, size):
+        return nearest(osc, *settled_loops(osc, candidates(osc), size), self)
+
+    def distance(self, osc: Oscillator, loop: Loop) -> Array:
+        """How far apart the edges are that the loop passes."""
+        return _passage(osc, loop, self.belts)[0]
+
+    def system(self, osc, loop, status):
+        distance, row, pair = _passage(osc, loop, self.belts)
+        exists = jnp.isfinite(distance) & _both_rub(osc, self.belts)
+        status = jnp.where(exists | (status != Status.OK), status, Status.NOT_TOUCHED.value)
+        chain, z = meshed(osc, loop)
+        return EdgesPassed(chain, row, pair), z, status
+
+    @classmethod
+    def at_meeting(cls, belts, before, after):
+        return [cls((belts[0], belts[1]))] if before.cycles != after.cycles else []
+
+
+def _passage(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array, TwoEdges]:
+    """Of the places where a loop passes an edge of each of the belts, one right after the other,
+    that at which these are nearest: how far apart they are, inf if there is none; the row that ends
+    on the first one; the edges."""
+    n, positions, pairs = len(osc.belts), jnp.stack(edges(osc)), _pairs(osc, belts)
+    passes = (loop.ends >= n) & (loop.ends < 3 * n)
+    last = jnp.arange(loop.ends.size) == jnp.sum(loop.used) - 1
+    at = jnp.where(passes, positions[jnp.clip(loop.ends - n, 0, 2 * n - 1)], jnp.nan)
+    following = jnp.where(last, at[0], jnp.roll(at, -1))
+
+    def distances(pair):
+        first, second = positions[pair.first], positions[pair.second]
+        # Where they are in one place both are passed at once.
+        then = jnp.where(first == second, at, following)
+        passed = (at == first) & (then == second) | (at == second) & (then == first)
+        return jnp.where(passed, _size(pair.gap(osc)), jnp.inf)
+
+    found = jax.vmap(distances)(pairs)
+    which, row = jnp.divmod(jnp.argmin(found), loop.ends.size)
+    return found[which, row], row, jax.tree.map(lambda leaf: leaf[which], pairs)
+
+
+# --- the mass rests there -------------------------------------------------------------------------
+
+
+class EdgesAtRest(RestSystem):
+    """Two edges meet, and nothing else is unknown; belts: those whose edges they are."""
+
+    pair: TwoEdges
+    belts: tuple[int | Array, int | Array]
+
+    @property
+    def otherwise(self):
+        return Status.NOT_TOUCHED
+
+    def residual(self, osc, x):
+        return self.pair.gap(osc)[None]
+
+    def exists(self, osc, x):
+        """Whether there is something at rest on, or between, them in either order."""
+        positions = jnp.stack(edges(osc))
+        ends = jnp.sort(jnp.stack([positions[self.pair.first], positions[self.pair.second]]))
+        rest = jnp.zeros(())
+        left = contact(osc, ends[0], rest, rightward=False)
+        right = contact(osc, ends[1], rest, rightward=True)
+        found = []
+        for passed in self.belts:
+            # Between them the belt whose edge comes first is in contact as to the right of both.
+            codes = [
+                jnp.where(passed == number, after, before)
+                for number, (before, after) in enumerate(zip(left.codes, right.codes, strict=True))
+            ]
+            pushes = [_push(osc, mode, ends[0]) for mode in (left, Mode(tuple(codes)), right)]
+            focus = [(a > 0) & (b < 0) for a, b in pairwise(pushes)]
+            found += [*focus, pushes[1] == 0]
+        return any_of(found) & _both_rub(osc, self.belts)
+
+
+def _push(osc: Oscillator, mode: Mode, x1: Array) -> Array:
+    """Where to the mass is pushed at rest: the sign of x2', 0 where belts at rest hold it."""
+    needed = mode_acceleration(osc, mode, x1, jnp.zeros(()))
+    held = mode.any_stuck & (jnp.abs(needed) <= capacity(osc, mode))
+    return jnp.where(held, 0.0, jnp.sign(needed))
+
+
+class MeetingEdges(AbstractRestCondition, _BetweenEdges):
+    """Contact edges of two belts meet and change places where the mass can rest.
+
+    What rests there is another one beyond, or of another stability, or begins or ceases to be.
+    """
+
+    caption: ClassVar[str] = "edges meet, belts {belt}"
+    line: ClassVar[Line] = Line("edges meet", "#D55E00", (0, (1, 1.2)))
+
+    def guess(self, osc, size):
+        return None
+
+    def system(self, osc, guess: Any):
+        pairs = _pairs(osc, self.belts)
+        sizes = _size(jax.vmap(lambda pair: pair.gap(osc))(pairs))
+        at = jnp.argmin(sizes)
+        pair = jax.tree.map(lambda leaf: leaf[at], pairs)
+        status = jnp.where(jnp.isfinite(sizes[at]), Status.OK.value, Status.NOT_TOUCHED.value)
+        return EdgesAtRest(pair, self.belts), NOTHING, status
+
+    @classmethod
+    def at_meeting(cls, belts, before, after):
+        return [cls((belts[0], belts[1]))] if before.equilibria != after.equilibria else []

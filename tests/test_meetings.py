@@ -1,0 +1,160 @@
+"""Contact edges of two belts that meet: against the oracle and closed forms."""
+
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import Status
+from jaxbelt.model.variations import varied
+from jaxbelt.numerics.continuation import Stop
+
+LAW = jb.Conti(1.0, 0.6, 10.0)
+EXCHANGE, MEETING = jb.EdgeExchange((0, 1)), jb.MeetingEdges((0, 1))
+
+
+def beside(upper, lower=0.4, nu=(0.2, -0.25), loads=(1.0, 1.0)):
+    """Belt 0 up to one edge, belt 1 from another one on; both, or none, in between."""
+    belts = (
+        jb.Belt(nu[0], LAW, load=loads[0], upper=upper),
+        jb.Belt(nu[1], LAW, load=loads[1], lower=lower),
+    )
+    return jb.Oscillator(0.5, belts)
+
+
+def its_oracle(upper, lower=0.4, nu=(0.2, -0.25)):
+    return oracle.class_d(*nu, lower, upper)
+
+
+@pytest.mark.slow(first=True)
+def test_a_cycle_passes_and_the_pseudo_focus_loses_its_stability():
+    span = (0.37, 0.431)
+    diagram = jb.bifurcation_diagram(beside, span=span, rows=24, resolution=8)
+    corner, exchange, meeting = diagram.points
+    assert [p.condition for p in (exchange, meeting)] == [EXCHANGE, MEETING]
+    assert corner.condition == jb.CornerCollision(0) and corner.value < 0.4
+    assert exchange.value == meeting.value == 0.4
+    assert exchange.status == meeting.status == Status.OK and exchange.residual < 1e-12
+    # At the point both edges are passed at once: class (c).
+    at = oracle_cycles.sticking_cycle(oracle.class_c(0.2, -0.25, 0.4), (0.41, 0.2))
+    assert exchange.cycle.period == pytest.approx(at.period, abs=1e-10)
+    assert exchange.cycle.x1_max == pytest.approx(at.x1_max, abs=1e-11)
+    # Beside it they are passed one after the other, in either order; the cycle goes on.
+    orders = []
+    for edge in (0.4 - 1e-6, 0.4 + 1e-6):
+        cycle = oracle_cycles.sticking_cycle(its_oracle(edge), (0.41, 0.2))
+        assert cycle.period == pytest.approx(at.period, abs=1e-4)
+        orders.append([belt for kind, belt in cycle.signature if kind == "EDGE"])
+    assert orders[0] != orders[1] and all(len(order) == 4 for order in orders)
+    assert oracle_cycles.pseudo_focus_rate(its_oracle(0.4 - 1e-6), 0.4 - 1e-6) < 0
+    assert oracle_cycles.pseudo_focus_rate(its_oracle(0.4 + 1e-6), 0.4) > 0
+    # Two points at one value; the equilibrium and the cycle go on through both.
+    rests, cycle = diagram.branches[:2]
+    for branch in (rests, cycle):
+        assert np.min(branch.values) < 0.399 and np.max(branch.values) == span[1]
+
+
+@pytest.mark.parametrize("guess", [0.39975, 0.4, 0.4005, 0.41])
+def test_an_exchange_from_either_side(guess):
+    """The corner at 0.3946 is beside it; at the guess 0.4 itself there is one edge."""
+    point = jb.refine(EXCHANGE, beside, at=guess)
+    assert point.status == Status.OK and point.value == pytest.approx(0.4, abs=1e-15)
+    assert point.iterations <= 5 and point.residual < 1e-12 and point.error < 1e-14
+    assert point.cycle.period == pytest.approx(1.3728405787, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("nu", "edge", "before", "after"),
+    [
+        # By the pushes left of both edges, between them (none, then both), right of both.
+        ((0.35, 0.6), 0.75, 0, 1),
+        ((0.35, 0.2), 0.6, 1, 0),
+        ((0.35, 0.2), 0.72, 0, 0),
+    ],
+)
+def test_what_rests_there_begins_or_ceases_to_be(nu, edge, before, after):
+    def foci(osc):
+        return sum(int(kind) == jb.EquilibriumKind.PSEUDO_FOCUS for kind in jb.equilibria(osc).kind)
+
+    counts = [foci(beside(edge + offset, edge, nu)) for offset in (-1e-3, 1e-3)]
+    assert counts == [before, after]
+    point = jb.refine(MEETING, lambda upper: beside(upper, edge, nu), at=edge + 0.02)
+    if before == after == 0:
+        assert point.status == Status.NOT_TOUCHED and jnp.isnan(point.value)
+    else:
+        assert point.status == Status.OK and point.value == pytest.approx(edge, abs=1e-15)
+
+
+@pytest.mark.slow
+def test_a_segment_between_the_edges():
+    """Belt 1 is at rest: where both touch it holds what belt 0 pulls, to the right it does not."""
+    osc = jb.Oscillator(
+        0.5,
+        (
+            jb.Belt(0.55, jb.Coulomb(1.0, 0.5), upper=0.65),
+            jb.Belt(0.0, jb.Coulomb(1.0, 0.5), lower=0.6),
+        ),
+        omega=0.5,
+    )
+    first, second = jb.scan(osc, lambda o: o.belts[1].lower, (0.6, 1.05), resolution=8)
+    assert (first.condition, second.condition) == (MEETING, jb.BoundaryEquilibrium(1))
+    assert first.value == 0.65 and second.value == pytest.approx(1.0, abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("make", "span"),
+    [
+        # The pseudo-focus stays on the edge of belt 0, to the left, and stable.
+        (lambda upper: beside(upper, 0.65, (0.35, -0.6)), (0.64, 0.66)),
+        # The edge of a belt without load is that of nothing.
+        (lambda upper: beside(upper, 0.4, loads=(1.0, 0.0)), (0.399, 0.401)),
+    ],
+)
+def test_nothing_happens_where_they_meet(make, span):
+    assert jb.scan(make, span=span, resolution=8) == ()
+
+
+def test_where_they_meet():
+    """Of straight and of bent ways; ends of the span, and edges that go together, do not count."""
+    straight = varied(beside, None, (0.3,))
+    bent = varied(lambda p: beside(p**2), None, (0.5,))
+    assert straight.meetings(0.3, 0.5) == {0.4: [(0, 1)]} and straight.meetings(0.4, 0.5) == {}
+    ((value, belts),) = bent.meetings(0.5, 0.7).items()
+    assert value == pytest.approx(np.sqrt(0.4), abs=1e-14) and belts == [(0, 1)]
+    together = varied(lambda sigma: jb.presets.class_c(0.2, -0.25, sigma), None, (0.3,))
+    assert together.meetings(0.3, 0.5) == {}
+
+
+@pytest.mark.slow
+def test_their_curves():
+    """That of the cycle ends where a stick phase on belt 0 has no duration; the other one goes
+    on."""
+
+    def make(upper, nu1):
+        return beside(upper, 0.4, (0.2, nu1))
+
+    span = ((0.3, 0.5), (-0.5, -0.1))
+    exchange, meeting = (
+        jb.bifurcation_curve(jb.refine(one, beside, at=0.4005), make, span=span, step=0.02)
+        for one in (EXCHANGE, MEETING)
+    )
+    for curve in (exchange, meeting):
+        assert np.allclose(curve.values[:, 0], 0.4, rtol=0, atol=1e-15)
+    assert np.ptp(meeting.values[:, 1]) == pytest.approx(0.4)
+    assert exchange.ends == (Stop.STOPPED, Stop.LEFT_SPAN)
+    (end,) = exchange.special
+    assert (end.kind, end.belts) == ("DoubleSliding", (0,))
+
+    def duration(nu1):
+        cycle = oracle_cycles.sticking_cycle(oracle.class_c(0.2, nu1, 0.4), (0.41, 0.2))
+        return cycle.stick_durations[0]
+
+    # It vanishes like a straight line.
+    values = end.values[1] + np.array([1e-3, 2e-3])
+    slope = np.diff([duration(nu1) for nu1 in values])[0] / 1e-3
+    assert duration(values[0]) == pytest.approx(slope * 1e-3, rel=0.05)
+    at = jb.refine(EXCHANGE, lambda upper: make(upper, -0.15), at=0.401)
+    expected = oracle_cycles.sticking_cycle(oracle.class_c(0.2, -0.15, 0.4), (0.41, 0.2))
+    assert at.cycle.period == pytest.approx(expected.period, abs=1e-10)
