@@ -47,6 +47,7 @@ from .results import EventKind, Status, describe
 from .si import in_si
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.datasets import decoded
+from .sweeps.fractions import BasinFractions, basin_fractions
 from .sweeps.moments import AtEvents, AtExtrema, AtSection, AtTimes
 from .sweeps.orbit_diagram import OrbitDiagram, orbit_diagram
 from .sweeps.shares import attractors
@@ -67,6 +68,7 @@ __all__ = [
     "AtExtrema",
     "AtSection",
     "AtTimes",
+    "BasinFractions",
     "BasinStability",
     "Basins",
     "Belt",
@@ -111,6 +113,7 @@ __all__ = [
     "Verified",
     "amplitude",
     "attractors",
+    "basin_fractions",
     "basin_stability",
     "basins",
     "bifurcation_curve",
