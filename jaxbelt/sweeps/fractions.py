@@ -19,10 +19,11 @@ from jaxtyping import Array, ArrayLike
 from ..activity import announced, tell
 from ..checks import as_array, as_interval, as_whole, check_positive
 from ..cycles.attractors import RUN, Runs
+from ..cycles.cycle import find_cycle
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
-from ..results import draw
+from ..results import Status, draw
 from ..tables import table_of
 from .attractor import CYCLE, EQUILIBRIUM, KINDS, STUCK_FOR_EVER, UNDECIDED, Attractor
 from .basins import as_box, check_key, rest_reached, starts_in
@@ -38,7 +39,11 @@ if TYPE_CHECKING:
 MOST_AT_ONCE = 2**20
 #: How far an attractor may move from value to value, unless told: this part of what the box and all
 #: attractors extend over.
-MOVES = 0.1
+MOVES = 0.25
+#: A cycle attracts if its multiplier is below 1 by more than this, which is beyond rounding.
+ATTRACTS = 1e-9
+#: Of more cycles at one value that do not stick none is looked into: they are a continuum.
+MOST_CYCLES = 50
 #: Where an attractor is: its smallest and largest x1 and x2; and how long a loop takes.
 PLACE = ("x1_min", "x1_max", "x2_min", "x2_max", "period")
 
@@ -131,7 +136,7 @@ def basin_fractions(
     function of the parameter that returns the oscillator. box: ((x1 from, to), (x2 from, to)),
     dimensionless; n: number of starts at each value, drawn uniformly and anew for each; key: from
     `jax.random.key`. rows: how many values of the parameter, evenly spaced. moves: how far an
-    attractor may move from one value to the next, in x1 or x2; None: a tenth of what the box and
+    attractor may move from one value to the next, in x1 or x2; None: a quarter of what the box and
     the attractors at all values extend over, in x1 or x2, whichever is longer. t1: when a run that
     reached no attractor is given up; rtol, atol: tolerances of a step.
 
@@ -140,10 +145,13 @@ def basin_fractions(
     attractor keeps its name if it is of one kind (equilibrium, cycle, stuck) and its smallest and
     largest x1 and x2 have moved by no more than `moves`. Of several ways to pair attractors so the
     one is taken that leaves the fewest alone, and of these the one with the least sum of the
-    largest of the four moves. So a cycle that comes to stick to another belt keeps its name, and
-    one that vanishes and comes back later has another then. The attractors are those that starts
-    lead to: one with a basin that no start is in is not seen. `ValueError` names an impossible
-    argument.
+    largest of the four moves. So a cycle that comes to stick to another belt keeps its name. An
+    attractor that pairs with none there is compared in the same way with those that were met
+    before, where they were met last: a small basin may have no start in it at a value in between.
+
+    The attractors are those that starts lead to: one with a basin that no start is in is not seen.
+    Starts on closed orbits that do not attract, such as those around a centre, are undecided.
+    `ValueError` names an impossible argument.
     """
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
@@ -225,9 +233,6 @@ def _attractors_met(osc: Oscillator, told: dict[str, np.ndarray], error: float) 
     attractors, [runs, ..]."""
     # Codes of runs that are not finite are not numbers.
     kinds = np.nan_to_num(told["kind"]).astype(int)
-    known = kinds != UNDECIDED
-    if not np.any(known):
-        return []
     places = np.nan_to_num(np.stack([told[name] for name in PLACE], axis=1))
     rest, segment, ends = rest_reached(osc, 0.5 * (places[:, 0] + places[:, 1]))
     rests, stuck = kinds == EQUILIBRIUM, kinds == STUCK_FOR_EVER
@@ -236,6 +241,7 @@ def _attractors_met(osc: Oscillator, told: dict[str, np.ndarray], error: float) 
         places[stuck, :2] = ends[segment[stuck]]
     held = np.column_stack([told["sticks"].astype(int), segment])
     runs = Runs(places, told["signature"], error)
+    kinds[_closed_only(osc, (kinds == CYCLE) & ~np.any(told["sticks"], axis=1), runs)] = UNDECIDED
     labels = told_apart(kinds, held, runs, lambda: osc)
     met = []
     for number in range(int(np.max(labels)) + 1):
@@ -245,21 +251,45 @@ def _attractors_met(osc: Oscillator, told: dict[str, np.ndarray], error: float) 
     return sorted(met, key=lambda one: -one.fraction)
 
 
+def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
+    """Which of the runs end on a closed orbit that does not attract; smooth: those that end on a
+    cycle that does not stick (one that does, attracts)."""
+    closed, left = np.zeros_like(smooth), smooth.copy()
+    for _ in range(MOST_CYCLES):
+        if not np.any(left):
+            return closed
+        first = int(np.argmax(left))
+        same = left & runs.same(runs.at(first))[0]
+        same[first] = True
+        cycle = find_cycle(osc, (float(runs.places[first, 1]), 0.0))
+        attracts = int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1 - ATTRACTS
+        closed |= same & (not attracts)
+        left &= ~same
+    return closed | left
+
+
 def _matched(
     found: list[list[_Met]], values: np.ndarray, moves: float, n: int, name: str
 ) -> BasinFractions:
-    """The attractors at each value, matched with those at the value before it."""
+    """The attractors at each value, matched with those before it."""
     names: list[str] = []
+    last: list[_Met] = []  # each of them, where it was met last
     numbers: list[list[int]] = []  # of the attractors at each value, in `names`
-    for row, met in enumerate(found):
-        before = found[row - 1] if row else []
-        pairs = _pairs(before, met, moves)
-        numbers.append([])
+    for met in found:
+        here: dict[int, int] = {}
+        just_before = numbers[-1] if numbers else []
+        for known in (just_before, [k for k in range(len(last)) if k not in just_before]):
+            new = [i for i in range(len(met)) if i not in here]
+            pairs = _pairs([last[k] for k in known], [met[i] for i in new], moves)
+            here |= {new[i]: known[j] for i, j in pairs.items()}
         for i, one in enumerate(met):
-            if i not in pairs:
+            if i not in here:
+                here[i] = len(names)
                 kind = KINDS[one.kind]
-                names.append(f"{kind} {sum(known.startswith(kind) for known in names)}")
-            numbers[-1].append(numbers[row - 1][pairs[i]] if i in pairs else len(names) - 1)
+                names.append(f"{kind} {sum(name.startswith(kind) for name in names)}")
+                last.append(one)
+            last[here[i]] = one
+        numbers.append([here[i] for i in range(len(met))])
     fractions = np.zeros((len(found), len(names)))
     places = np.full((len(PLACE), *fractions.shape), np.nan)
     for row, met in enumerate(found):
@@ -284,7 +314,7 @@ def _pairs(before: list[_Met], met: list[_Met], moves: float) -> dict[int, int]:
 
     if not before or not met:
         return {}
-    far = np.array([[_distance(one, other) for other in before] for one in met])
+    far = np.array([[_moved(one, other) for other in before] for one in met])
     fits = far <= moves
     # A pair that does not fit costs more than all that do.
     rows, columns = linear_sum_assignment(np.where(fits, far, 1 + moves * (1 + far.size)))
@@ -292,7 +322,7 @@ def _pairs(before: list[_Met], met: list[_Met], moves: float) -> dict[int, int]:
     return {i: j for i, j in pairs if fits[i, j]}
 
 
-def _distance(one: _Met, other: _Met) -> float:
+def _moved(one: _Met, other: _Met) -> float:
     """How far apart two attractors are, in x1 or x2; inf if of different kinds."""
     if one.kind != other.kind:
         return np.inf

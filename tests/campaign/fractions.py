@@ -49,15 +49,20 @@ class Seen(NamedTuple):
 
 def by_engine(nu0: float, starts: int, threads: int) -> Seen:
     """What the engine's runs lead to, from about so many starts on a grid, two by one."""
-    law_and_contact = PAPER, 1.0, -np.inf, np.inf
-    belts = tuple(engine.Belt(nu, *law_and_contact) for nu in (nu0, NU1))
-    osc = engine.Oscillator(0.5, belts)
     across = max(1, round(np.sqrt(starts / 2)))
     middles = [
         low + (high - low) * (np.arange(n) + 0.5) / n
         for (low, high), n in zip(BOX, (2 * across, across), strict=True)
     ]
-    grid = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1)
+    return of_starts(nu0, grid.reshape(-1, 2), threads)
+
+
+def of_starts(nu0: float, starts: np.ndarray, threads: int) -> Seen:
+    """What the engine's runs from starts, [n, 2], lead to."""
+    law_and_contact = PAPER, 1.0, -np.inf, np.inf
+    belts = tuple(engine.Belt(nu, *law_and_contact) for nu in (nu0, NU1))
+    osc = engine.Oscillator(0.5, belts)
 
     def label(y0) -> Place:
         seen = engine.attractor(osc, tuple(y0))
@@ -66,7 +71,7 @@ def by_engine(nu0: float, starts: int, threads: int) -> Seen:
 
     with ThreadPoolExecutor(threads) as pool:
         found: Counter[Place] = Counter()
-        for one in pool.map(label, grid.tolist()):
+        for one in pool.map(label, starts.tolist()):
             known = (other for other in found if _is_same(one, other))
             found[next(known, one)] += 1
     return Seen(tuple(found), tuple(found.values()))
