@@ -1,7 +1,5 @@
 """Basin fractions along a parameter: against the engine, closed forms, and what must come out."""
 
-from types import SimpleNamespace
-
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
@@ -213,53 +211,3 @@ def test_start_by_start_the_engine_agrees():
         assert not wrong
         counts = np.sort(n * told.fractions[row][told.fractions[row] > 0])
         np.testing.assert_allclose(counts, np.sort(seen.counts), rtol=0, atol=1e-9)
-
-
-# --- basin entropy --------------------------------------------------------------------------------
-
-
-def entropy_of(labels, side):
-    """Of basins of which only the labels are known."""
-    return jb.Basins.entropy(SimpleNamespace(label=np.asarray(labels)), side)
-
-
-def test_one_basin_has_no_entropy():
-    entropy = entropy_of(np.zeros((6, 4), int), 2)
-    assert entropy.basins == 0 and np.isnan(entropy.boundary)
-
-
-def test_a_straight_boundary():
-    """Through the middles of one column of boxes of three."""
-    labels = np.zeros((20, 12), int)
-    labels[10:] = 1
-    entropy = entropy_of(labels, 4)
-    assert entropy.boundary == pytest.approx(np.log(2), abs=1e-15)
-    assert entropy.basins == pytest.approx(np.log(2) / 5, abs=1e-15)
-    # On the edges of boxes it is not seen.
-    assert entropy_of(labels, (10, 4)).basins == 0
-    # A quarter of each box.
-    labels[9:] = 1
-    quarter = -0.25 * np.log(0.25) - 0.75 * np.log(0.75)
-    assert entropy_of(labels, 4).boundary == pytest.approx(quarter, abs=1e-15)
-
-
-def test_a_checkerboard_and_more_than_two_labels():
-    board = np.indices((8, 6)).sum(axis=0) % 2
-    assert entropy_of(board, 2) == pytest.approx((np.log(2), np.log(2)), abs=1e-15)
-    three = np.tile([[-1, 0, 1]], (4, 2))
-    assert entropy_of(three, (2, 3)) == pytest.approx((np.log(3),) * 2, abs=1e-15)
-    assert entropy_of(three, 1).basins == 0
-
-
-@pytest.mark.parametrize(
-    ("side", "message"),
-    [
-        (5, r"side must be one that divides the 8 x 6 starts, got 5"),
-        ((2, 4), r"side must be one that divides the 8 x 6 starts, got \(2, 4\)"),
-        (0, "side must be a positive integer, got 0"),
-        ((2, -1), "side must be a positive integer, got -1"),
-    ],
-)
-def test_impossible_boxes_are_named(side, message):
-    with pytest.raises(ValueError, match=message):
-        entropy_of(np.zeros((8, 6), int), side)

@@ -105,6 +105,40 @@ class Basins(eqx.Module):
         boundary = float(np.mean(entropy[mixed])) if np.any(mixed) else float("nan")
         return BasinEntropy(float(np.mean(entropy)), boundary)
 
+    def finite_time_stability(self, t: ArrayLike, within: ArrayLike) -> np.ndarray:
+        """The finite-time basin stability of each attractor, [attractors]: the fraction of all
+        starts that lead to it and are near to it at time t.
+
+        t: time since the start; within: how near, the largest distance between the states (x1, x2)
+        of the run at that time and of the attractor that is nearest to it; dimensionless. For long
+        times it is the fraction that leads there at all (P. Schultz, F. Hellmann, K. N. Webster,
+        J. Kurths, Bounding the first exit from the basin: Independence times and finite-time basin
+        stability, Chaos 28 (2018) 043102). A run that was near before and is not at time t does not
+        count. NaN of a cycle that shooting did not find. `ValueError` for what is not positive.
+        """
+        t, within = (float(as_array(one, name)) for one, name in ((t, "t"), (within, "within")))
+        check_positive(t, "t")
+        check_positive(within, "within")
+        settings = {name: self.dataset.attrs[name] for name in ("rtol", "atol")}
+        axes = {name: self.dataset[name].values for name in ("x1", "x2")}
+        ends = sweep(lambda: self.oscillator, axes, t1=t, progress=False, **settings)
+        states = np.stack([ends[name].values for name in ("x1_end", "x2_end")], axis=-1)
+        labels, cycles = np.asarray(self.label), iter(self.cycles)
+        low, high = (self.dataset[name].values for name in ("x1_min", "x1_max"))
+        rest, segment, pieces = rest_reached(self.oscillator, 0.5 * (low + high))
+        found = []
+        for number, name in enumerate(self.attractors):
+            of_it = labels == number
+            if name.startswith("cycle"):
+                away = _away_from_cycle(next(cycles), states[of_it])
+            else:
+                held = len(pieces) and name.startswith("stuck")
+                ends_of_it = pieces[segment[of_it]] if held else rest[of_it][:, None]
+                nearest = np.clip(states[of_it, 0], ends_of_it[:, 0], ends_of_it[:, -1])
+                away = np.hypot(states[of_it, 0] - nearest, states[of_it, 1])
+            found.append(np.nan if np.any(np.isnan(away)) else np.sum(away <= within) / labels.size)
+        return np.array(found)
+
     def table(self) -> "pandas.DataFrame":
         """A row for each attractor, and one for undecided starts: label, attractor (its words),
         fraction of the starts, and of a cycle x1_min, x1_max, x2_min, x2_max, period, multiplier
@@ -142,6 +176,30 @@ class Basins(eqx.Module):
         if np.any(labels < 0):
             parts.append(f"{np.mean(labels < 0):.1%} undecided")
         return f"Basins({labels.shape[0]} x {labels.shape[1]} starts: {', '.join(parts)})"
+
+
+#: States of a cycle, between which it is taken for straight.
+CHORDS = 4000
+
+
+def _away_from_cycle(cycle: Cycle, states: np.ndarray) -> np.ndarray:
+    """Distances of states, [n, 2], from a cycle, [n]; NaN where it is none."""
+    from scipy.spatial import KDTree  # late, as only this needs it
+
+    if int(cycle.status) != Status.OK:
+        return np.full(max(1, len(states)), np.nan)
+    # The last of the samples is the first one.
+    points = np.asarray(cycle.sample(CHORDS))[:-1]
+    nearest = KDTree(points).query(states)[1]
+    away = np.full(len(states), np.inf)
+    for first, second in ((nearest - 1, nearest), (nearest, nearest + 1)):
+        begin, end = points[first], points[second % len(points)]
+        way, offset = end - begin, states - begin
+        length = np.sum(way**2, axis=-1)
+        share = np.sum(offset * way, axis=-1) / np.where(length > 0, length, 1.0)
+        across = offset - np.clip(share, 0, 1)[:, None] * way
+        away = np.minimum(away, np.hypot(*across.T))
+    return away
 
 
 class BasinStability(eqx.Module):

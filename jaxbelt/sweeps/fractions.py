@@ -314,7 +314,7 @@ def _pairs(before: list[_Met], met: list[_Met], moves: float) -> dict[int, int]:
 
     if not before or not met:
         return {}
-    far = np.array([[_moved(one, other) for other in before] for one in met])
+    far = np.array([[_move_between(one, other) for other in before] for one in met])
     fits = far <= moves
     # A pair that does not fit costs more than all that do.
     rows, columns = linear_sum_assignment(np.where(fits, far, 1 + moves * (1 + far.size)))
@@ -322,7 +322,7 @@ def _pairs(before: list[_Met], met: list[_Met], moves: float) -> dict[int, int]:
     return {i: j for i, j in pairs if fits[i, j]}
 
 
-def _moved(one: _Met, other: _Met) -> float:
+def _move_between(one: _Met, other: _Met) -> float:
     """How far apart two attractors are, in x1 or x2; inf if of different kinds."""
     if one.kind != other.kind:
         return np.inf
