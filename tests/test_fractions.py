@@ -1,6 +1,7 @@
 """Basin fractions along a parameter: against the engine, closed forms, and what must come out."""
 
 import jax
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -116,6 +117,16 @@ def test_without_damping_all_starts_are_undecided(most, monkeypatch):
     assert table.attractor.tolist() == ["undecided"] * 2 and table.x1_min.isna().all()
     assert repr(found).endswith("no attractor; up to 100.0% undecided)")
     assert found.plot().get_legend_handles_labels()[1] == ["undecided"]
+
+
+def test_where_there_is_no_oscillator_nothing_is_decided():
+    def make(s):
+        return jb.presets.class_b(jnp.sqrt(s**2 - 0.01), NU1)
+
+    found = jb.basin_fractions(make, span=(-0.4, 0.4), rows=3, box=BOX, n=200, key=KEY)
+    assert found.undecided.tolist() == [0.0, 1.0, 0.0] and found.name == "s"
+    assert np.all(found.fractions[1] == 0) and np.all(found.fractions[[0, 2], 0] > 0.9)
+    assert sorted(found.attractors) == ["cycle 0", "equilibrium 0"]
 
 
 # --- matching, of attractors that are made up -----------------------------------------------------

@@ -4,7 +4,9 @@
 that separates them, where there is one. `basin_stability` gives the fraction of a box of starts
 that leads to each kind of attractor, with its standard error (P. J. Menck, J. Heitzig, N. Marwan,
 J. Kurths, How basin stability complements the linear-stability paradigm, Nature Physics 9 (2013)
-89-92). Both run in the kernel behind `sweep`, where a run ends as soon as its attractor is known.
+89-92). Of labelled grids there are measures: their entropy, and how many starts are near to their
+attractor at some time. All run in the kernel behind `sweep`, where a run ends as soon as its
+attractor is known.
 """
 
 from collections.abc import Sequence

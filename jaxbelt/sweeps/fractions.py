@@ -54,7 +54,8 @@ class BasinFractions(eqx.Module):
     values: of the parameter, increasing, [values]. attractors: their names, such as "equilibrium 0"
     and "cycle 1", in the order in which they are met along the parameter, of those met at one value
     that with the largest fraction first. fractions: of the starts that lead there, [values,
-    attractors], 0 where none does; undecided: of those whose attractor is not known, [values].
+    attractors], 0 where none does; undecided: of those whose attractor is not known, [values]: of
+    those that go to infinity, too, and of all where the oscillator is impossible.
     standard_errors: of the fractions, sqrt(f (1 - f) / n); 0 where f is 0 or 1: what none of the n
     starts met has a fraction below 3/n, with a confidence of 95 per cent. x1_min, x1_max, x2_min,
     x2_max: the extent of each attractor, [values, attractors], of what holds the mass for ever the
@@ -150,7 +151,8 @@ def basin_fractions(
     before, where they were met last: a small basin may have no start in it at a value in between.
 
     The attractors are those that starts lead to: one with a basin that no start is in is not seen.
-    Starts on closed orbits that do not attract, such as those around a centre, are undecided.
+    Starts on closed orbits that do not attract, such as those around a centre, are undecided, and
+    so are those that go to infinity, where the damping is negative: then a smaller t1 saves time.
     `ValueError` names an impossible argument.
     """
     if isinstance(osc, Oscillator):
@@ -223,26 +225,31 @@ def _found_along(
         tell("telling the attractors apart")
         for row in range(len(part)):
             here = {name: column[row * n : (row + 1) * n] for name, column in told.items()}
-            osc = variation.oscillator(values[first + row : first + row + 1])
-            found.append(_attractors_met(osc, here, error))
+            value = values[first + row : first + row + 1]
+            found.append(_attractors_met(variation, value, here, error))
     return found
 
 
-def _attractors_met(osc: Oscillator, told: dict[str, np.ndarray], error: float) -> list[_Met]:
-    """What the runs of one oscillator lead to, the largest fraction first; told: by the observer of
+def _attractors_met(
+    variation: Variation, value: np.ndarray, told: dict[str, np.ndarray], error: float
+) -> list[_Met]:
+    """What the runs at a value, [1], lead to, the largest fraction first; told: by the observer of
     attractors, [runs, ..]."""
     # Codes of runs that are not finite are not numbers.
     kinds = np.nan_to_num(told["kind"]).astype(int)
+    if np.all(kinds == UNDECIDED):
+        return []
+    osc = variation.oscillator(value)
     places = np.nan_to_num(np.stack([told[name] for name in PLACE], axis=1))
     rest, segment, ends = rest_reached(osc, 0.5 * (places[:, 0] + places[:, 1]))
     rests, stuck = kinds == EQUILIBRIUM, kinds == STUCK_FOR_EVER
     places[rests, 0] = places[rests, 1] = rest[rests]
     if len(ends):
         places[stuck, :2] = ends[segment[stuck]]
-    held = np.column_stack([told["sticks"].astype(int), segment])
+    sticks = np.nan_to_num(told["sticks"]).astype(int)
     runs = Runs(places, told["signature"], error)
-    kinds[_closed_only(osc, (kinds == CYCLE) & ~np.any(told["sticks"], axis=1), runs)] = UNDECIDED
-    labels = told_apart(kinds, held, runs, lambda: osc)
+    kinds[_closed_only(osc, (kinds == CYCLE) & ~np.any(sticks, axis=1), runs)] = UNDECIDED
+    labels = told_apart(kinds, np.column_stack([sticks, segment]), runs, lambda: osc)
     met = []
     for number in range(int(np.max(labels)) + 1):
         of_it = labels == number
