@@ -12,7 +12,9 @@ from jaxbelt.sweeps import fractions as module
 from jaxbelt.sweeps.attractor import CYCLE, EQUILIBRIUM, STUCK_FOR_EVER
 from jaxbelt.sweeps.basins import starts_in
 from jaxbelt.sweeps.fractions import _matched, _Met
+from tests.campaign import engine
 from tests.campaign import fractions as campaign
+from tests.campaign.cases import PAPER
 
 NU1, BOX, KEY = 0.35, ((-1.0, 3.0), (-1.0, 1.0)), jax.random.key(4)
 #: Where the equilibrium of class (b) loses its stability, and where the cycle vanishes.
@@ -206,19 +208,41 @@ def test_bands_end_half_way_to_where_an_attractor_is_not():
 def test_start_by_start_the_engine_agrees():
     """Its own starts: no error of sampling hides a wrong label. The whole campaign is
     `python -m tests.campaign fractions --runs 100000`."""
-    n, key = 300, jax.random.key(7)
     told = jb.basin_fractions(
         lambda nu0: jb.presets.class_b(nu0, NU1),
         span=campaign.SPAN,
         rows=campaign.VALUES,
-        box=campaign.BOX,
-        n=n,
-        key=key,
+        **{"box": campaign.BOX, "n": 300, "key": KEY},
     )
+    agree(told, campaign.class_b, campaign.BOX)
+
+
+@pytest.mark.slow
+def test_start_by_start_with_edges_and_three_equilibria():
+    """Most of the basin of one of them goes over to another at about 0.53."""
+    box = ((-2.0, 2.0), (-1.0, 1.0))
+    told = jb.basin_fractions(
+        lambda sigma1: jb.presets.class_d(-0.5, 0.5, -0.4, sigma1),
+        span=(0.44, 0.56),
+        rows=4,
+        **{"box": box, "n": 300, "key": KEY},
+    )
+    assert told.attractors == ("equilibrium 0", "equilibrium 1", "equilibrium 2")
+    assert np.all(told.fractions[:3, 1] > 0.2) and 0 < told.fractions[3, 1] < 0.1
+
+    def make(sigma1):
+        belts = engine.Belt(-0.5, PAPER, upper=sigma1), engine.Belt(0.5, PAPER, lower=-0.4)
+        return engine.Oscillator(0.5, belts)
+
+    agree(told, make, box)
+
+
+def agree(told, make, box):
+    """At every value as many of its starts lead to each attractor by the engine."""
     for row, value in enumerate(told.values):
-        starts = starts_in(np.array(campaign.BOX), n, jax.random.fold_in(key, row))
-        seen = campaign.of_starts(float(value), starts.T, threads=2)
+        starts = starts_in(np.array(box), told.n, jax.random.fold_in(KEY, row))
+        seen = campaign.of_starts(make(float(value)), starts.T, threads=2)
         wrong, _ = campaign.differences(told, row, seen)
         assert not wrong
-        counts = np.sort(n * told.fractions[row][told.fractions[row] > 0])
+        counts = np.sort(told.n * told.fractions[row][told.fractions[row] > 0])
         np.testing.assert_allclose(counts, np.sort(seen.counts), rtol=0, atol=1e-9)

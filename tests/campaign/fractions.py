@@ -55,14 +55,16 @@ def by_engine(nu0: float, starts: int, threads: int) -> Seen:
         for (low, high), n in zip(BOX, (2 * across, across), strict=True)
     ]
     grid = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1)
-    return of_starts(nu0, grid.reshape(-1, 2), threads)
+    return of_starts(class_b(nu0), grid.reshape(-1, 2), threads)
 
 
-def of_starts(nu0: float, starts: np.ndarray, threads: int) -> Seen:
+def class_b(nu0: float) -> engine.Oscillator:
+    """The oscillator at a value."""
+    return engine.Oscillator(0.5, tuple(engine.Belt(nu, PAPER) for nu in (nu0, NU1)))
+
+
+def of_starts(osc: engine.Oscillator, starts: np.ndarray, threads: int) -> Seen:
     """What the engine's runs from starts, [n, 2], lead to."""
-    law_and_contact = PAPER, 1.0, -np.inf, np.inf
-    belts = tuple(engine.Belt(nu, *law_and_contact) for nu in (nu0, NU1))
-    osc = engine.Oscillator(0.5, belts)
 
     def label(y0) -> Place:
         seen = engine.attractor(osc, tuple(y0))
