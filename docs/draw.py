@@ -95,6 +95,16 @@ def basins():
     return figure
 
 
+def basin_fractions():
+    """How much of a box of starts each attractor attracts, along a parameter."""
+    osc = jb.presets.class_b(nu0=0.45, nu1=0.35)
+    box, key = ((-0.5, 2.0), (-0.4, 0.4)), jax.random.key(0)
+    figure = journal_figure(5.2, 3.2)
+    found = jb.basin_fractions(osc, nu0, (-0.7, 0.7), box=box, key=key, n=4000, rows=140)
+    found.plot(figure.subplots())
+    return figure
+
+
 def portrait():
     """Everything there is at one oscillator, separatrices included."""
     osc = jb.presets.class_c(nu0=-0.3, nu1=0.3, sigma=0.1)
@@ -147,7 +157,7 @@ def period_map():
 
 
 GALLERY = [model, region_map, history, phase_plane, diagram, orbit_diagram, basins]
-GALLERY += [portrait, curve, period_map, vector_field, friction_laws]
+GALLERY += [basin_fractions, portrait, curve, period_map, vector_field, friction_laws]
 
 # --- bifurcations ---------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     cycles/         outlines nearest sides shocks
     sweeps/         marks observers moments along reducers attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
-    sweeps/         orbit_diagram
+    sweeps/         fractions orbit_diagram
     bifurcations/   special labels systems guesses conditions tangencies crossings rests edges folds
     bifurcations/   meetings path scan refine curves faces regions diagrams switch_folds
     inverse/        selection record fit margins design

@@ -48,6 +48,7 @@ from .results import EventKind, Status, describe
 from .si import in_si
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.datasets import decoded
+from .sweeps.fractions import BasinFractions, basin_fractions
 from .sweeps.moments import AtEvents, AtExtrema, AtSection, AtTimes
 from .sweeps.orbit_diagram import OrbitDiagram, orbit_diagram
 from .sweeps.shares import attractors
@@ -68,6 +69,7 @@ __all__ = [
     "AtExtrema",
     "AtSection",
     "AtTimes",
+    "BasinFractions",
     "BasinStability",
     "Basins",
     "Belt",
@@ -114,6 +116,7 @@ __all__ = [
     "Verified",
     "amplitude",
     "attractors",
+    "basin_fractions",
     "basin_stability",
     "basins",
     "bifurcation_curve",

@@ -276,6 +276,22 @@ MISTAKES = [
         "jb.basin_stability(osc, box=((3, 0), (-1, 1)), key=key)",
         r"box\[0\], x1 must .*got \(3, 0\)",
     ),
+    ("jb.basin_fractions(osc, nu0, box=BOX, key=key)", "span " + PAIR + "None"),
+    ("jb.basin_fractions(osc, 'nu0', (0.1, 0.7), box=BOX, key=key)", SELECTS + ".*, got 'nu0'"),
+    ("jb.basin_fractions(osc, nu0, (0.1, 0.7), box=(0, 1), key=key)", r"box must be .*\(0, 1\)"),
+    ("jb.basin_fractions(osc, nu0, (0.1, 0.7), box=BOX, key=3)", "key must be one key, .* got 3"),
+    (
+        "jb.basin_fractions(osc, nu0, (0.1, 0.7), box=BOX, key=key, rows=1)",
+        "rows must be an integer >= 2, got 1",
+    ),
+    (
+        "jb.basin_fractions(osc, nu0, (0.1, 0.7), box=BOX, key=key, moves=0)",
+        r"moves must be > 0, got 0\.0",
+    ),
+    (
+        "jb.basin_fractions(osc, lambda o: o.omega, (-1.0, 1.0), box=BOX, key=key)",
+        r"omega must be > 0, got -1\.0",
+    ),
     ("jb.basin_stability(osc, box=BOX, key=key, n=1e4)", f"n {WHOLE}10000.0"),
     # --- from data to parameters
     ("jb.fit(osc, row, row)", "missing 1 required keyword-only argument: 'where'"),

@@ -75,6 +75,11 @@ def results() -> dict[type, Any]:
             *({"1": (), "2b": (cycle, inner)}, label == "", (), jb.presets.class_b),
         ),
         jb.Basins(osc, dataset, ("cycle that sticks to belt 1", "rest at 1.36"), (cycle,), inner),
+        jb.BasinFractions(
+            *(span[:2], ("cycle 0",), rows[:2, 1:], rows[:2, :1], 1 - rows[:2, 1]),
+            *(rows[:2, :1] for _ in range(5)),
+            *(100, "belts[0].velocity"),
+        ),
         jb.BasinStability(kinds, dict.fromkeys(kinds, 0.01), 1000),
         jb.Fit(
             *(osc, ("damping",), ts[1:2], ts[1:2], ts[:1, None], two, two, ts, ys, 0.1 * ys, two),
@@ -106,6 +111,7 @@ def test_every_public_class_is_a_result_or_known_to_be_none(results):
 TABLES = {
     jb.Arcs: (None, "t x1 x2 duration contact_0 contact_1"),
     jb.Basins: (4, "label attractor fraction x1_min period multiplier signature"),
+    jb.BasinFractions: (3, "value attractor fraction standard_error x1_min x2_max period"),
     jb.BasinStability: (2, "kind fraction standard_error n"),
     jb.BifurcationCurve: (6, "condition belts nu0 nu1 multiplier residual special"),
     jb.BifurcationDiagram: (1, "branch kind value stable x1_min x2_max period amplitude signature"),

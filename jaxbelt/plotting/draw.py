@@ -19,6 +19,7 @@ from ..inverse.fit import Fit
 from ..model.equilibria import Equilibria
 from ..motion.simulate import Arcs, Events, Trajectory
 from ..sweeps.basins import Basins, BasinStability
+from ..sweeps.fractions import BasinFractions
 from ..sweeps.orbit_diagram import OrbitDiagram
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
@@ -30,7 +31,7 @@ from .phase import plot_portrait, plot_separatrix
 from .points import plot_cycle, plot_design, plot_equilibria, plot_point, plot_shock
 from .regions import plot_region_map
 from .style import add_key, figure_of
-from .sweeps import plot_basins, plot_blocks, plot_explanation, plot_stability
+from .sweeps import plot_basins, plot_blocks, plot_explanation, plot_fractions, plot_stability
 
 
 def _plot_curve(curve: BifurcationCurve, ax: Axes | None = None) -> Axes:
@@ -39,6 +40,7 @@ def _plot_curve(curve: BifurcationCurve, ax: Axes | None = None) -> Axes:
 
 PICTURES: dict[type, Callable[..., Axes]] = {
     Arcs: plot_arcs,
+    BasinFractions: plot_fractions,
     Basins: plot_basins,
     BasinStability: plot_stability,
     BifurcationCurve: _plot_curve,

@@ -13,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..checks import require, require_one_of, require_value
 from ..sweeps.basins import Basins, BasinStability
+from ..sweeps.fractions import BasinFractions
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
 from .categories import LINE, draw_categories, words_of_runs
@@ -138,8 +139,8 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
 def _basin_colours(attractors: Sequence[str]) -> list[str]:
     """Pale, so that lines stay visible; light enough apart for print without colour."""
     cycles, others = (
-        iter(["#B5D6EC", "#A9DCC8", "#D5E8F5"]),
-        iter(["#F6C98F", "#F3DCE8", "#F5E9A9"]),
+        iter(["#B5D6EC", "#A9DCC8", "#D5E8F5", "#8FB8D8", "#7FC4A8"]),
+        iter(["#F6C98F", "#F3DCE8", "#F5E9A9", "#E3A56B", "#DDB5CB"]),
     )
     return [next(cycles if name.startswith("cycle") else others, "#DDDDDD") for name in attractors]
 
@@ -165,6 +166,51 @@ def plot_stability(stability: BasinStability, ax: Axes | None = None) -> Axes:
     words = f"fraction of {stability.n:,} starts"
     ax.set(xlabel="what they lead to", ylabel=words, ylim=(0.0, 1.12))
     return ax
+
+
+def plot_fractions(fractions: BasinFractions, ax: Axes | None = None) -> Axes:
+    """The fractions as bands over the parameter; see `BasinFractions.plot`."""
+    ax = new_axes() if ax is None else ax
+    values, undecided = fractions.values, fractions.undecided
+    shares = np.column_stack([fractions.fractions, undecided])
+    # What rests lies below, what is undecided on top; the rest in the order of the names.
+    names = [*fractions.attractors, "undecided"]
+    order = np.argsort([_layer(name) for name in names], kind="stable")
+    x, shares = _with_steps(values, shares[:, order])
+    tops = np.cumsum(shares, axis=1)
+    colours = [*_basin_colours(fractions.attractors), "#FFFFFF"]
+    bottom = np.zeros(len(x))
+    for place, number in enumerate(order):
+        met, top = shares[:, place] > 0, tops[:, place]
+        if np.any(met):
+            style = {"facecolor": colours[number], "edgecolor": "0.4", "linewidth": 0.5}
+            ax.fill_between(x, bottom, top, where=met.tolist(), label=names[number], **style)
+        inner = (top > 0) & (top < 1)
+        spread = 2 * np.sqrt(np.clip(top * (1 - top), 0, None) / fractions.n)
+        ends = np.clip([top - spread, top + spread], 0, 1)
+        errors = {"color": "black", "alpha": 0.3, "linewidth": 0, "zorder": 2.5}  # above the bands
+        ax.fill_between(x, *ends, where=inner.tolist(), **errors)
+        bottom = top
+    ax.set(xlim=(values[0], values[-1]), ylim=(0, 1))
+    ax.set(xlabel=parameter_label(fractions.name), ylabel=f"fraction of {fractions.n:,} starts")
+    return ax
+
+
+def _layer(name: str) -> int:
+    """Which attractors lie on which."""
+    return ("equilibrium", "stuck", "cycle", "undecided").index(name.split()[0])
+
+
+def _with_steps(values: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shares [values, bands] over the parameter, constant from a value to half-way towards the next
+    where the bands that there are change, twice there."""
+    changes = np.flatnonzero(np.any((shares[1:] > 0) != (shares[:-1] > 0), axis=1))
+    middles = 0.5 * (values[changes] + values[changes + 1])
+    x = np.concatenate([values, middles, middles])
+    rows = np.concatenate([np.arange(len(values)), changes, changes + 1])
+    # Where three are one above the other the left-hand side comes first.
+    order = np.lexsort((rows, x))
+    return x[order], shares[rows[order]]
 
 
 def plot_explanation(explanation: Explanation, ax: Axes | None = None) -> Axes:

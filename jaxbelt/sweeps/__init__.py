@@ -9,7 +9,8 @@
 - `work`: runs of blocks, here; `clusters`: blocks as tasks of a Dask cluster; `progress`: a bar;
 - `sweep`: named axes in, a labelled dataset out; `audit`: runs again, without shortcuts;
 - `shares`: the attractors that several starts lead to, and how many lead to each;
-- `basins`: the same for starts of one oscillator.
+- `basins`: the same for starts of one oscillator; `fractions`: for starts at many values of one
+  parameter, the attractors matched from value to value.
 
 A new observable is a subclass of `kernel.lanes.Observer` in a file of its own; `sweep` takes it as
 it is.

@@ -4,7 +4,9 @@
 that separates them, where there is one. `basin_stability` gives the fraction of a box of starts
 that leads to each kind of attractor, with its standard error (P. J. Menck, J. Heitzig, N. Marwan,
 J. Kurths, How basin stability complements the linear-stability paradigm, Nature Physics 9 (2013)
-89-92). Both run in the kernel behind `sweep`, where a run ends as soon as its attractor is known.
+89-92). Of labelled grids there are measures: their entropy, and how many starts are near to their
+attractor at some time. All run in the kernel behind `sweep`, where a run ends as soon as its
+attractor is known.
 """
 
 from collections.abc import Sequence
@@ -49,6 +51,13 @@ if TYPE_CHECKING:
 OF_CYCLES = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
 
 
+class BasinEntropy(NamedTuple):
+    """Basin entropy: over all boxes, and over those with a boundary in them."""
+
+    basins: float
+    boundary: float
+
+
 class Basins(eqx.Module):
     """What `basins` returns.
 
@@ -68,6 +77,69 @@ class Basins(eqx.Module):
     @property
     def label(self) -> "xarray.DataArray":
         return self.dataset["label"]
+
+    def entropy(self, side: int | tuple[int, int]) -> BasinEntropy:
+        """The basin entropy S_b, `.basins`, and the boundary basin entropy S_bb, `.boundary`: how
+        little a start that is known to a box tells of where it leads.
+
+        side: of the boxes that the grid is cut into, in starts, along x1 and x2 alike or (along x1,
+        along x2); it has to divide the numbers of starts. In a box in which the shares p_j of the
+        starts lead to the attractors j the entropy is -sum p_j log p_j, natural logarithms; S_b is
+        its mean over all boxes, S_bb over those that have more than one label, NaN where none has.
+        Undecided starts count as one more attractor. Both depend on the size of the boxes: compare
+        at one size. A boundary with S_bb > log 2 is fractal (A. Daza, A. Wagemakers, B. Georgeot,
+        D. Guery-Odelin, M. A. F. Sanjuan, Basin entropy: a new tool to analyze uncertainty in
+        dynamical systems, Scientific Reports 6 (2016) 31416). `ValueError` for an impossible side.
+        """
+        sides = side if isinstance(side, tuple) and len(side) == 2 else (side, side)
+        across, along = (as_whole(one, "side") for one in sides)
+        labels = np.asarray(self.label)
+        fits = labels.shape[0] % across == 0 and labels.shape[1] % along == 0
+        expected = f"one that divides the {labels.shape[0]} x {labels.shape[1]} starts"
+        require_value(fits, "side", expected, side)
+        shape = labels.shape[0] // across, across, labels.shape[1] // along, along
+        boxes = labels.reshape(shape).swapaxes(1, 2).reshape(-1, across * along)
+        entropy, mixed = np.zeros(len(boxes)), np.zeros(len(boxes), bool)
+        for label in np.unique(labels):
+            p = np.mean(boxes == label, axis=1)
+            mixed |= (p > 0) & (p < 1)
+            entropy -= p * np.log(np.where(p > 0, p, 1.0))
+        boundary = float(np.mean(entropy[mixed])) if np.any(mixed) else float("nan")
+        return BasinEntropy(float(np.mean(entropy)), boundary)
+
+    def finite_time_stability(self, t: ArrayLike, within: ArrayLike) -> np.ndarray:
+        """The finite-time basin stability of each attractor, [attractors]: the fraction of all
+        starts that lead to it and are near to it at time t.
+
+        t: time since the start; within: how near, the largest distance between the states (x1, x2)
+        of the run at that time and of the attractor that is nearest to it; dimensionless. For long
+        times it is the fraction that leads there at all (P. Schultz, F. Hellmann, K. N. Webster,
+        J. Kurths, Bounding the first exit from the basin: Independence times and finite-time basin
+        stability, Chaos 28 (2018) 043102). A run that was near before and is not at time t does not
+        count. NaN of a cycle that shooting did not find. `ValueError` for what is not positive.
+        """
+        t, within = (float(as_array(one, name)) for one, name in ((t, "t"), (within, "within")))
+        check_positive(t, "t")
+        check_positive(within, "within")
+        settings = {name: self.dataset.attrs[name] for name in ("rtol", "atol")}
+        axes = {name: self.dataset[name].values for name in ("x1", "x2")}
+        ends = sweep(lambda: self.oscillator, axes, t1=t, progress=False, **settings)
+        states = np.stack([ends[name].values for name in ("x1_end", "x2_end")], axis=-1)
+        labels, cycles = np.asarray(self.label), iter(self.cycles)
+        low, high = (self.dataset[name].values for name in ("x1_min", "x1_max"))
+        rest, segment, pieces = rest_reached(self.oscillator, 0.5 * (low + high))
+        found = []
+        for number, name in enumerate(self.attractors):
+            of_it = labels == number
+            if name.startswith("cycle"):
+                away = _away_from_cycle(next(cycles), states[of_it])
+            else:
+                held = len(pieces) and name.startswith("stuck")
+                ends_of_it = pieces[segment[of_it]] if held else rest[of_it][:, None]
+                nearest = np.clip(states[of_it, 0], ends_of_it[:, 0], ends_of_it[:, -1])
+                away = np.hypot(states[of_it, 0] - nearest, states[of_it, 1])
+            found.append(np.nan if np.any(np.isnan(away)) else np.sum(away <= within) / labels.size)
+        return np.array(found)
 
     def table(self) -> "pandas.DataFrame":
         """A row for each attractor, and one for undecided starts: label, attractor (its words),
@@ -106,6 +178,30 @@ class Basins(eqx.Module):
         if np.any(labels < 0):
             parts.append(f"{np.mean(labels < 0):.1%} undecided")
         return f"Basins({labels.shape[0]} x {labels.shape[1]} starts: {', '.join(parts)})"
+
+
+#: States of a cycle, between which it is taken for straight.
+CHORDS = 4000
+
+
+def _away_from_cycle(cycle: Cycle, states: np.ndarray) -> np.ndarray:
+    """Distances of states, [n, 2], from a cycle, [n]; NaN where it is none."""
+    from scipy.spatial import KDTree  # late, as only this needs it
+
+    if int(cycle.status) != Status.OK:
+        return np.full(max(1, len(states)), np.nan)
+    # The last of the samples is the first one.
+    points = np.asarray(cycle.sample(CHORDS))[:-1]
+    nearest = KDTree(points).query(states)[1]
+    away = np.full(len(states), np.inf)
+    for first, second in ((nearest - 1, nearest), (nearest, nearest + 1)):
+        begin, end = points[first], points[second % len(points)]
+        way, offset = end - begin, states - begin
+        length = np.sum(way**2, axis=-1)
+        share = np.sum(offset * way, axis=-1) / np.where(length > 0, length, 1.0)
+        across = offset - np.clip(share, 0, 1)[:, None] * way
+        away = np.minimum(away, np.hypot(*across.T))
+    return away
 
 
 class BasinStability(eqx.Module):
@@ -215,7 +311,7 @@ def _labels(
     kinds = np.asarray(decoded(dataset[["kind"]])["kind"])
     sticks = np.asarray(dataset["sticks"]).astype(bool)
     low, high = np.asarray(dataset["x1_min"]), np.asarray(dataset["x1_max"])
-    rest, held = _rest_reached(osc, 0.5 * (low + high))
+    rest, held, _ = rest_reached(osc, 0.5 * (low + high))
     runs = Runs.of(dataset, ("x1", "x2"))
     found: list[_Found] = []
     left = kinds != "undecided"
@@ -257,8 +353,9 @@ class _Found(NamedTuple):
         return self.cycle is not None and is_same(self.cycle, cycle)
 
 
-def _rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of an equilibrium that each may have come to: its x1, and the number of its segment.
+def rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of an equilibrium that each may have come to: its x1, and the number of its segment; and the
+    ends of all segments, [segments, 2].
 
     A run ends in the neighbourhood of the equilibrium. A segment across an edge is in pieces.
     """
@@ -267,14 +364,15 @@ def _rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarr
     is_point = ~is_segment & np.asarray(found.stable)
     lower, upper = np.asarray(found.x1_lower), np.asarray(found.x1_upper)
     points, pieces = np.asarray(found.x1)[is_point], np.stack([lower, upper], 1)[is_segment]
-    rest, segment = x1, np.zeros(x1.shape, int)
+    rest, segment, ends = x1, np.zeros(x1.shape, int), np.zeros((0, 2))
     if len(points):
         rest = points[np.argmin(np.abs(x1[..., None] - points), axis=-1)]
     if len(pieces):
-        apart = np.append(0, np.cumsum(pieces[1:, 0] > pieces[:-1, 1]))
+        begins = np.append(True, pieces[1:, 0] > pieces[:-1, 1])
         outside = np.maximum(pieces[:, 0] - x1[..., None], x1[..., None] - pieces[:, 1])
-        segment = apart[np.argmin(outside, axis=-1)]
-    return rest, segment
+        segment = (np.cumsum(begins) - 1)[np.argmin(outside, axis=-1)]
+        ends = np.stack([pieces[begins, 0], pieces[np.append(begins[1:], True), 1]], axis=1)
+    return rest, segment, ends
 
 
 def _words_for(kind: str, sticks: np.ndarray, x1: float) -> str:
@@ -304,22 +402,31 @@ def basin_stability(
     sqrt(f (1 - f) / n). `ValueError` names an argument that is impossible.
     """
     check_oscillator(oscillator, "oscillator")
-    require_value(np.shape(box) == (2, 2), "box", "((x1 from, to), (x2 from, to))", box)
-    corners = np.array([as_interval(ends, f"box[{i}], x{i + 1}") for i, ends in enumerate(box)])
-    n = as_whole(n, "n")
-    _check_key(key)
+    corners, n = as_box(box), as_whole(n, "n")
+    check_key(key)
     numbers = {"t1": t1, "rtol": rtol, "atol": atol}
     for name, value in numbers.items():
         numbers[name] = float(as_array(value, name))
         check_positive(numbers[name], name)
-    starts = jax.random.uniform(key, (2, n), minval=corners[:, :1], maxval=corners[:, 1:])
-    kinds = _kinds(oscillator, np.asarray(starts), **numbers)
+    kinds = _kinds(oscillator, starts_in(corners, n, key), **numbers)
     fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(KINDS)}
     errors = {name: float(np.sqrt(f * (1 - f) / n)) for name, f in fractions.items()}
     return BasinStability(fractions, errors, n)
 
 
-def _check_key(key: Any) -> None:
+def as_box(box: Any) -> np.ndarray:
+    """The corners of a box of starts, [2, 2], x1 and x2 from and to, or a `ValueError`."""
+    require_value(np.shape(box) == (2, 2), "box", "((x1 from, to), (x2 from, to))", box)
+    return np.array([as_interval(ends, f"box[{i}], x{i + 1}") for i, ends in enumerate(box)])
+
+
+def starts_in(corners: np.ndarray, n: int, key: Array) -> np.ndarray:
+    """Starts drawn uniformly from a box, [2, n]."""
+    low, high = corners[:, :1], corners[:, 1:]
+    return np.asarray(jax.random.uniform(key, (2, n), minval=low, maxval=high))
+
+
+def check_key(key: Any) -> None:
     """Raise unless it is a key of JAX, of either sort."""
     dtype, shape = getattr(key, "dtype", np.dtype(object)), np.shape(key)
     typed = jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()

@@ -2,6 +2,7 @@
 
 `attractors` takes the dataset of a sweep with `x1` or `x2` among its axes and puts, in the place of
 the starts, an axis of attractors, each with the fraction of the starts that lead to it.
+`told_apart` tells apart what the starts at one point lead to.
 """
 
 from collections.abc import Callable
@@ -141,6 +142,21 @@ def _labels_of(kinds: np.ndarray, sticks: np.ndarray, runs: Runs) -> np.ndarray:
         untold &= ~same
         number += 1
     return labels
+
+
+def told_apart(
+    kinds: np.ndarray, sticks: np.ndarray, runs: Runs, oscillator: Callable[[], Oscillator]
+) -> np.ndarray:
+    """Numbers of what the runs of one oscillator lead to, [runs], in the order in which they are
+    met, or -1.
+
+    kinds: codes, [runs]; sticks: whatever else tells apart what is stuck for ever, [runs, ..];
+    oscillator: gives it, where shooting has to tell.
+    """
+    here = runs.at((None,))
+    labels = _labels_of(kinds[None], sticks[None], here)
+    doubts = _doubts(kinds[None], labels, here)
+    return _settled(oscillator(), labels[0], runs.places, doubts[0]) if doubts else labels[0]
 
 
 # --- cycles that the runs do not tell apart -------------------------------------------------------

@@ -1,5 +1,5 @@
 """Campaigns: `python -m tests.campaign WHAT`, WHAT being final, simulate, derivatives, attractors,
-grazing, paths, refine, portraits or shocks."""
+grazing, paths, refine, portraits, shocks or fractions."""
 
 import argparse
 import functools
@@ -19,7 +19,7 @@ def main(arguments=None):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from . import cases, compare, package, paths, portraits, refine, shocks
+    from . import cases, compare, fractions, package, paths, portraits, refine, shocks
 
     if options.what == "paths":
         return paths.run(options.seed, options.paths)
@@ -29,6 +29,8 @@ def main(arguments=None):
         return portraits.run(options.seed, options.runs)
     if options.what == "shocks":
         return shocks.run(options.seed, options.runs, verbose=options.verbose)
+    if options.what == "fractions":
+        return fractions.run(options.seed, options.runs, options.threads)
     rng = np.random.default_rng(options.seed)
     began = time.monotonic()
     verdicts, disagreements, right, done = Counter(), [], [], 0
@@ -99,7 +101,7 @@ def _parser():
         "what",
         choices=(
             *("final", "simulate", "derivatives", "attractors", "grazing", "paths", "refine"),
-            *("portraits", "shocks"),
+            *("portraits", "shocks", "fractions"),
         ),
     )
     parser.add_argument("--seed", type=int, default=0)

@@ -1,0 +1,336 @@
+"""Basin fractions along a parameter: how much of a box of starts each attractor attracts.
+
+`basin_fractions` is basin stability (P. J. Menck, J. Heitzig, N. Marwan, J. Kurths, How basin
+stability complements the linear-stability paradigm, Nature Physics 9 (2013) 89-92) of each
+attractor at each of many values of a parameter, the attractors matched from value to value, as
+global continuation does it (G. Datseris, K. Luiz Rossi, A. Wagemakers, Framework for global
+stability analysis of dynamical systems, Chaos 33 (2023) 073151). The values are data of one
+compiled program, that of `sweep` for attractors.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from ..activity import announced, tell
+from ..checks import as_array, as_interval, as_whole, check_positive
+from ..cycles.attractors import RUN, Runs
+from ..cycles.cycle import find_cycle
+from ..model.oscillator import Oscillator
+from ..model.parameters import leaf_index
+from ..model.variations import Variation, varied
+from ..results import Status, draw
+from ..tables import table_of
+from .attractor import CYCLE, EQUILIBRIUM, KINDS, STUCK_FOR_EVER, UNDECIDED, Attractor
+from .basins import as_box, check_key, rest_reached, starts_in
+from .grid import Grid
+from .question import LONG_ENOUGH
+from .shares import told_apart
+from .work import results_of
+
+if TYPE_CHECKING:
+    import pandas
+
+#: Runs that are done at once, at most, unless one value has more: their results are in memory.
+MOST_AT_ONCE = 2**20
+#: How far an attractor may move from value to value, unless told: this part of what the box and all
+#: attractors extend over.
+MOVES = 0.25
+#: A cycle attracts if its multiplier is below 1 by more than this, which is beyond rounding.
+ATTRACTS = 1e-9
+#: Of more cycles at one value that do not stick none is looked into: they are a continuum.
+MOST_CYCLES = 50
+#: Where an attractor is: its smallest and largest x1 and x2; and how long a loop takes.
+PLACE = ("x1_min", "x1_max", "x2_min", "x2_max", "period")
+
+
+class BasinFractions(eqx.Module):
+    """What `basin_fractions` returns.
+
+    values: of the parameter, increasing, [values]. attractors: their names, such as "equilibrium 0"
+    and "cycle 1", in the order in which they are met along the parameter, of those met at one value
+    that with the largest fraction first. fractions: of the starts that lead there, [values,
+    attractors], 0 where none does; undecided: of those whose attractor is not known, [values]: of
+    those that go to infinity, too, and of all where the oscillator is impossible.
+    standard_errors: of the fractions, sqrt(f (1 - f) / n); 0 where f is 0 or 1: what none of the n
+    starts met has a fraction below 3/n, with a confidence of 95 per cent. x1_min, x1_max, x2_min,
+    x2_max: the extent of each attractor, [values, attractors], of what holds the mass for ever the
+    ends of the segment; period: of a cycle; all NaN where it is not met. n: starts at each value;
+    name: of the parameter, as the path to it, or that of the function's argument.
+    """
+
+    values: np.ndarray
+    attractors: tuple[str, ...] = eqx.field(static=True)
+    fractions: np.ndarray
+    standard_errors: np.ndarray
+    undecided: np.ndarray
+    x1_min: np.ndarray
+    x1_max: np.ndarray
+    x2_min: np.ndarray
+    x2_max: np.ndarray
+    period: np.ndarray
+    n: int
+    name: str = eqx.field(static=True)
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each value and each attractor that is met there, and one for undecided starts
+        where there are some: value (of the parameter), attractor, fraction, standard_error, x1_min,
+        x1_max, x2_min, x2_max, period (NaN of what rests)."""
+        names = [*self.attractors, "undecided"]
+        fractions = np.column_stack([self.fractions, self.undecided])
+        errors = np.column_stack([self.standard_errors, _errors(self.undecided, self.n)])
+        rows, which = np.nonzero(fractions)
+        nothing = np.full(len(self.values), np.nan)
+        return table_of(
+            {
+                "value": self.values[rows],
+                "attractor": np.array(names, object)[which],
+                "fraction": fractions[rows, which],
+                "standard_error": errors[rows, which],
+                **{
+                    column: np.column_stack([getattr(self, column), nothing])[rows, which]
+                    for column in PLACE
+                },
+            }
+        )
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the fractions over the parameter as bands, one on the other, into the axes `ax`
+        (None: new ones), which are returned.
+
+        Between values with the same attractors the edges of the bands are straight; where an
+        attractor comes or goes they end half-way. Grey along an edge: two standard errors.
+        """
+        return draw(self, ax)
+
+    def __repr__(self) -> str:
+        ends = f"{self.values[0]:.6g} to {self.values[-1]:.6g}"
+        names = ", ".join(self.attractors) or "no attractor"
+        told = f"{len(self.values)} values, {self.n} starts each: {names}"
+        most = np.max(self.undecided)
+        more = f"; up to {most:.1%} undecided" if most > 0 else ""
+        return f"BasinFractions({self.name} from {ends}, {told}{more})"
+
+
+@announced("basin_fractions")
+def basin_fractions(
+    osc: Oscillator | Callable[..., Oscillator],
+    where: Callable[[Oscillator], Any] | None = None,
+    span: tuple[float, float] | None = None,
+    *,
+    box: Any,
+    n: int = 10_000,
+    key: Array,
+    rows: int = 50,
+    moves: float | None = None,
+    t1: ArrayLike = LONG_ENOUGH,
+    rtol: ArrayLike = 1e-8,
+    atol: ArrayLike = 1e-8,
+) -> BasinFractions:
+    """The fraction of a box of starts that leads to each attractor, against one parameter.
+
+    osc, where, span: as for `scan`: an oscillator and the parameter of it that varies, or a
+    function of the parameter that returns the oscillator. box: ((x1 from, to), (x2 from, to)),
+    dimensionless; n: number of starts at each value, drawn uniformly and anew for each; key: from
+    `jax.random.key`. rows: how many values of the parameter, evenly spaced. moves: how far an
+    attractor may move from one value to the next, in x1 or x2; None: a quarter of what the box and
+    the attractors at all values extend over, in x1 or x2, whichever is longer. t1: when a run that
+    reached no attractor is given up; rtol, atol: tolerances of a step.
+
+    At each value attractors are told apart as by `attractors`, equilibria and the segments on which
+    a mass is stuck for ever by which of `equilibria` they are. From one value to the next an
+    attractor keeps its name if it is of one kind (equilibrium, cycle, stuck) and its smallest and
+    largest x1 and x2 have moved by no more than `moves`. Of several ways to pair attractors so the
+    one is taken that leaves the fewest alone, and of these the one with the least sum of the
+    largest of the four moves. So a cycle that comes to stick to another belt keeps its name. An
+    attractor that pairs with none there is compared in the same way with those that were met
+    before, where they were met last: a small basin may have no start in it at a value in between.
+
+    The attractors are those that starts lead to: one with a basin that no start is in is not seen.
+    Starts on closed orbits that do not attract, such as those around a centre, are undecided, and
+    so are those that go to infinity, where the damping is negative: then a smaller t1 saves time.
+    `ValueError` names an impossible argument.
+    """
+    if isinstance(osc, Oscillator):
+        leaf_index(osc, where)
+    first, last = as_interval(span, "span")
+    corners, n, rows = as_box(box), as_whole(n, "n"), as_whole(rows, "rows", 2)
+    check_key(key)
+    numbers = {"t1": _positive(t1, "t1")}
+    numbers |= {"rtol": _positive(rtol, "rtol"), "atol": _positive(atol, "atol")}
+    moves = None if moves is None else _positive(moves, "moves")
+    variation = varied(osc, where, (first,))
+    for value in (first, last):
+        variation.check(value)
+    values = np.linspace(first, last, rows)
+    starts = [starts_in(corners, n, jax.random.fold_in(key, row)) for row in range(rows)]
+    found = _found_along(variation, values, np.stack(starts), numbers)
+    if moves is None:
+        moves = MOVES * _longest(corners, found)
+    return _matched(found, values, moves, n, variation.names[0])
+
+
+def _positive(value: Any, field: str) -> float:
+    """`value` as a positive number, or a `ValueError`."""
+    number = float(as_array(value, field))
+    check_positive(number, field)
+    return number
+
+
+def _longest(corners: np.ndarray, found: list[list["_Met"]]) -> float:
+    """The longer side of what a box and all attractors extend over."""
+    sides = [corners, *(one.place[:4].reshape(2, 2) for met in found for one in met)]
+    low, high = np.min(sides, axis=(0, 2)), np.max(sides, axis=(0, 2))
+    return float(np.max(high - low))
+
+
+def _errors(fractions: np.ndarray, n: int) -> np.ndarray:
+    """The standard errors of fractions of n starts."""
+    return np.sqrt(fractions * (1 - fractions) / n)
+
+
+class _Met(NamedTuple):
+    """An attractor at one value: the code of its kind, where it is (as `PLACE`), and the fraction
+    of the starts that lead there."""
+
+    kind: int
+    place: np.ndarray
+    fraction: float
+
+
+def _found_along(
+    variation: Variation, values: np.ndarray, starts: np.ndarray, numbers: dict[str, float]
+) -> list[list[_Met]]:
+    """The attractors at each value that its starts, [values, 2, n], lead to, the largest fraction
+    first."""
+    grid = Grid(lambda parameter: variation.make(parameter), {"parameter": values}, (0.0, 0.0))
+    program, n = grid.program(Attractor()), starts.shape[2]
+    error = RUN * max(numbers["rtol"], numbers["atol"])
+    found: list[list[_Met]] = []
+    step = max(1, MOST_AT_ONCE // n)
+    for first in range(0, len(values), step):
+        part = starts[first : first + step]
+
+        def rows_of(begin: int, end: int, first=first, part=part) -> np.ndarray:
+            which, place = np.divmod(np.arange(begin, end), n)
+            return np.concatenate(
+                [part[which, :, place].T[None], grid.rows(first + which)[:, 2:]], axis=1
+            )
+
+        told = results_of(program, grid.shared, rows_of, len(part) * n, **numbers)
+        tell("telling the attractors apart")
+        for row in range(len(part)):
+            here = {name: column[row * n : (row + 1) * n] for name, column in told.items()}
+            value = values[first + row : first + row + 1]
+            found.append(_attractors_met(variation, value, here, error))
+    return found
+
+
+def _attractors_met(
+    variation: Variation, value: np.ndarray, told: dict[str, np.ndarray], error: float
+) -> list[_Met]:
+    """What the runs at a value, [1], lead to, the largest fraction first; told: by the observer of
+    attractors, [runs, ..]."""
+    # Codes of runs that are not finite are not numbers.
+    kinds = np.nan_to_num(told["kind"]).astype(int)
+    if np.all(kinds == UNDECIDED):
+        return []
+    osc = variation.oscillator(value)
+    places = np.nan_to_num(np.stack([told[name] for name in PLACE], axis=1))
+    rest, segment, ends = rest_reached(osc, 0.5 * (places[:, 0] + places[:, 1]))
+    rests, stuck = kinds == EQUILIBRIUM, kinds == STUCK_FOR_EVER
+    places[rests, 0] = places[rests, 1] = rest[rests]
+    if len(ends):
+        places[stuck, :2] = ends[segment[stuck]]
+    sticks = np.nan_to_num(told["sticks"]).astype(int)
+    runs = Runs(places, told["signature"], error)
+    kinds[_closed_only(osc, (kinds == CYCLE) & ~np.any(sticks, axis=1), runs)] = UNDECIDED
+    labels = told_apart(kinds, np.column_stack([sticks, segment]), runs, lambda: osc)
+    met = []
+    for number in range(int(np.max(labels)) + 1):
+        of_it = labels == number
+        one = int(np.argmax(of_it))
+        met.append(_Met(int(kinds[one]), places[one], float(np.mean(of_it))))
+    return sorted(met, key=lambda one: -one.fraction)
+
+
+def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
+    """Which of the runs end on a closed orbit that does not attract; smooth: those that end on a
+    cycle that does not stick (one that does, attracts)."""
+    closed, left = np.zeros_like(smooth), smooth.copy()
+    for _ in range(MOST_CYCLES):
+        if not np.any(left):
+            return closed
+        first = int(np.argmax(left))
+        same = left & runs.same(runs.at(first))[0]
+        same[first] = True
+        cycle = find_cycle(osc, (float(runs.places[first, 1]), 0.0))
+        attracts = int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1 - ATTRACTS
+        closed |= same & (not attracts)
+        left &= ~same
+    return closed | left
+
+
+def _matched(
+    found: list[list[_Met]], values: np.ndarray, moves: float, n: int, name: str
+) -> BasinFractions:
+    """The attractors at each value, matched with those before it."""
+    names: list[str] = []
+    last: list[_Met] = []  # each of them, where it was met last
+    numbers: list[list[int]] = []  # of the attractors at each value, in `names`
+    for met in found:
+        here: dict[int, int] = {}
+        just_before = numbers[-1] if numbers else []
+        for known in (just_before, [k for k in range(len(last)) if k not in just_before]):
+            new = [i for i in range(len(met)) if i not in here]
+            pairs = _pairs([last[k] for k in known], [met[i] for i in new], moves)
+            here |= {new[i]: known[j] for i, j in pairs.items()}
+        for i, one in enumerate(met):
+            if i not in here:
+                here[i] = len(names)
+                kind = KINDS[one.kind]
+                names.append(f"{kind} {sum(name.startswith(kind) for name in names)}")
+                last.append(one)
+            last[here[i]] = one
+        numbers.append([here[i] for i in range(len(met))])
+    fractions = np.zeros((len(found), len(names)))
+    places = np.full((len(PLACE), *fractions.shape), np.nan)
+    for row, met in enumerate(found):
+        for number, one in zip(numbers[row], met, strict=True):
+            fractions[row, number] = one.fraction
+            places[:, row, number] = one.place
+            if one.kind != CYCLE:
+                places[-1, row, number] = np.nan
+    # Of as many starts: what is left is exact to rounding.
+    undecided = np.round(n * (1 - np.sum(fractions, axis=1))) / n
+    columns = dict(zip(PLACE, places, strict=True))
+    errors = _errors(fractions, n)
+    return BasinFractions(
+        values, tuple(names), fractions, errors, undecided, **columns, n=n, name=name
+    )
+
+
+def _pairs(before: list[_Met], met: list[_Met], moves: float) -> dict[int, int]:
+    """Which attractor of those before each of those met now is, where it is one; see
+    `basin_fractions`."""
+    from scipy.optimize import linear_sum_assignment  # late, as only this needs it
+
+    if not before or not met:
+        return {}
+    far = np.array([[_move_between(one, other) for other in before] for one in met])
+    fits = far <= moves
+    # A pair that does not fit costs more than all that do.
+    rows, columns = linear_sum_assignment(np.where(fits, far, 1 + moves * (1 + far.size)))
+    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
+    return {i: j for i, j in pairs if fits[i, j]}
+
+
+def _move_between(one: _Met, other: _Met) -> float:
+    """How far apart two attractors are, in x1 or x2; inf if of different kinds."""
+    if one.kind != other.kind:
+        return np.inf
+    return float(np.max(np.abs(one.place[:4] - other.place[:4])))

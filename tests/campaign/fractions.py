@@ -1,0 +1,150 @@
+"""Basin fractions along a parameter: what `basin_fractions` tells against runs by the engine.
+
+Along nu0 of class (b), nu1 = 0.35, at ten values. The engine runs from the middles of the cells of
+a grid over the box, whose counts err by less than those of starts at random: the boundary of a
+basin is a curve, and only cells that it passes are counted wrong. Three things must hold.
+
+- At each value there are as many attractors, of the same kinds and at the same places.
+- Each fraction is the engine's, to two standard errors of as many random starts as the engine has;
+  `basin_fractions` has more.
+- In standard errors of their own the fractions differ from the engine's as they should: the sum of
+  the squares, one for each value with two attractors, is one that chance gives.
+"""
+
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from scipy.stats import chi2
+
+import jaxbelt as jb
+
+from . import engine
+from .cases import PAPER
+
+#: The path, and the box of starts; six of the values have two attractors.
+NU1, SPAN, VALUES, BOX = 0.35, (-0.55, 0.53), 10, ((-1.0, 3.0), (-1.0, 1.0))
+#: Starts of `basin_fractions` for one of the engine.
+MORE = 10
+#: Extrema of one attractor differ by less.
+SAME = 1e-4
+#: The sum of squares is beyond what chance gives once in so many campaigns, and so is a fault.
+CHANCE = 1e-3
+
+
+#: Kind, smallest and largest x1 of an attractor.
+Place = tuple[str, float, float]
+
+
+class Seen(NamedTuple):
+    """Attractors at one value, and how many starts lead to each; a kind "undecided" where the
+    engine does not tell."""
+
+    places: tuple[Place, ...]
+    counts: tuple[int, ...]
+
+
+def by_engine(nu0: float, starts: int, threads: int) -> Seen:
+    """What the engine's runs lead to, from about so many starts on a grid, two by one."""
+    across = max(1, round(np.sqrt(starts / 2)))
+    middles = [
+        low + (high - low) * (np.arange(n) + 0.5) / n
+        for (low, high), n in zip(BOX, (2 * across, across), strict=True)
+    ]
+    grid = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1)
+    return of_starts(class_b(nu0), grid.reshape(-1, 2), threads)
+
+
+def class_b(nu0: float) -> engine.Oscillator:
+    """The oscillator at a value."""
+    return engine.Oscillator(0.5, tuple(engine.Belt(nu, PAPER) for nu in (nu0, NU1)))
+
+
+def of_starts(osc: engine.Oscillator, starts: np.ndarray, threads: int) -> Seen:
+    """What the engine's runs from starts, [n, 2], lead to."""
+
+    def label(y0) -> Place:
+        seen = engine.attractor(osc, tuple(y0))
+        x1_min, x1_max = seen.x1 if seen.kind != "undecided" else (0.0, 0.0)
+        return seen.kind, x1_min, x1_max
+
+    with ThreadPoolExecutor(threads) as pool:
+        found: Counter[Place] = Counter()
+        for one in pool.map(label, starts.tolist()):
+            known = (other for other in found if _is_same(one, other))
+            found[next(known, one)] += 1
+    return Seen(tuple(found), tuple(found.values()))
+
+
+def _is_same(one: Place, other: Place) -> bool:
+    return one[0] == other[0] and bool(np.max(np.abs(np.subtract(one[1:], other[1:]))) < SAME)
+
+
+def differences(told: jb.BasinFractions, row: int, seen: Seen) -> tuple[list[str], float]:
+    """What is wrong with the fractions at a value, and the square of the difference of one of two
+    in standard errors of its own, else 0."""
+    met = np.flatnonzero(told.fractions[row])
+    mine = {
+        (told.attractors[k].split()[0], float(told.x1_min[row, k]), float(told.x1_max[row, k])): k
+        for k in met.tolist()
+    }
+    total, wrong, square = sum(seen.counts), [], 0.0
+    if len(mine) != len(seen.places) or told.undecided[row] > 0:
+        wrong.append(f"attractors {list(mine)}, engine {seen}")
+    for place, count in zip(seen.places, seen.counts, strict=True):
+        k = next((k for one, k in mine.items() if _is_same(one, place)), None)
+        if k is None:
+            wrong.append(f"missing: {place}, {count} starts")
+            continue
+        right = count / total
+        away = float(told.fractions[row, k]) - right
+        if abs(away) > 2 * np.sqrt(right * (1 - right) / total):
+            wrong.append(f"{place}: {told.fractions[row, k]:.5f}, engine {right:.5f}")
+        if 0 < right < 1:
+            square = (away / float(told.standard_errors[row, k])) ** 2
+    return wrong, square
+
+
+def compared(seen: list[Seen], seed: int) -> int:
+    """Print how the fractions differ from what the engine saw; 1 where they are wrong."""
+    began, n = time.monotonic(), MORE * sum(seen[0].counts)
+    told = jb.basin_fractions(
+        lambda nu0: jb.presets.class_b(nu0, NU1),
+        span=SPAN,
+        rows=VALUES,
+        box=BOX,
+        n=n,
+        key=jax.random.key(seed),
+    )
+    print(f"{told}, {time.monotonic() - began:.0f} s")
+    bad, squares = False, []
+    for row, (value, one) in enumerate(zip(told.values, seen, strict=True)):
+        wrong, square = differences(told, row, one)
+        bad |= bool(wrong)
+        squares += [square] if len(one.places) > 1 else []
+        fractions = ", ".join(
+            f"{name} {told.fractions[row, k]:.5f} +- {told.standard_errors[row, k]:.5f}"
+            for k, name in enumerate(told.attractors)
+            if told.fractions[row, k]
+        )
+        shares = ", ".join(
+            f"{place[0]} {count / sum(one.counts):.5f}"
+            for place, count in zip(one.places, one.counts, strict=True)
+        )
+        print(f"nu0 = {value:.4f}: {fractions}; engine {shares}; {square**0.5:.2f} errors off")
+        for line in wrong:
+            print(f"  {line}")
+    chance = float(chi2.sf(sum(squares), len(squares)))
+    print(f"sum of {len(squares)} squares {sum(squares):.2f}, by chance with {chance:.3f}")
+    return int(bad or chance < CHANCE)
+
+
+def run(seed: int, starts: int, threads: int) -> int:
+    """Compare at all values, with about so many starts of the engine at each."""
+    began = time.monotonic()
+    seen = [by_engine(float(nu0), starts, threads) for nu0 in np.linspace(*SPAN, VALUES)]
+    print(f"{sum(seen[0].counts):,} starts of the engine each, {time.monotonic() - began:.0f} s")
+    return compared(seen, seed)
