@@ -119,12 +119,15 @@ ADVICE = {
     ),
     Status.NOT_IDENTIFIED: (
         "The record does not tell all of the parameters: those with an infinite standard error may "
-        "have any value. Fit fewer of them, or measure a motion that feels them."
+        "have any value, alone or together with another. Fit fewer of them, tie some, or measure a "
+        "motion that feels them: one that touches that belt, or slips at other speeds."
     ),
     Status.MISFIT: (
-        "The best fit leaves more than the given noise: the model, or the noise, is not that of "
-        "the record, or a better fit was not found. Look at the residuals; try a nearer guess or "
-        "more starts."
+        "The best fit leaves more than the given noise. Where the autocorrelation of the residuals "
+        "is about 0 it found the motion, and the noise is larger than was said: by the root of the "
+        "reduced chi^2. Else the model is not that of the record (a number that is kept is wrong, "
+        "or the law), or a better fit was not found: look at plot(), free another parameter, try "
+        "a nearer guess or more starts."
     ),
     Status.UNREACHABLE: (
         "No choice of the parameters within their bounds reaches the targets along this way; what "

@@ -15,6 +15,8 @@ from jaxtyping import Array
 from .checks import require
 from .cycles.cycle import Cycle
 from .cycles.functionals import energy_dissipated
+from .inverse.fit import Fit
+from .model.friction import Conti, Coulomb, Stribeck
 from .model.machine import Machine, Units
 from .model.modes import mode_acceleration, mode_of
 from .model.oscillator import Oscillator
@@ -31,29 +33,44 @@ DIMENSIONS = {
     **dict.fromkeys(("t", "t_event", "period", "transient", "stick_duration"), "time"),
     **dict.fromkeys(("x1", "x1_event", "x1_end", "x1_min", "x1_max", "amplitude"), "length"),
     **dict.fromkeys(("x2", "x2_event", "x2_end", "x2_min", "x2_max"), "velocity"),
+    **{"x1_residual": "length", "x2_residual": "velocity"},
     "force": "force",
     "energy": "energy",
+}
+#: The same for the numbers of oscillators and laws, by their fields: a unit, and what 1 is in it.
+PARAMETERS: dict[str, tuple[str, Callable[[Units], Any]]] = {
+    "damping": ("N s m-1", lambda units: units.force / units.velocity),
+    "velocity": ("m s-1", lambda units: units.velocity),
+    "load": ("N", lambda units: units.force),
+    **dict.fromkeys(("lower", "upper"), ("m", lambda units: units.length)),
+    **dict.fromkeys(("static", "residual", "kinetic"), ("1", lambda _: 1.0)),
+    "steepness": ("s m-1", lambda units: 1 / units.velocity),
+    "quadratic": ("s2 m-2", lambda units: 1 / units.velocity**2),
 }
 SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
 
 
 def in_si(
-    result: "Trajectory | Cycle | Basins | xarray.Dataset",
+    result: "Trajectory | Cycle | Basins | Fit | xarray.Dataset",
     machine: Machine | Callable[..., Machine],
 ) -> "xarray.Dataset":
     """A result in SI units, as a dataset whose variables carry their units.
 
-    result: of the machine's oscillator, a `Trajectory`, a `Cycle`, `Basins`, or the dataset of a
-    sweep. machine: the `Machine`; where the sweep has axes other than starts, a function of these
-    that returns it, for its units may be others in each run.
+    result: of the machine's oscillator, a `Trajectory`, a `Cycle`, `Basins`, a `Fit`, or the
+    dataset of a sweep. machine: the `Machine`; where the sweep has axes other than starts, a
+    function of these that returns it, for its units may be others in each run.
 
     Of a trajectory: `t` in s, `x1` in m, `x2` in m/s, `force`, the friction on the mass, in N
     (exact formulation only), and `mode` at each sample; `t_event`, `x1_event`, `x2_event`,
     `event_kind` and `event_belt`. Of a cycle: `period`, `stick_duration` of each belt, `x1_min`,
     `x1_max`, `x2_min`, `x2_max`, `amplitude`, and `energy`, what friction and dashpot turn into
-    heat in one period. Of a dataset: its own variables, with derivatives by starts and parameters
-    where the units are the same in all runs; results of an observable of one's own stay
-    dimensionless. `TypeError` for anything else.
+    heat in one period. Of a fit: over `parameter`, the names in its table, `estimate`,
+    `standard_error`, `lower` and `upper` (the confidence interval of 95 per cent), each in the
+    `unit` beside it, where a load is a normal_force, and a parameter of a law of one's own stays as
+    the law has it, with the unit ""; over `t` the fitted motion, `x1` and `x2`, and `x1_residual`
+    and `x2_residual`, datum minus motion. Of a dataset: its own variables, with derivatives by
+    starts and parameters where the units are the same in all runs; results of an observable of
+    one's own stay dimensionless. `TypeError` for anything else.
     """
     import xarray
 
@@ -64,10 +81,12 @@ def in_si(
             return _cycle(result, _one(machine))
         case Basins():
             return _dataset(result.dataset, machine)
+        case Fit():
+            return _fit(result, _one(machine))
         case xarray.Dataset():
             return _dataset(result, machine)
     raise TypeError(
-        "result must be a Trajectory, a Cycle, Basins, or the dataset of a sweep, "
+        "result must be a Trajectory, a Cycle, Basins, a Fit, or the dataset of a sweep, "
         f"got {type(result).__name__}"
     )
 
@@ -154,6 +173,50 @@ def _cycle(cycle: Cycle, machine: Machine) -> "xarray.Dataset":
     }
     attrs = {"status": Status(int(cycle.status)).name}
     return xarray.Dataset(found, {"belt": np.arange(len(machine.belts))}, attrs)
+
+
+def _fit(fit: Fit, machine: Machine) -> "xarray.Dataset":
+    import xarray
+
+    machine.of_oscillator(fit.oscillator)  # a `ValueError` where it is of another machine
+    units, table = machine.units, fit.table()
+    told = [*(_unit_of(name, fit.oscillator, units) for name in fit.names), *_starts(units)]
+    symbols, sizes = zip(*told, strict=True)
+    names = [name.replace(".load", ".normal_force") for name in table["name"]]
+    columns = ("estimate", "standard_error", "lower", "upper")
+    found: dict[str, Any] = {
+        name: ("parameter", table[name].to_numpy() * np.array(sizes)) for name in columns
+    }
+    motions = {"": fit.ys, "_residual": fit.residuals}
+    for i, word in enumerate(("displacement", "velocity")):
+        for end, values in motions.items():
+            name, words = (
+                f"x{i + 1}{end}",
+                "fitted " + word if not end else "residual of the " + word,
+            )
+            found[name] = _variable("t", values[:, i], name, units, words)
+    time = _variable("t", fit.ts, "t", units, "time")
+    coordinates = {"parameter": names, "unit": ("parameter", list(symbols)), "t": time}
+    chi2 = float(fit.reduced_chi_squared)
+    attrs = {"status": Status(int(fit.status)).name, "reduced_chi_squared": chi2}
+    return xarray.Dataset(found, coordinates, attrs)
+
+
+def _unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
+    """The unit of a parameter of a fit, and what 1 is in it; tied ones have to have the same."""
+    told = set()
+    for path in name.split(" = "):
+        law, _, field = path.partition(".friction.")
+        index = int(law.removeprefix("belts[").removesuffix("]")) if field else 0
+        own = field and not isinstance(osc.belts[index].friction, Conti | Coulomb | Stribeck)
+        symbol, size = ("", lambda _: 1.0) if own else PARAMETERS[path.rpartition(".")[2]]
+        told.add((symbol, float(size(units))))
+    require(len(told) == 1, "result", "of tied parameters with one unit", name)
+    return told.pop()
+
+
+def _starts(units: Units) -> list[tuple[str, float]]:
+    return [(SYMBOLS[name], float(getattr(units, name))) for name in ("length", "velocity")]
 
 
 def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":

@@ -66,7 +66,7 @@ MISTAKES = [
     ("jb.PhysicalBelt(0.1, law, -1.0)", r"normal_force must be >= 0, got -1\.0"),
     ("jb.PhysicalBelt(0.1, 0.4, 1.0)", f"friction must be {LAW}.*, got 0.4"),
     ("jb.Units(1.0)", "missing 4 required positional arguments"),
-    ("jb.in_si(3.0, machine)", "result must be a Trajectory, a Cycle, Basins.*, got float"),
+    ("jb.in_si(3.0, machine)", "result must be a Trajectory, .* a Fit, .*, got float"),
     ("jb.in_si(cycle, osc)", r"machine must be a Machine, got Oscillator\("),
     ("jb.plot_in_si(cycle, osc)", r"machine must be a Machine, got Oscillator\("),
     ("jb.explore((1.0, 0.0))", OSC + r"\(1\.0, 0\.0\)"),
@@ -359,10 +359,13 @@ MISTAKES = [
     ("jaxbelt diagram --span 1 0", r"span must be FROM TO with FROM < TO, got 1\.0 0\.0"),
     ("jaxbelt diagram --quantity x3", "quantity must be one of .*, got x3"),
     ("jaxbelt map --axes nu0 nu0", "axes must be different ones, got nu0 twice"),
+    ("jaxbelt map --axes nu0 zta", "axes must be among nu0, .* got zta .did you mean 'zeta'"),
     ("jaxbelt map --cells 1", "cells must be at least 2, got 1"),
     ("jaxbelt basins --points 1", "points must be at least 2, got 1"),
     ("jaxbelt basins --x1 3 0", r"x1 must be FROM TO with FROM < TO, got 3\.0 0\.0"),
     ("jaxbelt sweep nu0", "an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got 'nu0'"),
+    ("jaxbelt sweep nu0=1 'belts[0].velocity=2'", r"different ones, got belts\[0\].velocity twice"),
+    ("jaxbelt sweep nu1=0:1:9 --belt 0.3", "axes must be among nu0, zeta, .*, got nu1"),
     ("jaxbelt sweep nu0=0:1:9 --variable nope", "variable must be one of kind, .*, got nope"),
     ("jaxbelt sweep nu0=0:1:9 --observe atractor", "observe must be .* got atractor .did you mean"),
     ("jaxbelt sweep nu0=0:1:9 --out plane.csv", "out must end in .nc or .zarr, got plane.csv"),
@@ -489,6 +492,9 @@ def called(what: str, known: dict) -> tuple[str, str]:
 def main() -> None:
     """Print a line for each mistake: what was called, what came, what was compiled, and seconds."""
     warnings.simplefilter("error")
+    # What other packages have yet to change is no mistake.
+    warnings.simplefilter("ignore", DeprecationWarning)
+    warnings.filterwarnings("error", category=DeprecationWarning, module="jaxbelt")
     jax.config.update("jax_enable_x64", True)
     known = names()
     # What each process does once: tricks are tried before they are first used, Matplotlib imported.

@@ -1,6 +1,7 @@
 """The command line: files that read back as what was computed, and errors in one sentence."""
 
 import csv
+import functools
 import json
 import os
 import subprocess
@@ -10,14 +11,22 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from typer.testing import CliRunner
 
 import jaxbelt as jb
 from jaxbelt import paper as reproduce
 from jaxbelt.cli import app
 from jaxbelt.commands.map import write_table
-from jaxbelt.commands.options import belts_of_class, parse_belt
+from jaxbelt.commands.options import (
+    belts_of_class,
+    family,
+    oscillator,
+    parameters,
+    parse_belt,
+)
 from jaxbelt.commands.sweep import VARIABLES
+from jaxbelt.model.parameters import names_of
 from jaxbelt.sweeps.question import Question
 from jaxbelt.tables import table_of
 
@@ -96,6 +105,62 @@ def test_belts_are_parsed():
     assert repr(belt) == repr(jb.Belt(0.5, jb.Coulomb(static=0.8, kinetic=0.5), lower=0.2))
     belt = parse_belt("0.5,steepness=3")
     assert repr(belt) == repr(jb.Belt(0.5, jb.Conti(static=1.0, residual=0.6, steepness=3.0)))
+
+
+#: Two belts of one's own, as they are described, and as a function of what may vary.
+OWN = ("0.3,law=coulomb,static=0.8,kinetic=0.5", "-0.1,steepness=8,load=0.5,lower=0.2")
+
+
+def own(nu0, load, damping=0.4):
+    second = jb.Belt(-0.1, jb.Conti(1.0, 0.6, 8.0), load, lower=0.2)
+    return jb.Oscillator(damping, (jb.Belt(nu0, jb.Coulomb(0.8, 0.5)), second), omega=1.1)
+
+
+@pytest.mark.parametrize("system", ["a", "b", "c", "d", OWN])
+def test_parameters_are_those_of_the_oscillator(system):
+    """Told without the oscillator, before anything that computes is imported."""
+    description = (system, None) if system in list("abcd") else ("b", system)
+    osc, known = oscillator(*description), parameters(*description)
+    assert set(known.values()) == set(names_of(osc))
+    assert [name for name in known if known[name] != name] == [
+        *(f"nu{i}" for i in range(len(osc.belts))),
+        "zeta",
+    ]
+
+
+def test_axes_by_name():
+    """Of a class its arguments, then anything by its path; dataset.attrs["call"] can be run."""
+    axes = {"nu0": 0.2, "belts[1].load": 0.7}
+    make = family("b", {}, OWN, 0.4, 1.1, axes)
+    assert repr(make(**axes)) == repr(own(0.2, 0.7))
+    assert repr(make(damping=0.3, nu0=0.2)) == repr(make(zeta=0.3, nu0=0.2))
+    assert float(make(zeta=0.3).damping) == 0.3
+    assert family("b", {}, None, 0.5, 1.0, ["nu0", "nu1"]) is jb.presets.class_b
+    edge = family("c", {"nu1": -0.2}, None, 0.5, 1.0, ["sigma"])
+    assert repr(edge(sigma=0.3)) == repr(jb.presets.class_c(0.2, -0.2, 0.3))
+    steep = family("c", {"nu1": -0.2}, None, 0.3, 1.0, ["sigma", "belts[0].friction.steepness"])
+    osc = steep(**{"sigma": 0.3, "belts[0].friction.steepness": 8.0})
+    first, second = jb.presets.class_c(0.2, -0.2, 0.3).belts
+    first = jb.Belt(first.velocity, jb.Conti(1.0, 0.6, 8.0), upper=0.3)
+    assert repr(osc) == repr(jb.Oscillator(0.3, (first, second)))
+    with pytest.raises(ValueError, match="load of belt 1 must be >= 0, got -1"):
+        make(**{"nu0": 0.2, "belts[1].load": -1.0})
+
+
+def test_sweep_of_belts_of_ones_own(tmp_path):
+    out = tmp_path / "own.nc"
+    arguments = ["nu0=0.1:0.5:3", "belts[1].load=0.5:1:2", "--damping", "0.4", "--omega", "1.1"]
+    arguments += ["--belt", OWN[0], f"--belt={OWN[1]}", "--observe", "final", "--t1", "20"]
+    result = runner.invoke(app, ["sweep", *arguments, "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    axes = {"nu0": np.linspace(0.1, 0.5, 3), "load": np.array([0.5, 1.0])}
+    expected = jb.sweep(own, axes, y0=(3.0, 0.0), t1=20.0)
+    with xr.open_dataset(out, engine="scipy") as written:
+        assert written.x1_end.dims == ("nu0", "belts[1].load")
+        np.testing.assert_array_equal(written.x1_end, expected.x1_end)
+        again = eval(written.attrs["make"], {"functools": functools, "jaxbelt": jb})
+        assert repr(again(**{"nu0": 0.2, "belts[1].load": 0.7})) == repr(own(0.2, 0.7))
+    assert (tmp_path / "own.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import pytest
 from laws import Lorentz
 
 import jaxbelt as jb
+from jaxbelt.model.parameters import names_of
 
 MASS, STIFFNESS, DAMPING = 0.5, 2000.0, 1.0
 
@@ -83,6 +84,105 @@ def test_a_cycle_in_si():
     fed = float(jb.energy_fed(cycle) * m.units.energy)
     assert float(ours.energy) == pytest.approx(fed, rel=1e-8)
     assert ours.energy.units == "J" and ours.stick_duration.dims == ("belt",)
+
+
+def fit_of(osc, **values):
+    """A fit of an oscillator, with a tenth of each estimate as its standard error."""
+    estimates, names = jnp.asarray(list(values.values())), tuple(values)
+    p, ts, one = len(names), jnp.linspace(0.0, 1.0, 3), jnp.asarray(1.0)
+    ys = jnp.asarray([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    return jb.Fit(
+        oscillator=osc,
+        names=names,
+        estimates=estimates,
+        standard_errors=0.1 * estimates,
+        covariance=jnp.diag((0.1 * estimates) ** 2) if p else jnp.zeros((0, 0)),
+        y0=ys[0],
+        y0_standard_errors=0.1 * ys[0],
+        ts=ts,
+        ys=ys,
+        residuals=0.01 * ys,
+        noise=jnp.ones(2),
+        reduced_chi_squared=one,
+        plausibility=one,
+        autocorrelation=one,
+        candidates=1,
+        evaluations=1,
+        status=jnp.asarray(jb.Status.OK.value),
+    )
+
+
+def test_a_fit_in_si():
+    """What a fit would find without noise are the numbers that the machine was made of."""
+    m = machine()
+    numbers = dict(zip(names_of(m.oscillator), jax.tree.leaves(m.oscillator), strict=True))
+    names = [name for name in numbers if name not in ("omega", "belts[0].lower", "belts[1].upper")]
+    ours = jb.in_si(fit_of(m.oscillator, **{name: numbers[name] for name in names}), m)
+    assert ours.attrs == {"status": "OK", "reduced_chi_squared": 1.0}
+    told = {
+        name: (float(v), u)
+        for name, v, u in zip(ours.parameter.values, ours.estimate, ours.unit.values)
+    }
+    # 5 N on 2000 N/m are 2.5 mm, and one unit of time is sqrt(m/k).
+    length, time = 5.0 / STIFFNESS, np.sqrt(MASS / STIFFNESS)
+    expected = {
+        "damping": (DAMPING, "N s m-1"),
+        "belts[0].velocity": (0.02, "m s-1"),
+        "belts[0].friction.static": (0.4, "1"),
+        "belts[0].friction.residual": (0.25, "1"),
+        "belts[0].friction.steepness": (100.0, "s m-1"),
+        "belts[0].friction.quadratic": (0.0, "s2 m-2"),
+        "belts[0].normal_force": (5.0, "N"),
+        "belts[0].upper": (0.004, "m"),
+        "belts[1].velocity": (0.05, "m s-1"),
+        "belts[1].friction.static": (0.3, "1"),
+        "belts[1].friction.residual": (0.2, "1"),
+        "belts[1].friction.steepness": (50.0, "s m-1"),
+        "belts[1].friction.quadratic": (0.3, "s2 m-2"),
+        "belts[1].normal_force": (2.0, "N"),
+        "belts[1].lower": (0.001, "m"),
+        "x1 at the start": (length, "m"),
+        "x2 at the start": (2 * length / time, "m s-1"),
+    }
+    assert {name: unit for name, (_, unit) in told.items()} == {
+        k: u for k, (_, u) in expected.items()
+    }
+    for name, (value, _) in expected.items():
+        assert told[name][0] == pytest.approx(value, rel=1e-14)
+    assert np.allclose(ours.standard_error, 0.1 * ours.estimate, rtol=1e-14)
+    assert np.allclose(ours.upper - ours.lower, 2 * 1.959964 * ours.standard_error, rtol=1e-6)
+    assert np.allclose(ours.x1, np.array([1, 3, 5]) * length) and ours.x1.units == "m"
+    assert np.allclose(ours.x2_residual, np.array([0.02, 0.04, 0.06]) * length / time)
+    assert np.allclose(ours.t, np.linspace(0, 1, 3) * time) and ours.t.units == "s"
+
+
+def test_a_fit_of_a_law_of_ones_own_and_of_tied_parameters_in_si():
+    law = Lorentz(jnp.asarray(0.5), jnp.asarray(0.3), jnp.asarray(0.1))
+    m = jb.Machine(MASS, STIFFNESS, DAMPING, [jb.PhysicalBelt(0.02, law, 5.0)] * 2)
+    (width,) = [
+        name for name in names_of(m.oscillator) if name.endswith("0].friction.law.velocity")
+    ]
+    tied = "belts[0].load = belts[1].load"
+    ours = jb.in_si(fit_of(m.oscillator, **{width: 0.1, tied: 1.0}), m)
+    assert ours.parameter.values.tolist()[:2] == [width, tied.replace("load", "normal_force")]
+    assert ours.estimate.values[:2] == pytest.approx([0.1, 5.0])
+    assert ours.unit.values.tolist()[:2] == ["", "N"]
+    with pytest.raises(ValueError, match="of tied parameters with one unit, got damping = belts"):
+        jb.in_si(fit_of(m.oscillator, **{"damping = belts[0].load": 1.0}), m)
+    with pytest.raises(ValueError, match="osc must be of 2 belts"):
+        jb.in_si(fit_of(jb.presets.class_a(0.3), damping=0.1), m)
+
+
+def test_a_picture_of_a_fit_in_si():
+    """Two quantities on one axis have no common unit: they stay as they are."""
+    m = machine()
+    both = fit_of(m.oscillator, damping=0.1)
+    ax = jb.plot_in_si(both, m)
+    assert ax.get_xlabel() == "time $t$ (s)"
+    assert ax.get_ylabel() == "displacement $x_1$, velocity $x_2$"
+    alone = dataclasses.replace(both, residuals=both.residuals.at[:, 1].set(jnp.nan))
+    assert jb.plot_in_si(alone, m).get_ylabel() == "displacement $X$ (m)"
+    plt.close("all")
 
 
 def test_its_numbers_are_differentiable():

@@ -271,7 +271,7 @@ def key_of(ax):
 def test_a_kind_has_one_colour_in_every_picture(dataset):
     whole = key_of(jb.plot_sweep(dataset, "kind"))
     assert set(whole) == {"equilibrium", "cycle, sticks to belt 0 and 1"}
-    resting = key_of(jb.plot_sweep(dataset.assign(kind=dataset.kind * 0 + 1), "kind"))
+    resting = key_of(jb.plot_sweep(dataset.assign(kind=xr.ones_like(dataset.kind)), "kind"))
     assert resting.items() <= whole.items()
     turned = dataset.assign(sticks=dataset.sticks & (dataset.belt == 0)).transpose()
     assert key_of(jb.plot_sweep(turned, "kind"))["equilibrium"] == whole["equilibrium"]

@@ -232,7 +232,8 @@ def _row_of_point(point: BifurcationPoint) -> dict[str, Any]:
 
 def _nodes(path: ParameterPath, a: float, b: float, rows: int) -> np.ndarray:
     """Values from a to b, dense at both ends, which are left out where they are special."""
-    count = max(9, round(rows * (b - a) / path.length))
+    # Short stretches are no less curved than long ones: of fewer rows the corners would be seen.
+    count = max(9, rows // 9, round(rows * (b - a) / path.length))
     inner = 0.5 * (1 - np.cos(np.linspace(0, np.pi, count)))
     first = path.beside(a)[1] if a in path.breaks or a != path.first else a
     last = path.beside(b)[0] if b in path.breaks or b != path.last else b

@@ -89,7 +89,7 @@ def basins(
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
         check_description(system, arguments, belt)
         turn_on_float64()
-        osc = oscillator(system, arguments, belt, damping, omega)
+        osc = oscillator(system, belt, damping, omega, **arguments)
         import jax
         import numpy as np
 

@@ -26,6 +26,7 @@ from .options import (
     make_console,
     oscillator,
     outputs,
+    parameters,
     plain,
     plain_errors,
     say,
@@ -37,8 +38,6 @@ EDGES = ("sigma", "sigma0", "sigma1")
 #: What a diagram shows.
 QUANTITIES = ("amplitude", "x1", "x2", "period")
 POINT_COLUMNS = ("value", "kind", "belts", "error", "status")
-#: Short names of parameters that may be varied.
-PARAMETERS = {"nu0": "belts[0].velocity", "nu1": "belts[1].velocity", "zeta": "damping"}
 
 
 def diagram(
@@ -55,7 +54,7 @@ def diagram(
         str,
         typer.Option(
             "--vary",
-            help="The parameter: nu0, nu1, zeta, sigma, sigma0, sigma1, or its path, such as "
+            help="The parameter: nu0, nu1, ..., zeta, sigma, sigma0, sigma1, or its path, such as "
             "belts[1].friction.steepness.",
         ),
     ] = "nu0",
@@ -106,17 +105,21 @@ def diagram(
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
         varied = {parameter: span[0]} if parameter in EDGES else {}
         check_description(system, arguments | varied, belt)
+        paths = {**dict.fromkeys(EDGES, ""), **parameters(system, belt)}
+        if parameter not in paths:
+            known, meant = ", ".join(paths), did_you_mean(parameter, paths)
+            raise ValueError(f"vary must be one of {known}, got {parameter}{meant}")
         turn_on_float64()
 
         def along(p):
-            return oscillator(system, {**arguments, parameter: p}, belt, damping, omega)
+            return oscillator(system, belt, damping, omega, **{**arguments, parameter: p})
 
         if parameter in EDGES:
             found = jb.bifurcation_diagram(along, span=span, rows=rows)
             found = replace(found, name=parameter)
         else:
-            osc = oscillator(system, arguments, belt, damping, omega)
-            found = jb.bifurcation_diagram(osc, _where(osc, parameter), span, rows=rows)
+            osc = oscillator(system, belt, damping, omega, **arguments)
+            found = jb.bifurcation_diagram(osc, _where(osc, paths[parameter]), span, rows=rows)
         from ..plotting.diagrams import plot_diagram
         from ..plotting.style import draw_key, journal_figure, journal_style, save
 
@@ -134,19 +137,14 @@ def diagram(
     say(console, lines, written, as_json=as_json, data=data)
 
 
-def _where(osc: "jb.Oscillator", name: str) -> Any:
-    """What selects the parameter of that name or path."""
+def _where(osc: "jb.Oscillator", path: str) -> Any:
+    """What selects the parameter of that path."""
     import jax
 
     from ..model.parameters import names_of
 
-    paths = names_of(osc)
-    path = PARAMETERS.get(name, name)
-    if path not in paths:
-        known = (*PARAMETERS, *EDGES, *paths)
-        meant = did_you_mean(name, known)
-        raise ValueError(f"vary must be one of {', '.join(known)}, got {name}{meant}")
-    return lambda osc: jax.tree.leaves(osc)[paths.index(path)]
+    place = names_of(osc).index(path)
+    return lambda osc: jax.tree.leaves(osc)[place]
 
 
 def write_points(points, path: Path) -> None:

@@ -9,11 +9,20 @@ import typer
 import jaxbelt as jb
 
 from .options import (
+    Belts,
     Class,
+    Damping,
     Json,
+    Nu0,
+    Nu1,
+    Omega,
+    Sigma,
+    Sigma0,
+    Sigma1,
     check_axes,
+    check_description,
     check_range,
-    class_along,
+    family,
     make_console,
     outputs,
     plain_errors,
@@ -24,8 +33,21 @@ from .options import (
 
 def region_map(
     system: Class = "b",
+    nu0: Nu0 = None,
+    nu1: Nu1 = None,
+    sigma: Sigma = None,
+    sigma0: Sigma0 = None,
+    sigma1: Sigma1 = None,
+    belt: Belts = None,
+    damping: Damping = 0.5,
+    omega: Omega = 1.0,
     axes: Annotated[
-        tuple[str, str], typer.Option(metavar="P Q", help="The two arguments of the class.")
+        tuple[str, str],
+        typer.Option(
+            metavar="P Q",
+            help="The two parameters: arguments of the class, nu0, nu1, ..., zeta, or paths, such "
+            "as belts[1].friction.steepness.",
+        ),
     ] = ("nu0", "nu1"),
     p: Annotated[
         tuple[float, float], typer.Option(metavar="FROM TO", help="Values of the first one.")
@@ -49,13 +71,19 @@ def region_map(
       the stick phase that vanishes, residual, special, a row a point of a curve. Points of
       codimension two stand at their places, named in the last column.
 
-    The other arguments of the class have the values that **simulate** takes for them.
+    An oscillator is described as for **simulate**; what is varied needs no value.
 
-    Example: jaxbelt map --class b --cells 400
+    Examples:
+
+    - jaxbelt map --class b --cells 400
+
+    - jaxbelt map --axes nu0 zeta --p 0 0.6 --q 0.1 1 --nu1 0.35
     """
     console = make_console()
     with plain_errors():
-        check_axes(system, axes)
+        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
+        check_description(system, arguments, belt)
+        check_axes(system, axes, belt=belt)
         if cells < 2:
             raise ValueError(f"cells must be at least 2, got {cells}")
         check_range("p", p)
@@ -64,7 +92,7 @@ def region_map(
         turn_on_float64()
         import numpy as np
 
-        make = class_along(system, axes)
+        make = family(system, arguments, belt, damping, omega, axes)
         # Other numbers of cells, lest cells lie on the line where both are the same.
         values = {axes[0]: np.linspace(*p, cells), axes[1]: np.linspace(*q, cells + 1)}
         found = jb.region_map(make, values)

@@ -10,7 +10,7 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -164,16 +164,59 @@ Json = Annotated[
 ]
 
 
-def oscillator(system, arguments, belt, damping, omega) -> "jb.Oscillator":
-    """The oscillator that the options describe: a class with its arguments, or belts in full."""
-    belts = belts_of_class(system, arguments) if not belt else list(map(parse_belt, belt))
+def oscillator(
+    system: str = "b",
+    belt: Sequence[str] | None = None,
+    damping: Any = 0.5,
+    omega: Any = 1.0,
+    **values: Any,
+) -> "jb.Oscillator":
+    """The oscillator that the options describe: a class with its arguments, or belts in full.
+
+    values: arguments of the class and `parameters`, by name; None for one that is not given.
+    """
+    arguments = {} if belt else CLASSES[system]
+    named = {name: value for name, value in values.items() if name in arguments}
+    belts = tuple(map(parse_belt, belt)) if belt else belts_of_class(system, named)
     from ..model.oscillator import Oscillator
 
-    return Oscillator(damping, belts, omega)
+    osc, paths = Oscillator(damping, belts, omega), parameters(system, belt)
+    others = _given({name: value for name, value in values.items() if name not in arguments})
+    return _with(osc, {paths[name]: value for name, value in others.items()}) if others else osc
+
+
+def _with(osc: "jb.Oscillator", values: dict[str, Any]) -> "jb.Oscillator":
+    """The oscillator with the parameters of these paths set."""
+    import jax
+
+    from ..checks import as_array
+    from ..model.parameters import names_of
+
+    leaves, structure = jax.tree.flatten(osc)
+    places = names_of(osc)
+    for path, value in values.items():
+        leaves[places.index(path)] = as_array(value, path)
+    changed: jb.Oscillator = jax.tree.unflatten(structure, leaves)
+    changed.check()
+    return changed
+
+
+def parameters(system: str, belt: Sequence[str] | None = None) -> dict[str, str]:
+    """The parameters of what is described: their short names, where they have one, and their paths
+    in the oscillator, such as belts[1].friction.steepness; each with its path."""
+    laws = [_parts_of_belt(text)[1] for text in belt or ()]
+    if not laws:
+        laws = [LAWS["conti"][1]] * (1 if system == "a" else 2)
+    short = {f"nu{i}": f"belts[{i}].velocity" for i in range(len(laws))} | {"zeta": "damping"}
+    paths = ["damping", "omega"]
+    for i, law in enumerate(laws):
+        fields = ("velocity", *(f"friction.{name}" for name in law), "load", "lower", "upper")
+        paths += [f"belts[{i}].{field}" for field in fields]
+    return short | {path: path for path in paths}
 
 
 def check_description(
-    system: str, arguments: dict[str, float | None], belt: list[str] | None = None
+    system: str, arguments: dict[str, float | None], belt: Sequence[str] | None = None
 ) -> None:
     """Raise unless these options describe belts; numbers are left to the classes themselves."""
     given = _given(arguments)
@@ -190,7 +233,7 @@ def check_description(
             raise ValueError(f"class {system} must have only {', '.join(names)}, got {name}")
 
 
-def _given(arguments: dict[str, float | None]) -> dict[str, float]:
+def _given(arguments: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in arguments.items() if value is not None}
 
 
@@ -200,28 +243,46 @@ def check_class(system: str) -> None:
         raise ValueError(f"class must be a, b, c or d, got {system}")
 
 
-def check_axes(system: str, axes: Iterable[str], others: tuple[str, ...] = ()) -> None:
-    """Raise unless all axes are arguments of the class, or among other names, and come once."""
-    check_class(system)
-    names, seen = (*CLASSES[system], *others), set()
+def check_axes(
+    system: str,
+    axes: Iterable[str],
+    others: tuple[str, ...] = (),
+    belt: Sequence[str] | None = None,
+) -> None:
+    """Raise unless all axes are arguments of the class or parameters of what is described, or
+    among other names, and come once."""
+    check_description(system, {}, belt)
+    paths = parameters(system, belt)
+    names, seen = (*({} if belt else CLASSES[system]), *paths, *others), set()
     for name in axes:
         if name not in names:
-            meant = did_you_mean(name, names)
-            known = ", ".join(names)
-            raise ValueError(f"axes of class {system} must be among {known}, got {name}{meant}")
-        if name in seen:
+            meant, known = did_you_mean(name, names), ", ".join(dict.fromkeys(names))
+            raise ValueError(f"axes must be among {known}, got {name}{meant}")
+        if paths.get(name, name) in seen:
             raise ValueError(f"axes must be different ones, got {name} twice")
-        seen.add(name)
+        seen.add(paths.get(name, name))
 
 
-def class_along(system: str, axes: Iterable[str]) -> "Callable[..., jb.Oscillator]":
-    """A class as a function of its arguments that are axes."""
-    fixed = {name: value for name, value in CLASSES[system].items() if name not in axes}
-    make = getattr(jb.presets, f"class_{system}")
-    return functools.partial(make, **fixed) if fixed else make
+def family(
+    system: str,
+    arguments: dict[str, float | None],
+    belt: Sequence[str] | None,
+    damping: float,
+    omega: float,
+    axes: Iterable[str],
+) -> "Callable[..., jb.Oscillator]":
+    """What is described as a function of its axes; its text, which datasets keep, can be run."""
+    given, axes = _given(arguments), tuple(axes)
+    if belt:
+        return functools.partial(oscillator, belt=tuple(belt), damping=damping, omega=omega)
+    fixed = {k: v for k, v in (CLASSES[system] | given).items() if k not in axes}
+    if (damping, omega) == (0.5, 1.0) and CLASSES[system].keys() >= set(axes):
+        make = getattr(jb.presets, f"class_{system}")
+        return functools.partial(make, **fixed) if fixed else make
+    return functools.partial(oscillator, system, damping=damping, omega=omega, **fixed)
 
 
-def belts_of_class(system: str, arguments: dict[str, float | None]) -> "tuple[jb.Belt, ...]":
+def belts_of_class(system: str, arguments: dict[str, Any]) -> "tuple[jb.Belt, ...]":
     """The belts of a class of the paper, with the arguments that are given."""
     from .. import presets
 

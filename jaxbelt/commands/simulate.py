@@ -117,7 +117,7 @@ def simulate(
         turn_on_float64()
         import numpy as np
 
-        osc = oscillator(system, arguments, belt, damping, omega)
+        osc = oscillator(system, belt, damping, omega, **arguments)
         trajectory = jb.simulate(
             osc,
             start,

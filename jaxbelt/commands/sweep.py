@@ -1,4 +1,4 @@
-"""`jaxbelt sweep`: a class of the paper from every point of a grid."""
+"""`jaxbelt sweep`: an oscillator from every point of a grid."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -10,12 +10,15 @@ import jaxbelt as jb
 
 from ..spelling import did_you_mean
 from .options import (
+    Belts,
     Class,
+    Damping,
     Json,
+    Omega,
     check_axes,
     check_out,
     check_positive,
-    class_along,
+    family,
     make_console,
     plain_errors,
     say,
@@ -40,11 +43,15 @@ def sweep(
         list[str],
         typer.Argument(
             metavar="AXIS...",
-            help="One axis or more, NAME=FROM:TO:COUNT or NAME=VALUE: arguments of the class, and "
-            "x1 and x2 for starts.",
+            help="One axis or more, NAME=FROM:TO:COUNT or NAME=VALUE: arguments of the class, nu0, "
+            "nu1, ..., zeta, or paths of parameters, such as belts[1].friction.steepness, and x1 "
+            "and x2 for starts.",
         ),
     ],
     system: Class = "b",
+    belt: Belts = None,
+    damping: Damping = 0.5,
+    omega: Omega = 1.0,
     observe: Annotated[
         str, typer.Option(help="attractor (what each run leads to) or final (where it ends).")
     ] = "attractor",
@@ -89,19 +96,23 @@ def sweep(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Run one of the paper's classes from every point of a grid; write the data and a picture.
+    """Run an oscillator from every point of a grid; write the data and a picture.
 
     - **OUT**: the dataset, labelled, with what it came from in its attributes.
 
     - the same name with **.png**: a picture, for one or two axes.
 
-    The other arguments of the class have the values that **simulate** takes for them.
+    An oscillator is described as for **simulate**, and has the values given there, or those that
+    **simulate** takes, but for what is an axis.
 
     Examples:
 
     - jaxbelt sweep nu0=-0.7:0.7:512 nu1=-0.7:0.7:512 --out plane.nc
 
     - jaxbelt sweep x1=-2:2:200 x2=-2:2:200 --observe final --t1 50 --out starts.zarr
+
+    - jaxbelt sweep nu0=0:1:64 "belts[0].friction.kinetic=0.2:0.8:64"
+      --belt 0.5,law=coulomb,static=0.8,kinetic=0.5 --damping 0.1
 
     - jaxbelt sweep nu0=-0.7:0.7:8192 nu1=-0.7:0.7:8192 --out plane.zarr --blocks 0:64
     """
@@ -113,7 +124,7 @@ def sweep(
         if part and out.suffix != ".zarr":
             raise ValueError(f"out must end in .zarr where blocks are given, got {out}")
         parsed = list(map(parse_axis, axes))
-        check_axes(system, [name for name, _ in parsed], ("x1", "x2"))
+        check_axes(system, [name for name, _ in parsed], ("x1", "x2"), belt)
         values = dict(parsed)
         if observe not in VARIABLES:
             meant = did_you_mean(observe, VARIABLES)
@@ -128,7 +139,8 @@ def sweep(
             check_out(out)
         check_out(out.with_suffix(".png"))
         turn_on_float64()
-        make = class_along(system, values)
+        own = [name for name in values if name not in ("x1", "x2")]
+        make = family(system, {}, belt, damping, omega, own)
         if t1 is None and observe != "attractor":
             t1 = 100.0
         asked: dict[str, Any] = dict(

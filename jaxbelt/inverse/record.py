@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from scipy.special import gammaincinv
 
 #: Length of the first windows, less than half a loop: no phase is lost over it.
 WINDOW = 2.5
@@ -83,6 +84,8 @@ def local_cubics(ts: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.nda
     inverse = np.linalg.pinv(powers)
     cubics = np.einsum("tpi,ti->tp", inverse, x[rows])
     off = x[rows] - np.einsum("tip,tp->ti", powers, cubics)
-    # The median: corners of the motion are no noise.
-    noise = np.sqrt(np.median(np.sum(off**2, axis=1) / (2 * half - 3)))
+    # The median: corners of the motion are no noise. That of chi^2 is below its mean, the freedom.
+    freedom = 2 * half - 3
+    median = 2 * gammaincinv(0.5 * freedom, 0.5)
+    noise = np.sqrt(np.median(np.sum(off**2, axis=1)) / median)
     return cubics[:, 0], cubics[:, 1], float(noise)

@@ -81,6 +81,7 @@ def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, n
         groups, names, values, _pairs_of(bounds, names), strict=True
     ):
         lower, upper = (_least(osc, group[0]), np.inf) if pair is None else pair
+        require(np.isfinite(value), name, "finite, as a guess", f"{value:.12g}")
         inside = f"inside of its bounds ({lower:.12g}, {upper:.12g})"
         require(lower < value < upper, name, inside, f"{value:.12g}")
         pairs.append((lower, upper))

@@ -77,9 +77,11 @@ def _relabel_key(ax: Axes, machine: Machine) -> None:
 
 def _relabel(axis: Axis, machine: Machine) -> None:
     text = axis.get_label_text()
-    shown = next((LABELS[begins] for begins in LABELS if text.startswith(begins)), None)
-    if shown is not None:
-        quantity, label = shown
+    shown = [
+        LABELS[begins] for part in text.split(", ") for begins in LABELS if part.startswith(begins)
+    ]
+    if len(shown) == 1:  # two quantities on one axis have no common unit
+        ((quantity, label),) = shown
         unit = float(getattr(machine.units, quantity))
         axis.set_major_locator(_RoundInUnits(unit))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value * unit:.6g}"))

@@ -1,0 +1,87 @@
+"""Builds the package and tests the wheel: on every Python, and with the oldest dependencies.
+
+`python -m tests.versions`, with `uv` installed (the group `release`), before a release. The wheel
+is built from the source distribution, and the tests are those of the latter, without the package's
+source beside them: what they import is what was installed. Names of environments as arguments
+choose among them. A part of the tests is run, of what depends on other packages most; with
+`--whole` all that the test command of the README runs, but for the tests of the source itself.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+#: By name, the version of Python, and which versions of the dependencies are taken.
+ENVIRONMENTS = {
+    "oldest": ("3.11", "lowest-direct"),
+    "3.11": ("3.11", "highest"),
+    "3.12": ("3.12", "highest"),
+    "3.13": ("3.13", "highest"),
+}
+PART = "cli clusters explorer machine messages modes parameters plotting results store".split()
+
+
+def run(*command: str | Path, cwd: Path) -> int:
+    """Shows a command and runs it; PYTHONPATH would put other code in the way."""
+    print("==", *command, flush=True)
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    return subprocess.run(command, cwd=cwd, env=environment).returncode
+
+
+def built(folder: Path) -> tuple[Path, Path]:
+    """The wheel, and the files of the source distribution without the package."""
+    if run("uv", "build", "--quiet", "--out-dir", folder, cwd=ROOT):
+        sys.exit("it cannot be built")
+    (archive,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    with tarfile.open(archive) as files:
+        files.extractall(folder, filter="data")
+    source = folder / archive.name.removesuffix(".tar.gz")
+    shutil.rmtree(source / "jaxbelt")
+    return wheel, source
+
+
+def tested(name: str, wheel: Path, source: Path, tests: list[str]) -> bool:
+    """Whether the wheel can be installed and used alone there, and the tests pass."""
+    version, resolution = ENVIRONMENTS[name]
+    environment = source.parent / name
+    python = environment / "bin" / "python"
+    install = ("uv", "pip", "install", "--quiet", "--python", python, "--resolution", resolution)
+    steps = [
+        ("uv", "venv", "--quiet", "--no-python-downloads", "--python", version, environment),
+        # What is named is direct: the bounds of the project, and then the wheel without any.
+        (*install, "-r", "pyproject.toml"),
+        (*install, "--no-deps", wheel),
+        (environment / "bin" / "jaxbelt", "simulate", "--t1", "10", "--out", "run"),
+        (*install, "-r", "pyproject.toml", "--group", "test"),
+        (python, "-m", "pytest", "-q", "-n", "auto", "--dist", "worksteal", *tests),
+    ]
+    return not any(run(*step, cwd=source) for step in steps)
+
+
+def main() -> None:
+    """Ends with 1 unless every environment that was asked for passes."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(ENVIRONMENTS))
+    parser.add_argument("--whole", action="store_true", help="all tests, and not a part of them")
+    options = parser.parse_args()
+    if unknown := set(options.names) - ENVIRONMENTS.keys():
+        parser.error(f"there is no {', '.join(sorted(unknown))}")
+    tests = ["--ignore=tests/test_package.py"] if options.whole else []
+    tests = tests or [f"tests/test_{name}.py" for name in PART]
+    with tempfile.TemporaryDirectory() as folder:
+        wheel, source = built(Path(folder))
+        passed = {
+            name: tested(name, wheel, source, tests) for name in options.names or ENVIRONMENTS
+        }
+    print(*(f"{name}: {'passed' if fine else 'FAILED'}" for name, fine in passed.items()), sep="\n")
+    sys.exit(not all(passed.values()))
+
+
+if __name__ == "__main__":
+    main()
