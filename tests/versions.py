@@ -10,6 +10,7 @@ choose among them. A part of the tests is run, of what depends on other packages
 import argparse
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tarfile
@@ -66,6 +67,8 @@ def tested(name: str, wheel: Path, source: Path, tests: list[str]) -> bool:
 
 def main() -> None:
     """Ends with 1 unless every environment that was asked for passes."""
+    # A shell's background jobs ignore interrupts, and so would the tests that send some.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(ENVIRONMENTS))
     parser.add_argument("--whole", action="store_true", help="all tests, and not a part of them")
