@@ -63,7 +63,7 @@ class _BetweenEdges(AbstractCondition):
             require_value(have, "belts", "two with a finite edge", self.belts)
 
 
-def _pairs(osc: Oscillator, belts: tuple[int | Array, int | Array]) -> TwoEdges:
+def _edge_pairs(osc: Oscillator, belts: tuple[int | Array, int | Array]) -> TwoEdges:
     """The four pairs of an edge of one belt and one of the other one, [4]."""
     n = len(osc.belts)
     pairs = [(belts[0] + i * n, belts[1] + j * n) for i, j in product((0, 1), repeat=2)]
@@ -135,7 +135,7 @@ def _passage(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array, TwoEdges
     """Of the places where a loop passes an edge of each of the belts, one right after the other,
     that at which these are nearest: how far apart they are, inf if there is none; the row that ends
     on the first one; the edges."""
-    n, positions, pairs = len(osc.belts), jnp.stack(edges(osc)), _pairs(osc, belts)
+    n, positions, pairs = len(osc.belts), jnp.stack(edges(osc)), _edge_pairs(osc, belts)
     passes = (loop.ends >= n) & (loop.ends < 3 * n)
     last = jnp.arange(loop.ends.size) == jnp.sum(loop.used) - 1
     at = jnp.where(passes, positions[jnp.clip(loop.ends - n, 0, 2 * n - 1)], jnp.nan)
@@ -209,7 +209,7 @@ class MeetingEdges(AbstractRestCondition, _BetweenEdges):
         return None
 
     def system(self, osc, guess: Any):
-        pairs = _pairs(osc, self.belts)
+        pairs = _edge_pairs(osc, self.belts)
         sizes = _size(jax.vmap(lambda pair: pair.gap(osc))(pairs))
         at = jnp.argmin(sizes)
         pair = jax.tree.map(lambda leaf: leaf[at], pairs)

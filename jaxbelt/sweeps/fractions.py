@@ -287,7 +287,7 @@ def _matched(
         just_before = numbers[-1] if numbers else []
         for known in (just_before, [k for k in range(len(last)) if k not in just_before]):
             new = [i for i in range(len(met)) if i not in here]
-            pairs = _pairs([last[k] for k in known], [met[i] for i in new], moves)
+            pairs = _partners([last[k] for k in known], [met[i] for i in new], moves)
             here |= {new[i]: known[j] for i, j in pairs.items()}
         for i, one in enumerate(met):
             if i not in here:
@@ -314,7 +314,7 @@ def _matched(
     )
 
 
-def _pairs(before: list[_Met], met: list[_Met], moves: float) -> dict[int, int]:
+def _partners(before: list[_Met], met: list[_Met], moves: float) -> dict[int, int]:
     """Which attractor of those before each of those met now is, where it is one; see
     `basin_fractions`."""
     from scipy.optimize import linear_sum_assignment  # late, as only this needs it
