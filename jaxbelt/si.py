@@ -38,7 +38,7 @@ DIMENSIONS = {
     "energy": "energy",
 }
 #: The same for the numbers of oscillators and laws, by their fields: a unit, and what 1 is in it.
-PARAMETERS: dict[str, tuple[str, Callable[[Units], Any]]] = {
+UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "damping": ("N s m-1", lambda units: units.force / units.velocity),
     "velocity": ("m s-1", lambda units: units.velocity),
     "load": ("N", lambda units: units.force),
@@ -82,7 +82,7 @@ def in_si(
         case Basins():
             return _dataset(result.dataset, machine)
         case Fit():
-            return _fit(result, _one(machine))
+            return _fitted(result, _one(machine))
         case xarray.Dataset():
             return _dataset(result, machine)
     raise TypeError(
@@ -175,12 +175,12 @@ def _cycle(cycle: Cycle, machine: Machine) -> "xarray.Dataset":
     return xarray.Dataset(found, {"belt": np.arange(len(machine.belts))}, attrs)
 
 
-def _fit(fit: Fit, machine: Machine) -> "xarray.Dataset":
+def _fitted(fit: Fit, machine: Machine) -> "xarray.Dataset":
     import xarray
 
     machine.of_oscillator(fit.oscillator)  # a `ValueError` where it is of another machine
     units, table = machine.units, fit.table()
-    told = [*(_unit_of(name, fit.oscillator, units) for name in fit.names), *_starts(units)]
+    told = [*(_unit_of(name, fit.oscillator, units) for name in fit.names), *_units_of_start(units)]
     symbols, sizes = zip(*told, strict=True)
     names = [name.replace(".load", ".normal_force") for name in table["name"]]
     columns = ("estimate", "standard_error", "lower", "upper")
@@ -209,13 +209,13 @@ def _unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
         law, _, field = path.partition(".friction.")
         index = int(law.removeprefix("belts[").removesuffix("]")) if field else 0
         own = field and not isinstance(osc.belts[index].friction, Conti | Coulomb | Stribeck)
-        symbol, size = ("", lambda _: 1.0) if own else PARAMETERS[path.rpartition(".")[2]]
+        symbol, size = ("", lambda _: 1.0) if own else UNITS_OF_FIELDS[path.rpartition(".")[2]]
         told.add((symbol, float(size(units))))
     require(len(told) == 1, "result", "of tied parameters with one unit", name)
     return told.pop()
 
 
-def _starts(units: Units) -> list[tuple[str, float]]:
+def _units_of_start(units: Units) -> list[tuple[str, float]]:
     return [(SYMBOLS[name], float(getattr(units, name))) for name in ("length", "velocity")]
 
 
