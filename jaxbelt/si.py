@@ -38,7 +38,7 @@ DIMENSIONS = {
     "energy": "energy",
 }
 #: The same for the numbers of oscillators and laws, by their fields: a unit, and what 1 is in it.
-PARAMETER_UNITS: dict[str, tuple[str, Callable[[Units], Any]]] = {
+UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "damping": ("N s m-1", lambda units: units.force / units.velocity),
     "velocity": ("m s-1", lambda units: units.velocity),
     "load": ("N", lambda units: units.force),
@@ -82,7 +82,7 @@ def in_si(
         case Basins():
             return _dataset(result.dataset, machine)
         case Fit():
-            return _estimates(result, _one(machine))
+            return _fitted(result, _one(machine))
         case xarray.Dataset():
             return _dataset(result, machine)
     raise TypeError(
@@ -175,7 +175,7 @@ def _cycle(cycle: Cycle, machine: Machine) -> "xarray.Dataset":
     return xarray.Dataset(found, {"belt": np.arange(len(machine.belts))}, attrs)
 
 
-def _estimates(fit: Fit, machine: Machine) -> "xarray.Dataset":
+def _fitted(fit: Fit, machine: Machine) -> "xarray.Dataset":
     import xarray
 
     machine.of_oscillator(fit.oscillator)  # a `ValueError` where it is of another machine
@@ -209,7 +209,7 @@ def _unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
         law, _, field = path.partition(".friction.")
         index = int(law.removeprefix("belts[").removesuffix("]")) if field else 0
         own = field and not isinstance(osc.belts[index].friction, Conti | Coulomb | Stribeck)
-        symbol, size = ("", lambda _: 1.0) if own else PARAMETER_UNITS[path.rpartition(".")[2]]
+        symbol, size = ("", lambda _: 1.0) if own else UNITS_OF_FIELDS[path.rpartition(".")[2]]
         told.add((symbol, float(size(units))))
     require(len(told) == 1, "result", "of tied parameters with one unit", name)
     return told.pop()
