@@ -13,6 +13,8 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
+from jaxbelt.cycles.cycle import as_loop, polish
+from jaxbelt.cycles.shooting import cut
 
 START = (3.0, 0.0)
 EXTREMA = ("x1_min", "x1_max", "x2_min", "x2_max")
@@ -120,6 +122,22 @@ def test_unstable_cycle_is_that_of_the_oracle(name, velocities):
 def test_there_is_no_unstable_cycle_outside_of_hopf_point_and_fold(nu):
     cycle = jb.unstable_cycle(jb.presets.class_b(nu, 0.35))
     assert cycle.status == Status.NO_UNSTABLE_CYCLE and jnp.isnan(cycle.period)
+
+
+def test_no_cycle_crosses_where_the_mass_would_stick():
+    """Crossing-sliding is at a damping of -0.595658067405: above it the cycle of class (a) sticks,
+    and what solves the equations of the one that crosses is no motion of the oscillator."""
+    belts = jb.presets.class_a(0.3).belts
+    cycle = jb.find_cycle(jb.Oscillator(-0.5957, belts), (1.0, 0.0))
+    assert cycle.signature == ((EventKind.CROSS, 0),) * 2
+    loop = cut([as_loop(cycle, 32)])[0]
+    below, above = (
+        polish(jb.Oscillator(damping, belts), loop, jnp.asarray(Status.OK.value))
+        for damping in (-0.59567, -0.59564)
+    )
+    assert below.status == Status.OK and above.status == Status.NOT_ADMISSIBLE
+    sticks = jb.find_cycle(jb.Oscillator(-0.59564, belts), (1.0, 0.0))
+    assert sticks.status == Status.OK and jb.stick_duration(sticks, 0) > 0
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

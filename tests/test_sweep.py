@@ -67,6 +67,21 @@ def test_a_mass_at_rest_is_near_no_edge():
     assert (rest.status == Status.OK) & (rest.x1_end == 0) & (rest.x2_end == 0)
 
 
+@pytest.mark.parametrize("observe", ["final", "attractor"])
+def test_a_motion_that_grows_beyond_all_bounds_keeps_nobody_waiting(observe):
+    """At 1e103 cubes overflow and steps become ever smaller; so many would be made until t1."""
+    belts = jb.presets.class_b(0.3, 0.35).belts
+    dataset = jb.sweep(
+        lambda damping: jb.Oscillator(damping, belts),
+        {"damping": [-0.1, 0.5], "x1": [20.0]},
+        y0=(0.0, 5.0),
+        t1=30_000.0,
+        observe=observe,
+    )
+    grows, settles = dataset.status.values.ravel()
+    assert grows == Status.NOT_FINITE and settles == Status.OK
+
+
 def test_many_chunks_lose_no_run():
     n = 2 * CHUNK + 1000
     many = jb.sweep(jb.presets.class_b, {"nu0": np.linspace(-0.7, 0.7, n), "nu1": [0.35]}, t1=2.0)

@@ -19,7 +19,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from ..checks import as_interval
 from ..cycles.attractors import (
@@ -33,14 +32,12 @@ from ..cycles.attractors import (
 )
 from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
 from ..cycles.settling import AT_REST
-from ..cycles.shooting import SIZES, Loop, cut, following_codes
+from ..cycles.shooting import SIZES, Loop, cut
 from ..model.equilibria import candidates
-from ..model.modes import STUCK, capacity, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import varied
 from ..numerics.compiling import each, jit
-from ..numerics.newton import HOLDS
 from ..results import Status
 from .conditions import AbstractCondition, check_conditions
 from .guesses import settled_loops
@@ -190,10 +187,9 @@ class ParameterPath:
         for cycle in (way() for way in ways[0 if closes else 1 :]):
             if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
                 # Not the equilibrium, to which a cycle may shrink.
-                found = jax.tree.map(np.asarray, as_loop(cycle, ROOM))
-                is_cycle = np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST
-                if is_cycle and bool(_crosses(osc, found)):
-                    return AttractingCycle(itinerary(osc, found), found)
+                if np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST:
+                    loop = jax.tree.map(np.asarray, as_loop(cycle, ROOM))
+                    return AttractingCycle(itinerary(osc, loop), loop)
         return None
 
     def _share(self) -> None:
@@ -292,24 +288,6 @@ def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> i
             if sticks(cycle.path) or apart(place_of(cycle.loop), place_of(other.loop)) < SOLVED:
                 return number
     return None
-
-
-@jit
-def _crosses(osc: Oscillator, loop: Loop) -> Array:
-    """Whether a loop crosses no boundary where the mass would stick to it: its equations, which
-    hold the signature, do not ask for that."""
-    velocities = jnp.stack([belt.velocity for belt in osc.belts])
-
-    def would_stick(codes, end, exit_x1, after):
-        velocity = velocities[jnp.clip(end, 0, len(osc.belts) - 1)]
-        held = jnp.where((velocities == velocity) & (jnp.abs(codes) < 1.5), STUCK, codes)
-        mode = mode_of(held)
-        needed = mode_acceleration(osc, mode, exit_x1, velocity / osc.omega)
-        crosses = (end < len(osc.belts)) & ~jnp.any(after == STUCK)
-        return crosses & (jnp.abs(needed) < capacity(osc, mode) - HOLDS)
-
-    rows = loop.codes, loop.ends, loop.exits[:, 0], following_codes(loop)
-    return ~jnp.any(jax.vmap(would_stick)(*rows))
 
 
 def _fits(loop: Loop, other: Loop) -> bool:

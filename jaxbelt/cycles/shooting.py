@@ -35,6 +35,7 @@ from ..model.modes import (
     capacity,
     edge_guards,
     edges,
+    held_at_boundary,
     mode_acceleration,
     mode_of,
     onset_position,
@@ -415,20 +416,27 @@ def _factors_and_slopes(osc, along: Oscillator, chain: Chain, following, z: Arra
 
 
 def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """Whether every arc stays inside its mode and has a duration >= 0, as far as equations hold.
+    """Whether the oscillator moves like that, as far as equations hold.
 
-    Both ends are looked at; between them x1, x2 and the needed force are monotone.
+    Every arc has a duration >= 0 and stays inside its mode: both ends are looked at; between them
+    x1, x2 and the needed force are monotone. None crosses a boundary where the mass would stick.
     """
+    belts = range(len(osc.belts))
 
-    def one(codes, unknown, following):
+    def one(codes, end, unknown, exit_, after):
         mode = mode_of(codes)
         fine = unknown[2] >= -HOLDS
-        for y in (unknown, following):
+        for y in (unknown, exit_):
             inside = jnp.stack([*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])])
             needed = mode_acceleration(osc, mode, y[0], y[1])
-            held = ~mode.any_stuck | (jnp.abs(needed) <= capacity(osc, mode) + HOLDS)
-            fine = fine & jnp.all(inside >= -HOLDS) & held
-        return fine
+            holds = ~mode.any_stuck | (jnp.abs(needed) <= capacity(osc, mode) + HOLDS)
+            fine = fine & jnp.all(inside >= -HOLDS) & holds
+        held, x2 = held_at_boundary(osc, mode, [end == belt for belt in belts])
+        needed = mode_acceleration(osc, held, exit_[0], x2)
+        would_stick = jnp.abs(needed) < capacity(osc, held) - HOLDS
+        crosses = (end < len(belts)) & ~mode_of(after).any_stuck
+        return fine & ~(crosses & would_stick)
 
-    each = jax.vmap(one)(chain.codes, z, jnp.roll(z, -1, axis=0))
+    exits = jnp.roll(z, -1, axis=0)
+    each = jax.vmap(one)(chain.codes, chain.ends, z, exits, following_codes(chain))
     return jnp.all(each | ~chain.used)

@@ -17,6 +17,10 @@ from jaxtyping import Array
 from ..model.modes import Mode
 from ..model.oscillator import Oscillator
 
+#: A motion this large grows beyond all bounds. The cube of a velocity above 5.6e102, which Conti's
+#: law takes, is no longer a number; there steps become ever smaller.
+BEYOND = 1e100
+
 
 class Lanes(eqx.Module):
     """The state of all lanes, arrays [lanes].
@@ -84,8 +88,8 @@ def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
 
 
 def are_finite(lanes: Lanes) -> Array:
-    """The lanes whose state and x2' are numbers."""
-    return jnp.isfinite(lanes.x1) & jnp.isfinite(lanes.x2) & jnp.isfinite(lanes.a)
+    """The lanes whose state and x2' are numbers, below `BEYOND`."""
+    return (jnp.abs(lanes.x1) < BEYOND) & (jnp.abs(lanes.x2) < BEYOND) & (jnp.abs(lanes.a) < BEYOND)
 
 
 def code_of(mode: Mode) -> Array:

@@ -270,8 +270,15 @@ def reach_boundary(
 ) -> tuple[Mode, Array]:
     """The mode after an orbit reached r_k = 0 of the belt with hit[k] set, and x2 = nu_k/omega.
 
-    All touching belts of that velocity are concerned. They stick, or the orbit crosses.
+    The belts that could hold the mass there do, or the orbit crosses.
     """
+    held, x2 = held_at_boundary(osc, mode, hit)
+    return settle(osc, held, x1, x2), x2
+
+
+def held_at_boundary(osc: Oscillator, mode: Mode, hit: Sequence[Array]) -> tuple[Mode, Array]:
+    """The mode in which all touching belts of the velocity of the one with hit[k] set hold the
+    mass, and x2 = nu_k/omega."""
     velocities = [belt.velocity for belt in osc.belts]
     velocity = first_of(hit, velocities, velocities[0])
     concerned = [
@@ -282,7 +289,7 @@ def reach_boundary(
         jnp.where(is_concerned, STUCK, code)
         for is_concerned, code in zip(concerned, mode.codes, strict=True)
     )
-    return settle(osc, Mode(codes), x1, x2), x2
+    return Mode(codes), x2
 
 
 def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Array) -> Mode:

@@ -152,7 +152,7 @@ def basin_fractions(
 
     The attractors are those that starts lead to: one with a basin that no start is in is not seen.
     Starts on closed orbits that do not attract, such as those around a centre, are undecided, and
-    so are those that go to infinity, where the damping is negative: then a smaller t1 saves time.
+    so are those that go to infinity, where the damping is negative.
     `ValueError` names an impossible argument.
     """
     if isinstance(osc, Oscillator):
