@@ -93,7 +93,9 @@ def basins(
         import jax
         import numpy as np
 
-        grid = [np.linspace(*span, points) for span in (x1, x2)]
+        from ..numerics.spacing import evenly_spaced
+
+        grid = [evenly_spaced(*span, points) for span in (x1, x2)]
         found = jb.basins(osc, x1=grid[0], x2=grid[1])
         lines, data = [repr(found)], _as_data(found)
         if starts:

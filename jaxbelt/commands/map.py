@@ -90,11 +90,12 @@ def region_map(
         check_range("q", q)
         written = outputs(out, ".png", ".csv", "_curves.csv")
         turn_on_float64()
-        import numpy as np
+        from ..numerics.spacing import evenly_spaced
 
         make = family(system, arguments, belt, damping, omega, axes)
         # Other numbers of cells, lest cells lie on the line where both are the same.
-        values = {axes[0]: np.linspace(*p, cells), axes[1]: np.linspace(*q, cells + 1)}
+        sizes = cells, cells + 1
+        values = {name: evenly_spaced(*span, n) for name, span, n in zip(axes, (p, q), sizes)}
         found = jb.region_map(make, values)
         from ..plotting.regions import draw_region_map
         from ..plotting.style import journal_figure, journal_style, save

@@ -206,9 +206,9 @@ def parse_axis(text: str) -> tuple[str, list[float]]:
         if equals and len(parts) == 1:
             return name, [float(words)]
         if equals and len(parts) == 3 and int(parts[2]) > 0:
-            import numpy as np
+            from ..numerics.spacing import evenly_spaced
 
-            return name, np.linspace(float(parts[0]), float(parts[1]), int(parts[2])).tolist()
+            return name, evenly_spaced(float(parts[0]), float(parts[1]), int(parts[2])).tolist()
     except ValueError:
         pass
     raise ValueError(f"an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got {text!r}")

@@ -19,7 +19,7 @@ from ..model.oscillator import Oscillator
 
 #: A motion this large grows beyond all bounds. The cube of a velocity above 5.6e102, which Conti's
 #: law takes, is no longer a number; there steps become ever smaller.
-BEYOND = 1e100
+GROWN = 1e100
 
 
 class Lanes(eqx.Module):
@@ -88,8 +88,8 @@ def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
 
 
 def are_finite(lanes: Lanes) -> Array:
-    """The lanes whose state and x2' are numbers, below `BEYOND`."""
-    return (jnp.abs(lanes.x1) < BEYOND) & (jnp.abs(lanes.x2) < BEYOND) & (jnp.abs(lanes.a) < BEYOND)
+    """The lanes whose state and x2' are numbers, below `GROWN`."""
+    return (jnp.abs(lanes.x1) < GROWN) & (jnp.abs(lanes.x2) < GROWN) & (jnp.abs(lanes.a) < GROWN)
 
 
 def code_of(mode: Mode) -> Array:

@@ -23,6 +23,7 @@ from ..cycles.cycle import find_cycle
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
+from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
 from .attractor import CYCLE, EQUILIBRIUM, KINDS, STUCK_FOR_EVER, UNDECIDED, Attractor
@@ -166,7 +167,7 @@ def basin_fractions(
     variation = varied(osc, where, (first,))
     for value in (first, last):
         variation.check(value)
-    values = np.linspace(first, last, rows)
+    values = evenly_spaced(first, last, rows)
     starts = [starts_in(corners, n, jax.random.fold_in(key, row)) for row in range(rows)]
     found = _found_along(variation, values, np.stack(starts), numbers)
     if moves is None:

@@ -30,6 +30,7 @@ from ..cycles.attractors import RUN
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
+from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
 from .along import Along
@@ -181,7 +182,7 @@ class Sampling:
         first, last = as_interval(span, "span")
         for value in (first, last):
             self.variation.check(value)
-        values = np.linspace(first, last, self.rows)
+        values = evenly_spaced(first, last, self.rows)
         grid = Grid(self._make, {"parameter": values}, (0.0, 0.0))
         shape = len(values), len(self.starts)
         found = self._results(grid, Attractor(), np.tile(self.starts.T, len(values)), LONG_ENOUGH)
