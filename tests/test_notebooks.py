@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import jax
 import matplotlib.pyplot as plt
 import pytest
 
@@ -27,5 +28,7 @@ def test_notebook_runs(path):
     for cell in cells:
         if cell["cell_type"] == "code":
             source = "".join(cell["source"]).replace("\nFULL = True", "\nFULL = False")
-            exec(compile(source, path.name, "exec"), namespace)
+            # Optax relies on promotion, as users of a notebook may.
+            with jax.numpy_dtype_promotion("standard"):
+                exec(compile(source, path.name, "exec"), namespace)
     plt.close("all")
