@@ -265,8 +265,17 @@ COMPOSITIONS = {
 }
 
 
-@pytest.mark.slow(first=True)
-@pytest.mark.parametrize("name", COMPOSITIONS)
+#: Those that are in another one, or close to it.
+AT_NIGHT = "vmap grad", "grad vmap", "map grad", "vmap jacfwd"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow(first=name not in AT_NIGHT))
+        for name in COMPOSITIONS
+    ],
+)
 def test_transformations_compose_in_any_order(name):
     def loss(row):
         run = jb.simulate(jb.presets.class_b(row[0], 0.35), (row[1], 0.1), 6.0, ts=SAMPLES[:3])
