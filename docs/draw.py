@@ -240,7 +240,7 @@ CASES = {
     "EdgeExchange": Case(
         jb.EdgeExchange((0, 1)),
         lambda sigma1: beside(sigma1, 0.3, 0.1, 0.4, -0.3),
-        r"\sigma_1",
+        "s",
         0.31,
         0.26,
         0.34,
@@ -248,7 +248,7 @@ CASES = {
     "MeetingEdges": Case(
         jb.MeetingEdges((0, 1)),
         lambda sigma1: beside(sigma1, 0.75, 0.5, 0.35, 0.6),
-        r"\sigma_1",
+        "s",
         0.76,
         0.72,
         0.79,
