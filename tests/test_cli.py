@@ -153,7 +153,7 @@ def test_sweep_of_belts_of_ones_own(tmp_path):
     arguments += ["--belt", OWN[0], f"--belt={OWN[1]}", "--observe", "final", "--t1", "20"]
     result = runner.invoke(app, ["sweep", *arguments, "--out", str(out)])
     assert result.exit_code == 0, result.output
-    axes = {"nu0": np.linspace(0.1, 0.5, 3), "load": np.array([0.5, 1.0])}
+    axes = {"nu0": np.array([0.1, 0.3, 0.5]), "load": np.array([0.5, 1.0])}
     expected = jb.sweep(own, axes, y0=(3.0, 0.0), t1=20.0)
     with xr.open_dataset(out, engine="scipy") as written:
         assert written.x1_end.dims == ("nu0", "belts[1].load")
