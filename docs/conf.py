@@ -36,6 +36,7 @@ nitpick_ignore = [
         "Array",
         "ArrayLike",
         "Axes",
+        "BasinEntropy",
         "BasinMargin",
         "ClosedOrbit",
         "Explorer",
