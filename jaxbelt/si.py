@@ -66,7 +66,7 @@ def in_si(
     `x1_max`, `x2_min`, `x2_max`, `amplitude`, and `energy`, what friction and dashpot turn into
     heat in one period. Of a fit: over `parameter`, the names in its table, `estimate`,
     `standard_error`, `lower` and `upper` (the confidence interval of 95 per cent), each in the
-    `unit` beside it, where a load is a normal_force, and a parameter of a law of one's own stays as
+    `unit` beside it (a `load` is the normal force), and a parameter of a law of one's own stays as
     the law has it, with the unit ""; over `t` the fitted motion, `x1` and `x2`, and `x1_residual`
     and `x2_residual`, datum minus motion. Of a dataset: its own variables, with derivatives by
     starts and parameters where the units are the same in all runs; results of an observable of
@@ -84,6 +84,9 @@ def in_si(
         case Fit():
             return _fitted(result, _one(machine))
         case xarray.Dataset():
+            told = {variable.attrs.get("units") for variable in result.variables.values()}
+            is_done = bool(told & set(SYMBOLS.values()))
+            require(not is_done, "result", "dimensionless", "a dataset that is in SI units")
             return _dataset(result, machine)
     raise TypeError(
         "result must be a Trajectory, a Cycle, Basins, a Fit, or the dataset of a sweep, "
@@ -182,7 +185,6 @@ def _fitted(fit: Fit, machine: Machine) -> "xarray.Dataset":
     units, table = machine.units, fit.table()
     told = [*(_unit_of(name, fit.oscillator, units) for name in fit.names), *_units_of_start(units)]
     symbols, sizes = zip(*told, strict=True)
-    names = [name.replace(".load", ".normal_force") for name in table["name"]]
     columns = ("estimate", "standard_error", "lower", "upper")
     found: dict[str, Any] = {
         name: ("parameter", table[name].to_numpy() * np.array(sizes)) for name in columns
@@ -196,7 +198,11 @@ def _fitted(fit: Fit, machine: Machine) -> "xarray.Dataset":
             )
             found[name] = _variable("t", values[:, i], name, units, words)
     time = _variable("t", fit.ts, "t", units, "time")
-    coordinates = {"parameter": names, "unit": ("parameter", list(symbols)), "t": time}
+    coordinates = {
+        "parameter": table["name"].tolist(),
+        "unit": ("parameter", list(symbols)),
+        "t": time,
+    }
     chi2 = float(fit.reduced_chi_squared)
     attrs = {"status": Status(int(fit.status)).name, "reduced_chi_squared": chi2}
     return xarray.Dataset(found, coordinates, attrs)

@@ -132,14 +132,14 @@ def test_a_fit_in_si():
         "belts[0].friction.residual": (0.25, "1"),
         "belts[0].friction.steepness": (100.0, "s m-1"),
         "belts[0].friction.quadratic": (0.0, "s2 m-2"),
-        "belts[0].normal_force": (5.0, "N"),
+        "belts[0].load": (5.0, "N"),
         "belts[0].upper": (0.004, "m"),
         "belts[1].velocity": (0.05, "m s-1"),
         "belts[1].friction.static": (0.3, "1"),
         "belts[1].friction.residual": (0.2, "1"),
         "belts[1].friction.steepness": (50.0, "s m-1"),
         "belts[1].friction.quadratic": (0.3, "s2 m-2"),
-        "belts[1].normal_force": (2.0, "N"),
+        "belts[1].load": (2.0, "N"),
         "belts[1].lower": (0.001, "m"),
         "x1 at the start": (length, "m"),
         "x2 at the start": (2 * length / time, "m s-1"),
@@ -164,7 +164,7 @@ def test_a_fit_of_a_law_of_ones_own_and_of_tied_parameters_in_si():
     ]
     tied = "belts[0].load = belts[1].load"
     ours = jb.in_si(fit_of(m.oscillator, **{width: 0.1, tied: 1.0}), m)
-    assert ours.parameter.values.tolist()[:2] == [width, tied.replace("load", "normal_force")]
+    assert ours.parameter.values.tolist()[:2] == [width, tied]
     assert ours.estimate.values[:2] == pytest.approx([0.1, 5.0])
     assert ours.unit.values.tolist()[:2] == ["", "N"]
     with pytest.raises(ValueError, match="of tied parameters with one unit, got damping = belts"):
@@ -327,3 +327,19 @@ def test_pictures_in_si(run):
 def test_what_cannot_be_is_told(wrong, message):
     with pytest.raises((ValueError, TypeError), match=message):
         wrong()
+
+
+def test_units_show_their_values():
+    belt = jb.PhysicalBelt(0.1, jb.Coulomb(0.5, 0.4), 20.0)
+    machine = jb.Machine(mass=2.0, stiffness=800.0, damping=4.0, belts=(belt,))
+    shown = "Units(time 0.05 s, length 0.025 m, velocity 0.5 m/s, force 20 N, energy 0.5 J)"
+    assert repr(machine.units) == shown
+
+
+def test_what_is_in_si_units_is_not_scaled_again():
+    belt = jb.PhysicalBelt(0.1, jb.Coulomb(0.5, 0.4), 20.0)
+    machine = jb.Machine(mass=2.0, stiffness=800.0, damping=4.0, belts=(belt,))
+    dataset = jb.sweep(lambda: machine.oscillator, {"x1": [1.0]}, t1=1.0)
+    once = jb.in_si(dataset, machine)
+    with pytest.raises(ValueError, match="result must be dimensionless, got a dataset that is in"):
+        jb.in_si(once, machine)

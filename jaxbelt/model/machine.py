@@ -7,7 +7,10 @@ normal force, max N_i / k; velocity, force and energy follow from these. So the 
 omega = 1, its largest load is 1, and its laws take speeds in the unit of velocity.
 """
 
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -20,6 +23,7 @@ from ..checks import (
     is_concrete,
     number,
     require,
+    require_value,
 )
 from .friction import AbstractFriction, as_friction
 from .oscillator import Belt, Oscillator, as_belts, check_oscillator
@@ -36,6 +40,11 @@ class Units(eqx.Module):
     velocity: Array
     force: Array
     energy: Array
+
+    def __repr__(self) -> str:
+        symbols = {"time": "s", "length": "m", "velocity": "m/s", "force": "N", "energy": "J"}
+        parts = (f"{name} {number(getattr(self, name))} {of}" for name, of in symbols.items())
+        return f"Units({', '.join(parts)})"
 
 
 class PhysicalBelt(eqx.Module):
@@ -127,12 +136,13 @@ class Machine(eqx.Module):
 
     def start(self, displacement: ArrayLike, velocity: ArrayLike) -> tuple[Array, Array]:
         """The dimensionless state (x1, x2) of a displacement in m and a velocity in m/s."""
+        x1, x2 = _si_numbers(displacement, "displacement"), _si_numbers(velocity, "velocity")
         units = self.units
-        return jnp.asarray(displacement) / units.length, jnp.asarray(velocity) / units.velocity
+        return x1 / units.length, x2 / units.velocity
 
     def tau(self, time: ArrayLike) -> Array:
         """The dimensionless time of a time in s."""
-        return jnp.asarray(time) / self.units.time
+        return _si_numbers(time, "time") / self.units.time
 
     def of_oscillator(self, osc: Oscillator) -> "Machine":
         """This machine with the numbers of a dimensionless oscillator, such as a fit's.
@@ -166,3 +176,10 @@ class Machine(eqx.Module):
             f"Machine(mass={number(self.mass)} kg, stiffness={number(self.stiffness)} N/m, "
             f"damping={number(self.damping)} N s/m, belts=({belts},))"
         )
+
+
+def _si_numbers(value: Any, field: str) -> Array:
+    """`value` as an array of any shape, or a `ValueError`."""
+    is_number = isinstance(value, jax.Array) or np.asarray(value).dtype.kind in "iuf"
+    require_value(is_number, field, "a number", value)
+    return jnp.asarray(value)

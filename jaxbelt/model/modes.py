@@ -265,31 +265,21 @@ def guard_passed(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     return first_of(passed, numbers, jnp.asarray(-1))
 
 
-def reach_boundary(
-    osc: Oscillator, mode: Mode, hit: Sequence[Array], x1: Array
-) -> tuple[Mode, Array]:
-    """The mode after an orbit reached r_k = 0 of the belt with hit[k] set, and x2 = nu_k/omega.
-
-    The belts that could hold the mass there do, or the orbit crosses.
-    """
-    held, x2 = held_at_boundary(osc, mode, hit)
-    return settle(osc, held, x1, x2), x2
-
-
 def held_at_boundary(osc: Oscillator, mode: Mode, hit: Sequence[Array]) -> tuple[Mode, Array]:
-    """The mode in which all touching belts of the velocity of the one with hit[k] set hold the
-    mass, and x2 = nu_k/omega."""
+    """The mode in which a mass at r_k = 0 of the belt with hit[k] set is held by all belts that
+    touch it and have that velocity, and x2 = nu_k/omega."""
     velocities = [belt.velocity for belt in osc.belts]
     velocity = first_of(hit, velocities, velocities[0])
-    concerned = [
-        touches & (nu == velocity) for nu, touches in zip(velocities, mode.touching, strict=True)
-    ]
-    x2 = foremost(osc, concerned, velocities, velocity) / osc.omega
-    codes = tuple(
-        jnp.where(is_concerned, STUCK, code)
-        for is_concerned, code in zip(concerned, mode.codes, strict=True)
+    held = _held_by(osc, mode, velocity)
+    return held, foremost(osc, held.stuck, velocities, velocity) / osc.omega
+
+
+def _held_by(osc: Oscillator, mode: Mode, velocity: Array) -> Mode:
+    """The mode in which all touching belts of a velocity hold the mass."""
+    rows = zip(osc.belts, mode.codes, mode.touching, strict=True)
+    return Mode(
+        tuple(jnp.where(on & (belt.velocity == velocity), STUCK, code) for belt, code, on in rows)
     )
-    return Mode(codes), x2
 
 
 def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Array) -> Mode:
@@ -308,12 +298,9 @@ def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Ar
         code = jnp.where(arrives, _slip_sign(belt.velocity, speed), code)
         codes.append(jnp.where(leaves, jnp.where(rightward, ABOVE, BELOW), code))
     # Slip may have set in just before; a belt of that very velocity that arrives asks anew.
-    velocity = stick_velocity(osc, Mode(tuple(codes)), jnp.full_like(edge, jnp.nan))
-    codes = [
-        jnp.where((jnp.abs(code) < 1.5) & (belt.velocity == velocity), STUCK, code)
-        for belt, code in zip(osc.belts, codes, strict=True)
-    ]
-    return settle(osc, Mode(tuple(codes)), edge, x2)
+    after = Mode(tuple(codes))
+    velocity = stick_velocity(osc, after, jnp.full_like(edge, jnp.nan))
+    return settle(osc, _held_by(osc, after, velocity), edge, x2)
 
 
 def _slip_sign(velocity: Array, speed: Array) -> Array:
@@ -424,7 +411,8 @@ def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) 
     n = len(osc.belts)
     at_boundary, at_edge = (guard >= 0) & (guard < n), (guard >= n) & (guard < 3 * n)
     hit = [guard == i for i in range(n)]
-    after_boundary, x2_boundary = reach_boundary(osc, mode, hit, x1)
+    held, x2_boundary = held_at_boundary(osc, mode, hit)
+    after_boundary = settle(osc, held, x1, x2_boundary)
     if not has_edges(osc):
         x2 = jnp.where(at_boundary, x2_boundary, x2)
         after_boundary = select(at_boundary, after_boundary, mode)
