@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import jaxbelt as jb
+from jaxbelt.numerics.spacing import evenly_spaced
 from jaxbelt.sweeps import clusters
 from jaxbelt.sweeps import store as stores
 from jaxbelt.sweeps.locks import locked
@@ -192,7 +193,7 @@ def test_processes_with_blocks_of_their_own_share_a_store(tmp_path):
     ]
     outputs = [job.communicate(timeout=120)[0] for job in jobs]
     assert [job.returncode for job in jobs] == [0, 0], outputs
-    nus = {"nu0": AXES["nu0"], "nu1": np.linspace(-0.2, 0.35, 3)}
+    nus = {"nu0": evenly_spaced(-0.6, 0.55, 5), "nu1": evenly_spaced(-0.2, 0.35, 3)}
     assert kills.Kept(path).identical_values(jb.sweep(MAKE, nus, **OPTIONS))
     assert jb.verify(path).finished
 
