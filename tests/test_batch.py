@@ -143,6 +143,7 @@ def test_runs_of_impossible_oscillators_are_told_in_place_in_every_engine():
         assert np.all(np.isnan(told[1:]))
 
 
+@pytest.mark.slow(first=True)
 def test_degenerate_velocities():
     """Equal belts (both stick together), belts at rest (the mass stays for ever), opposite ones."""
     cases = np.array([[0.2, 0.2], [0.0, 0.3], [0.3, 0.0], [0.0, 0.0], [0.3, -0.3]]).T

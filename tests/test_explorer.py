@@ -5,6 +5,7 @@ import pytest
 import jaxbelt as jb
 
 
+@pytest.mark.slow(first=True)
 def test_sliders_move_the_oscillator_and_the_picture():
     explorer = jb.explore(jb.presets.class_d(0.45, 0.35, -0.5, 0.6), t1=20.0)
     assert {"damping", "belts[0].velocity", "belts[1].lower", "x1"} <= explorer.sliders.keys()

@@ -88,6 +88,7 @@ def test_an_interrupt_ends_a_sweep_and_says_what_became_of_it(when, delay):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.slow(first=True)
 def test_an_interrupt_ends_the_command(tmp_path):
     axes = ["nu0=-0.6:0.55:3000", "nu1=-0.5:0.5:3000"]
     out = ["--out", str(tmp_path / "plane.nc")]

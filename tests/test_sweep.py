@@ -114,6 +114,7 @@ def test_derivatives_equal_those_of_simulate():
         assert np.max(np.abs(swept[name].values - expected[..., i]) / size) < 1e-8
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_of_a_cycle_equal_differences_of_the_oracle():
     nu0, nu1 = 0.1, 0.35
     swept = jb.sweep(
