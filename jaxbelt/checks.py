@@ -209,6 +209,13 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
         return jnp.asarray(numbers, dtype=jnp.float64)
 
 
+def as_positive(value: Any, field: str) -> float:
+    """`value` as a finite number > 0, or a `ValueError`."""
+    number = float(as_array(value, field))
+    check_positive(number, field)
+    return number
+
+
 def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array | np.ndarray:
     """As `as_array`, but left in NumPy if it is known, for what goes into a compiled function."""
     require_usable_jax()

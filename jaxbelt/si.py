@@ -192,10 +192,7 @@ def _fitted(fit: Fit, machine: Machine) -> "xarray.Dataset":
     motions = {"": fit.ys, "_residual": fit.residuals}
     for i, word in enumerate(("displacement", "velocity")):
         for end, values in motions.items():
-            name, words = (
-                f"x{i + 1}{end}",
-                "fitted " + word if not end else "residual of the " + word,
-            )
+            name, words = f"x{i + 1}{end}", f"residual of the {word}" if end else f"fitted {word}"
             found[name] = _variable("t", values[:, i], name, units, words)
     time = _variable("t", fit.ts, "t", units, "time")
     coordinates = {

@@ -35,7 +35,6 @@ from ..checks import is_concrete, number, require, require_value
 from ..cycles.attractors import place_of
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import SIZES, Chain, Loop, cut, meshed
-from ..model.equilibria import candidates
 from ..model.oscillator import Oscillator
 from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
@@ -44,7 +43,7 @@ from ..numerics.continuation import Stop
 from ..numerics.newton import HOLDS, NEWTON_STEPS, STEP_ROUNDING, is_settled
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
-from .guesses import nearest, settled_loops
+from .guesses import nearest
 from .labels import AttractingCycle, Label
 from .special import SpecialPoint
 from .systems import (
@@ -88,7 +87,8 @@ class Trail(NamedTuple):
         if len(self.values) < 3:
             return None
         oscs = [self.variation.oscillator(row) for row in self.values]
-        slopes = self.variation.family(self.values[-1]).velocity_slopes()
+        family = self.variation.family(self.values[-1])
+        slopes = [family.belt_slopes(belt, "velocity") for belt in range(len(oscs[0].belts))]
         for held in (0, 1):
             for belt, slope in enumerate(slopes):
                 v = np.array([float(osc.belts[belt].velocity) for osc in oscs])
@@ -121,6 +121,12 @@ def check_conditions(conditions: Any, field: str = "conditions") -> tuple["Abstr
     for one in conditions:
         require_value(isinstance(one, AbstractCondition), field, expected, one)
     return conditions
+
+
+def check_two_belts(belts: Any) -> None:
+    """`ValueError` unless they are the numbers of two belts."""
+    two = isinstance(belts, tuple | list) and len(set(belts)) == len(belts) == 2
+    require_value(two, "belts", "two different numbers, such as (0, 1)", belts)
 
 
 class AbstractCondition(eqx.Module):
@@ -525,7 +531,7 @@ class CycleEquation(AbstractCycleCondition):
         return jnp.abs(self.equation(osc, *meshed(osc, loop)))
 
     def guess(self, osc, size):
-        return nearest(osc, *settled_loops(osc, candidates(osc), size), self)
+        return nearest(osc, size, self)
 
     def system(self, osc, loop, status):
         chain, z = meshed(osc, loop)

@@ -16,15 +16,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..checks import require_value
 from ..cycles.shooting import SIZES, Chain, Loop, meshed
-from ..model.equilibria import candidates
 from ..model.modes import mode_of, stick_limit
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..results import EventKind, Status
-from .conditions import AbstractCycleCondition, Line
-from .guesses import nearest, orbit_after_stick, repeated_loop, settled_loops, without_arcs
+from .conditions import AbstractCycleCondition, Line, check_two_belts
+from .guesses import nearest, orbit_after_stick, repeated_loop, without_arcs
 from .special import SpecialPoint
 from .systems import CycleSystem, contact_tests, nearest_contacts, stick_phase_from
 from .tangencies import Encounter
@@ -79,7 +77,7 @@ class CrossingSliding(AbstractCycleCondition):
         return SIZES[1]  # passing edges takes more of them
 
     def guess(self, osc, size):
-        return nearest(osc, *settled_loops(osc, candidates(osc), size), self)
+        return nearest(osc, size, self)
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
         """How far a loop arrives from such an end."""
@@ -153,8 +151,7 @@ class SlidingExchange(AbstractCycleCondition):
     line: ClassVar[Line] = Line("exchange", "black", (0, (3, 1, 1, 1)))
 
     def check(self, osc):
-        two = isinstance(self.belts, tuple | list) and len(set(self.belts)) == len(self.belts) == 2
-        require_value(two, "belts", "two different numbers, such as (0, 1)", self.belts)
+        check_two_belts(self.belts)
         super().check(osc)
 
     def guess(self, osc, size):

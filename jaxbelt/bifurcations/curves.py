@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, tell
-from ..checks import as_array, as_interval, as_whole, check_positive, require, require_value
+from ..checks import as_array, as_interval, as_positive, as_whole, require, require_value
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import Family, Variation
@@ -165,8 +165,7 @@ def bifurcation_curve(
     two = isinstance(span, tuple | list | np.ndarray) and len(span) == 2 and np.ndim(span[0]) > 0
     require_value(two, "span", "((first, last), (first, last)), one pair a parameter", span)
     limits = np.array([as_interval(ends, f"span[{i}]") for i, ends in enumerate(span)])
-    step = float(as_array(step, "step"))
-    check_positive(step, "step")
+    step = as_positive(step, "step")
     max_points = as_whole(max_points, "max_points")
     near = None if at is None else np.asarray(as_array(at, "at", (2,)))
     variation = _varied_by_two(point.oscillator, where, near, limits)

@@ -23,7 +23,6 @@ from jaxtyping import Array
 from ..cycles.cycle import separating_loop
 from ..cycles.settling import AT_REST
 from ..cycles.shooting import SIZES, Chain, Loop, end_guard, following_codes, meshed
-from ..model.equilibria import candidates
 from ..model.modes import edges, mode_acceleration, mode_of, onset_position
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
@@ -33,7 +32,7 @@ from ..numerics.newton import HOLDS
 from ..results import Status
 from .conditions import AbstractCycleCondition, Line
 from .crossings import arrival_tests
-from .guesses import nearest, settled_loops, without_arcs
+from .guesses import nearest, without_arcs
 from .rests import check_edge, hopf_limit
 from .systems import CycleSystem
 
@@ -122,7 +121,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
     def guess(self, osc, size):
         if self.repels:
             return separating_loop(osc, size)[:2]
-        return nearest(osc, *settled_loops(osc, candidates(osc), size), self)
+        return nearest(osc, size, self)
 
     def guess_near(self, loop):
         # In as many rows as those of the guess, so that one program serves both.

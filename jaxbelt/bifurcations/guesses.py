@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from ..cycles.orbits import Orbit, before_stick_ends, follow, last_loop, loop_of
 from ..cycles.shooting import Loop, following_codes
-from ..model.equilibria import Equilibria
+from ..model.equilibria import Equilibria, candidates
 from ..model.modes import STUCK, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
@@ -112,10 +112,14 @@ def settled_loops(osc: Oscillator, rests: Equilibria, size: int) -> tuple[Loop, 
     return each(run)(starts(osc, rests))
 
 
+def nearest(osc: Oscillator, size: int, condition: Any) -> tuple[Loop, Array]:
+    """Of the attracting cycles, in `size` arcs, the one with the least condition.distance(osc,
+    loop), and a status."""
+    return _least_distant(osc, *settled_loops(osc, candidates(osc), size), condition)
+
+
 @jit
-def nearest(osc: Oscillator, loops: Loop, status: Array, condition: Any) -> tuple[Loop, Array]:
-    """Of the loops that were found the one with the least condition.distance(osc, loop), and a
-    status."""
+def _least_distant(osc: Oscillator, loops: Loop, status: Array, condition: Any):
     distances = jax.vmap(functools.partial(condition.distance, lax.stop_gradient(osc)))(loops)
     known = (status == Status.OK) & ~jnp.isnan(distances)
     distances = jnp.where(known, distances, jnp.inf)

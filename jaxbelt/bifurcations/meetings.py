@@ -25,13 +25,12 @@ from jaxtyping import Array
 
 from ..checks import is_concrete, require_value
 from ..cycles.shooting import SIZES, Chain, Loop, meshed
-from ..model.equilibria import candidates
 from ..model.modes import Mode, any_of, capacity, contact, edges, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..results import Status
-from .conditions import AbstractCondition, AbstractCycleCondition, Line
+from .conditions import AbstractCondition, AbstractCycleCondition, Line, check_two_belts
 from .crossings import arrival_tests
-from .guesses import nearest, settled_loops
+from .guesses import nearest
 from .rests import NOTHING, AbstractRestCondition
 from .systems import CycleSystem, RestSystem
 
@@ -54,8 +53,7 @@ class _BetweenEdges(AbstractCondition):
     belts: tuple[int, int]
 
     def check(self, osc):
-        two = isinstance(self.belts, tuple | list) and len(set(self.belts)) == len(self.belts) == 2
-        require_value(two, "belts", "two different numbers, such as (0, 1)", self.belts)
+        check_two_belts(self.belts)
         super().check(osc)
         if is_concrete(osc):
             ends = [(osc.belts[belt].lower, osc.belts[belt].upper) for belt in self.belts]
@@ -113,7 +111,7 @@ class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
         return SIZES[1]  # passing edges takes more of them
 
     def guess(self, osc, size):
-        return nearest(osc, *settled_loops(osc, candidates(osc), size), self)
+        return nearest(osc, size, self)
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
         """How far apart the edges are that the loop passes."""

@@ -20,10 +20,10 @@ from jaxtyping import Array, ArrayLike
 from ..activity import announced, tell
 from ..checks import (
     as_array,
+    as_positive,
     as_whole,
     check_arguments,
     check_finite,
-    check_positive,
     require_one_of,
     require_value,
 )
@@ -215,8 +215,7 @@ def region_map(
         increases = along.size > 1 and np.all(np.diff(along) > 0)
         require_value(increases, name, "two values or more that increase", along)
     starts = _checked_starts(starts)
-    step = float(as_array(step, "step"))
-    check_positive(step, "step")
+    step = as_positive(step, "step")
     lines = as_whole(lines, "lines", 0)
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:

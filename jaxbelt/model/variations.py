@@ -69,17 +69,16 @@ class Family(eqx.Module):
             leaves[place] = jnp.asarray(sum(moves, start=one.asarray(leaf)))
         return jax.tree.unflatten(structure, leaves)
 
-    def velocity_slopes(self) -> list[Any]:
-        """Those of the velocities of the belts, [k] each."""
+    def belt_slopes(self, belt: int, name: str) -> Any:
+        """Those of a number of a belt, [k]."""
         slopes = jax.tree.unflatten(jax.tree.structure(self.oscillator), self.slopes)
-        return [belt.velocity for belt in slopes.belts]
+        return getattr(slopes.belts[belt], name)
 
     def zeros(self, which: Sequence[tuple[int, str]]) -> list[float]:
         """The value of the one parameter at which a number of a belt, (belt, name), is zero, or two
         of them are equal; none where that does not change."""
-        slopes = jax.tree.unflatten(jax.tree.structure(self.oscillator), self.slopes)
         at = [*(float(getattr(self.oscillator.belts[belt], name)) for belt, name in which), 0.0]
-        along = [*(float(getattr(slopes.belts[belt], name)[0]) for belt, name in which), 0.0]
+        along = [*(float(self.belt_slopes(belt, name)[0]) for belt, name in which), 0.0]
         if along[0] == along[1]:
             return []
         return [float(self.origin[0]) + (at[1] - at[0]) / (along[0] - along[1])]
@@ -309,7 +308,7 @@ class Variation:
         for _ in range(PASSES):
             family = self.family(np.array([value]))
             velocity = family.at(np.array([value])).belts[belt].velocity
-            change = -float(velocity) / float(family.velocity_slopes()[belt][0])
+            change = -float(velocity) / float(family.belt_slopes(belt, "velocity")[0])
             value += change
             if not abs(change) > ROUNDING:
                 break

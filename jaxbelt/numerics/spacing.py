@@ -4,10 +4,10 @@ import numpy as np
 
 
 def evenly_spaced(first: float, last: float, n: int) -> np.ndarray:
-    """n numbers from first to last, [n], each rounded once.
+    """n numbers from first to last, [n]; those of (-b, -a) are minus those of (a, b).
 
-    Between -0.7 and 0.7 some of `np.linspace` are 1e-16 where they should be 0, and a belt of that
-    velocity creeps instead of being at rest.
+    So the middle of a span such as (-0.7, 0.7) is 0. Of `np.linspace` it may be 1e-16, and a belt
+    of that velocity creeps instead of being at rest.
     """
     after = np.arange(n)
     before = after[::-1]

@@ -6,7 +6,7 @@ from jaxtyping import Array
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon, Rectangle
 
-from ..checks import as_array, check_positive, require_value
+from ..checks import as_positive, require_value
 from ..model.friction import AbstractFriction
 from ..numerics.compiling import jit
 from .style import belt_colour, new_axes
@@ -26,8 +26,7 @@ def plot_friction_law(
     """
     law = "a law such as jb.Conti(...)"
     require_value(isinstance(friction, AbstractFriction), "friction", law, friction)
-    speed = float(as_array(speed, "speed"))
-    check_positive(speed, "speed")
+    speed = as_positive(speed, "speed")
     ax = new_axes() if ax is None else ax
     r = jnp.linspace(0.0, speed, 401)
     mu, static = np.asarray(_coefficient(friction, r)), float(friction.static)

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from ..checks import require, require_one_of, require_value
-from ..sweeps.basins import Basins, BasinStability
+from ..sweeps.basins import Basins, BasinStability, standard_error
 from ..sweeps.fractions import BasinFractions
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
@@ -186,7 +186,7 @@ def plot_fractions(fractions: BasinFractions, ax: Axes | None = None) -> Axes:
             style = {"facecolor": colours[number], "edgecolor": "0.4", "linewidth": 0.5}
             ax.fill_between(x, bottom, top, where=met.tolist(), label=names[number], **style)
         inner = (top > 0) & (top < 1)
-        spread = 2 * np.sqrt(np.clip(top * (1 - top), 0, None) / fractions.n)
+        spread = 2 * standard_error(top, fractions.n)
         ends = np.clip([top - spread, top + spread], 0, 1)
         errors = {"color": "black", "alpha": 0.3, "linewidth": 0, "zorder": 2.5}  # above the bands
         ax.fill_between(x, *ends, where=inner.tolist(), **errors)

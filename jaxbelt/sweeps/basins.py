@@ -22,9 +22,9 @@ from ..activity import Activity, announced, tell
 from ..checks import (
     as_array,
     as_interval,
+    as_positive,
     as_whole,
     check_finite,
-    check_positive,
     in_words,
     require,
     require_value,
@@ -118,9 +118,7 @@ class Basins(eqx.Module):
         stability, Chaos 28 (2018) 043102). A run that was near before and is not at time t does not
         count. NaN of a cycle that shooting did not find. `ValueError` for what is not positive.
         """
-        t, within = (float(as_array(one, name)) for one, name in ((t, "t"), (within, "within")))
-        check_positive(t, "t")
-        check_positive(within, "within")
+        t, within = as_positive(t, "t"), as_positive(within, "within")
         settings = {name: self.dataset.attrs[name] for name in ("rtol", "atol")}
         axes = {name: self.dataset[name].values for name in ("x1", "x2")}
         ends = sweep(lambda: self.oscillator, axes, t1=t, progress=False, **settings)
@@ -404,14 +402,17 @@ def basin_stability(
     check_oscillator(oscillator, "oscillator")
     corners, n = as_box(box), as_whole(n, "n")
     check_key(key)
-    numbers = {"t1": t1, "rtol": rtol, "atol": atol}
-    for name, value in numbers.items():
-        numbers[name] = float(as_array(value, name))
-        check_positive(numbers[name], name)
+    given = {"t1": t1, "rtol": rtol, "atol": atol}
+    numbers = {name: as_positive(value, name) for name, value in given.items()}
     kinds = _kinds(oscillator, starts_in(corners, n, key), **numbers)
     fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(KINDS)}
-    errors = {name: float(np.sqrt(f * (1 - f) / n)) for name, f in fractions.items()}
+    errors = {name: float(standard_error(f, n)) for name, f in fractions.items()}
     return BasinStability(fractions, errors, n)
+
+
+def standard_error(fraction: ArrayLike, n: int) -> np.ndarray:
+    """Of fractions of n starts."""
+    return np.sqrt(np.clip(fraction * (1 - np.asarray(fraction)), 0, None) / n)
 
 
 def as_box(box: Any) -> np.ndarray:

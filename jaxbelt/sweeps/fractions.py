@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, tell
-from ..checks import as_array, as_interval, as_whole, check_positive
+from ..checks import as_interval, as_positive, as_whole
 from ..cycles.attractors import RUN, Runs
 from ..cycles.cycle import find_cycle
 from ..model.oscillator import Oscillator
@@ -27,7 +27,7 @@ from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
 from .attractor import CYCLE, EQUILIBRIUM, KINDS, STUCK_FOR_EVER, UNDECIDED, Attractor
-from .basins import as_box, check_key, rest_reached, starts_in
+from .basins import as_box, check_key, rest_reached, standard_error, starts_in
 from .grid import Grid
 from .question import LONG_ENOUGH
 from .shares import told_apart
@@ -83,7 +83,7 @@ class BasinFractions(eqx.Module):
         x1_max, x2_min, x2_max, period (NaN of what rests)."""
         names = [*self.attractors, "undecided"]
         fractions = np.column_stack([self.fractions, self.undecided])
-        errors = np.column_stack([self.standard_errors, _errors(self.undecided, self.n)])
+        errors = np.column_stack([self.standard_errors, standard_error(self.undecided, self.n)])
         rows, which = np.nonzero(fractions)
         nothing = np.full(len(self.values), np.nan)
         return table_of(
@@ -161,9 +161,9 @@ def basin_fractions(
     first, last = as_interval(span, "span")
     corners, n, rows = as_box(box), as_whole(n, "n"), as_whole(rows, "rows", 2)
     check_key(key)
-    numbers = {"t1": _positive(t1, "t1")}
-    numbers |= {"rtol": _positive(rtol, "rtol"), "atol": _positive(atol, "atol")}
-    moves = None if moves is None else _positive(moves, "moves")
+    given = {"t1": t1, "rtol": rtol, "atol": atol}
+    numbers = {name: as_positive(value, name) for name, value in given.items()}
+    moves = None if moves is None else as_positive(moves, "moves")
     variation = varied(osc, where, (first,))
     for value in (first, last):
         variation.check(value)
@@ -175,23 +175,11 @@ def basin_fractions(
     return _matched(found, values, moves, n, variation.names[0])
 
 
-def _positive(value: Any, field: str) -> float:
-    """`value` as a positive number, or a `ValueError`."""
-    number = float(as_array(value, field))
-    check_positive(number, field)
-    return number
-
-
 def _longest(corners: np.ndarray, found: list[list["_Met"]]) -> float:
     """The longer side of what a box and all attractors extend over."""
     sides = [corners, *(one.place[:4].reshape(2, 2) for met in found for one in met)]
     low, high = np.min(sides, axis=(0, 2)), np.max(sides, axis=(0, 2))
     return float(np.max(high - low))
-
-
-def _errors(fractions: np.ndarray, n: int) -> np.ndarray:
-    """The standard errors of fractions of n starts."""
-    return np.sqrt(fractions * (1 - fractions) / n)
 
 
 class _Met(NamedTuple):
@@ -262,18 +250,18 @@ def _attractors_met(
 def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
     """Which of the runs end on a closed orbit that does not attract; smooth: those that end on a
     cycle that does not stick (one that does, attracts)."""
-    closed, left = np.zeros_like(smooth), smooth.copy()
+    closed, untold = np.zeros_like(smooth), smooth.copy()
     for _ in range(MOST_CYCLES):
-        if not np.any(left):
+        if not np.any(untold):
             return closed
-        first = int(np.argmax(left))
-        same = left & runs.same(runs.at(first))[0]
+        first = int(np.argmax(untold))
+        same = untold & runs.same(runs.at(first))[0]
         same[first] = True
         cycle = find_cycle(osc, (float(runs.places[first, 1]), 0.0))
         attracts = int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1 - ATTRACTS
         closed |= same & (not attracts)
-        left &= ~same
-    return closed | left
+        untold &= ~same
+    return closed | untold
 
 
 def _matched(
@@ -309,7 +297,7 @@ def _matched(
     # Of as many starts: what is left is exact to rounding.
     undecided = np.round(n * (1 - np.sum(fractions, axis=1))) / n
     columns = dict(zip(PLACE, places, strict=True))
-    errors = _errors(fractions, n)
+    errors = standard_error(fractions, n)
     return BasinFractions(
         values, tuple(names), fractions, errors, undecided, **columns, n=n, name=name
     )

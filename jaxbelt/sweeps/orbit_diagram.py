@@ -21,9 +21,9 @@ from ..activity import announced
 from ..checks import (
     as_array,
     as_interval,
+    as_positive,
     as_whole,
     check_finite,
-    check_positive,
     require_value,
 )
 from ..cycles.attractors import RUN
@@ -147,9 +147,7 @@ def orbit_diagram(
     kinds = AtExtrema | AtSection | AtEvents
     require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
     starts = _starts_of(y0)
-    numbers = {name: float(as_array(one, name)) for name, one in (("rtol", rtol), ("atol", atol))}
-    for name, number in numbers.items():
-        check_positive(number, name)
+    numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_positive(atol, "atol")}
     variation = varied(osc, where, (first,))
     rows = as_whole(rows, "rows", 2)
     return Sampling(variation, at, starts, rows, numbers).diagram((first, last))

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..checks import (
-    as_array,
-    check_positive,
+    as_positive,
     in_words,
     require,
     require_one_of,
@@ -62,10 +61,8 @@ class Question:
             given = 'given, the end of each run, but for observe="attractor"'
             require(observe == "attractor", "t1", given, "None")
             t1 = LONG_ENOUGH
-        numbers: dict[str, Any] = {"t1": t1, "rtol": rtol, "atol": atol}
-        for name, value in numbers.items():
-            numbers[name] = float(as_array(value, name))
-            check_positive(numbers[name], name)
+        given = {"t1": t1, "rtol": rtol, "atol": atol}
+        numbers: dict[str, Any] = {name: as_positive(value, name) for name, value in given.items()}
         wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
         fits = isinstance(wanted, Sequence)
         require_value(fits, "derivatives", "a tuple of names of axes", wanted)
