@@ -410,7 +410,7 @@ def basin_stability(
     return BasinStability(fractions, errors, n)
 
 
-def standard_error(fraction: ArrayLike, n: int) -> np.ndarray | np.floating:
+def standard_error(fraction: Any, n: int) -> Any:
     """Of fractions of n starts."""
     return np.sqrt(np.clip(fraction * (1 - np.asarray(fraction)), 0, None) / n)
 
