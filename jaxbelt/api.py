@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from . import presets
 from .activity import show_progress
 from .bifurcations.conditions import BifurcationPoint
+from .bifurcations.connections import SaddleConnection
 from .bifurcations.crossings import CrossingSliding, SlidingExchange
 from .bifurcations.curves import BifurcationCurve, bifurcation_curve
 from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
@@ -105,6 +106,7 @@ __all__ = [
     "Portrait",
     "PseudoHopf",
     "RegionMap",
+    "SaddleConnection",
     "Separatrix",
     "SlidingExchange",
     "SpecialPoint",

@@ -90,7 +90,7 @@ ADVICE = {
         "equilibrium is stable, or everything comes to rest there."
     ),
     Status.NOT_TOUCHED: (
-        "No cycle comes near the boundary or an edge of that belt here, so no such point is near, "
+        "Nothing comes near the boundary or an edge of that belt here, so no such point is near, "
         "or the cycle ends in it and exists on its other side only; try another belt or another "
         "value of the parameter, or jb.scan with a span around it."
     ),

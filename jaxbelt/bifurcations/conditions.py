@@ -40,7 +40,7 @@ from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.continuation import Stop
-from ..numerics.newton import HOLDS, NEWTON_STEPS, STEP_ROUNDING, is_settled
+from ..numerics.newton import NEWTON_STEPS
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
 from .guesses import nearest
@@ -50,8 +50,8 @@ from .systems import (
     NOWHERE,
     AbstractSystem,
     CycleSystem,
+    Solution,
     Tests,
-    accuracy,
     solve_system,
 )
 
@@ -174,6 +174,10 @@ class AbstractCondition(eqx.Module):
     def named(self, point: "BifurcationPoint") -> "AbstractCondition":
         """What a point that was sought is."""
         return self
+
+    def covers(self, other: "AbstractCondition") -> bool:
+        """Whether a point of the other condition is one of this one."""
+        return self == other
 
     def check(self, osc: Oscillator) -> None:
         """`ValueError` where the oscillator cannot meet it."""
@@ -450,7 +454,7 @@ class AbstractCycleCondition(AbstractCondition):
         return _prepared(self, osc, *guess)
 
     def solved(self, family, system, x, p, status):
-        return solved_point(family, system, x, p, status)
+        return _solved_point(family, system, x, p, status)
 
     def guess_near(self, loop):
         return cut([loop], more=self.more_arcs)[0], jnp.asarray(Status.OK.value)
@@ -473,34 +477,33 @@ def _prepared(condition: AbstractCycleCondition, osc: Oscillator, loop: Loop, st
 
 
 @jit
-def solved_point(family: Family, system: CycleSystem, z0, p0, status):
+def _solved_point(family: Family, system: CycleSystem, z0, p0, status):
     """The solution near a guess (z0, p0) of the unknowns; one program serves a kind of system."""
-    # Without a guess Newton's method ends at once.
-    z0 = jnp.where(status == Status.OK, z0, jnp.nan)
-    z, p, steps, matrix = solve_system(family, system, z0, lax.stop_gradient(p0))
-    iterations = jnp.sum(~jnp.isnan(steps))
-    at_point = family.at(p)
-    # By the last steps: the residual costs an integration more, and who asks for it gets it.
-    last, before = steps[jnp.maximum(iterations - 1, 0)], steps[jnp.maximum(iterations - 2, 0)]
-    converged = is_settled(last, before, HOLDS) | (last < STEP_ROUNDING) | (status != Status.OK)
-    status = jnp.where(converged, status, Status.NO_CONVERGENCE.value)
-    size, error = accuracy(*lax.stop_gradient((at_point, system, z, matrix)))
-    cycle, slope = cycle_of(at_point, system.ordinary, z, iterations, status, size)
-    status, multiplier = system.judge(at_point, z, cycle, slope)
+    solution = solve_system(family, system, z0, p0, status)
+    osc, z = family.at(solution.p), solution.z
+    numbers = solution.iterations, solution.status, solution.residual
+    cycle, slope = cycle_of(osc, system.ordinary, z, *numbers)
+    status, multiplier = system.judge(osc, z, cycle, slope)
+    return point_of(family, solution, cycle, multiplier, status), (z, solution.p)
+
+
+def point_of(
+    family: Family, solution: Solution, cycle: Cycle, multiplier: Array, status: Array
+) -> BifurcationPoint:
+    """The point of a solution, NaN where the status is not OK."""
     known = functools.partial(jnp.where, status == Status.OK)
-    point = BifurcationPoint(
+    return BifurcationPoint(
         condition=UNNAMED,
-        value=known(p[0], jnp.nan),
-        residual=known(size, jnp.nan),
-        iterations=iterations,
-        steps=steps,
-        error=known(error, jnp.nan),
+        value=known(solution.p[0], jnp.nan),
+        residual=known(solution.residual, jnp.nan),
+        iterations=solution.iterations,
+        steps=solution.steps,
+        error=known(solution.error, jnp.nan),
         multiplier=known(multiplier, jnp.nan),
-        oscillator=family.at(known(p, jnp.nan)),
+        oscillator=family.at(known(solution.p, jnp.nan)),
         cycle=cycle,
         status=status,
     )
-    return point, (z, p)
 
 
 class CycleEquation(AbstractCycleCondition):

@@ -13,12 +13,23 @@ from ..results import EventKind
 
 class Label(NamedTuple):
     """What there is at one value: (kind, stable, contact codes) of the equilibria from left to
-    right, the itineraries of the attracting cycles in order, and the marks of further conditions
-    that `scan` was asked to look for."""
+    right, the itineraries of the attracting cycles in order, the marks of further conditions that
+    `scan` was asked to look for, and the courses of the orbits that leave saddles of contact edges,
+    see `connections`."""
 
     equilibria: tuple[tuple[int, bool, tuple[int, ...]], ...]
     cycles: tuple[Itinerary, ...]
     marks: tuple[Hashable, ...] = ()
+    courses: tuple[Hashable, ...] = ()
+
+    def is_as(self, other: "Label") -> bool:
+        """Whether two labels tell the same.
+
+        Courses are compared where there are as many saddles: one that begins to be there is told by
+        the equilibria, and just there it is not one yet.
+        """
+        courses = other.courses if len(self.courses) == len(other.courses) else self.courses
+        return self == other._replace(courses=courses)
 
     def events(self, kind: EventKind) -> Counter[int]:
         """How often there is an event of a kind in the cycles, by its belt."""

@@ -6,12 +6,15 @@ it passes in one loop, see `attractors`. A cycle that sticks comes by a place wh
 ends, in slip onset or on a contact edge, so it is found by following the orbits from there; a few
 starts beside the equilibria find the rest. Values are looked at in batches by one compiled program.
 
+Where contact edges have saddles a label also has the courses of the orbits that leave them, see
+`connections`.
+
 Between two values with one label nothing is taken to happen, if each cycle at one of them goes on
 to one at the other. One that sticks does so if they have one itinerary. Of those that do not stick
 several may have it: each is followed to where its derivative by the parameter leads.
 """
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -40,6 +43,7 @@ from ..model.variations import varied
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .conditions import AbstractCondition, check_conditions
+from .connections import Course, courses_of
 from .guesses import settled_loops
 from .labels import AttractingCycle, Label
 
@@ -132,8 +136,9 @@ class ParameterPath:
             filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
             oscs = self.variation.oscillators(filled[:, None])
             seen = jax.tree.map(np.asarray, _motions(oscs))
+            courses = courses_of(oscs) if self.edged else [()] * BATCH
             for lane, value in enumerate(batch.tolist()):
-                self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen))
+                self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen), courses[lane])
         self._share()
 
     def changes(self, settled: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -142,10 +147,10 @@ class ParameterPath:
             (a, b)
             for a, b in pairwise(sorted(self.labels))
             if not any(low <= a and b <= high for low, high in settled)
-            and not (self.labels[a] == self.labels[b] and self._all_go_on(a, b))
+            and not (self.labels[a].is_as(self.labels[b]) and self._all_go_on(a, b))
         ]
 
-    def _take(self, value: float, seen: "_Motions") -> None:
+    def _take(self, value: float, seen: "_Motions", courses: tuple[Course, ...]) -> None:
         """Label a value by what was seen there."""
         exists = seen.kind > 0
         modes = map(tuple, without_idle(self.at(value), seen.modes[exists]).tolist())
@@ -164,13 +169,13 @@ class ParameterPath:
                 self._settled(value, loops[-1], closes=False) or AttractingCycle((), loops[-1])
             )
         self.cycles[value] = found
-        self._name(value, rests)
+        self._name(value, rests, courses)
 
-    def _name(self, value: float, rests) -> None:
+    def _name(self, value: float, rests, courses: tuple[Hashable, ...]) -> None:
         cycles = sorted(self.cycles[value], key=lambda one: one.path)
         loops, osc = [one.loop for one in cycles if one.path], self.at(value)
         marks = tuple(condition.mark(osc, loops) for condition in self.conditions)
-        self.labels[value] = Label(rests, tuple(one.path for one in cycles), marks)
+        self.labels[value] = Label(rests, tuple(one.path for one in cycles), marks, courses)
 
     def _settled(self, value: float, loop: Loop, *, closes: bool = True) -> AttractingCycle | None:
         """The attracting cycle that a loop is nearly one of, or else leads to, or None.
@@ -241,7 +246,7 @@ class ParameterPath:
             # In place of one that was only taken to be there.
             at = 0 if others and not others[0].path else len(others)
             others[at : at + 1] = [found]
-            self._name(value, self.labels[value].equilibria)
+            self._name(value, self.labels[value].equilibria, self.labels[value].courses)
         return at
 
     def followed(self, values: Sequence[float]) -> list[dict[float, Loop]]:

@@ -87,7 +87,8 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         path = ParameterPath(variation, None, (first, last), [condition])
         # From farther off, too, than in `scan`: these paths are short.
         found = search(path, INTERVALS, near=1.0)
-        of_kind = [one for one in found if one.condition == condition and one.status == Status.OK]
+        found = [one for one in found if int(one.status) == Status.OK]
+        of_kind = [one for one in found if condition.covers(one.condition)]
         if of_kind:
             nearest = min(of_kind, key=lambda one: _away(one, guess))
             return nearest if _away(nearest, guess) < away - SAME_POINT else point

@@ -337,11 +337,11 @@ class PseudoHopf(_EdgeCondition):
         return _edge_balance(osc, self.belt)
 
 
-def check_edge(osc: Oscillator, belt: Any) -> None:
+def check_edge(osc: Oscillator, belt: Any, field: str = "belt") -> None:
     """`ValueError` where a belt has no finite contact edge."""
     if is_concrete(osc):
         ends = [osc.belts[belt].lower, osc.belts[belt].upper]
-        require_value(np.any(np.isfinite(ends)), "belt", "one with a finite edge", belt)
+        require_value(np.any(np.isfinite(ends)), field, "one with a finite edge", belt)
 
 
 def _edges_of(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:

@@ -26,7 +26,7 @@ from ..cycles.shooting import Chain, Loop, jacobian, meshed, residual, residual_
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
-from ..numerics.newton import HOLDS, Equations, newton, solve
+from ..numerics.newton import HOLDS, STEP_ROUNDING, Equations, is_settled, newton, solve
 from ..results import Status
 
 #: Unknowns of a cycle count this much in the length of a step along a curve, beside the two
@@ -275,13 +275,39 @@ class _InParameter(Equations):
         return self.system.linearized(given.at, *z)
 
 
-def solve_system(family: Family, system, z0, p0):
-    """Unknowns, the parameter, the steps of Newton's method and the matrix of the last one."""
-    solved = solve(_InParameter(system), family, (z0, p0))
-    return (*solved.z, solved.lengths, solved.matrix)
+class Solution(NamedTuple):
+    """What Newton's method finds of a system, near a guess.
+
+    z, p: unknowns and parameter, [1]; steps: how far each step went, NaN padded; iterations: how
+    many there were; residual: the largest error in the equations; error: a bound on that of p;
+    status: that of the guess, where it was not OK, or whether the steps converged.
+    """
+
+    z: Array
+    p: Array
+    steps: Array
+    iterations: Array
+    residual: Array
+    error: Array
+    status: Array
 
 
-def accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
+def solve_system(family: Family, system: CycleSystem, z0, p0, status: Array) -> Solution:
+    """The solution of a system near (z0, p0); status: of that guess."""
+    # Without a guess Newton's method ends at once.
+    z0 = jnp.where(status == Status.OK, z0, jnp.nan)
+    solved = solve(_InParameter(system), family, (z0, lax.stop_gradient(p0)))
+    (z, p), steps = solved.z, solved.lengths
+    iterations = jnp.sum(~jnp.isnan(steps))
+    # By the last steps: the residual costs an integration more, and who asks for it gets it.
+    last, before = steps[jnp.maximum(iterations - 1, 0)], steps[jnp.maximum(iterations - 2, 0)]
+    converged = is_settled(last, before, HOLDS) | (last < STEP_ROUNDING) | (status != Status.OK)
+    status = jnp.where(converged, status, Status.NO_CONVERGENCE.value)
+    at_point, system, at, matrix = lax.stop_gradient((family.at(p), system, z, solved.matrix))
+    return Solution(z, p, steps, iterations, *_accuracy(at_point, system, at, matrix), status)
+
+
+def _accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
     """The residual, and a bound on the error of p: what the residual with halved steps and rounding
     do to it."""
     mesh = system.chain.mesh

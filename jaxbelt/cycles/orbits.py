@@ -172,6 +172,12 @@ def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
     return _settled_or_not(_follow_from(osc, _beginning(osc, y0, budget)))
 
 
+def follow_from(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: int) -> Orbit:
+    """The orbit that leaves y0 in a mode, as in `follow`; none where the status is not OK."""
+    osc, mode, y0 = lax.stop_gradient((osc, mode, y0))
+    return _settled_or_not(_follow_from(osc, _standing(osc, mode, y0, status, budget)))
+
+
 def follow_to_top(osc: Oscillator, y0: Array, budget: int) -> tuple[Orbit, Array]:
     """The orbit from y0 until a top, or it comes to rest; and x1 at the top, NaN where it has come
     to none."""

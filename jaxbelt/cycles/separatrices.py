@@ -173,14 +173,14 @@ def _as_arrays(*numbers: float | int | bool) -> list[Array]:
 def _repels(osc: Oscillator, x1: Array, rightward: Array) -> Array:
     """Whether orbits that turn just beyond an end of a segment leave it, to the side given."""
     zero = jnp.zeros(())
-    mode = _mode_onward(osc, x1, rightward)
+    mode = mode_onward(osc, x1, rightward)
     (trace,) = trace_of(osc, mode, x1, zero)
     pull = mode_acceleration(osc, mode, x1, zero)
     pushes = jnp.where(rightward, pull, -pull) > force_rounding(x1)
     return pushes | (jnp.abs(pull) < force_rounding(x1)) & (trace >= 2)
 
 
-def _mode_onward(osc: Oscillator, x1: Array, rightward: Array) -> Mode:
+def mode_onward(osc: Oscillator, x1: Array, rightward: Array) -> Mode:
     """The slip mode beside (x1, 0) to one side; a belt at rest opposes the motion to there."""
     sides = (contact(osc, x1, jnp.zeros(()), rightward=side) for side in (True, False))
     mode = select(rightward, *sides)
@@ -191,7 +191,7 @@ def _mode_onward(osc: Oscillator, x1: Array, rightward: Array) -> Mode:
 @jit
 def _leaves(osc: Oscillator, x1: Array, rightward: Array) -> tuple[Array, Array]:
     """Whether an orbit leaves (x1, 0) to a side, and the mode in which it would, [belts]."""
-    mode = _mode_onward(osc, x1, rightward)
+    mode = mode_onward(osc, x1, rightward)
     pull = mode_acceleration(osc, mode, x1, jnp.zeros(()))
     return jnp.where(rightward, pull, -pull) > 0, jnp.stack(mode.codes)
 

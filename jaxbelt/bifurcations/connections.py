@@ -1,0 +1,394 @@
+"""Orbits that lead from one saddle of a contact edge to another, or back to the same one:
+`SaddleConnection`.
+
+At (sigma, 0) of an edge from which both sides push away two orbits begin and two end, in finite
+time: its unstable and its stable separatrices, see `cycles.separatrices`. Where one that begins at
+a saddle is one that ends at a saddle, the basins beside them change. Back to the same saddle it is
+a cycle of finite period that passes a point where orbits part: an unstable or an attracting one
+begins or ceases to be there.
+
+The orbit from the saddle is a chain of arcs that is open. With the arcs of a cycle, see
+`cycles.shooting`, it has as many equations: that it begins at the saddle stands in place of that it
+closes, and that it ends at a saddle is the equation more. On one side of the point the orbit turns
+just before the edge, on the other one it passes it; the last arc is made to end where x2 = 0, so
+the equation, x1 = sigma there, is linear in the unknowns.
+
+Between two values the orbits from the saddles are compared by their courses: between which saddles
+each of their extrema of x1 lies, one after the other. These change where an extremum lies on a
+saddle, and nowhere else, for an orbit depends continuously on the parameter until it comes to one.
+It does not where the static limit of a belt exceeds mu(0), or a belt is at rest; courses are not
+compared there.
+
+Connections of two-folds are described by M. Guardia, T. Seara, M. Teixeira, Generic bifurcations of
+low codimension of planar Filippov systems, J. Differential Equations 250 (2011) 1967-2023, and
+those of pseudo-saddles by Yu. Kuznetsov, S. Rinaldi, A. Gragnani, One-parameter bifurcations in
+planar Filippov systems, Int. J. Bifurcation and Chaos 13 (2003) 2157-2188.
+"""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..checks import require_value
+from ..cycles.attractors import extent
+from ..cycles.cycle import cycle_of
+from ..cycles.orbits import Orbit, follow_from, place_of_rest
+from ..cycles.returns import side_pulls
+from ..cycles.separatrices import mode_onward
+from ..cycles.shooting import SIZES, Chain, Loop, admissible, meshed
+from ..model.modes import edges, mode_acceleration, mode_of
+from ..model.oscillator import Oscillator
+from ..model.variations import Family
+from ..motion.arcs import Ends
+from ..numerics.compiling import each, jit
+from ..numerics.newton import HOLDS, newton
+from ..results import Status
+from .conditions import AbstractCondition, Line, point_of
+from .rests import check_edge
+from .systems import CycleSystem, Seen, solve_system, velocity_tests
+
+#: Arcs for which the orbits from saddles are followed: some ten loops.
+ARCS = SIZES[2] - 1
+
+
+class Connection(CycleSystem):
+    """An orbit from the saddle of one edge to that of another; leaves, arrives: their numbers, see
+    `modes.edges`. The chain has a row that is not used, the last one: its state is where the orbit
+    ends."""
+
+    chain: Chain
+    leaves: Array
+    arrives: Array
+
+    def condition(self, osc, z, miss):
+        return z[-1, 0] - jnp.stack(edges(osc))[self.arrives]
+
+    def _beginning(self, osc: Oscillator, entry: Array) -> Array:
+        """How far from its saddle it begins, [2]."""
+        return entry - jnp.stack([jnp.stack(edges(osc))[self.leaves], jnp.zeros(())])
+
+    def residual(self, osc, x):
+        closed = super().residual(osc, x)
+        return closed.at[self._closing(x)].set(self._beginning(osc, x[0, :2]))
+
+    def _closing(self, x: Array) -> slice:
+        """The two of the equations of a closed chain that say that it closes."""
+        return slice(x.size - 3, x.size - 1)
+
+    def linearized(self, osc_of, x, p):
+        value, matrix = super().linearized(osc_of, x, p)
+
+        def begins(u):
+            return self._beginning(osc_of(u[2:]), u[:2])
+
+        u, rows = jnp.append(x[0, :2], p), self._closing(x)
+        slopes = jax.jacfwd(begins)(u)
+        row = jnp.zeros((2, matrix.shape[1]))
+        row = row.at[:, :2].set(slopes[:, :2]).at[:, x.size :].set(slopes[:, 2:])
+        return value.at[rows].set(begins(u)), matrix.at[rows].set(row)
+
+    def exists(self, osc: Oscillator, x: Array) -> Array:
+        """Whether the oscillator moves like that, from a saddle to a saddle."""
+        ends = jnp.stack([self.leaves, self.arrives])
+        return admissible(osc, self.chain, x) & jnp.all(saddles(osc)[ends])
+
+    def closes(self, osc: Oscillator) -> Array:
+        """Whether it comes back to its saddle."""
+        positions = jnp.stack(edges(osc))
+        return positions[self.leaves] == positions[self.arrives]
+
+    def place(self, x):
+        # The state at its end, too.
+        used = np.asarray(self.chain.used)
+        return extent(np.concatenate([x[used], x[-1:]]))
+
+    def look(self, osc, x):
+        error = jnp.max(jnp.abs(self.residual(osc, x)))
+        exists = (error < HOLDS) & self.exists(osc, x)
+        return Seen(velocity_tests(osc), exists, jnp.asarray(jnp.nan), error)
+
+
+class SaddleConnection(AbstractCondition):
+    """A separatrix that leaves a saddle, (sigma, 0) of a contact edge, ends in a saddle.
+
+    belt: that of the edge which it leaves; to: that of the edge where it ends, the same or another
+    one (None: any). Where it is the same saddle, `cycle` of the point is the connection itself, a
+    cycle that begins or ceases to be there. Two belts may share the edge: either may be named.
+    """
+
+    belt: int | Array
+    to: int | Array | None = None
+
+    caption: ClassVar[str] = "saddle connection, belt {belt}"
+    line: ClassVar[Line] = Line("saddle connection", "#CC79A7", (0, (4, 1, 1, 1)))
+    has_several: ClassVar[bool] = True
+
+    @property
+    def belts_concerned(self):
+        return tuple(int(belt) for belt in dict.fromkeys([self.belt, self.to]) if belt is not None)
+
+    @property
+    def sought(self):
+        return SaddleConnection(self.belt)
+
+    def named(self, point):
+        system, _ = self.followed(point)
+        positions = np.asarray(jnp.stack(edges(point.oscillator))).reshape(2, -1)
+        at = positions.reshape(-1)[int(system.arrives)]
+        return SaddleConnection(self.belt, int(np.argmax(np.any(positions == at, axis=0))))
+
+    def covers(self, other):
+        return self == other or self == other.sought
+
+    def check(self, osc):
+        super().check(osc)
+        check_edge(osc, self.belt)
+        if self.to is not None:
+            n = len(osc.belts)
+            there = isinstance(self.to, int) and 0 <= self.to < n
+            require_value(there, "to", f"0 to {n - 1}, or None", self.to)
+            check_edge(osc, self.to, "to")
+
+    def as_data(self):
+        # One program serves all.
+        to = -1 if self.to is None else self.to
+        return SaddleConnection(*(jnp.asarray(np.array(one)) for one in (self.belt, to)))
+
+    @property
+    def room(self):
+        return SIZES[2]
+
+    def guess(self, osc, size):
+        return _nearest_connection(osc, self.belt, self.to, size)
+
+    def prepared(self, osc, guess):
+        return _prepared(osc, *guess)
+
+    def solved(self, family, system, x, p, status):
+        return _solved(family, system, x, p, status)
+
+    def followed(self, point):
+        osc, data = point.oscillator, self.as_data()
+        system, x, _ = data.prepared(osc, data.guess(osc, self.room))
+        return system, _solved_at(osc, system, x)
+
+    def place(self, point):
+        system, x = self.followed(point)
+        return system.place(np.asarray(x))
+
+    @classmethod
+    def between(cls, before, after, edged):
+        differ = len(before.courses) == len(after.courses) and before.courses != after.courses
+        return [cls(belt) for belt in edged] if differ else []
+
+
+@jit
+def _prepared(osc: Oscillator, loop: Loop, leaves: Array, arrives: Array, status: Array):
+    chain, z = meshed(lax.stop_gradient(osc), loop)
+    return Connection(chain, leaves, arrives), z, status
+
+
+@jit
+def _solved(family: Family, system: Connection, z0, p0, status):
+    solution = solve_system(family, system, z0, p0, status)
+    osc, z, status = family.at(solution.p), solution.z, solution.status
+    fails = (status == Status.OK) & ~system.exists(osc, z)
+    status = jnp.where(fails, Status.NOT_ADMISSIBLE.value, status)
+    closes = jnp.where(system.closes(osc), status, Status.EQUILIBRIUM.value)
+    cycle, _ = cycle_of(osc, system.chain, z, solution.iterations, closes, solution.residual)
+    return point_of(family, solution, cycle, jnp.asarray(jnp.nan), status), (z, solution.p)
+
+
+@jit
+def _solved_at(osc: Oscillator, system: Connection, x: Array) -> Array:
+    """The unknowns of the orbit from its saddle, to the extremum that is to be one, too."""
+
+    def linearized(x):
+        value, matrix = system.linearized(lambda _: osc, x.reshape(-1, 3), jnp.zeros(1))
+        return value[:-1], matrix[:-1, :-1]
+
+    return newton(linearized, x.reshape(-1)).z.reshape(-1, 3)
+
+
+@jit
+def saddles(osc: Oscillator) -> Array:
+    """Whether both sides push away from the point (sigma, 0) of each edge, [edges]."""
+    positions = jnp.stack(edges(osc))
+    left, right = side_pulls(osc, jnp.where(jnp.isfinite(positions), positions, 0.0))
+    return jnp.isfinite(positions) & (left < 0) & (right > 0)
+
+
+def _departing(osc: Oscillator, edge: Array, rightward: Array, parts: Array, budget: int) -> Orbit:
+    """The orbit that leaves the saddle of an edge to one side; parts: whether there is one."""
+    x1 = jnp.where(parts, jnp.stack(edges(osc))[edge], 0.0)
+    status = jnp.where(parts, Status.OK.value, Status.NOT_FINITE.value)
+    y = jnp.stack([x1, jnp.zeros(())])
+    return follow_from(osc, mode_onward(osc, x1, rightward), y, status, budget)
+
+
+def _exits(orbit: Orbit) -> Array:
+    """The states at the ends of the arcs of an orbit, [arcs, 2]."""
+    last = jnp.arange(orbit.ends.size) == orbit.count - 1
+    return jnp.where(last[:, None], orbit.y, jnp.roll(orbit.entries, -1, axis=0))
+
+
+def _turns_back(osc: Oscillator, orbit: Orbit) -> Array:
+    """Whether each arc ends in an extremum of x1, [arcs]; the boundary of a belt at rest is one."""
+    n, velocities = len(osc.belts), jnp.stack([belt.velocity for belt in osc.belts])
+    meets_rest = (orbit.ends < n) & (velocities[jnp.clip(orbit.ends, 0, n - 1)] == 0)
+    return (orbit.ends == Ends(n).extremum_x1) | meets_rest
+
+
+@jit
+def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
+    """Of the orbits from the saddles of a belt that which comes nearest to a saddle: as a loop, up
+    to there; the numbers of both edges; a status. to: the belt of that saddle; -1: any."""
+    osc = lax.stop_gradient(osc)
+    n, names, parts = len(osc.belts), Ends(len(osc.belts)), saddles(osc)
+    positions = jnp.stack(edges(osc))
+    numbers = jnp.arange(2 * n)
+    shared = positions == jnp.where(to < 0, jnp.nan, positions[to])
+    shared = shared | (positions == jnp.where(to < 0, jnp.nan, positions[n + to]))
+    wanted = parts & ((to < 0) | shared)
+
+    def one(start):
+        edge, rightward = start
+        orbit = _departing(osc, edge, rightward, parts[edge], size - 1)
+        exits = _exits(orbit)
+        turns = jnp.where(_turns_back(osc, orbit), 0.0, jnp.inf)
+        turned = jnp.abs(exits[:, :1] - positions) + turns[:, None]
+        # How much further one that passes a saddle would have gone in its mode.
+        on_edge = (orbit.ends >= n) & (orbit.ends < 3 * n)
+        at = positions[jnp.clip(orbit.ends - n, 0, 2 * n - 1)]
+        push = jax.vmap(
+            lambda codes, x1: mode_acceleration(osc, mode_of(codes), x1, jnp.zeros(()))
+        )(orbit.codes, jnp.where(on_edge, at, 0.0))
+        further = 0.5 * exits[:, 1] ** 2 / jnp.where(push == 0, jnp.nan, jnp.abs(push))
+        passed = jnp.where(on_edge[:, None] & (at[:, None] == positions), further[:, None], jnp.inf)
+        used = (jnp.arange(orbit.ends.size) < orbit.count)[:, None]
+        distance = jnp.where(used & wanted, jnp.fmin(turned, passed), jnp.inf)
+        row, arrives = jnp.divmod(jnp.argmin(distance), 2 * n)
+        rows = jnp.arange(size)
+        last = jnp.where(jnp.isfinite(turns[row]), orbit.ends[row], names.extremum_x1)
+        ends = jnp.where(rows < row, jnp.append(orbit.ends, names.unused), names.unused)
+        ends = jnp.where(rows == row, last, ends)
+        end = jnp.where(rows[:, None] <= row, 0.0, exits[row])
+        entries = jnp.where(rows[:, None] <= row, jnp.append(orbit.entries, end[-1:], axis=0), end)
+        durations = jnp.where(rows <= row, jnp.append(orbit.durations, 0.0), 0.0)
+        codes = jnp.append(orbit.codes, orbit.codes[:1], axis=0)
+        return distance[row, arrives], Loop(codes, ends, entries, durations), arrives
+
+    own = jnp.stack([belt, n + belt])
+    starts = jnp.tile(own, 2), jnp.repeat(jnp.array([False, True]), 2)
+    distances, loops, arrives = each(one)(starts)
+    best = jnp.argmin(distances)
+    status = jnp.where(jnp.isfinite(distances[best]), Status.OK.value, Status.NOT_TOUCHED.value)
+    loop = jax.tree.map(lambda leaf: leaf[best], loops)
+    return loop, numbers[starts[0][best]], arrives[best], status
+
+
+# --- courses --------------------------------------------------------------------------------------
+
+#: Between which saddles the extrema of x1 lie: at first, and then again and again.
+Course = tuple[tuple[int, ...], tuple[int, ...]]
+
+
+class _Courses(eqx.Module):
+    """Of each edge and each side, [edges, sides]: whether an orbit leaves a saddle there, x1 at the
+    ends of its arcs that are extrema of it, else NaN, [edges, sides, arcs], and the row after which
+    it repeats, or -1."""
+
+    positions: Array
+    leaves: Array
+    extrema: Array
+    repeats: Array
+    rest: Array
+
+
+@jit
+def _all_saddles(oscs: Oscillator) -> Array:
+    rows, rest = eqx.partition(oscs, eqx.is_array)
+    return jax.vmap(lambda row: saddles(eqx.combine(row, rest)))(rows)
+
+
+@jit
+def _courses_of(oscs: Oscillator) -> _Courses:
+    rows, rest = eqx.partition(oscs, eqx.is_array)
+
+    def at(row):
+        osc = lax.stop_gradient(eqx.combine(row, rest))
+        n, parts = len(osc.belts), saddles(osc)
+        smooth = [(belt.velocity != 0) & ~_jumps(belt) for belt in osc.belts]
+        parts = parts & jnp.all(jnp.stack(smooth))
+
+        def one(start):
+            edge, rightward = start
+            orbit = _departing(osc, edge, rightward, parts[edge], ARCS)
+            extrema = jnp.where(_turns_back(osc, orbit), _exits(orbit)[:, 0], jnp.nan)
+            return extrema, orbit.repeats, place_of_rest(osc, orbit)
+
+        starts = jnp.repeat(jnp.arange(2 * n), 2), jnp.tile(jnp.array([False, True]), 2 * n)
+        found = jax.tree.map(
+            lambda leaf: leaf.reshape(2 * n, 2, *leaf.shape[1:]), each(one)(starts)
+        )
+        return _Courses(jnp.stack(edges(osc)), parts, *found)
+
+    return each(at)(rows)
+
+
+def _jumps(belt: Any) -> Array:
+    """Whether the static limit of a belt exceeds mu(0)."""
+    law = belt.friction
+    return belt.load * (law.static - law.mu(jnp.zeros(()))) > 0
+
+
+def courses_of(oscs: Oscillator) -> list[tuple[Course, ...]]:
+    """Of each of many oscillators the courses of the orbits that leave saddles, from left to right,
+    that to the left first."""
+    if not np.any(_all_saddles(oscs)):
+        return [()] * len(oscs.damping)
+    seen = jax.tree.map(np.asarray, _courses_of(oscs))
+    return [
+        _courses_at(jax.tree.map(lambda leaf, lane=lane: leaf[lane], seen))
+        for lane in range(len(seen.positions))
+    ]
+
+
+def _courses_at(seen: _Courses) -> tuple[Course, ...]:
+    at, rows = np.unique(np.where(seen.leaves, seen.positions, np.nan), return_index=True)
+    rows, at = rows[~np.isnan(at)], at[~np.isnan(at)]
+    return tuple(
+        _course(at, *(one[row, side] for one in (seen.extrema, seen.repeats, seen.rest)))
+        for row in rows
+        for side in (0, 1)
+    )
+
+
+def _course(at: np.ndarray, extrema: Any, repeats: Any, rest: Any) -> Course:
+    """A course between saddles at these x1."""
+    known = ~np.isnan(extrema)
+    first, again = np.searchsorted(at, extrema[known]).tolist(), [int(np.searchsorted(at, rest))]
+    if np.isnan(rest):
+        # One that has not settled turns where it last did, to both sides.
+        loop = int(np.sum(known[int(repeats) + 1 :])) if repeats >= 0 else 2
+        first, again = first[: max(len(first) - loop, 0)], first[max(len(first) - loop, 0) :]
+    return _shortest(first, again)
+
+
+def _shortest(first: Sequence[int], again: Sequence[int]) -> Course:
+    """The one shortest way to write a course."""
+    first, again = list(first), list(again)
+    for length in range(1, len(again) + 1):
+        if len(again) % length == 0 and again == again[:length] * (len(again) // length):
+            again = again[:length]
+            break
+    while first and again and first[-1] == again[-1]:
+        again.insert(0, again.pop())
+        first.pop()
+    return tuple(first), tuple(again)
