@@ -25,7 +25,6 @@ those of pseudo-saddles by Yu. Kuznetsov, S. Rinaldi, A. Gragnani, One-parameter
 planar Filippov systems, Int. J. Bifurcation and Chaos 13 (2003) 2157-2188.
 """
 
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -35,13 +34,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import require_value
+from ..checks import is_concrete, require_value
 from ..cycles.attractors import extent
 from ..cycles.cycle import cycle_of
 from ..cycles.orbits import Orbit, follow_from, place_of_rest
 from ..cycles.returns import side_pulls
 from ..cycles.separatrices import mode_onward
-from ..cycles.shooting import SIZES, Chain, Loop, admissible, meshed
+from ..cycles.shooting import SIZES, Chain, Loop, admissible, cut, meshed
 from ..model.modes import edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
@@ -51,10 +50,19 @@ from ..numerics.newton import HOLDS, newton
 from ..results import Status
 from .conditions import AbstractCondition, Line, point_of
 from .rests import check_edge
-from .systems import CycleSystem, Seen, solve_system, velocity_tests
+from .systems import (
+    CycleSystem,
+    Seen,
+    contact_tests,
+    nearest_contacts,
+    solve_system,
+    velocity_tests,
+)
 
 #: Arcs for which the orbits from saddles are followed: some ten loops.
 ARCS = SIZES[2] - 1
+#: Extrema of x1 in a course. There may be five arcs between two of them.
+EXTREMA = 12
 
 
 class Connection(CycleSystem):
@@ -111,7 +119,15 @@ class Connection(CycleSystem):
     def look(self, osc, x):
         error = jnp.max(jnp.abs(self.residual(osc, x)))
         exists = (error < HOLDS) & self.exists(osc, x)
-        return Seen(velocity_tests(osc), exists, jnp.asarray(jnp.nan), error)
+        sticks = self.chain.used & jnp.any(self.chain.codes == 0, axis=-1)
+        nearest, _ = nearest_contacts(osc, self.chain, x, sticks)
+        tests = velocity_tests(osc) | contact_tests("DoubleSliding", nearest, jnp.isfinite(nearest))
+        # The weakest push away from either saddle.
+        away = jnp.stack(_pushes_away(osc))[:, jnp.stack([self.leaves, self.arrives])]
+        tests["BoundaryEquilibrium", ()] = jnp.min(away)
+        leaves, arrives = jnp.stack(edges(osc))[jnp.stack([self.leaves, self.arrives])]
+        tests["MeetingEdges", ()] = jnp.where(leaves == arrives, jnp.nan, leaves - arrives)
+        return Seen(tests, exists, jnp.asarray(jnp.nan), error)
 
 
 class SaddleConnection(AbstractCondition):
@@ -132,6 +148,10 @@ class SaddleConnection(AbstractCondition):
     @property
     def belts_concerned(self):
         return tuple(int(belt) for belt in dict.fromkeys([self.belt, self.to]) if belt is not None)
+
+    @property
+    def lineage(self):
+        return type(self).__name__, (int(self.belt),)
 
     @property
     def sought(self):
@@ -165,13 +185,15 @@ class SaddleConnection(AbstractCondition):
         return SIZES[2]
 
     def guess(self, osc, size):
-        return _nearest_connection(osc, self.belt, self.to, size)
+        loop, *rest = _nearest_connection(osc, self.belt, self.to, size)
+        # In as few rows as it needs, where that is known; one more stands for its end.
+        return cut([loop], more=1)[0] if is_concrete(loop) else loop, *rest
 
     def prepared(self, osc, guess):
-        return _prepared(osc, *guess)
+        return _with_mesh(osc, *guess)
 
     def solved(self, family, system, x, p, status):
-        return _solved(family, system, x, p, status)
+        return _solved_connection(family, system, x, p, status)
 
     def followed(self, point):
         osc, data = point.oscillator, self.as_data()
@@ -189,13 +211,13 @@ class SaddleConnection(AbstractCondition):
 
 
 @jit
-def _prepared(osc: Oscillator, loop: Loop, leaves: Array, arrives: Array, status: Array):
+def _with_mesh(osc: Oscillator, loop: Loop, leaves: Array, arrives: Array, status: Array):
     chain, z = meshed(lax.stop_gradient(osc), loop)
     return Connection(chain, leaves, arrives), z, status
 
 
 @jit
-def _solved(family: Family, system: Connection, z0, p0, status):
+def _solved_connection(family: Family, system: Connection, z0, p0, status):
     solution = solve_system(family, system, z0, p0, status)
     osc, z, status = family.at(solution.p), solution.z, solution.status
     fails = (status == Status.OK) & ~system.exists(osc, z)
@@ -219,9 +241,17 @@ def _solved_at(osc: Oscillator, system: Connection, x: Array) -> Array:
 @jit
 def saddles(osc: Oscillator) -> Array:
     """Whether both sides push away from the point (sigma, 0) of each edge, [edges]."""
+    left, right = _pushes_away(osc)
+    return (left > 0) & (right > 0)
+
+
+def _pushes_away(osc: Oscillator) -> tuple[Array, Array]:
+    """How hard both sides push away from the point (sigma, 0) of each edge, [edges] each."""
     positions = jnp.stack(edges(osc))
     left, right = side_pulls(osc, jnp.where(jnp.isfinite(positions), positions, 0.0))
-    return jnp.isfinite(positions) & (left < 0) & (right > 0)
+    none = jnp.full_like(positions, jnp.nan)
+    exists = jnp.isfinite(positions)
+    return jnp.where(exists, -left, none), jnp.where(exists, right, none)
 
 
 def _departing(osc: Oscillator, edge: Array, rightward: Array, parts: Array, budget: int) -> Orbit:
@@ -262,7 +292,7 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
         orbit = _departing(osc, edge, rightward, parts[edge], size - 1)
         exits = _exits(orbit)
         turns = jnp.where(_turns_back(osc, orbit), 0.0, jnp.inf)
-        turned = jnp.abs(exits[:, :1] - positions) + turns[:, None]
+        turned = jnp.abs(exits[:, :1] - positions[None]) + turns[:, None]
         # How much further one that passes a saddle would have gone in its mode.
         on_edge = (orbit.ends >= n) & (orbit.ends < 3 * n)
         at = positions[jnp.clip(orbit.ends - n, 0, 2 * n - 1)]
@@ -270,9 +300,11 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
             lambda codes, x1: mode_acceleration(osc, mode_of(codes), x1, jnp.zeros(()))
         )(orbit.codes, jnp.where(on_edge, at, 0.0))
         further = 0.5 * exits[:, 1] ** 2 / jnp.where(push == 0, jnp.nan, jnp.abs(push))
-        passed = jnp.where(on_edge[:, None] & (at[:, None] == positions), further[:, None], jnp.inf)
+        passed = jnp.where(
+            on_edge[:, None] & (at[:, None] == positions[None]), further[:, None], jnp.inf
+        )
         used = (jnp.arange(orbit.ends.size) < orbit.count)[:, None]
-        distance = jnp.where(used & wanted, jnp.fmin(turned, passed), jnp.inf)
+        distance = jnp.where(used & wanted[None], jnp.fmin(turned, passed), jnp.inf)
         row, arrives = jnp.divmod(jnp.argmin(distance), 2 * n)
         rows = jnp.arange(size)
         last = jnp.where(jnp.isfinite(turns[row]), orbit.ends[row], names.extremum_x1)
@@ -295,8 +327,8 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
 
 # --- courses --------------------------------------------------------------------------------------
 
-#: Between which saddles the extrema of x1 lie: at first, and then again and again.
-Course = tuple[tuple[int, ...], tuple[int, ...]]
+#: Between which saddles the first extrema of x1 lie, `EXTREMA` of them.
+Course = tuple[int, ...]
 
 
 class _Courses(eqx.Module):
@@ -373,22 +405,13 @@ def _courses_at(seen: _Courses) -> tuple[Course, ...]:
 def _course(at: np.ndarray, extrema: Any, repeats: Any, rest: Any) -> Course:
     """A course between saddles at these x1."""
     known = ~np.isnan(extrema)
-    first, again = np.searchsorted(at, extrema[known]).tolist(), [int(np.searchsorted(at, rest))]
-    if np.isnan(rest):
-        # One that has not settled turns where it last did, to both sides.
-        loop = int(np.sum(known[int(repeats) + 1 :])) if repeats >= 0 else 2
-        first, again = first[: max(len(first) - loop, 0)], first[max(len(first) - loop, 0) :]
-    return _shortest(first, again)
-
-
-def _shortest(first: Sequence[int], again: Sequence[int]) -> Course:
-    """The one shortest way to write a course."""
-    first, again = list(first), list(again)
-    for length in range(1, len(again) + 1):
-        if len(again) % length == 0 and again == again[:length] * (len(again) // length):
-            again = again[:length]
-            break
-    while first and again and first[-1] == again[-1]:
-        again.insert(0, again.pop())
-        first.pop()
-    return tuple(first), tuple(again)
+    letters = np.searchsorted(at, extrema[known]).tolist()
+    if not np.isnan(rest):
+        again = [int(np.searchsorted(at, rest))]
+    elif repeats >= 0:
+        again = letters[-max(int(np.sum(known[int(repeats) + 1 :])), 1) :]
+    else:
+        again = letters[-2:]  # not yet settled: where it last turned, to both sides
+    while again and len(letters) < EXTREMA:
+        letters += again
+    return tuple(letters[:EXTREMA])

@@ -455,9 +455,10 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np
                     continue
                 at = values.copy()
                 at[free] = float(point.value)
+                inside = np.all((problem.limits[:, 0] <= at) & (at <= problem.limits[:, 1]))
                 away = at - centre
                 distance = float(np.linalg.norm(away))
-                fine = 0 < distance < 3 * problem.step
+                fine = inside and 0 < distance < 3 * problem.step
                 if fine and (away / distance) @ came_from < 0.7:
                     if best is None or distance < best[0]:
                         best = distance, point, at

@@ -16,8 +16,10 @@ class SpecialPoint(NamedTuple):
     "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
     point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too),
     "BoundaryHopf" (a Hopf point on a contact edge: there the curves of boundary equilibria and of
-    pseudo-Hopf points meet its own), "BeltAtRest", "EqualVelocities", or what a condition of your
-    own watches; belts: concerned; values: of the two parameters; residual: the largest error in all
+    pseudo-Hopf points meet its own), "BoundaryEquilibrium" (a side of a saddle ceases to push away,
+    and its connection ends), "MeetingEdges" (the saddles of a connection come together),
+    "BeltAtRest", "EqualVelocities", or what a condition of your own watches; belts: concerned;
+    values: of the two parameters; residual: the largest error in all
     equations.
     """
 
