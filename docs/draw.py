@@ -22,6 +22,7 @@ import jaxbelt as jb
 from jaxbelt import paper
 from jaxbelt.bifurcations.conditions import AbstractCondition
 from jaxbelt.plotting.model import draw_mechanical_model
+from jaxbelt.plotting.phase import draw_orbit, plot_portrait
 from jaxbelt.plotting.style import draw_key, journal_figure, journal_style
 
 PICTURES = Path(__file__).parent / "pictures"
@@ -171,6 +172,7 @@ class Case(NamedTuple):
     guess: float
     before: float
     after: float
+    parts: bool = False  # whether separatrices are drawn
 
 
 class Lorentz(jb.AbstractFriction):
@@ -253,6 +255,15 @@ CASES = {
         0.72,
         0.79,
     ),
+    "SaddleConnection": Case(
+        jb.SaddleConnection(1),
+        lambda sigma1: jb.presets.class_d(-0.5, 0.5, -0.4, sigma1),
+        r"\sigma_1",
+        0.3,
+        0.22,
+        0.36,
+        parts=True,
+    ),
 }
 
 
@@ -274,9 +285,14 @@ def bifurcation(case: Case) -> Figure:
     titles = (*titles, f"${case.symbol} = {case.after:g}$")
     oscillators = (before.oscillator, osc, after.oscillator)
     for ax, osc, some, rest, title in zip(axes, oscillators, cycles, rests, titles):
-        jb.plot_phase_portrait(osc, cycles=some, equilibria=rest, ax=ax, **window)
+        if case.parts:
+            plot_portrait(jb.portrait(osc), ax)
+        else:
+            jb.plot_phase_portrait(osc, cycles=some, equilibria=rest, ax=ax, **window)
         ax.set_title(title)
         ax.label_outer()
+    if (orbit := case.condition.orbit(point)) is not None:
+        draw_orbit(axes[1], orbit, "saddle connection")
     draw_key(figure)
     return figure
 

@@ -153,6 +153,11 @@ MISTAKES = [
         r"belts must be two with a finite edge, got \(0, 1\)",
     ),
     ("jb.refine(jb.GrazingEdge(0), osc, where=nu0)", "belt must be one with a finite edge, got 0"),
+    ("jb.refine(jb.SaddleConnection(0), osc, where=nu0)", "belt must be one with a finite edge"),
+    (
+        "jb.refine(jb.SaddleConnection(0, 'left'), jb.presets.class_c(0.1, 0.3, 0.2), where=nu0)",
+        "to must be 0 to 1, or None, got 'left'",
+    ),
     ("jb.refine(jb.CornerCollision(0), osc, where=nu0)", "belt must be one with a finite edge"),
     ("jb.refine(jb.PseudoHopf(1), osc, where=nu0)", "belt must be one with a finite edge, got 1"),
     ("jb.refine(jb.BoundaryEquilibrium(1), osc, where=nu0)", "belt must be one with a finite edge"),

@@ -26,7 +26,7 @@ SLOW = """
 AtEvents AtExtrema AtSection AtTimes BasinFractions BasinStability Basins-class BeltAtRest
 BifurcationCurve BifurcationDiagram BoundaryEquilibrium CornerCollision CrossingSliding Design-class
 EdgeExchange FatalShock Fit-class FoldOfCycles GrazingEdge MeetingEdges OrbitDiagram Portrait-class
-PseudoHopf RegionMap Separatrix SpecialPoint
+PseudoHopf RegionMap SaddleConnection Separatrix SpecialPoint
 attractors basin_fractions basin_stability basins bifurcation_curve bifurcation_diagram design
 distance_to distance_to_basin_boundary find_cycle fit minimal_fatal_shock orbit_diagram plot_basins
 portrait region_map scan

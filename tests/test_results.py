@@ -28,7 +28,8 @@ NO_RESULTS = {
     *(jb.EquilibriumKind, jb.EventKind, jb.Status),
     *(jb.BeltAtRest, jb.BoundaryEquilibrium, jb.CornerCollision, jb.CrossingSliding),
     *(jb.EdgeExchange, jb.FoldOfCycles, jb.GrazingEdge, jb.GrazingSliding, jb.Hopf),
-    *(jb.MeetingEdges, jb.NonsmoothFold, jb.PseudoHopf, jb.SlidingExchange, jb.SuddenSliding),
+    *(jb.MeetingEdges, jb.NonsmoothFold, jb.PseudoHopf, jb.SaddleConnection),
+    *(jb.SlidingExchange, jb.SuddenSliding),
 }
 PUBLIC = [getattr(jb, name) for name in jb.__all__]
 RESULTS = [one for one in PUBLIC if inspect.isclass(one) and one not in NO_RESULTS]

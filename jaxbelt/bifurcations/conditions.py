@@ -39,13 +39,12 @@ from ..model.oscillator import Oscillator
 from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
-from ..numerics.continuation import Stop
 from ..numerics.newton import NEWTON_STEPS
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
 from .guesses import nearest
 from .labels import AttractingCycle, Label
-from .special import SpecialPoint
+from .special import SpecialPoint, Trail
 from .systems import (
     NOWHERE,
     AbstractSystem,
@@ -66,50 +65,6 @@ class Line(NamedTuple):
     name: str
     colour: str
     style: str | tuple[float, tuple[float, ...]] = "-"
-
-
-class Trail(NamedTuple):
-    """The last stretch of a curve, as its condition is asked where it leads.
-
-    variation: of the two parameters; step: between rows; values: of the parameters in the last
-    rows, three at most, [rows, 2]; system, x: of the last row; end: why the stretch ends there.
-    """
-
-    variation: Variation
-    step: float
-    values: np.ndarray
-    system: Any
-    x: np.ndarray
-    end: Stop
-
-    def stopping(self) -> "Stopping | None":
-        """A belt that comes to rest and whose velocity one of the parameters alone decides."""
-        if len(self.values) < 3:
-            return None
-        oscs = [self.variation.oscillator(row) for row in self.values]
-        family = self.variation.family(self.values[-1])
-        slopes = [family.belt_slopes(belt, "velocity") for belt in range(len(oscs[0].belts))]
-        for held in (0, 1):
-            for belt, slope in enumerate(slopes):
-                v = np.array([float(osc.belts[belt].velocity) for osc in oscs])
-                near = 0 < abs(v[-1]) < min(abs(v[-2]), 2 * self.step * abs(slope[held]))
-                if slope[held] != 0 and slope[1 - held] == 0 and near:
-                    along = self.variation.held(1 - held, self.values[-1, 1 - held])
-                    return Stopping(held, belt, along.rest_of(belt, self.values[-1, held]), v)
-        return None
-
-
-class Stopping(NamedTuple):
-    """A belt that comes to rest at the end of a curve.
-
-    held: which parameter decides its velocity, 0 or 1; belt: its number; value: of that parameter
-    where it is at rest; velocities: in the last rows.
-    """
-
-    held: int
-    belt: int
-    value: float
-    velocities: np.ndarray
 
 
 def check_conditions(conditions: Any, field: str = "conditions") -> tuple["AbstractCondition", ...]:
@@ -332,6 +287,10 @@ class AbstractCondition(eqx.Module):
     def place(self, point: "BifurcationPoint") -> np.ndarray:
         """Where the motion at a point is, see `place_of`; NaN where there is none."""
         return place_of(point.cycle) if int(point.cycle.status) == Status.OK else NOWHERE
+
+    def orbit(self, point: "BifurcationPoint") -> np.ndarray | None:
+        """States of the motion at a point that is no cycle, [samples, 2]; None: there is none."""
+        return None
 
 
 class BifurcationPoint(eqx.Module):

@@ -40,7 +40,7 @@ from ..cycles.cycle import cycle_of
 from ..cycles.orbits import Orbit, follow_from, place_of_rest
 from ..cycles.returns import side_pulls
 from ..cycles.separatrices import mode_onward
-from ..cycles.shooting import SIZES, Chain, Loop, admissible, cut, meshed
+from ..cycles.shooting import SIZES, Chain, Loop, admissible, cut, flow, meshed
 from ..model.modes import edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
@@ -61,6 +61,8 @@ from .systems import (
 
 #: Arcs for which the orbits from saddles are followed: some ten loops.
 ARCS = SIZES[2] - 1
+#: States along each arc of a connection that is drawn.
+SAMPLES = 33
 #: Extrema of x1 in a course. There may be five arcs between two of them.
 EXTREMA = 12
 
@@ -204,6 +206,11 @@ class SaddleConnection(AbstractCondition):
         system, x = self.followed(point)
         return system.place(np.asarray(x))
 
+    def orbit(self, point):
+        system, x = self.followed(point)
+        states = np.asarray(_samples(point.oscillator, system, x))
+        return states[np.asarray(system.chain.used)].reshape(-1, 2)
+
     @classmethod
     def between(cls, before, after, edged):
         differ = len(before.courses) == len(after.courses) and before.courses != after.courses
@@ -236,6 +243,21 @@ def _solved_at(osc: Oscillator, system: Connection, x: Array) -> Array:
         return value[:-1], matrix[:-1, :-1]
 
     return newton(linearized, x.reshape(-1)).z.reshape(-1, 3)
+
+
+@jit
+def _samples(osc: Oscillator, system: Connection, x: Array) -> Array:
+    """States along each arc, its ends included, [arcs, samples, 2]."""
+
+    def arc(row):
+        codes, mesh, (x1, x2, duration) = row
+
+        def at(fraction):
+            return flow(osc, codes, mesh, jnp.stack([x1, x2]), fraction * duration)
+
+        return lax.map(at, jnp.linspace(0.0, 1.0, SAMPLES))
+
+    return lax.map(arc, (system.chain.codes, system.chain.mesh, x))
 
 
 @jit

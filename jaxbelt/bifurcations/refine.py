@@ -48,9 +48,9 @@ def refine(
     condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`, `SlidingExchange(belts)`,
     `CrossingSliding(belt)`, `SuddenSliding(belt)`, `BeltAtRest(belt)`, `FoldOfCycles()`, or of a
     belt with a contact edge `GrazingEdge(belt)`, `CornerCollision(belt)`,
-    `BoundaryEquilibrium(belt)` or `PseudoHopf(belt)`, of two such belts `EdgeExchange(belts)` or
-    `MeetingEdges(belts)`; or one of your own. osc: a rough guess, on either side of the point.
-    where: selects the parameter that is varied, such as
+    `BoundaryEquilibrium(belt)`, `PseudoHopf(belt)` or `SaddleConnection(belt)`, of two such belts
+    `EdgeExchange(belts)` or `MeetingEdges(belts)`; or one of your own. osc: a rough guess, on
+    either side of the point. where: selects the parameter that is varied, such as
     `lambda osc: osc.belts[0].velocity`. Or osc, without where: a function of the parameter that
     returns the oscillator, of what JAX can differentiate; and at: the value of the parameter to
     begin from. max_arcs: room for the arcs of one loop (default 16; where edges are passed 32).

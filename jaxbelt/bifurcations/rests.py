@@ -52,11 +52,10 @@ from ..results import Status
 from .conditions import (
     AbstractCondition,
     Line,
-    Trail,
     point_without_cycle,
 )
 from .guesses import HINT_BUDGET, orbit_after_stick
-from .special import SpecialPoint
+from .special import SpecialPoint, Trail
 from .systems import RestSystem, small_newton, velocity_of
 
 #: The unknowns of a state of rest of which all is known.

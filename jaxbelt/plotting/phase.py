@@ -210,6 +210,15 @@ def plot_phase_portrait(
     return ax
 
 
+def draw_orbit(ax: Axes, path: np.ndarray, words: str) -> None:
+    """An orbit that begins and ends, [samples, 2], and a window that holds it, too."""
+    for limits, extend, x in ((ax.get_xlim(), ax.set_xlim, 0), (ax.get_ylim(), ax.set_ylim, 1)):
+        margin = 0.05 * np.ptp(path[:, x])
+        extend(min(limits[0], path[:, x].min() - margin), max(limits[1], path[:, x].max() + margin))
+    ax.plot(*path.T, color="black", linewidth=1.7, zorder=4, label=words)
+    _draw_arrowheads(ax, path, "black", [len(path) // 2])
+
+
 def plot_portrait(portrait: Portrait, ax: Axes | None = None) -> Axes:
     """All that there is at one oscillator, see `Portrait`: its cycles and equilibria as in
     `plot_phase_portrait`, and its separatrices, with an arrow in the direction of time.

@@ -11,7 +11,7 @@ from ..inverse.design import Design
 from ..model.equilibria import Equilibria
 from ..results import Status
 from ..tables import require_single
-from .phase import draw_equilibrium, plot_phase_portrait, plot_portrait
+from .phase import draw_equilibrium, draw_orbit, plot_phase_portrait, plot_portrait
 from .style import BELT_COLOURS, new_axes
 
 #: Of the arrow of a shock: that of a fourth belt, which no class has.
@@ -41,6 +41,9 @@ def plot_point(point: BifurcationPoint, ax: Axes | None = None) -> Axes:
     _check_found(point, "point")
     cycles = [point.cycle] if int(point.cycle.status) == Status.OK else []
     ax = plot_phase_portrait(point.oscillator, cycles=cycles, ax=ax)
+    orbit = point.condition.orbit(point)
+    if orbit is not None and not cycles:
+        draw_orbit(ax, orbit, point.condition.line.name)
     ax.set_title(f"{point.condition.words} at {float(point.value):.6g}", fontsize="medium")
     return ax
 

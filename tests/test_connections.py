@@ -1,0 +1,175 @@
+"""Connections of saddles of contact edges: against plain integration with SciPy, and relations that
+must hold."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+import jaxbelt as jb
+from jaxbelt import Status
+from jaxbelt.bifurcations.connections import courses_of
+from jaxbelt.model.variations import varied
+
+NU = 0.5  # of both belts, in opposite directions
+
+
+def over(sigma1, sigma0=-0.4, nu=NU):
+    """Three fixed points, and a saddle on each of the edges between them."""
+    return jb.presets.class_d(-nu, nu, sigma0, sigma1)
+
+
+def beside(nu0):
+    """A fixed point on either side of one edge, on which there is a saddle."""
+    return jb.presets.class_c(nu0, 0.3, sigma=-0.5)
+
+
+def slips(y0, belts, *, extrema, zeta=0.5):
+    """x1 at an extremum of an orbit, by its number, in one slip mode; belts: (velocity, sign)."""
+
+    def mu(r):
+        return 0.4 / (1 + 10 * r) + 0.6
+
+    def field(t, y):
+        pull = sum(sign * mu(sign * (nu - y[1])) for nu, sign in belts)
+        return [y[1], -y[0] - zeta * y[1] + pull]
+
+    # It begins at one.
+    def turns(t, y):
+        return y[1] if t > 1e-3 else y[1] + np.sign(field(0.0, y0)[1])
+
+    turns.terminal = extrema
+    found = solve_ivp(
+        field, (0, 50), y0, "DOP853", events=turns, rtol=1e-13, atol=1e-13, max_step=0.1
+    )
+    return found.y_events[0][extrema - 1][0]
+
+
+def miss(sigma1, sigma0=-0.4, nu=NU):
+    """How far the orbit from the saddle on the left edge turns from the right one."""
+    return slips((sigma0, 0.0), ((-nu, -1), (nu, 1)), extrema=1) - sigma1
+
+
+def test_from_one_saddle_to_another():
+    wanted = brentq(miss, 0.2, 0.4, xtol=1e-15)
+    assert wanted == pytest.approx(0.2910103952526, abs=1e-12)  # known before there was this kind
+    point = jb.refine(jb.SaddleConnection(1), over, at=0.3)
+    assert point.status == Status.OK and point.value == pytest.approx(wanted, abs=1e-12)
+    assert point.residual < 1e-13 and point.error < 1e-12
+    # Beyond, the orbit leads elsewhere.
+    ends = [jb.simulate(over(s), (-0.4, 1e-9), 200.0).ys[-1, 0] for s in (0.29, 0.292)]
+    assert ends[0] == pytest.approx(2 / 3, abs=1e-3) and ends[1] == pytest.approx(0, abs=1e-3)
+    # It is no cycle.
+    assert point.cycle.status == Status.EQUILIBRIUM and jnp.isnan(point.cycle.period)
+    orbit = point.condition.orbit(point)
+    assert orbit[0] == pytest.approx((-0.4, 0.0), abs=1e-12)
+    assert orbit[-1] == pytest.approx((wanted, 0.0), abs=1e-12)
+
+
+def test_scan_finds_what_changes_no_attractor():
+    (point,) = jb.scan(over, span=(0.2, 0.4), resolution=12)
+    assert point.condition == jb.SaddleConnection(1, to=0)
+    assert point.value == pytest.approx(brentq(miss, 0.2, 0.4, xtol=1e-15), abs=1e-12)
+
+
+def test_back_to_the_same_saddle():
+    """An unstable cycle ends there, and with it the basin within."""
+
+    def opens(nu0):
+        # Down from the saddle, up to the left of it and back: the second extremum is its own.
+        return slips((-0.5, 0.0), ((nu0, -1),), extrema=2) + 0.5
+
+    wanted = brentq(opens, -0.2645, -0.2635, xtol=1e-15)
+    assert wanted == pytest.approx(-0.263755321469, abs=1e-12)
+    for guess in (-0.2636, -0.264):
+        point = jb.refine(jb.SaddleConnection(0), beside, at=guess)
+        assert point.status == Status.OK and point.value == pytest.approx(wanted, abs=1e-12)
+    # The cycle that ends there, beside the point.
+    assert point.cycle.multiplier > 1
+    near = jb.unstable_cycle(beside(wanted + 1e-7))
+    assert near.period == pytest.approx(float(point.cycle.period), abs=1e-5)
+    assert jb.unstable_cycle(beside(wanted - 1e-4)).status == Status.NO_UNSTABLE_CYCLE
+    # Two belts share the edge.
+    other = jb.refine(jb.SaddleConnection(1, to=0), beside, at=-0.264)
+    assert other.value == pytest.approx(wanted, abs=1e-12)
+    points = jb.scan(beside, span=(-0.27, -0.25), resolution=12)
+    kinds = [jb.NonsmoothFold(0), jb.SaddleConnection(0, 0), jb.GrazingEdge(0)]
+    assert [one.condition for one in points] == kinds[-len(points) :]
+    assert points[-1].value == pytest.approx(-0.252465, abs=1e-6)
+
+
+def test_a_separatrix_that_sticks_forgets_where_it_began():
+    """From slip onset on belt 1 to the saddle, wherever the orbit begins to stick."""
+    # Belt 1 holds its limit, against the damping and belt 0, which slips at a speed of 1.
+    x1 = 1.0 - 0.5 * NU - (0.4 / (1 + 10 * 1.0) + 0.6)
+    wanted = slips((x1, NU), ((-NU, -1), (NU, 1)), extrema=1)
+    for sigma0 in (-0.52, -0.6):
+        point = jb.refine(jb.SaddleConnection(1), functools.partial(over, sigma0=sigma0), at=0.5)
+        assert point.status == Status.OK and point.value == pytest.approx(wanted, abs=1e-11)
+
+
+def test_point_symmetry():
+    point = jb.refine(jb.SaddleConnection(1), over, at=0.3)
+    mirrored = jb.refine(jb.SaddleConnection(0), lambda s: over(0.4, s), at=-0.3)
+    assert mirrored.value == pytest.approx(-float(point.value), abs=1e-13)
+
+
+@pytest.mark.slow(first=True)
+def test_derivatives_and_batches():
+    def value(nu, sigma0=-0.4):
+        return jb.refine(jb.SaddleConnection(1), lambda s: over(s, sigma0, nu), at=0.3).value
+
+    wanted, _ = oracle.richardson(
+        lambda nu: brentq(lambda s: miss(s, nu=nu), 0.2, 0.4, xtol=1e-15), NU, 1e-3
+    )
+    assert jax.grad(value)(NU) == pytest.approx(float(wanted), abs=1e-8)
+    edges = jnp.array([-0.42, -0.4, -0.38])
+    values = jax.vmap(lambda sigma0: value(NU, sigma0))(edges)
+    alone = [float(value(NU, float(sigma0))) for sigma0 in edges]
+    np.testing.assert_allclose(values, alone, rtol=0, atol=1e-13)
+
+
+@pytest.mark.slow(first=True)
+def test_curve_from_one_saddle_to_another():
+    point = jb.refine(jb.SaddleConnection(1), over, at=0.3)
+    span = ((-0.7, -0.3), (0.0, 1.0))
+    curve = jb.bifurcation_curve(
+        point, lambda a, b: over(b, a), span=span, at=(-0.4, float(point.value))
+    )
+    assert np.all(curve.residual < 1e-10)
+    sticks, ends = (
+        next(one for one in curve.special if one.kind == kind)
+        for kind in ("DoubleSliding", "BoundaryEquilibrium")
+    )
+    # From where it begins to stick on belt 1 it does not depend on where it began, up to where the
+    # fixed point to the left of the first edge comes to it: 0.4 / 6 + 0.6 = 2/3.
+    assert ends.values[0] == pytest.approx(-2 / 3, abs=1e-12)
+    assert ends.values[1] == pytest.approx(sticks.values[1], abs=1e-11)
+    assert -0.51 < sticks.values[0] < -0.50
+
+
+def test_no_courses_where_orbits_depend_on_the_parameter_with_jumps():
+    """With belts at rest, and laws that jump."""
+
+    def courses(make):
+        return courses_of(varied(make, None, (1.0,)).oscillators(np.array([[0.9], [1.1]])))
+
+    law, jumps = jb.Conti(1.0, 0.6, 10.0), jb.Coulomb(1.0, 0.6)
+
+    def with_law(law, nu):
+        right = jb.Belt(nu, law, lower=0.0)
+        return lambda load: jb.Oscillator(0.5, (jb.Belt(-nu, law, load=load, upper=0.0), right))
+
+    assert [len(one) for one in courses(with_law(law, 0.5))] == [2, 2]
+    assert courses(with_law(jumps, 0.5)) == courses(with_law(law, 0.0)) == [(), ()]
+
+
+def test_no_saddle_no_connection():
+    # A pseudo-focus on the edge.
+    point = jb.refine(jb.SaddleConnection(0), lambda n: jb.presets.class_c(n, -0.3, 0.0), at=0.3)
+    assert point.status == Status.NOT_TOUCHED and jnp.isnan(point.value)
