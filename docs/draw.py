@@ -264,6 +264,14 @@ CASES = {
         0.36,
         parts=True,
     ),
+    "HopfAtInfinity": Case(
+        jb.HopfAtInfinity(),
+        lambda zeta: jb.Oscillator(zeta, jb.presets.class_a(0.3).belts),
+        r"\zeta",
+        -0.1,
+        0.1,
+        -0.3,
+    ),
 }
 
 

@@ -15,6 +15,7 @@ from .bifurcations.curves import BifurcationCurve, bifurcation_curve
 from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
 from .bifurcations.edges import CornerCollision, GrazingEdge
 from .bifurcations.folds import FoldOfCycles
+from .bifurcations.infinity import HopfAtInfinity
 from .bifurcations.meetings import EdgeExchange, MeetingEdges
 from .bifurcations.refine import refine
 from .bifurcations.regions import RegionMap, region_map
@@ -97,6 +98,7 @@ __all__ = [
     "GrazingEdge",
     "GrazingSliding",
     "Hopf",
+    "HopfAtInfinity",
     "Machine",
     "MeetingEdges",
     "NonsmoothFold",

@@ -28,6 +28,7 @@ NO_RESULTS = {
     *(jb.EquilibriumKind, jb.EventKind, jb.Status),
     *(jb.BeltAtRest, jb.BoundaryEquilibrium, jb.CornerCollision, jb.CrossingSliding),
     *(jb.EdgeExchange, jb.FoldOfCycles, jb.GrazingEdge, jb.GrazingSliding, jb.Hopf),
+    jb.HopfAtInfinity,
     *(jb.MeetingEdges, jb.NonsmoothFold, jb.PseudoHopf, jb.SaddleConnection),
     *(jb.SlidingExchange, jb.SuddenSliding),
 }

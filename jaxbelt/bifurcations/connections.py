@@ -62,7 +62,7 @@ from .systems import (
 #: Arcs for which the orbits from saddles are followed: some ten loops.
 ARCS = SIZES[2] - 1
 #: States along each arc of a connection that is drawn.
-SAMPLES = 33
+CONNECTION_SAMPLES = 33
 #: Extrema of x1 in a course. There may be five arcs between two of them.
 EXTREMA = 12
 
@@ -208,7 +208,7 @@ class SaddleConnection(AbstractCondition):
 
     def orbit(self, point):
         system, x = self.followed(point)
-        states = np.asarray(_samples(point.oscillator, system, x))
+        states = np.asarray(_states_along(point.oscillator, system, x))
         return states[np.asarray(system.chain.used)].reshape(-1, 2)
 
     @classmethod
@@ -246,7 +246,7 @@ def _solved_at(osc: Oscillator, system: Connection, x: Array) -> Array:
 
 
 @jit
-def _samples(osc: Oscillator, system: Connection, x: Array) -> Array:
+def _states_along(osc: Oscillator, system: Connection, x: Array) -> Array:
     """States along each arc, its ends included, [arcs, samples, 2]."""
 
     def arc(row):
@@ -255,7 +255,7 @@ def _samples(osc: Oscillator, system: Connection, x: Array) -> Array:
         def at(fraction):
             return flow(osc, codes, mesh, jnp.stack([x1, x2]), fraction * duration)
 
-        return lax.map(at, jnp.linspace(0.0, 1.0, SAMPLES))
+        return lax.map(at, jnp.linspace(0.0, 1.0, CONNECTION_SAMPLES))
 
     return lax.map(arc, (system.chain.codes, system.chain.mesh, x))
 
@@ -350,7 +350,7 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
 # --- courses --------------------------------------------------------------------------------------
 
 #: Between which saddles the first extrema of x1 lie, `EXTREMA` of them.
-Course = tuple[int, ...]
+SaddleCourse = tuple[int, ...]
 
 
 class _Courses(eqx.Module):
@@ -378,7 +378,7 @@ def _courses_of(oscs: Oscillator) -> _Courses:
     def at(row):
         osc = lax.stop_gradient(eqx.combine(row, rest))
         n, parts = len(osc.belts), saddles(osc)
-        smooth = [(belt.velocity != 0) & ~_jumps(belt) for belt in osc.belts]
+        smooth = [(belt.velocity != 0) & ~_has_jump(belt) for belt in osc.belts]
         parts = parts & jnp.all(jnp.stack(smooth))
 
         def one(start):
@@ -396,13 +396,13 @@ def _courses_of(oscs: Oscillator) -> _Courses:
     return each(at)(rows)
 
 
-def _jumps(belt: Any) -> Array:
+def _has_jump(belt: Any) -> Array:
     """Whether the static limit of a belt exceeds mu(0)."""
     law = belt.friction
     return belt.load * (law.static - law.mu(jnp.zeros(()))) > 0
 
 
-def courses_of(oscs: Oscillator) -> list[tuple[Course, ...]]:
+def courses_of(oscs: Oscillator) -> list[tuple[SaddleCourse, ...]]:
     """Of each of many oscillators the courses of the orbits that leave saddles, from left to right,
     that to the left first."""
     if not np.any(_all_saddles(oscs)):
@@ -414,7 +414,7 @@ def courses_of(oscs: Oscillator) -> list[tuple[Course, ...]]:
     ]
 
 
-def _courses_at(seen: _Courses) -> tuple[Course, ...]:
+def _courses_at(seen: _Courses) -> tuple[SaddleCourse, ...]:
     at, rows = np.unique(np.where(seen.leaves, seen.positions, np.nan), return_index=True)
     rows, at = rows[~np.isnan(at)], at[~np.isnan(at)]
     return tuple(
@@ -424,7 +424,7 @@ def _courses_at(seen: _Courses) -> tuple[Course, ...]:
     )
 
 
-def _course(at: np.ndarray, extrema: Any, repeats: Any, rest: Any) -> Course:
+def _course(at: np.ndarray, extrema: Any, repeats: Any, rest: Any) -> SaddleCourse:
     """A course between saddles at these x1."""
     known = ~np.isnan(extrema)
     letters = np.searchsorted(at, extrema[known]).tolist()

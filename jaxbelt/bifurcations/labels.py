@@ -14,13 +14,14 @@ from ..results import EventKind
 class Label(NamedTuple):
     """What there is at one value: (kind, stable, contact codes) of the equilibria from left to
     right, the itineraries of the attracting cycles in order, the marks of further conditions that
-    `scan` was asked to look for, and the courses of the orbits that leave saddles of contact edges,
-    see `connections`."""
+    `scan` was asked to look for, the courses of the orbits that leave saddles of contact edges, see
+    `connections`, and whether loops far out shrink, see `infinity`."""
 
     equilibria: tuple[tuple[int, bool, tuple[int, ...]], ...]
     cycles: tuple[Itinerary, ...]
     marks: tuple[Hashable, ...] = ()
     courses: tuple[Hashable, ...] = ()
+    bounded: bool = True
 
     def is_as(self, other: "Label") -> bool:
         """Whether two labels tell the same.

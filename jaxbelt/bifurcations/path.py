@@ -43,8 +43,9 @@ from ..model.variations import varied
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .conditions import AbstractCondition, check_conditions
-from .connections import Course, courses_of
+from .connections import SaddleCourse, courses_of
 from .guesses import settled_loops
+from .infinity import is_bounded
 from .labels import AttractingCycle, Label
 
 #: Values of the parameter in one batch.
@@ -150,7 +151,7 @@ class ParameterPath:
             and not (self.labels[a].is_as(self.labels[b]) and self._all_go_on(a, b))
         ]
 
-    def _take(self, value: float, seen: "_Motions", courses: tuple[Course, ...]) -> None:
+    def _take(self, value: float, seen: "_Motions", courses: tuple[SaddleCourse, ...]) -> None:
         """Label a value by what was seen there."""
         exists = seen.kind > 0
         modes = map(tuple, without_idle(self.at(value), seen.modes[exists]).tolist())
@@ -175,7 +176,9 @@ class ParameterPath:
         cycles = sorted(self.cycles[value], key=lambda one: one.path)
         loops, osc = [one.loop for one in cycles if one.path], self.at(value)
         marks = tuple(condition.mark(osc, loops) for condition in self.conditions)
-        self.labels[value] = Label(rests, tuple(one.path for one in cycles), marks, courses)
+        bounded = bool(is_bounded(osc))
+        paths = tuple(one.path for one in cycles)
+        self.labels[value] = Label(rests, paths, marks, courses, bounded)
 
     def _settled(self, value: float, loop: Loop, *, closes: bool = True) -> AttractingCycle | None:
         """The attracting cycle that a loop is nearly one of, or else leads to, or None.

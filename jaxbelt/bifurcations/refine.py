@@ -46,14 +46,15 @@ def refine(
     """The bifurcation point near an oscillator, by Newton's method with exact derivatives.
 
     condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`, `SlidingExchange(belts)`,
-    `CrossingSliding(belt)`, `SuddenSliding(belt)`, `BeltAtRest(belt)`, `FoldOfCycles()`, or of a
-    belt with a contact edge `GrazingEdge(belt)`, `CornerCollision(belt)`,
-    `BoundaryEquilibrium(belt)`, `PseudoHopf(belt)` or `SaddleConnection(belt)`, of two such belts
-    `EdgeExchange(belts)` or `MeetingEdges(belts)`; or one of your own. osc: a rough guess, on
-    either side of the point. where: selects the parameter that is varied, such as
-    `lambda osc: osc.belts[0].velocity`. Or osc, without where: a function of the parameter that
-    returns the oscillator, of what JAX can differentiate; and at: the value of the parameter to
-    begin from. max_arcs: room for the arcs of one loop (default 16; where edges are passed 32).
+    `CrossingSliding(belt)`, `SuddenSliding(belt)`, `BeltAtRest(belt)`, `FoldOfCycles()`,
+    `HopfAtInfinity()`, or of a belt with a contact edge `GrazingEdge(belt)`,
+    `CornerCollision(belt)`, `BoundaryEquilibrium(belt)`, `PseudoHopf(belt)` or
+    `SaddleConnection(belt)`, of two such belts `EdgeExchange(belts)` or `MeetingEdges(belts)`; or
+    one of your own. osc: a rough guess, on either side of the point. where: selects the parameter
+    that is varied, such as `lambda osc: osc.belts[0].velocity`. Or osc, without where: a function
+    of the parameter that returns the oscillator, of what JAX can differentiate; and at: the value
+    of the parameter to begin from. max_arcs: room for the arcs of one loop (default 16; where edges
+    are passed 32).
 
     Where Newton's method does not converge from the guess, what `scan` does is done around the
     guess, up to 0.2 to both sides, and the nearest point of that kind is taken; and where it ends

@@ -31,6 +31,7 @@ from .connections import SaddleConnection
 from .crossings import CrossingSliding, SlidingExchange
 from .edges import GrazingEdge
 from .folds import FoldOfCycles
+from .infinity import HopfAtInfinity
 from .meetings import EdgeExchange, MeetingEdges
 from .path import ROOM, ParameterPath
 from .rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
@@ -51,6 +52,7 @@ LOOKED_FOR: tuple[type[AbstractCondition], ...] = (
     GrazingEdge,
     FoldOfCycles,
     SaddleConnection,
+    HopfAtInfinity,
 )
 #: Intervals narrower than this fraction of the span are good guesses for Newton's method. On the
 #: paper's path 1/100 finds the same points as fast, 1/1600 in a third more time.
