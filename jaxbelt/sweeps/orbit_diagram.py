@@ -187,7 +187,7 @@ class Sampling:
         # Codes of runs that are not finite are not numbers.
         kind = np.nan_to_num(found["kind"]).astype(int)
         status = found["status"].astype(int)
-        x1, x2 = (np.where(kind == UNDECIDED, np.nan, found[name])[:, None] for name in RESTS_AT)
+        x1, x2 = (found[name][:, None] for name in RESTS_AT)
         cycles = np.flatnonzero(kind == CYCLE)
         if len(cycles):
             loops = {name: found[name][cycles] for name in ("x1_min", "x1_max", "period")}
