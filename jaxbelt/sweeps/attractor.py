@@ -208,8 +208,9 @@ class Attractor(Observer):
 
     def watch_rarely(self, osc, lanes, ones):
         loop: _LoopSoFar = lanes.memory
-        margin, x1_rest = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
-        found = materialise(jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin), ones) > 0
+        margin, x1_rest, lost = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
+        slips = ~lanes.mode.any_stuck & ~lanes.done
+        found = materialise(jnp.where(slips, margin, 0.0), ones) > 0
         memory = replace(
             loop,
             kind=jnp.where(found, EQUILIBRIUM, loop.kind).astype(loop.kind.dtype),
@@ -222,7 +223,8 @@ class Attractor(Observer):
             lanes,
             lower=jnp.where(found, 0.0, lanes.lower),
             upper=jnp.where(found, 0.0, lanes.upper),
-            done=lanes.done | found,
+            # What stands there to rounding would do so until t1: it stays undecided.
+            done=lanes.done | found | (lost & slips),
             memory=memory,
         )
 
