@@ -32,7 +32,8 @@ def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
     belt: index of the belt; None: any belt. `ValueError` if there is no such belt.
     """
     if belt is None:
-        return jnp.sum(cycle.unknowns[..., 2] * jnp.where(_is_stuck(cycle), 1.0, 0.0), axis=-1)
+        stuck = jnp.where(_is_stuck(cycle), 1.0, 0.0)
+        return jnp.sum(cycle.unknowns[..., 2] * stuck, axis=-1)
     number = _belt_index(cycle, belt)
     return cycle.stick_durations[..., number]
 

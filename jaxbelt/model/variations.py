@@ -90,12 +90,14 @@ class Variation:
 
     make: gives the oscillator at numbers; names: of the parameters; line: all of them, where they
     are linear in the parameters; else tangents: those that are known, by the parameters.
+    varies_leaves: whether these are numbers of the oscillator, not arguments of a function.
     """
 
     make: Callable[..., Oscillator]
     names: tuple[str, ...]
     line: Family | None
     tangents: dict[tuple[float, ...], Family] = field(default_factory=dict)
+    varies_leaves: bool = False
 
     @classmethod
     def of_leaves(cls, osc: Oscillator, numbers: Sequence[int]) -> "Variation":
@@ -112,7 +114,7 @@ class Variation:
         line = Family(jax.tree.unflatten(structure, leaves), tuple(slopes), np.zeros(len(numbers)))
         named = names_of(osc)
         names = tuple(named[number] for number in numbers)
-        return cls(lambda *p: line.at(jnp.stack(p)), names, line)
+        return cls(lambda *p: line.at(jnp.stack(p)), names, line, varies_leaves=True)
 
     @classmethod
     def of_function(

@@ -23,6 +23,7 @@ from .style import (
     belt_colour,
     draw_key,
     figure_of,
+    in_fractions,
     journal_figure,
     new_axes,
     parameter_label,
@@ -106,7 +107,7 @@ def _axis_label(axis: xr.DataArray) -> str:
 
 
 def _with_unit(words: str, told: dict[str, Any]) -> str:
-    return f"{words} ({told['units'].replace('m s-1', 'm/s')})" if "units" in told else words
+    return f"{words} ({in_fractions(told['units'])})" if "units" in told else words
 
 
 def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:

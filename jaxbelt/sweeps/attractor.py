@@ -77,8 +77,8 @@ class Attractor(Observer):
       fixed point, see `rest.settling_margin`. A pseudo-focus is recognised by `modes.is_captured`.
     - Stuck for ever: on a belt at rest.
 
-    The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`. What
-    a run tells of its attractor is NaN where it is undecided, and `sticks` false.
+    The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
+    What a run tells of its attractor is NaN where it is undecided, and `sticks` false.
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {

@@ -61,7 +61,8 @@ class BasinFractions(eqx.Module):
     starts met has a fraction below 3/n, with a confidence of 95 per cent. x1_min, x1_max, x2_min,
     x2_max: the extent of each attractor, [values, attractors], of what holds the mass for ever the
     ends of the segment; period: of a cycle; all NaN where it is not met. n: starts at each value;
-    name: of the parameter, as the path to it, or that of the function's argument.
+    name: of the parameter, as the path to it, or that of the function's argument (then is_argument
+    is true).
     """
 
     values: np.ndarray
@@ -76,6 +77,7 @@ class BasinFractions(eqx.Module):
     period: np.ndarray
     n: int
     name: str = eqx.field(static=True)
+    is_argument: bool = eqx.field(static=True, default=False)
 
     def table(self) -> "pandas.DataFrame":
         """A row for each value and each attractor that is met there, and one for undecided starts
@@ -172,7 +174,7 @@ def basin_fractions(
     found = _found_along(variation, values, np.stack(starts), numbers)
     if moves is None:
         moves = MOVES * _longest(corners, found)
-    return _matched(found, values, moves, n, variation.names[0])
+    return _matched(found, values, moves, n, variation)
 
 
 def _longest(corners: np.ndarray, found: list[list["_Met"]]) -> float:
@@ -265,7 +267,7 @@ def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
 
 
 def _matched(
-    found: list[list[_Met]], values: np.ndarray, moves: float, n: int, name: str
+    found: list[list[_Met]], values: np.ndarray, moves: float, n: int, variation: Variation
 ) -> BasinFractions:
     """The attractors at each value, matched with those before it."""
     names: list[str] = []
@@ -299,7 +301,15 @@ def _matched(
     columns = dict(zip(PLACE, places, strict=True))
     errors = standard_error(fractions, n)
     return BasinFractions(
-        values, tuple(names), fractions, errors, undecided, **columns, n=n, name=name
+        values,
+        tuple(names),
+        fractions,
+        errors,
+        undecided,
+        **columns,
+        n=n,
+        name=variation.names[0],
+        is_argument=not variation.varies_leaves,
     )
 
 

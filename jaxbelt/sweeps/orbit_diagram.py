@@ -60,8 +60,8 @@ class OrbitDiagram(eqx.Module):
     cycle, else NaN, likewise; status: a `Status` each. x1, x2: the points of the attractors,
     [values, starts, points], NaN where there are fewer: of a cycle one for each of its moments, in
     their order; of what rests the one at which it does; dimensionless. at: which moments these are;
-    name: of the parameter, as the path to it, or that of the function's argument; sampling: what
-    `over` asks again.
+    name: of the parameter, as the path to it, or that of the function's argument (then is_argument
+    is true); sampling: what `over` asks again.
     """
 
     values: np.ndarray
@@ -73,6 +73,7 @@ class OrbitDiagram(eqx.Module):
     at: Any = eqx.field(static=True)
     name: str = eqx.field(static=True)
     sampling: "Sampling" = eqx.field(static=True, repr=False)
+    is_argument: bool = eqx.field(static=True, default=False)
 
     def over(self, span: tuple[float, float]) -> "OrbitDiagram":
         """The same over another span of the parameter, (first, last): with as many values, so that
@@ -207,6 +208,7 @@ class Sampling:
             at=self.at,
             name=self.variation.names[0],
             sampling=self,
+            is_argument=not self.variation.varies_leaves,
         )
 
     def _make(self, parameter: Any) -> Oscillator:
