@@ -16,7 +16,7 @@ from ..cycles.cycle import Cycle
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.oscillator import Oscillator
 from .diagrams import plot_curves
-from .phase import draw_equilibrium
+from .phase import draw_equilibrium, path_around
 from .style import (
     BELT_COLOURS,
     belt_colour,
@@ -141,7 +141,7 @@ def _has_area(regions: RegionMap, name: str) -> bool:
 
 
 def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle], name: str) -> None:
-    loops = [np.asarray(cycle.sample(300)) for cycle in cycles]
+    loops = [path_around(cycle) for cycle in cycles]
     rests = find_equilibria(osc)
     x1 = float(rests.x1[0])
     for i, belt in enumerate(osc.belts):
