@@ -332,3 +332,10 @@ def test_no_cell_of_a_symmetric_map_is_at_rest():
         first, second = (evenly_spaced(-0.7, 0.7, n) for n in cells_along(cells))
         assert np.all(first != 0) and np.all(second != 0)
         assert not set(first[1:-1]) & set(second[1:-1])
+
+
+def test_the_error_band_of_fractions_is_in_the_key(results):
+    some = results[jb.BasinFractions]
+    assert some.plot().get_legend_handles_labels()[1][-1] == "two standard errors"
+    sure = dataclasses.replace(some, fractions=np.ones((2, 1)), undecided=np.zeros(2))
+    assert sure.plot().get_legend_handles_labels()[1] == ["cycle 0"]

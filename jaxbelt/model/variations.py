@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-from ..checks import is_concrete, require, require_callable, require_value
+from ..checks import as_interval, is_concrete, require, require_callable, require_value
 from ..numerics.compiling import depends, is_affine, is_outermost
 from .oscillator import Oscillator, check_oscillator, check_scalars
 from .parameters import is_number, is_real, leaf_index, names_of
@@ -382,6 +382,15 @@ class Variation:
                 break
         found = np.all(np.abs(misses(values)) <= SAME_NUMBER * (1 + np.abs(wanted)))
         return values if found else None
+
+
+def as_span(span: Any, where: Any) -> tuple[float, float]:
+    """The span of a parameter, or a `ValueError`: also where it stands in the place of `where`."""
+    numbers = isinstance(where, tuple | list | np.ndarray) and len(where) == 2
+    if span is None and numbers and not any(map(callable, where)):
+        first, last = where
+        require(False, "span", f"given by its name, span=({first}, {last})", "it as where")
+    return as_interval(span, "span")
 
 
 def varied(osc: Any, where: Any, values: Sequence[Any]) -> Variation:

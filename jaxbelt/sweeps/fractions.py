@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, tell
-from ..checks import as_interval, as_positive, as_whole
+from ..checks import as_positive, as_whole
 from ..cycles.attractors import RUN, Runs
 from ..cycles.cycle import find_cycle
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
-from ..model.variations import Variation, varied
+from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
@@ -160,7 +160,7 @@ def basin_fractions(
     """
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
-    first, last = as_interval(span, "span")
+    first, last = as_span(span, where)
     corners, n, rows = as_box(box), as_whole(n, "n"), as_whole(rows, "rows", 2)
     check_key(key)
     given = {"t1": t1, "rtol": rtol, "atol": atol}

@@ -29,7 +29,7 @@ from ..checks import (
 from ..cycles.attractors import RUN
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
-from ..model.variations import Variation, varied
+from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
@@ -143,7 +143,7 @@ def orbit_diagram(
     """
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
-    first, last = as_interval(span, "span")
+    first, last = as_span(span, where)
     at = AtExtrema("x1") if at is None else at
     kinds = AtExtrema | AtSection | AtEvents
     require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)

@@ -57,8 +57,10 @@ def sweep(
 
     make: a function of parameters that returns an `Oscillator`, such as `jb.presets.class_b`; the
     rest of its arguments can be fixed by `functools.partial`. It is called with traced arrays.
-    axes: values, shape [n], of arguments of `make`, and of `x1` and `x2` for starts; NaN is
-    allowed and gives runs with the status NOT_FINITE. y0: start (x1, x2) where no axis says
+    axes: values, shape [n], of arguments of `make`, and of `x1` and `x2` for starts. NaN, and
+    parameters that are impossible, such as a negative load, give runs with the status NOT_FINITE;
+    but the oscillator at the first finite value of each axis, which is made before anything runs,
+    has to be possible. y0: start (x1, x2) where no axis says
     otherwise. t1: end of each run, from t = 0 (dimensionless time tau = omega t). rtol, atol:
     tolerances of a step.
 
