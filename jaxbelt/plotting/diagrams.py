@@ -129,9 +129,11 @@ def _smoothed(
     is_special = np.isin(values, special)
     breaks = (passed[1:] != passed[:-1]) & ~is_special[:-1] & ~is_special[1:]
     turns = np.append(False, way[1:] != way[:-1])
-    ends = np.unique([0, *np.flatnonzero(breaks) + 1, *np.flatnonzero(turns | is_special[:-1])])
+    # A piece begins behind a special value, or at one, or where the branch turns.
+    behind, at = np.flatnonzero(breaks) + 1, np.flatnonzero(turns | is_special[:-1])
+    begins = sorted({0, *behind.tolist(), *at.tolist()})
     pieces = []
-    for first, last in pairwise([*ends.tolist(), len(values)]):
+    for first, last in pairwise([*begins, len(values)]):
         x, y = values[first : last + 1], curve[first : last + 1]
         if last < len(values) and breaks[last - 1]:
             x, y = x[:-1], y[:-1]

@@ -152,6 +152,9 @@ def basin_fractions(
     largest of the four moves. So a cycle that comes to stick to another belt keeps its name. An
     attractor that pairs with none there is compared in the same way with those that were met
     before, where they were met last: a small basin may have no start in it at a value in between.
+    What moves by more than `moves` in one step, as a cycle on a steep branch may, is two attractors
+    by this rule, one that ends and one that begins: with more rows, or a larger `moves`, it is one.
+    The other way round, `moves` that is too large joins what only lies near to one another.
 
     The attractors are those that starts lead to: one with a basin that no start is in is not seen.
     Starts on closed orbits that do not attract, such as those around a centre, are undecided, and
