@@ -52,12 +52,12 @@ UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "quadratic": ("s2 m-2", lambda units: 1 / units.velocity**2),
 }
 #: Results along a parameter.
-Along = BifurcationDiagram | OrbitDiagram | BasinFractions
+AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
 SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
 
 
 def in_si(
-    result: "Trajectory | Cycle | Basins | Fit | Along | xarray.Dataset",
+    result: "Trajectory | Cycle | Basins | Fit | AlongParameter | xarray.Dataset",
     machine: Machine | Callable[..., Machine],
 ) -> "xarray.Dataset":
     """A result in SI units, as a dataset whose variables carry their units.
@@ -235,7 +235,7 @@ def _units_of_start(units: Units) -> list[tuple[str, float]]:
     return [(SYMBOLS[name], float(getattr(units, name))) for name in ("length", "velocity")]
 
 
-def _along(result: Along, machine: Any) -> "xarray.Dataset":
+def _along(result: AlongParameter, machine: Any) -> "xarray.Dataset":
     import xarray
 
     table = result.table()
@@ -256,7 +256,9 @@ def _along(result: Along, machine: Any) -> "xarray.Dataset":
     return xarray.Dataset(found)
 
 
-def units_along(result: Along, values: np.ndarray, machine: Any) -> tuple[Units, tuple[str, float]]:
+def units_along(
+    result: AlongParameter, values: np.ndarray, machine: Any
+) -> tuple[Units, tuple[str, float]]:
     """The units at values of the parameter of a result, numbers or as many; and the unit of the
     parameter itself, and what 1 is in it: "" and 1 where whoever wrote the function knows it."""
     if result.is_argument:

@@ -14,7 +14,7 @@ from jaxbelt import EventKind
 from jaxbelt.bifurcations.faces import Faces
 from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.regions import RegionMap, in_plane_of_paper, region_name
-from jaxbelt.plotting.diagrams import _smoothed
+from jaxbelt.plotting.diagrams import _between_rows
 
 
 def nu0(osc):
@@ -413,7 +413,7 @@ def test_lines_are_smooth_between_rows_and_sharp_at_special_points():
     turned = 0.5 * (1 - np.cos(np.linspace(0, np.pi, 9)))
     inside = 1e-9 + (1 - 2e-9) * turned
     rows = np.concatenate([inside, 1 + inside])
-    x, y = _smoothed(rows, np.sqrt(1 - np.abs(rows - 1)), np.array([0.0, 1.0]))
+    x, y = _between_rows(rows, np.sqrt(1 - np.abs(rows - 1)), np.array([0.0, 1.0]))
     for row, height in zip(rows, np.sqrt(1 - np.abs(rows - 1))):
         at = np.argmin(np.abs(x - row))
         assert abs(x[at] - row) < 1e-12 and abs(y[at] - height) < 1e-12
@@ -424,7 +424,7 @@ def test_lines_are_smooth_between_rows_and_sharp_at_special_points():
     # There and back at a fold, and as they are where something is not known.
     there = np.append(rows[8::-1], rows[:9])
     heights = np.append(np.sqrt(rows[8::-1]), -np.sqrt(rows[:9]))
-    x, y = _smoothed(there, heights, np.array([0.0]))
+    x, y = _between_rows(there, heights, np.array([0.0]))
     assert np.max(np.abs(np.abs(y) - np.sqrt(x))) < 3e-3 and x[0] == x[-1] == there[0]
     unknown = np.append(np.nan, heights[1:])
-    np.testing.assert_array_equal(_smoothed(there, unknown, np.array([]))[1][:9], unknown[:9])
+    np.testing.assert_array_equal(_between_rows(there, unknown, np.array([]))[1][:9], unknown[:9])

@@ -60,7 +60,7 @@ def plot_diagram(
     special = np.array([float(point.value) for point in diagram.points])
     for branch, drawn in zip(diagram.branches, curves, strict=True):
         for rows in _stretches_of(branch.stable):
-            lines = [_smoothed(branch.values[rows], curve[rows], special) for curve in drawn]
+            lines = [_between_rows(branch.values[rows], curve[rows], special) for curve in drawn]
             _draw_rows(ax, branch, rows, lines)
     first, last = diagram.regions[0][0], diagram.regions[-1][1]
     ax.set_xlim(first, last)
@@ -115,7 +115,7 @@ def _stretches_of(flags: np.ndarray) -> list[slice]:
 BETWEEN_ROWS = 8
 
 
-def _smoothed(
+def _between_rows(
     values: np.ndarray, curve: np.ndarray, special: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The values of the parameter and a curve through them, with points between the rows.

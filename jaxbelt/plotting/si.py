@@ -13,7 +13,7 @@ from matplotlib.ticker import AutoLocator, FuncFormatter
 
 from ..checks import require
 from ..model.machine import Machine, Units
-from ..si import Along, units_along
+from ..si import AlongParameter, units_along
 from .draw import draw_result
 from .style import figure_of, in_fractions, parameter_label
 
@@ -76,7 +76,7 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
         "sweep is jb.plot_sweep(jb.in_si(dataset, machine), ...))"
     )
     shown = [repr(axis.get_label_text()) for one in every for axis in (one.xaxis, one.yaxis)]
-    fits = any(done) or isinstance(result, Along)
+    fits = any(done) or isinstance(result, AlongParameter)
     require(fits, "result", expected, f"axes of {', '.join(shown)}")
     for one in every:
         _relabel_key(one, units)
@@ -86,7 +86,7 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
 def _units_of(result: Any, machine: Any) -> tuple[Units, tuple[float, str] | None]:
     """The units of a picture; and of its parameter what 1 is, and its label, where it has one that
     is not in SI units anyway."""
-    if not isinstance(result, Along):
+    if not isinstance(result, AlongParameter):
         require(isinstance(machine, Machine), "machine", "a Machine", repr(machine))
         return machine.units, None
     values = result.table()["value"].to_numpy(float)
