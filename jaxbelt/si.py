@@ -4,7 +4,8 @@ What a number is, is told by its name, as this package gives them. What has anot
 result of an observable of one's own, stays as it is.
 """
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .bifurcations.diagrams import BifurcationDiagram
 from .checks import require
 from .cycles.cycle import Cycle
 from .cycles.functionals import energy_dissipated
@@ -24,6 +26,8 @@ from .motion.simulate import Trajectory
 from .results import EventKind, Status
 from .sweeps.basins import Basins
 from .sweeps.datasets import flags
+from .sweeps.fractions import BasinFractions
+from .sweeps.orbit_diagram import OrbitDiagram
 
 if TYPE_CHECKING:
     import xarray
@@ -47,18 +51,21 @@ UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "steepness": ("s m-1", lambda units: 1 / units.velocity),
     "quadratic": ("s2 m-2", lambda units: 1 / units.velocity**2),
 }
+#: Results along a parameter.
+AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
 SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
 
 
 def in_si(
-    result: "Trajectory | Cycle | Basins | Fit | xarray.Dataset",
+    result: "Trajectory | Cycle | Basins | Fit | AlongParameter | xarray.Dataset",
     machine: Machine | Callable[..., Machine],
 ) -> "xarray.Dataset":
     """A result in SI units, as a dataset whose variables carry their units.
 
-    result: of the machine's oscillator, a `Trajectory`, a `Cycle`, `Basins`, a `Fit`, or the
-    dataset of a sweep. machine: the `Machine`; where the sweep has axes other than starts, a
-    function of these that returns it, for its units may be others in each run.
+    result: of the machine's oscillator, a `Trajectory`, a `Cycle`, `Basins`, a `Fit`, a
+    `BifurcationDiagram`, an `OrbitDiagram`, `BasinFractions`, or the dataset of a sweep. machine:
+    the `Machine`; where the sweep has axes other than starts, or a function was given in place of
+    an oscillator, a function of these that returns it, for its units may be others in each run.
 
     Of a trajectory: `t` in s, `x1` in m, `x2` in m/s, `force`, the friction on the mass, in N
     (exact formulation only), and `mode` at each sample; `t_event`, `x1_event`, `x2_event`,
@@ -68,9 +75,13 @@ def in_si(
     `standard_error`, `lower` and `upper` (the confidence interval of 95 per cent), each in the
     `unit` beside it (a `load` is the normal force), and a parameter of a law of one's own stays as
     the law has it, with the unit ""; over `t` the fitted motion, `x1` and `x2`, and `x1_residual`
-    and `x2_residual`, datum minus motion. Of a dataset: its own variables, with derivatives by
-    starts and parameters where the units are the same in all runs; results of an observable of
-    one's own stay dimensionless. `TypeError` for anything else.
+    and `x2_residual`, datum minus motion. Of a diagram, or of fractions: over `row`, the columns of
+    its `table()`; a special point is a row with the branch -1; `value`, of the parameter, is in m/s
+    for the velocity of a belt, in N for a load (the normal force), in m for a contact edge, in N
+    s/m for the damping, and that of a function's argument stays as the function takes it. Of a
+    dataset: its own variables, with derivatives by starts and parameters where the units are the
+    same in all runs; results of an observable of one's own stay dimensionless. `TypeError` for
+    anything else.
     """
     import xarray
 
@@ -83,14 +94,16 @@ def in_si(
             return _dataset(result.dataset, machine)
         case Fit():
             return _fitted(result, _one(machine))
+        case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
+            return _along(result, machine)
         case xarray.Dataset():
             told = {variable.attrs.get("units") for variable in result.variables.values()}
             is_done = bool(told & set(SYMBOLS.values()))
             require(not is_done, "result", "dimensionless", "a dataset that is in SI units")
             return _dataset(result, machine)
     raise TypeError(
-        "result must be a Trajectory, a Cycle, Basins, a Fit, or the dataset of a sweep, "
-        f"got {type(result).__name__}"
+        "result must be a Trajectory, a Cycle, Basins, a Fit, a BifurcationDiagram, an "
+        f"OrbitDiagram, BasinFractions, or the dataset of a sweep, got {type(result).__name__}"
     )
 
 
@@ -222,6 +235,46 @@ def _units_of_start(units: Units) -> list[tuple[str, float]]:
     return [(SYMBOLS[name], float(getattr(units, name))) for name in ("length", "velocity")]
 
 
+def _along(result: AlongParameter, machine: Any) -> "xarray.Dataset":
+    import xarray
+
+    table = result.table()
+    values = table["value"].to_numpy(float)
+    units, (symbol, size) = units_along(result, values, machine)
+    told = {"long_name": result.name, **({"units": symbol} if symbol else {})}
+    found: dict[str, Any] = {"value": ("row", values * size, told)}
+    for name in map(str, table.columns.drop("value")):
+        quantity = "stick_duration" if name.startswith("stick_duration_") else name
+        if quantity in DIMENSIONS:
+            words = name.replace("_", " ")
+            found[name] = _variable("row", table[name].to_numpy(float), quantity, units, words)
+        else:
+            missing = {"branch": -1, "stable": False}.get(name)
+            column = table[name] if missing is None else table[name].fillna(missing)
+            plain = column.to_numpy({"branch": int, "stable": bool}.get(name))
+            found[name] = ("row", plain.astype(str) if plain.dtype == object else plain)
+    return xarray.Dataset(found)
+
+
+def units_along(
+    result: AlongParameter, values: np.ndarray, machine: Any
+) -> tuple[Units, tuple[str, float]]:
+    """The units at values of the parameter of a result, numbers or as many; and the unit of the
+    parameter itself, and what 1 is in it: "" and 1 where whoever wrote the function knows it."""
+    if result.is_argument:
+        given = {result.name: values}
+        expected = f"a function of {result.name} that returns the Machine at a value of it"
+        require(not isinstance(machine, Machine), "machine", expected, "one Machine")
+        return _units_at(machine, given), ("", 1.0)
+    units, osc = _one(machine).units, machine.oscillator
+    name, belts = result.name, len(osc.belts)
+    belt = name.removeprefix("belts[").partition("]")[0] if name.startswith("belts[") else "0"
+    require(int(belt) < belts, "machine", f"of a belt {belt}, of which result is", f"{belts} belts")
+    known = "the velocity, load, edges or law of a belt, or the damping"
+    require(name != "omega", "result", f"along {known}", "one along omega, 1 in every machine")
+    return units, _unit_of(name, osc, units)
+
+
 def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
     axes = [str(name) for name in dataset.dims if name in dataset.coords]
     own = [name for name in axes if name not in ("x1", "x2", "belt")]
@@ -260,16 +313,28 @@ def _units_of_runs(dataset: "xarray.Dataset", machine: Any, own: list[str]) -> U
         expected = f"a function of {', '.join(own)} that returns the Machine of a run"
         require(not own, "machine", expected, "one Machine")
         return jax.tree.map(np.asarray, machine.units)
-    require(callable(machine), "machine", "a Machine, or a function that returns one", machine)
+    if not own:
+        return _units_at(machine, {})
+    grid = xarray.broadcast(*(dataset[name] for name in own))
+    found = _units_at(machine, dict(zip(own, map(np.ravel, grid), strict=True)))
+    shape = grid[0].shape
+    return jax.tree.map(lambda leaf: grid[0].copy(data=leaf.reshape(shape)), found)
 
-    def units(*arguments):
-        found = machine(**dict(zip(own, arguments, strict=True)))
+
+def _units_at(machine: Any, values: Mapping[str, np.ndarray]) -> Units:
+    """The units of what a function gives at the values of its arguments, [n] each; of none: one."""
+    require(callable(machine), "machine", "a Machine, or a function that returns one", machine)
+    try:
+        inspect.signature(machine).bind(**values)
+    except TypeError as error:
+        names = ", ".join(values) or "nothing"
+        expected = f"a function of {names} that returns the Machine of a run"
+        raise ValueError(f"machine must be {expected}, got another: {error}") from error
+
+    def units(arguments):
+        found = machine(**arguments)
         require(isinstance(found, Machine), "machine", "a function that returns a Machine", found)
         return found.units
 
-    if not own:
-        return jax.tree.map(np.asarray, units())
-    grid = xarray.broadcast(*(dataset[name] for name in own))
-    found = jax.vmap(units)(*(jnp.asarray(np.ravel(one)) for one in grid))
-    shape = grid[0].shape
-    return jax.tree.map(lambda leaf: grid[0].copy(data=np.asarray(leaf).reshape(shape)), found)
+    given = {name: jnp.asarray(column) for name, column in values.items()}
+    return jax.tree.map(np.asarray, jax.vmap(units)(given) if given else units(given))

@@ -61,6 +61,7 @@ MISTAKES = [
     ("jb.plot_sweep(dataset, 'knd')", "variable must be \"kind\", got 'knd'"),
     # --- machines
     ("jb.Machine(0.0, 1.0, 0.1, (physical,))", r"mass must be > 0, got 0\.0"),
+    ("jb.Machine(m=1.0, k=1.0, c=0.1, belts=(physical,))", "stiffness, not k, damping, not c"),
     ("jb.Machine(1.0, 1.0, 0.1, physical)", r"belts must be a tuple of belts, .*got PhysicalBelt"),
     ("jb.Machine(1.0, 1.0, 0.1, (belt,))", r"belts\[0\] must be a PhysicalBelt, got Belt"),
     ("jb.PhysicalBelt(0.1, law, -1.0)", r"normal_force must be >= 0, got -1\.0"),
@@ -163,6 +164,7 @@ MISTAKES = [
     ("jb.refine(jb.BoundaryEquilibrium(1), osc, where=nu0)", "belt must be one with a finite edge"),
     ("jb.refine(jb.FoldOfCycles(), osc, where=nu0, max_arcs=0)", f"max_arcs {WHOLE}0"),
     ("jb.scan(osc, nu0)", "span " + PAIR + "None"),
+    ("jb.scan(jb.presets.class_a, (0.1, 0.5))", r"span must be given by .* span=\(0\.1, 0\.5\)"),
     ("jb.scan(osc, (-0.7, 0.7))", SELECTS + r".*, got \(-0\.7, 0\.7\)"),
     ("jb.scan(osc, nu0, (0.7, -0.7))", "span " + PAIR + r"\(0\.7, -0\.7\)"),
     ("jb.scan(osc, nu0, (0.1, math.nan))", r"span must be finite, got \[0\.1 nan\]"),
@@ -172,6 +174,7 @@ MISTAKES = [
     ("jb.scan(jb.presets.class_a, nu0, (0.1, 0.7))", "where must be left out .*got the function"),
     ("jb.bifurcation_diagram(osc, nu0, row)", "span " + PAIR + r"an array of .*\(200,\)"),
     ("jb.bifurcation_diagram(osc, nu0, (0.1, 0.7), rows=20.0)", f"rows {WHOLE}20.0"),
+    ("jb.orbit_diagram(jb.presets.class_a, [0.1, 0.5])", r"span must be given by its name, span="),
     ("jb.orbit_diagram(osc, nu0)", "span " + PAIR + "None"),
     ("jb.orbit_diagram(osc, 'nu0', (0.1, 0.7))", SELECTS + ".*, got 'nu0'"),
     ("jb.orbit_diagram(osc, nu0, (0.1, 0.7), at='x1')", "at must be an AtExtrema, .* got 'x1'"),

@@ -148,6 +148,23 @@ def test_a_start_that_sticks_to_a_belt_at_rest_stays_there(sign):
     assert jb.find_cycle(osc, (sign * 0.57, sign * 1.2)).status == Status.STUCK_FOREVER
 
 
+def test_where_there_is_no_cycle_every_number_is_nan():
+    held = jb.find_cycle(jb.presets.class_a(0.0), (3.0, 0.0))
+    assert held.status == Status.STUCK_FOREVER
+    durations = jb.stick_duration(held), jb.slip_duration(held), jb.slip_duration(held, 0)
+    assert np.all(np.isnan([*held.stick_durations, *durations]))
+
+
+@pytest.mark.parametrize("nu", [2.8e-17, 1e-14, 1e-12])
+def test_a_belt_that_creeps_brings_the_mass_to_no_rest(nu):
+    """Slip begins at a fixed point that repels, up to rounding: for any nu > 0 there is a cycle."""
+    cycle = jb.find_cycle(jb.presets.class_a(nu), (3.0, 0.0))
+    assert cycle.status in (Status.OK, Status.NOT_SETTLED, Status.NO_CONVERGENCE)
+    axes, long = {"nu0": [nu]}, 1e19  # a sweep ends long before, if it cannot tell
+    run = jb.decoded(jb.sweep(jb.presets.class_a, axes, observe="attractor", t1=long)).squeeze()
+    assert run.kind in ("cycle", "undecided") and (run.kind == "cycle") == (run.status == "ok")
+
+
 def test_a_start_that_comes_to_rest_leads_to_no_cycle():
     cycle = jb.find_cycle(jb.presets.class_b(0.6, 0.35), START)
     assert cycle.status == Status.EQUILIBRIUM and jnp.isnan(cycle.period)

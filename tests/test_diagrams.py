@@ -14,6 +14,7 @@ from jaxbelt import EventKind
 from jaxbelt.bifurcations.faces import Faces
 from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.regions import RegionMap, in_plane_of_paper, region_name
+from jaxbelt.plotting.diagrams import _between_rows
 
 
 def nu0(osc):
@@ -405,3 +406,25 @@ def nearest(path, at):
     p, chord = path[:-1], np.diff(path, axis=0)
     part = np.sum((at - p) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-30)
     return np.min(np.hypot(*(at - p - np.clip(part, 0, 1)[:, None] * chord).T))
+
+
+def test_lines_are_smooth_between_rows_and_sharp_at_special_points():
+    """A fold at 0 and a corner at 1, from nine rows on each side."""
+    turned = 0.5 * (1 - np.cos(np.linspace(0, np.pi, 9)))
+    inside = 1e-9 + (1 - 2e-9) * turned
+    rows = np.concatenate([inside, 1 + inside])
+    x, y = _between_rows(rows, np.sqrt(1 - np.abs(rows - 1)), np.array([0.0, 1.0]))
+    for row, height in zip(rows, np.sqrt(1 - np.abs(rows - 1))):
+        at = np.argmin(np.abs(x - row))
+        assert abs(x[at] - row) < 1e-12 and abs(y[at] - height) < 1e-12
+    assert np.all(np.diff(x) >= 0) and np.max(np.abs(np.diff(y))) < 0.03
+    assert np.max(np.abs(y - np.sqrt(np.clip(1 - np.abs(x - 1), 0, 1)))) < 3e-3
+    straight = np.interp(x, rows, np.sqrt(1 - np.abs(rows - 1)))
+    assert np.max(np.abs(straight - y)) > 0.02
+    # There and back at a fold, and as they are where something is not known.
+    there = np.append(rows[8::-1], rows[:9])
+    heights = np.append(np.sqrt(rows[8::-1]), -np.sqrt(rows[:9]))
+    x, y = _between_rows(there, heights, np.array([0.0]))
+    assert np.max(np.abs(np.abs(y) - np.sqrt(x))) < 3e-3 and x[0] == x[-1] == there[0]
+    unknown = np.append(np.nan, heights[1:])
+    np.testing.assert_array_equal(_between_rows(there, unknown, np.array([]))[1][:9], unknown[:9])

@@ -37,6 +37,37 @@ def examples(path: Path) -> str:
     return "\n".join(re.findall(r"^```pycon\n(.+?)^```$", path.read_text("utf-8"), re.M | re.S))
 
 
+@pytest.mark.slow
+def test_the_page_on_scaling_runs():
+    """Its blocks in their order; what they say of units holds."""
+    blocks = re.findall(
+        r"^```python\n(.+?)^```$", (DOCS / "scaling.md").read_text("utf-8"), re.M | re.S
+    )
+    assert len(blocks) >= 6
+    given: dict = {}
+    for block in blocks:
+        exec(compile(block, "scaling.md", "exec"), given)
+    m, machine = given["m"], given["machine"]
+    x1 = jb.in_si(given["basins"], m).x1.values
+    np.testing.assert_allclose(x1[[0, -1]], [-0.002, 0.004], rtol=1e-12)
+    starts = jb.in_si(given["dataset"], lambda N: m).x1
+    np.testing.assert_allclose(starts, [0.001, 0.003], rtol=1e-12)
+    velocity = jb.in_si(given["orbits"], m).value
+    np.testing.assert_allclose([velocity.min(), velocity.max()], [0.02, 0.04], rtol=1e-12)
+    # The one belt sticks at its own speed, in whatever units the runs are.
+    found = jb.in_si(given["fractions"], machine).to_dataframe()
+    sticks = found[found.attractor.str.startswith("cycle")]
+    np.testing.assert_allclose(sticks.x2_max, sticks.value, rtol=1e-9)
+    # In one machine's units and in its own a machine does the same: at 8 N a cycle of one period.
+    own, held = machine(N=8.0), given["pressed"](8.0)
+    periods = (
+        float(jb.find_cycle(osc, one.start(0.003, 0.0)).period * one.units.time)
+        for osc, one in ((own.oscillator, own), (held, m))
+    )
+    assert next(periods) == pytest.approx(next(periods), rel=1e-9)
+    plt.close("all")
+
+
 @pytest.mark.parametrize(
     "page",
     [

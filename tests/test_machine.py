@@ -8,9 +8,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import pytest
+import xarray as xr
 from laws import Lorentz
 
 import jaxbelt as jb
+from jaxbelt.bifurcations.diagrams import Branch
 from jaxbelt.model.parameters import names_of
 
 MASS, STIFFNESS, DAMPING = 0.5, 2000.0, 1.0
@@ -304,6 +306,89 @@ def test_pictures_in_si(run):
     assert np.allclose(shown, ticks * float(m.units.length), rtol=1e-5)
     axes = jb.plot_in_si(jb.plot_time_history(run), m)
     assert axes[1].get_xlabel() == "time $t$ (s)"
+    plt.close("all")
+
+
+def along(name="belts[0].velocity", is_argument=False, **changes):
+    """Results along a parameter, of two values; their numbers are made up."""
+    values, two = np.array([0.5, 1.0]), np.array([[1.0, 2.0], [3.0, 4.0]])
+    fractions = jb.BasinFractions(
+        *(values, ("cycle 0", "equilibrium 0"), two / 4, two / 100, 0 * values),
+        *(-two, two, -two, two, np.array([[6.0, np.nan]] * 2), 100, name, is_argument),
+    )
+    kind, status = np.array([["cycle"], ["undecided"]]), np.zeros((2, 1), int)
+    points = np.array([[[1.0, 2.0]], [[np.nan] * 2]])
+    orbits = jb.OrbitDiagram(
+        *(values, kind, two[:, :1], status, points, 0 * points, jb.AtEvents(), name, None),
+        is_argument,
+    )
+    branch = Branch(
+        *("cycle", values, np.array([True, False]), *(i * values for i in (-1, 1, -2, 2, 6, 0))),
+        *(two, two, tuple(jb.find_cycle(machine().oscillator, (1.0, 0.0)) for _ in values)),
+    )
+    region = ((0.5, 1.0, "1"),)
+    diagram = jb.BifurcationDiagram((), (branch,), region, machine().oscillator, name, False)
+    return fractions, orbits, dataclasses.replace(diagram, is_argument=is_argument)
+
+
+def test_results_along_a_parameter_in_si():
+    m, length, time = machine(), 5.0 / STIFFNESS, np.sqrt(MASS / STIFFNESS)
+    for one in along():
+        ours, table = jb.in_si(one, m), one.table()
+        assert set(ours) == set(table) and len(ours.row) == len(table)
+        assert np.allclose(ours.value, table.value * length / time) and ours.value.units == "m s-1"
+        assert np.allclose(ours.period, table.period.astype(float) * time, equal_nan=True)
+        name = "x1" if "x1" in ours else "x1_max"
+        assert np.allclose(ours[name], table[name] * length, equal_nan=True)
+        assert ours[name].units == "m" and ours.period.units == "s"
+        ax = jb.plot_in_si(one, m)
+        assert ax.get_xlabel() == "belt velocity $V_0$ (m/s)"
+        shown = [float(label.get_text()) for label in ax.get_xticklabels()]
+        assert np.allclose(shown, ax.get_xticks() * length / time, rtol=1e-5)
+    diagram = along()[2]
+    assert jb.in_si(diagram, m).stick_duration_1.units == "s"
+    assert jb.plot_in_si(diagram, m, quantity="x1").get_ylabel() == "displacement $X$ (m)"
+    root = np.sqrt(STIFFNESS * MASS)
+    sizes = {"belts[1].load": 5.0, "belts[0].upper": length, "belts[1].lower": length}
+    sizes |= {"damping": root, "belts[1].friction.static": 1.0}
+    for name, size in sizes.items():
+        (ours,) = {tuple(jb.in_si(one, m).value.values) for one in along(name)[:1]}
+        assert ours[0] == pytest.approx(0.5 * size)
+    plt.close("all")
+
+
+def test_a_parameter_of_a_function_stays_as_the_function_takes_it():
+    for one in along("N", True):
+        ours, table = jb.in_si(one, lambda N: machine(0.02, 10 * N)), one.table()
+        assert np.array_equal(ours.value, table.value) and "units" not in ours.value.attrs
+        lengths = 10 * table.value / STIFFNESS  # the largest force is that of the first belt
+        name = "x1" if "x1" in ours else "x1_max"
+        assert np.allclose(ours[name], table[name] * lengths, equal_nan=True)
+        with pytest.raises(ValueError, match="machine must be a function of N that returns"):
+            jb.in_si(one, machine())
+        with pytest.raises(ValueError, match=r"no unit depends .* got along N"):
+            jb.plot_in_si(one, lambda N: machine(0.02, 10 * N))
+        with pytest.raises(ValueError, match=r"machine must be a function of N .* 'V'"):
+            jb.in_si(one, lambda V: machine(V))
+    label = jb.plot_in_si(along("V", True)[2], machine).get_xlabel()
+    assert label == "parameter $V$"
+    plt.close("all")
+
+
+def test_what_has_no_si_units_is_told():
+    m = machine()
+    with pytest.raises(ValueError, match=r"result must be along .* one along omega"):
+        jb.in_si(along("omega")[0], m)
+    with pytest.raises(ValueError, match=r"machine must be of a belt 2, .* got 2 belts"):
+        jb.in_si(along("belts[2].load")[0], m)
+    axes = {"V": ("V", [0.01, 0.02]), "x1": ("x1", [1.0, 2.0])}
+    dataset = xr.Dataset({"x1_end": (("V", "x1"), np.ones((2, 2)))}, axes)
+    with pytest.raises(ValueError, match=r"with an axis of time, .* jb.plot_sweep\(jb.in_si"):
+        jb.plot_in_si(jb.plot_sweep(dataset, "x1_end"), m)
+    with pytest.raises(ValueError, match=r"machine must be a function of V that .* 'speed'"):
+        jb.in_si(dataset, lambda speed: machine(speed))
+    drawn = jb.plot_sweep(jb.in_si(dataset, machine), "x1_end")
+    assert drawn.get_ylabel() == "x1 (m)"
     plt.close("all")
 
 

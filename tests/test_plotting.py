@@ -169,6 +169,18 @@ class Loop:
         return self.radius * np.column_stack([np.cos(angle), np.sin(angle)])
 
 
+def test_drawn_cycles_pass_through_their_corners():
+    osc = jb.presets.class_b(0.1, 0.35)
+    cycle = jb.find_cycle(osc, (3.0, 0.0))
+    drawn = states(line(jb.plot_phase_portrait(osc, cycles=[cycle]), "stable cycle"))
+    for entry in np.asarray(cycle.arcs.y):
+        assert np.min(np.hypot(*(drawn - entry).T)) < 1e-12
+    # In order: nowhere does the line go back and forth.
+    steps = np.hypot(*np.diff(drawn, axis=0).T)
+    once = np.hypot(*np.diff(np.asarray(cycle.sample(4000)), axis=0).T)
+    assert np.sum(steps) == pytest.approx(np.sum(once), rel=1e-3)
+
+
 def test_stability_shows():
     osc = jb.presets.class_b(0.45, 0.35)
     ax = jb.plot_phase_portrait(osc, cycles=[Loop(0.5, True), Loop(0.3, False)])

@@ -1,5 +1,6 @@
 """Every public result has a table, a DataFrame, and a picture that can be saved."""
 
+import dataclasses
 import inspect
 from typing import Any
 
@@ -14,8 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 
 import jaxbelt as jb
+from jaxbelt.commands.map import cells_along, write_cells
 from jaxbelt.cycles.shooting import Loop
 from jaxbelt.numerics.continuation import Stop
+from jaxbelt.numerics.spacing import evenly_spaced
 from jaxbelt.plotting.categories import COLOURS, _colour_of_kind
 from jaxbelt.plotting.draw import draw_result
 from jaxbelt.plotting.style import parameter_label
@@ -312,3 +315,29 @@ def test_pictures_of_sweeps_tell_the_unit(dataset):
     ax = jb.plot_sweep(values, "stick_duration")
     assert ax.figure.axes[1].get_ylabel() == "time stuck (s)"
     assert ax.get_ylabel() == "velocity of belt 1 (m/s)"
+
+
+def test_a_map_says_in_its_table_what_it_says_in_its_key(results, tmp_path):
+    made = results[jb.RegionMap]
+    path = tmp_path / "map.csv"
+    write_cells(dataclasses.replace(made, on_line=np.eye(2, dtype=bool)), path)
+    rows = path.read_text().splitlines()
+    assert rows[0] == "nu0,nu1,region,words,on_line" and len(rows) == 5
+    assert rows[1] == "0.4,0.3,1,rest,1" and rows[2] == "0.4,0.5,2b,rest; cycle on belt 1,0"
+    other = dataclasses.replace(made, make=lambda nu0, nu1: jb.presets.class_c(nu0, nu1, 0.1))
+    shown = set(other.plot(plt.figure().subplots()).get_legend_handles_labels()[1])
+    assert set(made.words.values()) <= shown
+
+
+def test_no_cell_of_a_symmetric_map_is_at_rest():
+    for cells in (2, 31, 200):
+        first, second = (evenly_spaced(-0.7, 0.7, n) for n in cells_along(cells))
+        assert np.all(first != 0) and np.all(second != 0)
+        assert not set(first[1:-1]) & set(second[1:-1])
+
+
+def test_the_error_band_of_fractions_is_in_the_key(results):
+    some = results[jb.BasinFractions]
+    assert some.plot().get_legend_handles_labels()[1][-1] == "two standard errors"
+    sure = dataclasses.replace(some, fractions=np.ones((2, 1)), undecided=np.zeros(2))
+    assert sure.plot().get_legend_handles_labels()[1] == ["cycle 0"]

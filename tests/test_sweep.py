@@ -137,6 +137,27 @@ def test_derivatives_of_a_cycle_equal_differences_of_the_oracle():
         np.testing.assert_allclose(swept[f"d_{name}_d_nu0"], there(name), atol=1e-7)
 
 
+def test_what_is_undecided_tells_of_no_attractor(tmp_path):
+    """A loop that is under way when time is up is none; and what is NaN has no derivative of 0."""
+    arguments = jb.presets.class_a, {"nu0": [0.0, 0.1, 0.2, 0.45]}
+    options = dict(observe="attractor", t1=10.0, derivatives=("nu0",))
+    found = jb.sweep(*arguments, **options)
+    kind = jb.decoded(found).kind.values
+    assert kind.tolist() == ["stuck", "undecided", "undecided", "equilibrium"]
+    undecided = kind == "undecided"
+    told = ("period", "stick_duration", "x1_min", "x1_max", "x2_min", "x2_max", "transient")
+    for name in told:
+        value, slope = found[name].values, found[f"d_{name}_d_nu0"].values
+        assert np.all(np.isnan(value[undecided]))
+        assert name == "period" or not np.any(np.isnan(value[~undecided]))
+        np.testing.assert_array_equal(np.isfinite(slope), np.isfinite(value))
+    assert not np.any(found.sticks[undecided]) and np.all(found.sticks[0])
+    assert np.all(found.n_events[undecided] > 0)
+    assert np.all(found.status[undecided] == Status.NOT_SETTLED)
+    stored = jb.sweep(*arguments, **options, store=tmp_path / "results.zarr")
+    assert all(stored[name].load().equals(found[name]) for name in found)
+
+
 class Sticks:
     """How often a run stuck to belt 1, and when something happened last."""
 

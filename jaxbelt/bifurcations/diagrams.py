@@ -125,6 +125,7 @@ class BifurcationDiagram(eqx.Module):
     oscillator: Oscillator
     name: str = eqx.field(static=True)
     as_paper: bool = eqx.field(static=True, default=False)
+    is_argument: bool = eqx.field(static=True, default=False)
 
     def table(self) -> "pandas.DataFrame":
         """A row for each row of each branch, in order, and then for each special point.
@@ -212,6 +213,7 @@ def bifurcation_diagram(
         oscillator=path.osc,
         name=path.name,
         as_paper=in_plane_of_paper([path.at(v) for v in (path.first, *middles, path.last)]),
+        is_argument=not path.variation.varies_leaves,
     )
 
 

@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..checks import as_interval
 from ..cycles.attractors import (
     SOLVED,
     Itinerary,
@@ -39,7 +38,7 @@ from ..cycles.shooting import SIZES, Loop, cut
 from ..model.equilibria import candidates
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
-from ..model.variations import varied
+from ..model.variations import as_span, varied
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .conditions import AbstractCondition, check_conditions
@@ -68,7 +67,7 @@ class ParameterPath:
         # `where` first: where it is left out, the span stands in its place.
         if isinstance(osc, Oscillator):
             leaf_index(osc, where)
-        self.first, self.last = as_interval(span, "span")
+        self.first, self.last = as_span(span, where)
         self.variation = varied(osc, where, (self.first,))
         conditions = check_conditions(conditions)
         for value in (self.first, self.last):

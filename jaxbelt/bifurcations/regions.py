@@ -103,8 +103,8 @@ class RegionMap(eqx.Module):
     attracting ones and the unstable one; on_line: cells where a belt is at rest, or two run at one
     velocity, [n, m]: what is so on that line only is the name of these; between: (p, q, name) in
     each part of the plane between curves in which there is no other cell; make: as given.
-    `example(name)` is a cell well inside a region; `table()` has the curves as rows; `plot()` draws
-    the map, with a portrait of each region.
+    `words` says what the names mean; `example(name)` is a cell well inside a region; `table()` has
+    the curves as rows; `plot()` draws the map, with a portrait of each region.
 
     In the name of a region a digit says what attracts: 1 an equilibrium only, 2 a cycle, too, 3
     cycles only; 6, 5 and 4 are the same where belts run in opposite directions. With several belts
@@ -126,6 +126,17 @@ class RegionMap(eqx.Module):
     def regions(self) -> tuple[str, ...]:
         """The names that occur, in order."""
         return tuple(sorted(set(np.unique(self.label).tolist()) - {""}))
+
+    @property
+    def words(self) -> dict[str, str]:
+        """What the name of each region says: what attracts, and which belts each cycle sticks to;
+        that belts run in opposite directions where that differs. As in the key of `plot()`."""
+        names = sorted({*self.regions, *(name for *_, name in self.between)})
+        opposite = {name: f"; {OPPOSITE}" * (name[0] in "456") for name in names}
+        if len(set(opposite.values())) < 2:
+            opposite = dict.fromkeys(names, "")
+        belts = len(self.oscillator(self.regions[0]).belts) if self.regions else 1
+        return {name: _attractors_of(name, belts) + opposite[name] for name in names}
 
     def example(self, name: str) -> tuple[float, float]:
         """The values of the parameters in the cell of a region that is farthest from its bounds."""
@@ -175,6 +186,25 @@ class RegionMap(eqx.Module):
             f"RegionMap({self.names[0]}, {self.names[1]}: {sizes} cells, "
             f"regions {' '.join(self.regions)}, {len(self.curves)} curves)"
         )
+
+
+#: How the words for a region end whose belts run in opposite directions.
+OPPOSITE = "belts opposite"
+
+
+def _attractors_of(name: str, belts: int) -> str:
+    """In words what attracts in a region of that name, of so many belts."""
+    digit, letters = name[:1], name[1:]
+    words = ["rest"] if digit in ("1", "2", "5", "6") else []
+    if belts == 1:
+        words += {"2": ["cycle"], "3": ["cycle"]}.get(digit, [])
+        words = [f"{word} without sticking" if "s" in letters else word for word in words]
+    for letter in letters if belts > 1 else "":
+        code = ord(letter) - ord("a") + 1
+        stuck = [str(belt) for belt in range(belts) if code >> belt & 1] if letter != "s" else []
+        which = f"belt{'s' * (len(stuck) > 1)} {', '.join(stuck)}"
+        words.append(f"cycle on {which}" if stuck else "cycle without sticking")
+    return "; ".join(words)
 
 
 def interior(inside: np.ndarray) -> tuple[int, int]:

@@ -55,7 +55,7 @@ def region_map(
     q: Annotated[
         tuple[float, float], typer.Option(metavar="FROM TO", help="Values of the second one.")
     ] = (-0.7, 0.7),
-    cells: Annotated[int, typer.Option(help="Cells along each side.")] = 200,
+    cells: Annotated[int, typer.Option(help="Cells along each side, about.")] = 200,
     out: Annotated[
         Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
     ] = Path("map"),
@@ -65,7 +65,9 @@ def region_map(
 
     - **OUT.png**: the map, and a sketch of the phase portrait of each region.
 
-    - **OUT.csv**: both parameters and the region's name, a row a cell.
+    - **OUT.csv**: both parameters, the region's name, and what that means in the words of the
+      picture's key, a row a cell; on_line: 1 of a cell where a belt is at rest, or two run at one
+      velocity, which the picture leaves out.
 
     - **OUT_curves.csv**: curve, condition, belts, both parameters, multiplier of the cycle without
       the stick phase that vanishes, residual, special, a row a point of a curve. Points of
@@ -93,9 +95,8 @@ def region_map(
         from ..numerics.spacing import evenly_spaced
 
         make = family(system, arguments, belt, damping, omega, axes)
-        # Other numbers of cells, lest cells lie on the line where both are the same.
-        sizes = cells, cells + 1
-        values = {name: evenly_spaced(*span, n) for name, span, n in zip(axes, (p, q), sizes)}
+        pairs = zip(axes, (p, q), cells_along(cells), strict=True)
+        values = {name: evenly_spaced(*span, n) for name, span, n in pairs}
         found = jb.region_map(make, values)
         from ..plotting.regions import draw_region_map
         from ..plotting.style import journal_figure, journal_style, save
@@ -108,18 +109,30 @@ def region_map(
         write_cells(found, written[1])
         write_table(found.table(), written[2])
     cells_of = {name: int((found.label == name).sum()) for name in found.regions}
-    data = {"axes": list(found.names), "cells": cells_of, "curves": len(found.curves)}
+    words = {name: found.words[name] for name in cells_of}
+    data = {"axes": list(found.names), "cells": cells_of, "words": words}
+    data["curves"] = len(found.curves)
     say(console, [repr(found)], written, as_json=as_json, data=data)
 
 
+def cells_along(cells: int) -> tuple[int, int]:
+    """How many cells there are along each axis: even numbers, lest cells of a symmetric range lie
+    on 0, where a belt is at rest; and not the same, lest they lie where both parameters are equal.
+    """
+    even = cells + cells % 2
+    return even, even + 2
+
+
 def write_cells(found: "jb.RegionMap", path: Path) -> None:
-    """Both parameters and the name of the region, a row a cell."""
+    """Both parameters, the name of the region, what it says, and `on_line`, a row a cell."""
     first, second = (values.tolist() for values in found.values)
+    words = {"": "undecided", **found.words}
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow([*found.names, "region"])
-        for p, names in zip(first, found.label, strict=True):
-            writer.writerows([p, q, name] for q, name in zip(second, names, strict=True))
+        writer.writerow([*found.names, "region", "words", "on_line"])
+        for p, names, lines in zip(first, found.label, found.on_line, strict=True):
+            cells = zip(second, names, lines, strict=True)
+            writer.writerows([p, q, name, words[name], int(line)] for q, name, line in cells)
 
 
 def write_table(table: Any, path: Path) -> None:

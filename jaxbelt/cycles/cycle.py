@@ -91,8 +91,9 @@ class Cycle(eqx.Module):
 
     @property
     def stick_durations(self) -> Array:
-        stuck = self.chain.codes == 0
-        return jnp.sum(jnp.where(stuck, self.unknowns[..., 2:], 0.0), axis=-2)
+        # A product, so that NaN stays, also of a belt that the mass does not stick to.
+        stuck = jnp.where(self.chain.codes == 0, 1.0, 0.0)
+        return jnp.sum(self.unknowns[..., 2:] * stuck, axis=-2)
 
     @property
     def x1_min(self) -> Array:

@@ -32,7 +32,8 @@ def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
     belt: index of the belt; None: any belt. `ValueError` if there is no such belt.
     """
     if belt is None:
-        return jnp.sum(jnp.where(_is_stuck(cycle), cycle.unknowns[..., 2], 0.0), axis=-1)
+        stuck = jnp.where(_is_stuck(cycle), 1.0, 0.0)
+        return jnp.sum(cycle.unknowns[..., 2] * stuck, axis=-1)
     number = _belt_index(cycle, belt)
     return cycle.stick_durations[..., number]
 
@@ -47,7 +48,8 @@ def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
         return _checked_cycle(cycle).period - stick_duration(cycle)
     number = _belt_index(cycle, belt)
     codes = cycle.chain.codes[..., number]
-    return jnp.sum(jnp.where(jnp.abs(codes) == 1, cycle.unknowns[..., 2], 0.0), axis=-1)
+    slips = jnp.where(jnp.abs(codes) == 1, 1.0, 0.0)
+    return jnp.sum(cycle.unknowns[..., 2] * slips, axis=-1)
 
 
 def stick_fraction(cycle: Cycle, belt: int | None = None) -> Array:

@@ -84,6 +84,10 @@ class PhysicalBelt(eqx.Module):
         )
 
 
+#: What the arguments of `Machine` are sometimes called.
+SHORT_NAMES = {"m": "mass", "k": "stiffness", "c": "damping", "belt": "belts"}
+
+
 class Machine(eqx.Module):
     """A mass on a spring and a dashpot, in contact with one belt or more, in SI units.
 
@@ -102,6 +106,12 @@ class Machine(eqx.Module):
     belts: tuple[PhysicalBelt, ...] = eqx.field(
         converter=lambda belts: as_belts(belts, "PhysicalBelt")
     )
+
+    def __new__(cls, *_: Any, **given: Any):
+        if short := [name for name in given if name in SHORT_NAMES]:
+            meant = ", ".join(f"{SHORT_NAMES[name]}, not {name}" for name in short)
+            raise TypeError(f"Machine() takes mass, stiffness, damping and belts: {meant}")
+        return super().__new__(cls)
 
     def __check_init__(self):
         check_positive(self.mass, "mass")

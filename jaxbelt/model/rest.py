@@ -34,17 +34,29 @@ def is_slow(x2: Array, a: Array) -> Array:
     return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < SLOW_MOTION
 
 
-def settling_margin(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
+def settling_margin(
+    osc: Oscillator, mode: Mode, x1: Array, x2: Array
+) -> tuple[Array, Array, Array]:
     """Positive where an orbit of a slip mode has entered a disc that its fixed point attracts, or
     is there up to rounding: a node on an edge, or on the boundary of a belt at rest, has no disc.
 
-    And that fixed point's x1.
+    And that fixed point's x1; and whether the orbit stands there up to rounding though everything
+    near it is repelled, as where slip begins on a belt that creeps: where it goes is not known.
+
+    In a slip mode x1'' = -(x1 - x1_rest) + f(x2) with f(0) = 0, so E = (x1 - x1_rest)^2 + x2^2
+    obeys E' = 2 x2 f(x2). If v f(v) < 0 for all 0 < |v| <= radius, and the disc lies within the
+    mode's boundaries and edges, E falls until the orbit is at rest. The sign is checked at 16
+    speeds; a law that wiggles on a scale below radius/8 could deceive that.
     """
     zero = jnp.zeros_like(x1)
     x1_rest = mode_acceleration(osc, mode, zero, zero)
     radius = jnp.maximum(jnp.hypot(x1 - x1_rest, x2), SMALLEST_DISC)
+    losses = _losses(osc, mode, x1_rest, radius)
     at_rest = jnp.maximum(jnp.abs(x1 - x1_rest), jnp.abs(x2)) < force_rounding(x1)
-    return jnp.where(at_rest, radius, disc_margin(osc, mode, x1_rest, radius)), x1_rest
+    repelled = functools.reduce(jnp.maximum, losses) < 0
+    margin = functools.reduce(jnp.minimum, [*losses, *_clearances(osc, mode, x1_rest, radius)])
+    margin = jnp.where(at_rest & ~repelled, radius, margin)
+    return margin, x1_rest, at_rest & repelled
 
 
 def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
@@ -52,18 +64,15 @@ def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     return ~mode.any_stuck & (settling_margin(osc, mode, x1, x2)[0] > 0)
 
 
-def disc_margin(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> Array:
-    """Positive where all orbits in the disc around the fixed point (x1_rest, 0) come to rest there.
+def _losses(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> list[Array]:
+    """-v f(v) at the speeds of `DISC`."""
+    speeds = [fraction * radius for fraction in DISC]
+    return [-v * mode_acceleration(osc, mode, x1_rest, v) for v in speeds]
 
-    In a slip mode x1'' = -(x1 - x1_rest) + f(x2) with f(0) = 0, so E = (x1 - x1_rest)^2 + x2^2
-    obeys E' = 2 x2 f(x2). If v f(v) < 0 for all 0 < |v| <= radius, and the disc lies within the
-    mode's boundaries and edges, E falls until the orbit is at rest. The sign is checked at 16
-    speeds; a law that wiggles on a scale below radius/8 could deceive that.
-    """
+
+def _clearances(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> list[Array]:
+    """How far the disc stays away from the boundaries and edges of its mode."""
     margins = []
-    for fraction in DISC:
-        v = fraction * radius
-        margins.append(-v * mode_acceleration(osc, mode, x1_rest, v))
     pulls = [belt.load != 0 for belt in osc.belts]  # no other belt is an obstacle
     for v in (radius, -radius):
         bounds = boundary_guards(osc, mode, v) + edge_guards(osc, mode, x1_rest + v)
@@ -71,4 +80,4 @@ def disc_margin(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> A
             jnp.where(matters, bound, jnp.inf)
             for matters, bound in zip(pulls * 3, bounds, strict=True)
         ]
-    return functools.reduce(jnp.minimum, margins)
+    return margins

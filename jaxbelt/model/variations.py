@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-from ..checks import is_concrete, require, require_callable, require_value
+from ..checks import as_interval, is_concrete, require, require_callable, require_value
 from ..numerics.compiling import depends, is_affine, is_outermost
 from .oscillator import Oscillator, check_oscillator, check_scalars
 from .parameters import is_number, is_real, leaf_index, names_of
@@ -90,12 +90,14 @@ class Variation:
 
     make: gives the oscillator at numbers; names: of the parameters; line: all of them, where they
     are linear in the parameters; else tangents: those that are known, by the parameters.
+    varies_leaves: whether these are numbers of the oscillator, not arguments of a function.
     """
 
     make: Callable[..., Oscillator]
     names: tuple[str, ...]
     line: Family | None
     tangents: dict[tuple[float, ...], Family] = field(default_factory=dict)
+    varies_leaves: bool = False
 
     @classmethod
     def of_leaves(cls, osc: Oscillator, numbers: Sequence[int]) -> "Variation":
@@ -112,7 +114,7 @@ class Variation:
         line = Family(jax.tree.unflatten(structure, leaves), tuple(slopes), np.zeros(len(numbers)))
         named = names_of(osc)
         names = tuple(named[number] for number in numbers)
-        return cls(lambda *p: line.at(jnp.stack(p)), names, line)
+        return cls(lambda *p: line.at(jnp.stack(p)), names, line, varies_leaves=True)
 
     @classmethod
     def of_function(
@@ -380,6 +382,15 @@ class Variation:
                 break
         found = np.all(np.abs(misses(values)) <= SAME_NUMBER * (1 + np.abs(wanted)))
         return values if found else None
+
+
+def as_span(span: Any, where: Any) -> tuple[float, float]:
+    """The span of a parameter, or a `ValueError`: also where it stands in the place of `where`."""
+    numbers = isinstance(where, tuple | list | np.ndarray) and len(where) == 2
+    if span is None and numbers and not any(map(callable, where)):
+        first, last = where
+        require(False, "span", f"given by its name, span=({first}, {last})", "it as where")
+    return as_interval(span, "span")
 
 
 def varied(osc: Any, where: Any, values: Sequence[Any]) -> Variation:

@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from scipy.interpolate import Akima1DInterpolator
 
 from ..bifurcations.curves import BifurcationCurve
 from ..bifurcations.diagrams import BifurcationDiagram, Branch
@@ -44,7 +45,8 @@ def plot_diagram(
     quantity: what is drawn, see `BifurcationDiagram.plot`. In "x2" the velocities of two belts that
     one cycle sticks to are joined by double arrows. Stable is black, unstable grey; unstable cycles
     are dashed. Dotted lines are the special points; in the plane of the paper's Fig. 6 the names of
-    the regions between them stand at the upper edge. Returns the axes.
+    the regions between them stand at the upper edge. Between rows the lines are interpolated, from
+    special point to special point. Returns the axes.
     """
     quantity = _default_quantity(diagram) if quantity is None else quantity
     if isinstance(quantity, str) or not callable(quantity):
@@ -55,9 +57,11 @@ def plot_diagram(
     quantity = next((name for one, name in named if quantity is one), quantity)
     curves = [_curves_of(branch, quantity) for branch in diagram.branches]
     ax = new_axes() if ax is None else ax
+    special = np.array([float(point.value) for point in diagram.points])
     for branch, drawn in zip(diagram.branches, curves, strict=True):
         for rows in _stretches_of(branch.stable):
-            _draw_rows(ax, branch, rows, [curve[rows] for curve in drawn])
+            lines = [_between_rows(branch.values[rows], curve[rows], special) for curve in drawn]
+            _draw_rows(ax, branch, rows, lines)
     first, last = diagram.regions[0][0], diagram.regions[-1][1]
     ax.set_xlim(first, last)
     ax.margins(y=0.08)
@@ -107,8 +111,55 @@ def _stretches_of(flags: np.ndarray) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
-def _draw_rows(ax: Axes, branch: Branch, rows: slice, curves: Sequence[np.ndarray]) -> None:
-    stable, values = bool(branch.stable[rows][0]), branch.values[rows]
+#: Points that are drawn of a curve between two of its rows.
+BETWEEN_ROWS = 8
+
+
+def _between_rows(
+    values: np.ndarray, curve: np.ndarray, special: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The values of the parameter and a curve through them, with points between the rows.
+
+    Each piece between special values and turning points by itself: how it departs from its chord is
+    taken for Akima's cubics, which do not swing where it bends suddenly, in an angle in which a
+    branch that ends like a square root is smooth.
+    """
+    way = np.sign(np.diff(values))
+    passed = np.searchsorted(np.sort(special), values)
+    is_special = np.isin(values, special)
+    breaks = (passed[1:] != passed[:-1]) & ~is_special[:-1] & ~is_special[1:]
+    turns = np.append(False, way[1:] != way[:-1])
+    # A piece begins behind a special value, or at one, or where the branch turns.
+    behind, at = np.flatnonzero(breaks) + 1, np.flatnonzero(turns | is_special[:-1])
+    begins = sorted({0, *behind.tolist(), *at.tolist()})
+    pieces = []
+    for first, last in pairwise([*begins, len(values)]):
+        x, y = values[first : last + 1], curve[first : last + 1]
+        if last < len(values) and breaks[last - 1]:
+            x, y = x[:-1], y[:-1]
+        pieces.append(_smooth_piece(x, y))
+    x, y = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+    return x, y
+
+
+def _smooth_piece(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    if len(x) < 3 or not np.all(np.isfinite(y)):
+        return x, y
+    angle = np.arccos(np.clip(1 - 2 * (x - x[0]) / (x[-1] - x[0]), -1, 1))
+    if not np.all(np.diff(angle) > 0):
+        return x, y
+    rows = np.arange(len(x))
+    dense = np.interp(np.linspace(0, rows[-1], BETWEEN_ROWS * rows[-1] + 1), rows, angle)
+    share, at_rows = (0.5 * (1 - np.cos(one)) for one in (dense, angle))
+    away = y - y[0] - (y[-1] - y[0]) * at_rows
+    bend = Akima1DInterpolator(angle, away, method="makima")(dense)
+    return x[0] + (x[-1] - x[0]) * share, y[0] + (y[-1] - y[0]) * share + bend
+
+
+def _draw_rows(
+    ax: Axes, branch: Branch, rows: slice, lines: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> None:
+    stable = bool(branch.stable[rows][0])
     is_cycle = branch.kind == "cycle"
     style: dict[str, Any] = {
         "color": "black" if stable else UNSTABLE_COLOUR,
@@ -118,7 +169,7 @@ def _draw_rows(ax: Axes, branch: Branch, rows: slice, curves: Sequence[np.ndarra
         "zorder": 3 if stable else 2.5,
         "label": f"{'' if stable else 'un'}stable {'cycle' if is_cycle else 'fixed point'}",
     }
-    for curve in curves:
+    for values, curve in lines:
         if not np.all(np.isnan(curve)):
             ax.plot(values, curve, **style)
 

@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from ..checks import as_interval, require_one_of, require_value
+from ..cycles.cycle import Cycle
 from ..cycles.portrait import Portrait
 from ..cycles.separatrices import Separatrix
 from ..model.equilibria import Equilibria, EquilibriumKind
@@ -157,6 +158,16 @@ def path_of(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     return t[known][order], ys[known][order]
 
 
+def path_around(cycle: ClosedOrbit) -> np.ndarray:
+    """States once around a cycle, its events among them where it tells its arcs, so that corners
+    are sharp: [states, 2]."""
+    ys = np.asarray(cycle.sample(400))
+    if not isinstance(cycle, Cycle):
+        return ys
+    t = np.concatenate([np.linspace(0.0, float(cycle.period), len(ys)), cycle.arcs.t])
+    return np.concatenate([ys, cycle.arcs.y])[np.argsort(t, kind="stable")]
+
+
 # --- phase portraits ----------------------------------------------------------------------------
 
 
@@ -188,7 +199,7 @@ def plot_phase_portrait(
     _check_window(xlim, ylim)
     ax = new_axes() if ax is None else ax
     paths = [path_of(trajectory)[1] for trajectory in trajectories]
-    loops = [np.asarray(cycle.sample(400)) for cycle in cycles]
+    loops = [path_around(cycle) for cycle in cycles]
     equilibria = find_equilibria(osc) if equilibria is None else equilibria
     window = _window(osc, [*paths, *loops], equilibria, xlim, ylim)
     ax.set(xlim=window[0], ylim=window[1])
@@ -228,7 +239,7 @@ def plot_portrait(portrait: Portrait, ax: Axes | None = None) -> Axes:
     ax = new_axes() if ax is None else ax
     osc, cycles = portrait.oscillator, [*portrait.cycles, *portrait.unstable]
     paths = [np.asarray(one.ys) for one in portrait.separatrices if not one.stable]
-    paths += [np.asarray(cycle.sample(400)) for cycle in cycles]
+    paths += [path_around(cycle) for cycle in cycles]
     x1, x2 = (_with_margin(ends) for ends in _window(osc, paths, portrait.equilibria, None, None))
     shown = {"equilibria": portrait.equilibria, "xlim": x1, "ylim": x2}
     plot_phase_portrait(osc, cycles=cycles, ax=ax, **shown)

@@ -11,12 +11,12 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from scipy import ndimage
 
-from ..bifurcations.regions import RegionMap, interior
+from ..bifurcations.regions import OPPOSITE, RegionMap, interior
 from ..cycles.cycle import Cycle
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.oscillator import Oscillator
 from .diagrams import plot_curves
-from .phase import draw_equilibrium
+from .phase import draw_equilibrium, path_around
 from .style import (
     BELT_COLOURS,
     belt_colour,
@@ -59,9 +59,10 @@ def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
     if regions.as_paper:
         _name_areas(ax, regions, raster)
     else:
-        words = _words_of_regions(regions)
+        words = regions.words
         for name in filter(None, known):
-            patch = {"facecolor": colours[name], "edgecolor": "0.4", "label": words[name]}
+            label = words[name].replace(f"; {OPPOSITE}", f"\n{OPPOSITE}")
+            patch = {"facecolor": colours[name], "edgecolor": "0.4", "label": label}
             ax.add_patch(Rectangle((x[0], y[0]), 0, 0, **patch))
     ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     first, second = map(parameter_label, regions.names)
@@ -96,32 +97,6 @@ def _colours_of(names: Sequence[str]) -> list[tuple[float, float, float]]:
     return colours
 
 
-def _words_of_regions(regions: RegionMap) -> dict[str, str]:
-    """What the name of each region says, see `RegionMap`: what attracts, and which belts each
-    cycle sticks to; whether belts run in opposite directions where that differs."""
-    names = sorted({*regions.regions, *(name for *_, name in regions.between)})
-    opposite = {name: name[0] in "456" for name in names}
-    told = {name: "\nbelts opposite" * flag for name, flag in opposite.items()}
-    if len(set(opposite.values())) < 2:
-        told = dict.fromkeys(names, "")
-    belts = len(regions.oscillator(regions.regions[0]).belts) if regions.regions else 1
-    return {name: _attractors_of(name, belts) + told[name] for name in names}
-
-
-def _attractors_of(name: str, belts: int) -> str:
-    digit, letters = name[:1], name[1:]
-    words = ["rest"] if digit in ("1", "2", "5", "6") else []
-    if belts == 1:
-        words += {"2": ["cycle"], "3": ["cycle"]}.get(digit, [])
-        words = [f"{word} without sticking" if "s" in letters else word for word in words]
-    for letter in letters if belts > 1 else "":
-        code = ord(letter) - ord("a") + 1
-        stuck = [str(belt) for belt in range(belts) if code >> belt & 1] if letter != "s" else []
-        which = f"belt{'s' * (len(stuck) > 1)} {', '.join(stuck)}"
-        words.append(f"cycle on {which}" if stuck else "cycle without sticking")
-    return "; ".join(words)
-
-
 def _region_colour(name: str) -> tuple[float, float, float]:
     """Pale for cycles, paler where an equilibrium is stable beside them; white for no cycle."""
     letters = {"a": BELT_COLOURS[0], "b": BELT_COLOURS[1], "c": "#7F5FA8"}
@@ -152,9 +127,7 @@ def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
     lower = whole[1].subgridspec(rows, columns)
     titles = {name: name for name in names}
     if not regions.as_paper:
-        titles = {
-            name: words.replace("; ", ";\n") for name, words in _words_of_regions(regions).items()
-        }
+        titles = {name: words.replace("; ", ";\n") for name, words in regions.words.items()}
     for place, name in enumerate(names):
         axis = figure.add_subplot(lower[place // columns, place % columns])
         cycles = regions.cycles[name]
@@ -168,7 +141,7 @@ def _has_area(regions: RegionMap, name: str) -> bool:
 
 
 def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle], name: str) -> None:
-    loops = [np.asarray(cycle.sample(300)) for cycle in cycles]
+    loops = [path_around(cycle) for cycle in cycles]
     rests = find_equilibria(osc)
     x1 = float(rests.x1[0])
     for i, belt in enumerate(osc.belts):

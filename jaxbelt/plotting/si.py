@@ -4,24 +4,33 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.ticker import AutoLocator, FuncFormatter
 
 from ..checks import require
-from ..model.machine import Machine
+from ..model.machine import Machine, Units
+from ..si import AlongParameter, units_along
 from .draw import draw_result
-from .style import figure_of
+from .style import figure_of, in_fractions, parameter_label
 
 #: By the beginning of its label, what an axis shows, and its label in SI units.
 LABELS = {
     "time": ("time", "time $t$ (s)"),
     "period": ("time", "period (s)"),
-    "displacement": ("length", "displacement $X$ (m)"),
+    "displacement $x_1$": ("length", "displacement $X$ (m)"),
     "amplitude": ("length", "amplitude (m)"),
     "velocity $x_2$": ("velocity", r"velocity $\dot X$ (m/s)"),
     "relative velocity": ("velocity", r"relative velocity $R$ (m/s)"),
+}
+#: Parameters of an oscillator that have another symbol in SI units, by the end of their path.
+SI_PARAMETERS = {
+    "damping": "damping $c$",
+    "velocity": "belt velocity $V_%$",
+    "load": "normal force $N_%$",
 }
 
 
@@ -40,27 +49,63 @@ class _RoundInUnits(AutoLocator):
         return np.asarray(super().tick_values(vmin * self.unit, vmax * self.unit)) / self.unit
 
 
-def plot_in_si(result: Any, machine: Machine, ax: Axes | None = None, **options: Any) -> Any:
+def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any) -> Any:
     """A picture with times in s, displacements in m and velocities in m/s, also in its key.
 
     result: of the machine's oscillator, anything that has a `.plot()`, drawn into the axes (None:
     new ones); or the axes, one or several, that another function of this package has drawn into.
-    options: of that `.plot()`. Returns the axes. Axes that show something else (a parameter, in
-    the units of whoever varies it) stay as they are. `ValueError` names a wrong argument.
+    machine: the `Machine`; for a diagram or fractions along the argument of a function, a function
+    of that which returns it. options: of that `.plot()`. Returns the axes.
+
+    The parameter of a diagram or of fractions is in SI units, too: that of a function's argument as
+    the function takes it. Other axes that show something else stay as they are. `ValueError` where
+    no axis can be converted, as in the picture of a sweep (draw what `in_si` returns instead),
+    where the units vary along the parameter, and for a wrong argument.
     """
-    require(isinstance(machine, Machine), "machine", "a Machine", repr(machine))
+    units, parameter = _units_of(result, machine)
     several = isinstance(result, Sequence) and all(isinstance(one, Axes) for one in result)
     is_drawn = isinstance(result, Axes) or several
     axes: Any = result if is_drawn else draw_result(result, ax, **options)
-    for one in [axes] if isinstance(axes, Axes) else axes:
-        _relabel(one.xaxis, machine)
-        _relabel(one.yaxis, machine)
-        _relabel_key(one, machine)
+    every = [axes] if isinstance(axes, Axes) else list(axes)
+    done = [_relabel(axis, units) for one in every for axis in (one.xaxis, one.yaxis)]
+    if parameter is not None:
+        unit, label = parameter
+        _rescale(axes.xaxis, unit, label)
+    expected = (
+        "a picture with an axis of time, displacement, velocity, amplitude or period (that of a "
+        "sweep is jb.plot_sweep(jb.in_si(dataset, machine), ...))"
+    )
+    shown = [repr(axis.get_label_text()) for one in every for axis in (one.xaxis, one.yaxis)]
+    fits = any(done) or isinstance(result, AlongParameter)
+    require(fits, "result", expected, f"axes of {', '.join(shown)}")
+    for one in every:
+        _relabel_key(one, units)
     return axes
 
 
-def _relabel_key(ax: Axes, machine: Machine) -> None:
-    unit = float(machine.units.length)
+def _units_of(result: Any, machine: Any) -> tuple[Units, tuple[float, str] | None]:
+    """The units of a picture; and of its parameter what 1 is, and its label, where it has one that
+    is not in SI units anyway."""
+    if not isinstance(result, AlongParameter):
+        require(isinstance(machine, Machine), "machine", "a Machine", repr(machine))
+        return machine.units, None
+    values = result.table()["value"].to_numpy(float)
+    units, (symbol, size) = units_along(result, values, machine)
+    vary = sorted(name for name, unit in vars(units).items() if np.ptp(np.asarray(unit)) > 0)
+    expected = "along a parameter on which no unit depends (jb.in_si converts each row)"
+    require(not vary, "result", expected, f"along {result.name}, with other {', '.join(vary)}")
+    units = jax.tree.map(lambda unit: jnp.ravel(unit)[0], units)
+    if symbol in ("", "1"):
+        return units, None
+    words = SI_PARAMETERS.get(result.name.rpartition(".")[2])
+    if words is None or result.name.endswith("friction.velocity"):
+        words = parameter_label(result.name)
+    words = words.replace("%", result.name.partition("[")[2].partition("]")[0])
+    return units, (size, f"{words} ({in_fractions(symbol)})")
+
+
+def _relabel_key(ax: Axes, units: Units) -> None:
+    unit = float(units.length)
 
     def in_m(found: re.Match) -> str:
         # With the digits that are known.
@@ -75,14 +120,20 @@ def _relabel_key(ax: Axes, machine: Machine) -> None:
             text.set_text(REST.sub(in_m, text.get_text()))
 
 
-def _relabel(axis: Axis, machine: Machine) -> None:
+def _relabel(axis: Axis, units: Units) -> bool:
+    """Put an axis in SI units, if it shows one quantity that has some; whether it does."""
     text = axis.get_label_text()
     shown = [
         LABELS[begins] for part in text.split(", ") for begins in LABELS if part.startswith(begins)
     ]
-    if len(shown) == 1:  # two quantities on one axis have no common unit
-        ((quantity, label),) = shown
-        unit = float(getattr(machine.units, quantity))
-        axis.set_major_locator(_RoundInUnits(unit))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value * unit:.6g}"))
-        axis.set_label_text(label)
+    if len(shown) != 1:  # two quantities on one axis have no common unit
+        return False
+    ((quantity, label),) = shown
+    _rescale(axis, float(getattr(units, quantity)), label)
+    return True
+
+
+def _rescale(axis: Axis, unit: float, label: str) -> None:
+    axis.set_major_locator(_RoundInUnits(unit))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value * unit:.6g}"))
+    axis.set_label_text(label)

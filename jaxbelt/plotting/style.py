@@ -162,6 +162,14 @@ def parameter_label(name: str) -> str:
     return f"{word.replace('%', belt)} ${symbol}$" if symbol else word.replace("%", belt)
 
 
+def in_fractions(unit: str) -> str:
+    """A unit such as "m s-1" as it stands in pictures: "m/s"."""
+    above = [part for part in unit.split() if "-" not in part]
+    below = [part.replace("-1", "").replace("-2", "$^2$") for part in unit.split() if "-" in part]
+    above = [part.replace("2", "$^2$") for part in above]
+    return " ".join(above or ["1"]) + "".join(f"/{part}" for part in below)
+
+
 def save(figure: Figure, path: Path, dpi: int = 220) -> None:
     """Write a figure as PNG (or what else the ending of the path says)."""
     figure.savefig(path, dpi=dpi)

@@ -23,6 +23,7 @@ from .style import (
     belt_colour,
     draw_key,
     figure_of,
+    in_fractions,
     journal_figure,
     new_axes,
     parameter_label,
@@ -106,7 +107,7 @@ def _axis_label(axis: xr.DataArray) -> str:
 
 
 def _with_unit(words: str, told: dict[str, Any]) -> str:
-    return f"{words} ({told['units'].replace('m s-1', 'm/s')})" if "units" in told else words
+    return f"{words} ({in_fractions(told['units'])})" if "units" in told else words
 
 
 def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
@@ -179,7 +180,8 @@ def plot_fractions(fractions: BasinFractions, ax: Axes | None = None) -> Axes:
     x, shares = _with_steps(values, shares[:, order])
     tops = np.cumsum(shares, axis=1)
     colours = [*_basin_colours(fractions.attractors), "#FFFFFF"]
-    bottom = np.zeros(len(x))
+    errors: Any = {"color": "black", "alpha": 0.3, "linewidth": 0, "zorder": 2.5}  # above the bands
+    bottom, is_uncertain = np.zeros(len(x)), False
     for place, number in enumerate(order):
         met, top = shares[:, place] > 0, tops[:, place]
         if np.any(met):
@@ -188,9 +190,11 @@ def plot_fractions(fractions: BasinFractions, ax: Axes | None = None) -> Axes:
         inner = (top > 0) & (top < 1)
         spread = 2 * standard_error(top, fractions.n)
         ends = np.clip([top - spread, top + spread], 0, 1)
-        errors = {"color": "black", "alpha": 0.3, "linewidth": 0, "zorder": 2.5}  # above the bands
         ax.fill_between(x, *ends, where=inner.tolist(), **errors)
+        is_uncertain |= bool(np.any(inner))
         bottom = top
+    if is_uncertain:
+        ax.fill_between(x[:1], 0, 0, label="two standard errors", **errors)
     ax.set(xlim=(values[0], values[-1]), ylim=(0, 1))
     ax.set(xlabel=parameter_label(fractions.name), ylabel=f"fraction of {fractions.n:,} starts")
     return ax

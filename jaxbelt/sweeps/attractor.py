@@ -78,6 +78,7 @@ class Attractor(Observer):
     - Stuck for ever: on a belt at rest.
 
     The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
+    What a run tells of its attractor is NaN where it is undecided, and `sticks` false.
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {
@@ -207,8 +208,9 @@ class Attractor(Observer):
 
     def watch_rarely(self, osc, lanes, ones):
         loop: _LoopSoFar = lanes.memory
-        margin, x1_rest = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
-        found = materialise(jnp.where(lanes.mode.any_stuck | lanes.done, 0.0, margin), ones) > 0
+        margin, x1_rest, lost = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
+        slips = ~lanes.mode.any_stuck & ~lanes.done
+        found = materialise(jnp.where(slips, margin, 0.0), ones) > 0
         memory = replace(
             loop,
             kind=jnp.where(found, EQUILIBRIUM, loop.kind).astype(loop.kind.dtype),
@@ -221,25 +223,32 @@ class Attractor(Observer):
             lanes,
             lower=jnp.where(found, 0.0, lanes.lower),
             upper=jnp.where(found, 0.0, lanes.upper),
-            done=lanes.done | found,
+            # What stands there to rounding would do so until t1: it stays undecided.
+            done=lanes.done | found | (lost & slips),
             memory=memory,
         )
 
     def finish(self, osc, lanes):
         loop: _LoopSoFar = lanes.memory
-        undecided = (loop.kind == UNDECIDED) & (lanes.status == Status.OK.value)
-        status = jnp.where(undecided, Status.NOT_SETTLED.value, lanes.status)
+        undecided = loop.kind == UNDECIDED
+        unsettled = undecided & (lanes.status == Status.OK.value)
+        status = jnp.where(unsettled, Status.NOT_SETTLED.value, lanes.status)
         word = jnp.where(jnp.isinf(loop.word), -1.0, loop.word)
+
+        def of_attractor(value):
+            """NaN where there is none: the loop that an undecided run was in is none."""
+            return jnp.where(undecided, jnp.nan, value)
+
         return {
             "kind": loop.kind,
             "signature": jnp.where(loop.kind == CYCLE, word, 0.0),
-            "sticks": tuple(total > 0 for total in loop.sticks),
+            "sticks": tuple((total > 0) & ~undecided for total in loop.sticks),
             "period": loop.period,
-            "stick_duration": loop.sticks,
-            "x1_min": loop.x1_min,
-            "x1_max": loop.x1_max,
-            "x2_min": lanes.lower,
-            "x2_max": lanes.upper,
+            "stick_duration": tuple(of_attractor(total) for total in loop.sticks),
+            "x1_min": of_attractor(loop.x1_min),
+            "x1_max": of_attractor(loop.x1_max),
+            "x2_min": of_attractor(lanes.lower),
+            "x2_max": of_attractor(lanes.upper),
             "transient": loop.transient,
             "n_events": jnp.where(loop.kind == CYCLE, loop.loop_events, lanes.events),
             "status": status,

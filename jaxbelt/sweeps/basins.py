@@ -412,7 +412,7 @@ def basin_stability(
 
 def standard_error(fraction: Any, n: int) -> Any:
     """Of fractions of n starts."""
-    return np.sqrt(np.clip(fraction * (1 - np.asarray(fraction)), 0, None) / n)
+    return np.asarray(np.sqrt(np.clip(fraction * (1 - np.asarray(fraction)), 0, None) / n))
 
 
 def as_box(box: Any) -> np.ndarray:

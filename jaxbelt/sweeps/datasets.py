@@ -133,8 +133,9 @@ class Table:
                 found[name] = (np.nan_to_num(part) if exact else part).astype(dtype)
         for i, by in enumerate(self.derivatives):
             found |= {
-                f"d_{name}_d_{by}": values[name][i + 1]
-                for name in values
+                # What is no number has no derivative; the kernel has that of a constant, 0.
+                f"d_{name}_d_{by}": np.where(np.isfinite(of[0]), of[i + 1], np.nan)
+                for name, of in values.items()
                 if f"d_{name}_d_{by}" in self.shapes
             }
         return found

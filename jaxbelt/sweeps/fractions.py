@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, tell
-from ..checks import as_interval, as_positive, as_whole
+from ..checks import as_positive, as_whole
 from ..cycles.attractors import RUN, Runs
 from ..cycles.cycle import find_cycle
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
-from ..model.variations import Variation, varied
+from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
@@ -61,7 +61,8 @@ class BasinFractions(eqx.Module):
     starts met has a fraction below 3/n, with a confidence of 95 per cent. x1_min, x1_max, x2_min,
     x2_max: the extent of each attractor, [values, attractors], of what holds the mass for ever the
     ends of the segment; period: of a cycle; all NaN where it is not met. n: starts at each value;
-    name: of the parameter, as the path to it, or that of the function's argument.
+    name: of the parameter, as the path to it, or that of the function's argument (then is_argument
+    is true).
     """
 
     values: np.ndarray
@@ -76,6 +77,7 @@ class BasinFractions(eqx.Module):
     period: np.ndarray
     n: int
     name: str = eqx.field(static=True)
+    is_argument: bool = eqx.field(static=True, default=False)
 
     def table(self) -> "pandas.DataFrame":
         """A row for each value and each attractor that is met there, and one for undecided starts
@@ -150,6 +152,9 @@ def basin_fractions(
     largest of the four moves. So a cycle that comes to stick to another belt keeps its name. An
     attractor that pairs with none there is compared in the same way with those that were met
     before, where they were met last: a small basin may have no start in it at a value in between.
+    What moves by more than `moves` in one step, as a cycle on a steep branch may, is two attractors
+    by this rule, one that ends and one that begins: with more rows, or a larger `moves`, it is one.
+    The other way round, `moves` that is too large joins what only lies near to one another.
 
     The attractors are those that starts lead to: one with a basin that no start is in is not seen.
     Starts on closed orbits that do not attract, such as those around a centre, are undecided, and
@@ -158,7 +163,7 @@ def basin_fractions(
     """
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
-    first, last = as_interval(span, "span")
+    first, last = as_span(span, where)
     corners, n, rows = as_box(box), as_whole(n, "n"), as_whole(rows, "rows", 2)
     check_key(key)
     given = {"t1": t1, "rtol": rtol, "atol": atol}
@@ -172,7 +177,7 @@ def basin_fractions(
     found = _found_along(variation, values, np.stack(starts), numbers)
     if moves is None:
         moves = MOVES * _longest(corners, found)
-    return _matched(found, values, moves, n, variation.names[0])
+    return _matched(found, values, moves, n, variation)
 
 
 def _longest(corners: np.ndarray, found: list[list["_Met"]]) -> float:
@@ -265,7 +270,7 @@ def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
 
 
 def _matched(
-    found: list[list[_Met]], values: np.ndarray, moves: float, n: int, name: str
+    found: list[list[_Met]], values: np.ndarray, moves: float, n: int, variation: Variation
 ) -> BasinFractions:
     """The attractors at each value, matched with those before it."""
     names: list[str] = []
@@ -299,7 +304,15 @@ def _matched(
     columns = dict(zip(PLACE, places, strict=True))
     errors = standard_error(fractions, n)
     return BasinFractions(
-        values, tuple(names), fractions, errors, undecided, **columns, n=n, name=name
+        values,
+        tuple(names),
+        fractions,
+        errors,
+        undecided,
+        **columns,
+        n=n,
+        name=variation.names[0],
+        is_argument=not variation.varies_leaves,
     )
 
 

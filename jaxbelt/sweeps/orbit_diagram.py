@@ -29,7 +29,7 @@ from ..checks import (
 from ..cycles.attractors import RUN
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
-from ..model.variations import Variation, varied
+from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
@@ -60,8 +60,8 @@ class OrbitDiagram(eqx.Module):
     cycle, else NaN, likewise; status: a `Status` each. x1, x2: the points of the attractors,
     [values, starts, points], NaN where there are fewer: of a cycle one for each of its moments, in
     their order; of what rests the one at which it does; dimensionless. at: which moments these are;
-    name: of the parameter, as the path to it, or that of the function's argument; sampling: what
-    `over` asks again.
+    name: of the parameter, as the path to it, or that of the function's argument (then is_argument
+    is true); sampling: what `over` asks again.
     """
 
     values: np.ndarray
@@ -73,6 +73,7 @@ class OrbitDiagram(eqx.Module):
     at: Any = eqx.field(static=True)
     name: str = eqx.field(static=True)
     sampling: "Sampling" = eqx.field(static=True, repr=False)
+    is_argument: bool = eqx.field(static=True, default=False)
 
     def over(self, span: tuple[float, float]) -> "OrbitDiagram":
         """The same over another span of the parameter, (first, last): with as many values, so that
@@ -142,7 +143,7 @@ def orbit_diagram(
     """
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
-    first, last = as_interval(span, "span")
+    first, last = as_span(span, where)
     at = AtExtrema("x1") if at is None else at
     kinds = AtExtrema | AtSection | AtEvents
     require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
@@ -187,7 +188,7 @@ class Sampling:
         # Codes of runs that are not finite are not numbers.
         kind = np.nan_to_num(found["kind"]).astype(int)
         status = found["status"].astype(int)
-        x1, x2 = (np.where(kind == UNDECIDED, np.nan, found[name])[:, None] for name in RESTS_AT)
+        x1, x2 = (found[name][:, None] for name in RESTS_AT)
         cycles = np.flatnonzero(kind == CYCLE)
         if len(cycles):
             loops = {name: found[name][cycles] for name in ("x1_min", "x1_max", "period")}
@@ -207,6 +208,7 @@ class Sampling:
             at=self.at,
             name=self.variation.names[0],
             sampling=self,
+            is_argument=not self.variation.varies_leaves,
         )
 
     def _make(self, parameter: Any) -> Oscillator:

@@ -57,8 +57,10 @@ def sweep(
 
     make: a function of parameters that returns an `Oscillator`, such as `jb.presets.class_b`; the
     rest of its arguments can be fixed by `functools.partial`. It is called with traced arrays.
-    axes: values, shape [n], of arguments of `make`, and of `x1` and `x2` for starts; NaN is
-    allowed and gives runs with the status NOT_FINITE. y0: start (x1, x2) where no axis says
+    axes: values, shape [n], of arguments of `make`, and of `x1` and `x2` for starts. NaN, and
+    parameters that are impossible, such as a negative load, give runs with the status NOT_FINITE;
+    but the oscillator at the first finite value of each axis, which is made before anything runs,
+    has to be possible. y0: start (x1, x2) where no axis says
     otherwise. t1: end of each run, from t = 0 (dimensionless time tau = omega t). rtol, atol:
     tolerances of a step.
 
@@ -69,8 +71,9 @@ def sweep(
       given), signature (the events of one loop, kind and belt), sticks(belt), period,
       stick_duration(belt) in a loop (inf where stuck for ever), x1_min, x1_max, x2_min, x2_max on
       the attractor, transient: the time at which it was reached, n_events: of a cycle in one loop,
-      else until it was known. Runs end as soon as their attractor is known, see
-      `attractor.Attractor`.
+      else until it was known. What is undecided has no attractor: all of these are NaN, sticks is
+      false, signature "none", and n_events those of the run. Runs end as soon as their attractor is
+      known, see `attractor.Attractor`.
     - an object with three methods for scalars: `init(osc, x1, x2)`, the state of a run, any tree of
       arrays; `update(state, event)`, the state after an `observers.RunEvent` (t, x1, x2, kind,
       belt); and `finish(state, end)`, a dictionary of results, numbers or vectors, from the state
@@ -84,17 +87,17 @@ def sweep(
     kind, are integers with the attributes flag_values and flag_meanings; `decoded` gives the words.
 
     derivatives: names of axes. Adds `d_<variable>_d_<axis>` for every variable that is a float, by
-    forward mode. store: a folder for the results as they come in, a Zarr group that
-    `xarray.open_zarr` opens; the same call with the same store goes on where one was interrupted,
-    and returns at once what is finished. executor: a `dask.distributed.Client`, whose workers then
-    do the blocks of the store, in a folder that all of them see; a worker that dies costs the block
-    that it was at. blocks: (first, last), which blocks of the store to do, `last` not among them,
-    for processes that share one store, such as those of a job array; who ends last finishes the
-    store, in which until then runs that are not done have the status and the kind -1, "not_done".
-    progress: whether to show a bar; None: on a terminal, when it takes long. audit: share of the
-    runs that are done once more without any shortcut and compared, see `audit` for what is left
-    out; the attributes audited and audit_differed say how many, and a warning says so where one
-    differed.
+    forward mode; NaN where the variable is not finite. store: a folder for the results as they come
+    in, a Zarr group that `xarray.open_zarr` opens; the same call with the same store goes on where
+    one was interrupted, and returns at once what is finished. executor: a
+    `dask.distributed.Client`, whose workers then do the blocks of the store, in a folder that all
+    of them see; a worker that dies costs the block that it was at. blocks: (first, last), which
+    blocks of the store to do, `last` not among them, for processes that share one store, such as
+    those of a job array; who ends last finishes the store, in which until then runs that are not
+    done have the status and the kind -1, "not_done". progress: whether to show a bar; None: on a
+    terminal, when it takes long. audit: share of the runs that are done once more without any
+    shortcut and compared, see `audit` for what is left out; the attributes audited and
+    audit_differed say how many, and a warning says so where one differed.
 
     Uses every core (every device, if JAX has others). `ValueError` names the argument that is
     impossible, a store of another sweep among them, and says what differs. `KeyboardInterrupt` ends
