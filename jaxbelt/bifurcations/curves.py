@@ -41,6 +41,8 @@ SHRINKS = 8
 #: A cycle changes by less in a step, relative to its size; a fixed point by less. Along curves of
 #: classes (b), (c) and (d) it was 0.15 at most.
 FAR = 0.2
+#: A curve that comes so near to a belt at rest comes no nearer in any number of steps.
+CREEPS = 1e-6
 
 
 class BifurcationCurve(eqx.Module):
@@ -270,10 +272,12 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         if end is not Stop.LEFT_SPAN and (limit := _limit(problem, track, rows, last, end)):
             rows += _towards(problem, rows[-1].values, limit)
             return _Side(rows, [*special, limit], Stop.STOPPED)
+        if creeping := _at_rest(problem, rows, CREEPS):
+            return _Side(rows, [*special, creeping], Stop.STOPPED)
         if len(rows) >= problem.max_points or not points:
-            return _Side(rows, special, Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL)
+            return _ended(problem, rows, special, Stop.POINT_COUNT if points else None)
         if beyond is None and end is not Stop.POINT_COUNT:
-            return _Side(rows, special, end)
+            return _ended(problem, rows, special, end)
         if beyond is None:
             # The same curve, its mesh spread anew.
             track, u, direction = track.remeshed(last, points[-1][0].tangent)
@@ -284,11 +288,57 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         place = track.place(last)
         further = None if is_end else _beyond(problem, last[-2:], centre, place)
         if further is None:
-            return _Side(rows, special, Stop.STOPPED)
+            return _ended(problem, rows, special, Stop.STOPPED)
         track, u = _Track.begun(problem, *further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
         rows.append(_row_at(problem, track, u, track.look(u)))
+
+
+def _ended(
+    problem: _Problem, rows: list[_Row], special: list[SpecialPoint], end: Stop | None
+) -> _Side:
+    """A side that ends after these rows; None: no step is short enough."""
+    end = end or Stop.STEP_TOO_SMALL
+    goes_on = end in (Stop.LEFT_SPAN, Stop.CLOSED)
+    limit = None if goes_on else _at_rest(problem, rows, 2 * problem.step)
+    if limit is None or any(np.allclose(limit.values, one.values) for one in special):
+        return _Side(rows, special, end)
+    return _Side(rows, [*special, limit], end)
+
+
+def _at_rest(problem: _Problem, rows: list[_Row], near: float) -> SpecialPoint | None:
+    """Where belts come to rest at the end of these rows, if one parameter is as near to that.
+
+    The time that the mass sticks goes to infinity there, so no step leads there. Where two belts
+    come to rest both parameters are known, else one: what the other one comes to is extrapolated.
+    """
+    if len(rows) < 3:
+        return None
+    values = np.array([row.values for row in rows[-3:]])
+    family = problem.variation.family(values[-1])
+    belts = range(len(family.oscillator.belts))
+    slopes = np.array([family.belt_slopes(belt, "velocity") for belt in belts], float)
+    oscs = [problem.variation.oscillator(row) for row in values]
+    v = np.array([[float(osc.belts[belt].velocity) for osc in oscs] for belt in belts])
+    size = np.linalg.norm(slopes, axis=1)
+    falls = (np.abs(v[:, 2]) < np.abs(v[:, 1])) & (np.abs(v[:, 1]) < np.abs(v[:, 0]))
+    stop = np.flatnonzero(falls & (np.abs(v[:, 2]) < near * size) & (v[:, 2] != 0))
+    if not stop.size:
+        return None
+    if np.linalg.matrix_rank(slopes[stop]) == 2:
+        shift = np.linalg.lstsq(slopes[stop], -v[stop, 2], rcond=None)[0]
+        at, error = values[-1] + shift, 0.0
+    else:
+        part = v[stop[0]] / v[stop[0], 2]
+        fits = [
+            np.array([np.polyval(np.polyfit(part[-n:], row, n - 1), 0.0) for row in values[-n:].T])
+            for n in (2, 3)
+        ]
+        at, error = fits[1], float(np.max(np.abs(fits[1] - fits[0])))
+    if np.linalg.norm(at - values[-1]) > 3 * problem.step:
+        return None
+    return SpecialPoint("BeltAtRest", tuple(stop.tolist()), (float(at[0]), float(at[1])), error)
 
 
 class _Leg(NamedTuple):

@@ -33,7 +33,7 @@ from ..tables import per_belt, table_of
 from .conditions import BifurcationPoint
 from .labels import Label
 from .path import ParameterPath
-from .regions import in_plane_of_paper, region_name
+from .cells import in_plane_of_paper, region_name
 from .scan import by_value, edges_touched, search
 
 if TYPE_CHECKING:
