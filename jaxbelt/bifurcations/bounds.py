@@ -26,12 +26,21 @@ from .special import SpecialPoint
 #: A curve bounds two neighbouring cells if it passes the way between them so near, in cells: chords
 #: of a bent curve are off by less.
 PASSES = 0.1
-#: A pair between which nothing is found stands for others of the same two motions so near, in cells.
+#: A pair between which nothing is found stands for others of the same two motions so near, in
+#: cells.
 ALIKE = 3.0
 #: Points on the way between two cells, and on a curve, so many a cell, whose distances are taken.
 PER_CELL = 8
 #: Values looked at first between two cells.
 BETWEEN = 6
+
+#: So many rows of a curve in succession on another one tell that they are one from there.
+DOUBLED = 4
+#: Places of one cycle on two curves differ by less, relative to its size.
+SAME_PLACE = 0.02
+#: A curve ends in a point that is known, if it is no farther than so many steps, and its own last
+#: rows lead by there, at this part of the distance; rows that tell.
+MEETS, MISSES, ROWS = 4.0, 0.2, 4
 
 #: Two neighbouring cells, the parameters of each.
 Pair = tuple[tuple[float, float], tuple[float, float]]
@@ -71,16 +80,16 @@ class Bounds:
                 self._follow(found.result(), along, fixed, told)
 
     def search_between(self, motions: np.ndarray, left_out: np.ndarray) -> tuple[Pair, ...]:
-        """Follow the curves between neighbouring cells that differ; return the pairs that have none.
+        """Follow the curves between neighbouring cells that differ; returns the pairs without any.
 
         motions: a number for what there is in each cell, [n, m], negative where that is not known;
         left_out: cells that are not asked, [n, m].
         """
-        rows = _differing(motions, left_out)
-        rows = rows[self._away(rows) > PASSES]
+        rows = differing(motions, left_out)
+        rows = rows[self.away(rows) > PASSES]
         untried = np.ones(len(rows), bool)
         while np.any(untried):
-            away = np.where(untried, self._away(rows), -1.0)
+            away = np.where(untried, self.away(rows), -1.0)
             # Far from curves that are known, and so from points of codimension two on them.
             at = int(np.argmax(away))
             row, column, along = rows[at].tolist()
@@ -92,11 +101,22 @@ class Bounds:
             self._follow(self._points(along, fixed, ends, BETWEEN), along, fixed, "pairs of cells")
             untried[at] = False
             if len(self.curves) > known:
-                left = self._away(rows) > PASSES
+                left = self.away(rows) > PASSES
                 rows, untried = rows[left], untried[left]
             else:
                 untried &= ~_alike(rows, at, motions)
-        return tuple(self._pair(row) for row in rows.tolist())
+        return tuple(self.pair(row) for row in rows.tolist())
+
+    def name_ends(self) -> None:
+        """Give ends without a name that of the point in which they meet another curve."""
+        for number, curve in enumerate(self.curves):
+            others = [other for other in self.curves if other is not curve]
+            known = [point for other in others for point in other.special]
+            for end in (0, -1):
+                if (point := _end_of(curve, end, known, self.step)) is not None:
+                    where = (point, *curve.special) if end == 0 else (*curve.special, point)
+                    curve = replace(curve, special=where)
+            self.curves[number] = curve
 
     def _points(self, along: int, fixed: float, ends, resolution: int = 0):
         """The points on a line parallel to an axis, the other parameter being fixed."""
@@ -118,30 +138,30 @@ class Bounds:
             ):
                 limits, step = self.limits, self.step
                 curve = follow_point(self.variation, point, pair, limits, step=step)
-                self.curves.append(curve)
+                self.curves.append(_without_known(curve, pair, self.curves, step))
 
-    def _away(self, rows: np.ndarray) -> np.ndarray:
+    def away(self, rows: np.ndarray) -> np.ndarray:
         """How far from the way between the two cells the next curve passes, in cells, [pairs]."""
         from scipy.spatial import KDTree  # late, as only maps need it
 
         if not self.curves or not len(rows):
             return np.full(len(rows), np.inf)
         paths = [_densely(curve.path / self.cell, 1 / PER_CELL) for curve in self.curves]
-        ends = np.array([self._pair(row) for row in rows.tolist()]) / self.cell
+        ends = np.array([self.pair(row) for row in rows.tolist()]) / self.cell
         parts = np.linspace(0, 1, PER_CELL + 1)[:, None, None]
         ways = (1 - parts) * ends[None, :, 0] + parts * ends[None, :, 1]
         away, _ = KDTree(np.concatenate(paths)).query(ways)
         return np.min(away, axis=0)
 
-    def _pair(self, row: Sequence[int]) -> Pair:
-        """The two cells of a row of `_differing`."""
+    def pair(self, row: Sequence[int]) -> Pair:
+        """The two cells of a row of `differing`."""
         i, j, along = row
         p, q = self.values
         other = (i + 1, j) if along == 0 else (i, j + 1)
         return (float(p[i]), float(q[j])), (float(p[other[0]]), float(q[other[1]]))
 
 
-def _differing(motions: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+def differing(motions: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     """Neighbouring cells that differ: row and column of the first one, and the axis, [pairs, 3]."""
     told = (motions >= 0) & ~left_out
     found = []
@@ -170,6 +190,97 @@ def _densely(path: np.ndarray, apart: float) -> np.ndarray:
     gone = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
     along = np.union1d(gone, np.arange(0.0, gone[-1], apart))
     return np.column_stack([np.interp(along, gone, column) for column in path.T])
+
+
+def _without_known(
+    curve: BifurcationCurve, start: np.ndarray, known: Sequence[BifurcationCurve], step: float
+) -> BifurcationCurve:
+    """The part of a curve, around where it began, that is on no other one: where curves of one kind
+    meet in a point of codimension two, they may go on as one."""
+    doubled = np.zeros(len(curve), bool)
+    for other in known:
+        if other.condition.lineage == curve.condition.lineage and len(other) > 1:
+            doubled |= _rows_on(curve, other, 0.02 * step)
+    begun = int(np.argmin(np.hypot(*(curve.values - start).T)))
+    first, last = 0, len(curve) - 1
+    # A few rows may be near where two curves cross.
+    for row in range(begun, -1, -1):
+        if row >= DOUBLED and np.all(doubled[row - DOUBLED + 1 : row + 1]):
+            first = min(row + 1, begun)
+            break
+    for row in range(begun, len(curve)):
+        if row + DOUBLED <= len(curve) and np.all(doubled[row : row + DOUBLED]):
+            last = max(row - 1, begun)
+            break
+    return _cut(curve, first, last)
+
+
+def _rows_on(curve: BifurcationCurve, other: BifurcationCurve, near: float) -> np.ndarray:
+    """Which rows of a curve are on another one, in the same place, [rows]."""
+    a, chord = other.values[:-1], np.diff(other.values, axis=0)
+    found = np.zeros(len(curve), bool)
+    for row, (at, place) in enumerate(zip(curve.values, curve.places, strict=True)):
+        along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
+        along = np.clip(along, 0, 1)[:, None]
+        away = np.hypot(*(at - a - along * chord).T)
+        nearest = int(np.argmin(away))
+        there = other.places[nearest] + along[nearest] * np.diff(other.places, axis=0)[nearest]
+        found[row] = away[nearest] < near and not is_elsewhere(place, there, SAME_PLACE)
+    return found
+
+
+def _cut(curve: BifurcationCurve, first: int, last: int) -> BifurcationCurve:
+    """A curve from one of its rows to another."""
+    if (first, last) == (0, len(curve) - 1):
+        return curve
+    special, row = [], -1
+    for item in curve.in_order():
+        if isinstance(item, SpecialPoint):
+            # Those between the last row left out and the first one kept are its ends.
+            if first - 1 <= row <= last:
+                special.append(item)
+        else:
+            row = item
+    kept = slice(first, last + 1)
+    ends = [
+        end if row == whole else Stop.STOPPED
+        for end, row, whole in zip(curve.ends, (first, last), (0, len(curve) - 1), strict=True)
+    ]
+    return replace(
+        curve,
+        values=curve.values[kept],
+        classes=curve.classes[kept],
+        multiplier=curve.multiplier[kept],
+        residual=curve.residual[kept],
+        places=curve.places[kept],
+        special=tuple(special),
+        ends=(ends[0], ends[1]),
+    )
+
+
+def _end_of(
+    curve: BifurcationCurve, end: int, known: Sequence[SpecialPoint], step: float
+) -> SpecialPoint | None:
+    """The point, of those known, in which a curve ends at its first row, 0, or its last one, -1, if
+    it stops there for no reason that is known.
+
+    It is near, and the curve goes there: as far as a parabola through its last rows tells.
+    """
+    if curve.ends[end] in (Stop.LEFT_SPAN, Stop.CLOSED) or curve.is_named(end):
+        return None
+    rows = curve.values[:ROWS] if end == 0 else curve.values[::-1][:ROWS]
+    gone = np.append(0.0, np.cumsum(np.hypot(*np.diff(rows, axis=0).T)))
+    degree = min(2, len(rows) - 1)
+    ahead = np.linspace(0.0, -MEETS * step, 200)
+    fits = [np.polyfit(gone, column, degree) for column in rows.T]
+    path = np.column_stack([np.polyval(fit, ahead) for fit in fits])
+    found = []
+    for point in known:
+        gap = float(np.hypot(*(point.values - rows[0])))
+        miss = float(np.min(np.hypot(*(path - point.values).T)))
+        if gap < MEETS * step and miss < MISSES * max(gap, 0.1 * step):
+            found.append((gap, point))
+    return min(found, key=lambda one: one[0])[1] if found else None
 
 
 def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, step: float) -> bool:

@@ -9,6 +9,7 @@ point of codimension two. There the signature may change; the condition is then 
 beyond, and the curve goes on from there with the signature that is found.
 """
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,7 +28,7 @@ from ..numerics.continuation import Corrected, CurvePoint, Stop, continue_curve,
 from ..results import Status, draw
 from ..tables import table_of
 from .conditions import AbstractCondition, BifurcationPoint, Trail
-from .special import SpecialPoint
+from .special import SpecialPoint, where_belts_stop
 from .systems import AbstractSystem, Seen
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ class BifurcationCurve(eqx.Module):
     @property
     def path(self) -> np.ndarray:
         """The values with those of the special points among them, [rows + special, 2]."""
-        at = (i.values if isinstance(i, SpecialPoint) else self.values[i] for i in self._order())
+        at = (i.values if isinstance(i, SpecialPoint) else self.values[i] for i in self.in_order())
         return np.array(list(at))
 
     def table(self, names: tuple[str, str] | None = None) -> "pandas.DataFrame":
@@ -89,7 +90,7 @@ class BifurcationCurve(eqx.Module):
         """
         belts, kinds = self.condition.belts_concerned, self.kinds
         rows, kind = [], kinds[0]
-        for item in self._order():
+        for item in self.in_order():
             if isinstance(item, SpecialPoint):
                 values, multiplier, residual = item.values, np.nan, item.residual
                 special = " ".join(map(str, (item.kind, *item.belts)))
@@ -108,7 +109,7 @@ class BifurcationCurve(eqx.Module):
             )
         return table_of(rows)
 
-    def _order(self) -> list[int | SpecialPoint]:
+    def in_order(self) -> list[int | SpecialPoint]:
         """The numbers of the rows, and the special points at their places among them."""
         path, order = self.values, list[int | SpecialPoint](range(len(self)))
         for point in self.special:
@@ -121,6 +122,10 @@ class BifurcationCurve(eqx.Module):
             path = np.insert(path, place, at, axis=0)
             order.insert(place, point)
         return order
+
+    def is_named(self, end: int) -> bool:
+        """Whether it ends, at its first row, 0, or its last one, -1, in a special point."""
+        return isinstance(self.in_order()[end], SpecialPoint)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned."""
@@ -272,7 +277,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         if end is not Stop.LEFT_SPAN and (limit := _limit(problem, track, rows, last, end)):
             rows += _towards(problem, rows[-1].values, limit)
             return _Side(rows, [*special, limit], Stop.STOPPED)
-        if creeping := _at_rest(problem, rows, CREEPS):
+        if end is not Stop.LEFT_SPAN and (creeping := _at_rest(problem, rows, CREEPS)):
             return _Side(rows, [*special, creeping], Stop.STOPPED)
         if len(rows) >= problem.max_points or not points:
             return _ended(problem, rows, special, Stop.POINT_COUNT if points else None)
@@ -302,43 +307,15 @@ def _ended(
     end = end or Stop.STEP_TOO_SMALL
     goes_on = end in (Stop.LEFT_SPAN, Stop.CLOSED)
     limit = None if goes_on else _at_rest(problem, rows, 2 * problem.step)
-    if limit is None or any(np.allclose(limit.values, one.values) for one in special):
+    known = [one.values for one in special if one.kind == "BeltAtRest"]
+    if limit is None or any(math.dist(limit.values, one) < problem.step for one in known):
         return _Side(rows, special, end)
     return _Side(rows, [*special, limit], end)
 
 
 def _at_rest(problem: _Problem, rows: list[_Row], near: float) -> SpecialPoint | None:
-    """Where belts come to rest at the end of these rows, if one parameter is as near to that.
-
-    The time that the mass sticks goes to infinity there, so no step leads there. Where two belts
-    come to rest both parameters are known, else one: what the other one comes to is extrapolated.
-    """
-    if len(rows) < 3:
-        return None
     values = np.array([row.values for row in rows[-3:]])
-    family = problem.variation.family(values[-1])
-    belts = range(len(family.oscillator.belts))
-    slopes = np.array([family.belt_slopes(belt, "velocity") for belt in belts], float)
-    oscs = [problem.variation.oscillator(row) for row in values]
-    v = np.array([[float(osc.belts[belt].velocity) for osc in oscs] for belt in belts])
-    size = np.linalg.norm(slopes, axis=1)
-    falls = (np.abs(v[:, 2]) < np.abs(v[:, 1])) & (np.abs(v[:, 1]) < np.abs(v[:, 0]))
-    stop = np.flatnonzero(falls & (np.abs(v[:, 2]) < near * size) & (v[:, 2] != 0))
-    if not stop.size:
-        return None
-    if np.linalg.matrix_rank(slopes[stop]) == 2:
-        shift = np.linalg.lstsq(slopes[stop], -v[stop, 2], rcond=None)[0]
-        at, error = values[-1] + shift, 0.0
-    else:
-        part = v[stop[0]] / v[stop[0], 2]
-        fits = [
-            np.array([np.polyval(np.polyfit(part[-n:], row, n - 1), 0.0) for row in values[-n:].T])
-            for n in (2, 3)
-        ]
-        at, error = fits[1], float(np.max(np.abs(fits[1] - fits[0])))
-    if np.linalg.norm(at - values[-1]) > 3 * problem.step:
-        return None
-    return SpecialPoint("BeltAtRest", tuple(stop.tolist()), (float(at[0]), float(at[1])), error)
+    return where_belts_stop(problem.variation, values, near, 3 * problem.step)
 
 
 class _Leg(NamedTuple):

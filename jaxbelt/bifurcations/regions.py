@@ -153,9 +153,10 @@ def region_map(
 
     make: gives an `Oscillator`, such as `jb.presets.class_b`; axes: two of its arguments and their
     values, increasing. starts: further ones, (x1, x2), from which each cell is run; those from
-    which `scan` follows orbits are always taken, and what attracts none of them is not seen. step: between the points of the curves, in units of the larger side of the map / 1.4; lines: on how many
-    lines parallel to each axis curves are looked for first, then between the cells that differ; 0
-    for no curves. `ValueError` names an impossible argument.
+    which `scan` follows orbits are always taken, and what attracts none of them is not seen. step:
+    between the points of the curves, in units of the larger side of the map / 1.4; lines: on how
+    many lines parallel to each axis curves are looked for first, then between the cells that
+    differ; 0 for no curves. `ValueError` names an impossible argument.
     """
     expected = "a dictionary, two arguments of make and their values"
     require_value(isinstance(axes, Mapping) and len(axes) == 2, "axes", expected, axes)
@@ -169,7 +170,7 @@ def region_map(
     step = as_positive(step, "step")
     lines = as_whole(lines, "lines", 0)
     span = names[0], names[1]
-    bounds = Bounds(_varied(make, span, values), values, step)
+    bounds = Bounds(varied_by_names(make, span, values), values, step)
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:
         seen = beside.submit(_look_at_all, make, span, values, further)
@@ -177,6 +178,7 @@ def region_map(
             bounds.search_lines(lines)
         label, motions, on_line = seen.result()
     uncovered = bounds.search_between(motions, on_line) if lines else ()
+    bounds.name_ends()
     curves = tuple(bounds.curves)
     cycles = _cycles_of_examples(make, span, values, label)
     between = _names_between(make, span, values, label, on_line, curves, further)
@@ -184,7 +186,9 @@ def region_map(
     return RegionMap(span, pair, label, curves, cycles, on_line, between, make, uncovered)
 
 
-def _varied(make, names: tuple[str, str], values: Sequence[np.ndarray]) -> Variation:
+def varied_by_names(make, names: tuple[str, str], values: Sequence[np.ndarray]) -> Variation:
+    """What is varied in a plane of two arguments of `make`; values: of both, possible ones first."""
+
     def at(p, q):
         return make(**dict(zip(names, (p, q), strict=True)))
 

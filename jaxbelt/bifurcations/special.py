@@ -2,6 +2,9 @@
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
+from ..model.variations import Variation
 from ..results import draw
 from ..tables import table_of
 
@@ -18,7 +21,7 @@ class SpecialPoint(NamedTuple):
     "BoundaryHopf" (a Hopf point on a contact edge: there the curves of boundary equilibria and of
     pseudo-Hopf points meet its own), "BeltAtRest", "EqualVelocities", or what a condition of your
     own watches; belts: concerned; values: of the two parameters; residual: the largest error in all
-    equations.
+    equations, where a curve ends at a belt at rest of the extrapolation there.
     """
 
     kind: str
@@ -36,3 +39,40 @@ class SpecialPoint(NamedTuple):
         """Draw it as a dot with its name in the plane of the two parameters, into the axes `ax`
         (None: new ones), which are returned."""
         return draw(self, ax)
+
+
+def where_belts_stop(
+    variation: Variation, values: np.ndarray, near: float, far: float
+) -> SpecialPoint | None:
+    """Where belts come to rest at the end of a curve, if a parameter is so near to that.
+
+    variation: of both; values: of the last rows, [rows, 2]; far: the point is not so far from the
+    last one. The time that the mass sticks goes to infinity there, so no step leads there. Where
+    two belts come to rest both parameters are known, else one: what the other comes to is
+    extrapolated, and the residual is by how much a parabola and a line differ there.
+    """
+    if len(values) < 3:
+        return None
+    family = variation.family(values[-1])
+    belts = range(len(family.oscillator.belts))
+    slopes = np.array([family.belt_slopes(belt, "velocity") for belt in belts], float)
+    oscs = [variation.oscillator(row) for row in values[-3:]]
+    v = np.array([[float(osc.belts[belt].velocity) for osc in oscs] for belt in belts])
+    size = np.abs(v)
+    falls = (0 < size[:, 2]) & (size[:, 2] < size[:, 1]) & (size[:, 1] < size[:, 0])
+    stop = np.flatnonzero(falls & (size[:, 2] < near * np.linalg.norm(slopes, axis=1)))
+    if not stop.size:
+        return None
+    if np.linalg.matrix_rank(slopes[stop]) == 2:
+        at = values[-1] - np.linalg.lstsq(slopes[stop], v[stop, 2], rcond=None)[0]
+        error = 0.0
+    else:
+        part = v[stop[0]] / v[stop[0], 2]
+        line, at = (
+            np.array([np.polyval(np.polyfit(part[-n:], row[-n:], n - 1), 0.0) for row in values.T])
+            for n in (2, 3)
+        )
+        error = float(np.max(np.abs(at - line)))
+    if np.linalg.norm(at - values[-1]) > far:
+        return None
+    return SpecialPoint("BeltAtRest", tuple(stop.tolist()), (float(at[0]), float(at[1])), error)
