@@ -271,7 +271,8 @@ def _end_of(
     rows = curve.values[:ROWS] if end == 0 else curve.values[::-1][:ROWS]
     gone = np.append(0.0, np.cumsum(np.hypot(*np.diff(rows, axis=0).T)))
     degree = min(2, len(rows) - 1)
-    ahead = np.linspace(0.0, -MEETS * step, 200)
+    # Where it was cut it may have gone a little beyond.
+    ahead = np.linspace(step, -MEETS * step, 200)
     fits = [np.polyfit(gone, column, degree) for column in rows.T]
     path = np.column_stack([np.polyval(fit, ahead) for fit in fits])
     found = []

@@ -187,7 +187,7 @@ def region_map(
 
 
 def varied_by_names(make, names: tuple[str, str], values: Sequence[np.ndarray]) -> Variation:
-    """What is varied in a plane of two arguments of `make`; values: of both, possible ones first."""
+    """What is varied in a plane of two arguments of `make`; values: of both, possible ones."""
 
     def at(p, q):
         return make(**dict(zip(names, (p, q), strict=True)))

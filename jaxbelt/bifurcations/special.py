@@ -18,6 +18,7 @@ class SpecialPoint(NamedTuple):
     kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
     "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
     point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too),
+    "EdgeTouch" (a cycle touches a contact edge, too, or is tangent to a boundary just there),
     "BoundaryHopf" (a Hopf point on a contact edge: there the curves of boundary equilibria and of
     pseudo-Hopf points meet its own), "BeltAtRest", "EqualVelocities", or what a condition of your
     own watches; belts: concerned; values: of the two parameters; residual: the largest error in all
