@@ -36,8 +36,9 @@ BETWEEN = 6
 
 #: So many rows of a curve in succession on another one tell that they are one from there.
 DOUBLED = 4
-#: Places of one cycle on two curves differ by less, relative to its size.
-SAME_PLACE = 0.02
+#: Places of one cycle in rows of two curves that are a step apart differ by less, relative to its
+#: size.
+SAME_PLACE = 0.05
 #: A curve ends in a point that is known, if it is no farther than so many steps, and its own last
 #: rows lead by there, at this part of the distance; rows that tell.
 MEETS, MISSES, ROWS = 4.0, 0.2, 4
@@ -217,15 +218,14 @@ def _without_known(
 
 def _rows_on(curve: BifurcationCurve, other: BifurcationCurve, near: float) -> np.ndarray:
     """Which rows of a curve are on another one, in the same place, [rows]."""
-    a, chord = other.values[:-1], np.diff(other.values, axis=0)
+    path = other.path
+    a, chord = path[:-1], np.diff(path, axis=0)
     found = np.zeros(len(curve), bool)
     for row, (at, place) in enumerate(zip(curve.values, curve.places, strict=True)):
         along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
-        along = np.clip(along, 0, 1)[:, None]
-        away = np.hypot(*(at - a - along * chord).T)
-        nearest = int(np.argmin(away))
-        there = other.places[nearest] + along[nearest] * np.diff(other.places, axis=0)[nearest]
-        found[row] = away[nearest] < near and not is_elsewhere(place, there, SAME_PLACE)
+        away = np.hypot(*(at - a - np.clip(along, 0, 1)[:, None] * chord).T)
+        there = other.places[int(np.argmin(np.hypot(*(other.values - at).T)))]
+        found[row] = np.min(away) < near and not is_elsewhere(place, there, SAME_PLACE)
     return found
 
 

@@ -9,7 +9,6 @@ point of codimension two. There the signature may change; the condition is then 
 beyond, and the curve goes on from there with the signature that is found.
 """
 
-import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,7 +27,7 @@ from ..numerics.continuation import Corrected, CurvePoint, Stop, continue_curve,
 from ..results import Status, draw
 from ..tables import table_of
 from .conditions import AbstractCondition, BifurcationPoint, Trail
-from .special import SpecialPoint, where_belts_stop
+from .special import CREEPS, SpecialPoint, where_belts_stop, where_edge_is_touched
 from .systems import AbstractSystem, Seen
 
 if TYPE_CHECKING:
@@ -42,8 +41,6 @@ SHRINKS = 8
 #: A cycle changes by less in a step, relative to its size; a fixed point by less. Along curves of
 #: classes (b), (c) and (d) it was 0.15 at most.
 FAR = 0.2
-#: A curve that comes so near to a belt at rest comes no nearer in any number of steps.
-CREEPS = 1e-6
 
 
 class BifurcationCurve(eqx.Module):
@@ -280,7 +277,8 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         if end is not Stop.LEFT_SPAN and (creeping := _at_rest(problem, rows, CREEPS)):
             return _Side(rows, [*special, creeping], Stop.STOPPED)
         if len(rows) >= problem.max_points or not points:
-            return _ended(problem, rows, special, Stop.POINT_COUNT if points else None)
+            why = Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL
+            return _ended(problem, rows, special, why)
         if beyond is None and end is not Stop.POINT_COUNT:
             return _ended(problem, rows, special, end)
         if beyond is None:
@@ -293,7 +291,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         place = track.place(last)
         further = None if is_end else _beyond(problem, last[-2:], centre, place)
         if further is None:
-            return _ended(problem, rows, special, Stop.STOPPED)
+            return _ended(problem, rows, special)
         track, u = _Track.begun(problem, *further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
@@ -301,16 +299,18 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
 
 
 def _ended(
-    problem: _Problem, rows: list[_Row], special: list[SpecialPoint], end: Stop | None
+    problem: _Problem, rows: list[_Row], special: list[SpecialPoint], end: Stop = Stop.STOPPED
 ) -> _Side:
-    """A side that ends after these rows; None: no step is short enough."""
-    end = end or Stop.STEP_TOO_SMALL
-    goes_on = end in (Stop.LEFT_SPAN, Stop.CLOSED)
-    limit = None if goes_on else _at_rest(problem, rows, 2 * problem.step)
-    known = [one.values for one in special if one.kind == "BeltAtRest"]
-    if limit is None or any(math.dist(limit.values, one) < problem.step for one in known):
+    if end in (Stop.LEFT_SPAN, Stop.CLOSED):
         return _Side(rows, special, end)
-    return _Side(rows, [*special, limit], end)
+    limit = _at_rest(problem, rows, 2 * problem.step)
+    if limit is None and end is Stop.STEP_TOO_SMALL:
+        last = [np.stack(column) for column in zip(*((row.values, row.place) for row in rows[-2:]))]
+        limit = where_edge_is_touched(problem.variation, last[0], last[1])
+    known = [one.values for one in special if limit and one.kind == limit.kind]
+    apart = [np.hypot(*np.subtract(limit.values, one)) for one in known] if limit else [0.0]
+    named = [] if min(apart, default=np.inf) < problem.step else [limit]
+    return _Side(rows, [*special, *filter(None, named)], end)
 
 
 def _at_rest(problem: _Problem, rows: list[_Row], near: float) -> SpecialPoint | None:

@@ -11,6 +11,11 @@ from ..tables import table_of
 if TYPE_CHECKING:
     import pandas
 
+#: A curve that comes so near to a belt at rest comes no nearer in any number of steps.
+CREEPS = 1e-6
+#: A cycle that reaches less far beyond an edge all but touches it; by less is rounding.
+TOUCHES, TOUCHED = 1e-5, 1e-13
+
 
 class SpecialPoint(NamedTuple):
     """A point of codimension two on a curve.
@@ -18,11 +23,11 @@ class SpecialPoint(NamedTuple):
     kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
     "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
     point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too),
-    "EdgeTouch" (a cycle touches a contact edge, too, or is tangent to a boundary just there),
+    "EdgeTouch" (on an edge a cycle turns back, is tangent to a boundary, or begins to slip),
     "BoundaryHopf" (a Hopf point on a contact edge: there the curves of boundary equilibria and of
     pseudo-Hopf points meet its own), "BeltAtRest", "EqualVelocities", or what a condition of your
     own watches; belts: concerned; values: of the two parameters; residual: the largest error in all
-    equations, where a curve ends at a belt at rest of the extrapolation there.
+    equations; where the end of a curve is extrapolated, of that.
     """
 
     kind: str
@@ -77,3 +82,28 @@ def where_belts_stop(
     if np.linalg.norm(at - values[-1]) > far:
         return None
     return SpecialPoint("BeltAtRest", tuple(stop.tolist()), (float(at[0]), float(at[1])), error)
+
+
+def where_edge_is_touched(
+    variation: Variation, values: np.ndarray, places: np.ndarray
+) -> SpecialPoint | None:
+    """Where the part of a cycle that is beyond a contact edge vanishes at the end of a curve.
+
+    values, places: of its last rows, [rows, 2] and [rows, 5]. That part takes a time that goes like
+    the square root of how far it reaches, so no step leads there; the parameters are linear in that
+    root. The residual is how far the point is from the last row.
+    """
+    belts = variation.oscillator(values[-1]).belts
+    edges = {float(edge) for belt in belts for edge in (belt.lower, belt.upper)}
+    reaches = [
+        reach
+        for edge in edges - {np.inf, -np.inf}
+        for reach in (places[-2:, 1] - edge, edge - places[-2:, 0])
+        if len(reach) == 2 and TOUCHED < reach[1] < min(reach[0], TOUCHES)
+    ]
+    if not reaches:
+        return None
+    before, last = np.sqrt(min(reaches, key=lambda reach: reach[1]))
+    at = values[-1] + (values[-1] - values[-2]) * last / (before - last)
+    error = float(np.max(np.abs(at - values[-1])))
+    return SpecialPoint("EdgeTouch", (), (float(at[0]), float(at[1])), error)

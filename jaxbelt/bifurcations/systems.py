@@ -262,8 +262,8 @@ def contact_tests(name: str, nearest: Array, watched: Array) -> Tests:
 
 def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: int | Array = -1) -> Array:
     """How near a cycle is to passing a contact edge otherwise, NaN where there is none: the least
-    distance of an extremum of x1, or of a place where it is tangent to a boundary, from an edge of
-    its mode. without: an arc whose end is not asked."""
+    distance of an extremum of x1, of a place where it is tangent to a boundary, or of a slip onset,
+    from an edge of its mode. without: an arc whose end is not asked."""
     kinds = Ends(chain.codes.shape[-1])
     following = jnp.roll(z, -1, axis=0)
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
@@ -272,7 +272,8 @@ def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: int | Array =
     def distance(codes, x1):
         return jnp.min(jnp.stack(edge_guards(osc, mode_of(codes), x1)))
 
-    told = chain.used & ((chain.ends == kinds.extremum_x1) | (chain.ends >= kinds.tangent))
+    told = (chain.ends == kinds.extremum_x1) | (chain.ends == kinds.onset)
+    told = chain.used & (told | (chain.ends >= kinds.tangent))
     told = told & (jnp.arange(chain.ends.size) != without)
     nearest = jnp.min(jnp.where(told, jax.vmap(distance)(chain.codes, following[:, 0]), jnp.inf))
     return jnp.where(jnp.isfinite(nearest), nearest, jnp.nan)
