@@ -306,7 +306,7 @@ def _ended(
     limit = _at_rest(problem, rows, 2 * problem.step)
     if limit is None and end is Stop.STEP_TOO_SMALL:
         last = [np.stack(column) for column in zip(*((row.values, row.place) for row in rows[-2:]))]
-        limit = where_edge_is_touched(problem.variation, last[0], last[1])
+        limit = where_edge_is_touched(problem.variation, *last, 1e-2 * problem.step)
     known = [one.values for one in special if limit and one.kind == limit.kind]
     apart = [np.hypot(*np.subtract(limit.values, one)) for one in known] if limit else [0.0]
     named = [] if min(apart, default=np.inf) < problem.step else [limit]

@@ -85,13 +85,14 @@ def where_belts_stop(
 
 
 def where_edge_is_touched(
-    variation: Variation, values: np.ndarray, places: np.ndarray
+    variation: Variation, values: np.ndarray, places: np.ndarray, far: float
 ) -> SpecialPoint | None:
     """Where the part of a cycle that is beyond a contact edge vanishes at the end of a curve.
 
-    values, places: of its last rows, [rows, 2] and [rows, 5]. That part takes a time that goes like
-    the square root of how far it reaches, so no step leads there; the parameters are linear in that
-    root. The residual is how far the point is from the last row.
+    values, places: of its last rows, [rows, 2] and [rows, 5]; far: the point is not so far from the
+    last one. That part takes a time that goes like the square root of how far it reaches, so no
+    step leads there; the parameters are linear in that root. The residual is how far the point is
+    from the last row.
     """
     belts = variation.oscillator(values[-1]).belts
     edges = {float(edge) for belt in belts for edge in (belt.lower, belt.upper)}
@@ -106,4 +107,6 @@ def where_edge_is_touched(
     before, last = np.sqrt(min(reaches, key=lambda reach: reach[1]))
     at = values[-1] + (values[-1] - values[-2]) * last / (before - last)
     error = float(np.max(np.abs(at - values[-1])))
+    if error > far:
+        return None
     return SpecialPoint("EdgeTouch", (), (float(at[0]), float(at[1])), error)
