@@ -11,7 +11,7 @@ from campaign import engine
 from campaign.cases import PAPER
 
 import jaxbelt as jb
-from jaxbelt.bifurcations.bounds import Bounds, _without_known, differing
+from jaxbelt.bifurcations.bounds import Bounds, _without_known, neighbours_that_differ
 from jaxbelt.bifurcations.cells import look_at, region_name
 from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.regions import varied_by_names
@@ -21,17 +21,15 @@ NUS = ("nu0", "nu1")
 class_c, class_d = jb.presets.class_c, jb.presets.class_d
 
 
-def seen_by_engine(osc):
-    """The digit and the letters that a name begins with, from a grid of starts."""
-    belts, rests, cycles = len(osc.belts), False, {}
+def letters_seen_by_engine(osc):
+    """Those that the name of the region has for cycles, from a grid of starts."""
+    cycles = {}
     for start in itertools.product(np.linspace(-2.0, 2.0, 9), np.linspace(-1.0, 1.0, 5)):
         seen = engine.attractor(osc, start, t_max=5000.0)
-        rests |= seen.kind in ("equilibrium", "stuck")
         if seen.kind == "cycle":
-            code = sum(2**belt for belt in range(belts) if seen.sticks[belt] > 0)
+            code = sum(2**belt for belt in (0, 1) if seen.sticks[belt] > 0)
             cycles[round(seen.x1[1], 6), round(seen.period, 6)] = "sabc"[code]
-    number = 2 if rests and cycles else 3 if cycles else 1
-    return f"{number}{''.join(sorted(cycles.values()))}"
+    return "".join(sorted(cycles.values()))
 
 
 def test_cells_have_the_attractors_that_an_engine_finds_from_a_grid_of_starts():
@@ -45,7 +43,8 @@ def test_cells_have_the_attractors_that_an_engine_finds_from_a_grid_of_starts():
             engine.Belt(nu0, PAPER, 1.0, -np.inf, 0.3),
             engine.Belt(nu1, PAPER, 1.0, -0.3, np.inf),
         )
-        assert name.partition(":")[0] == seen_by_engine(engine.Oscillator(0.5, belts))
+        letters = letters_seen_by_engine(engine.Oscillator(0.5, belts))
+        assert name.partition(":")[0][1:] == letters
 
 
 def test_names_tell_equilibria_where_there_are_edges():
@@ -78,7 +77,7 @@ def test_curves_are_found_where_no_line_meets_them(corner_of_map):
     bounds.search_lines(1)
     grid = np.meshgrid(*told.values, indexing="ij")
     cells = look_at(make, told.names, np.column_stack([axis.ravel() for axis in grid]))
-    pairs = differing(cells.motions.reshape(grid[0].shape), told.on_line)
+    pairs = neighbours_that_differ(cells.motions.reshape(grid[0].shape), told.on_line)
     missing = int(np.sum(bounds.away(pairs) > 0.5))
     bounds.curves = list(told.curves)
     assert missing > 0 and np.all(bounds.away(pairs) < 0.5)

@@ -19,13 +19,14 @@ from ..numerics.continuation import Stop
 from ..results import Status
 from .conditions import BifurcationPoint
 from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
+from .faces import densely
 from .path import ParameterPath
 from .scan import search
 from .special import SpecialPoint
 
 #: A curve bounds two neighbouring cells if it passes the way between them so near, in cells: chords
 #: of a bent curve are off by less.
-PASSES = 0.1
+PASSES_BY = 0.1
 #: A pair between which nothing is found stands for others of the same two motions so near, in
 #: cells.
 ALIKE = 3.0
@@ -41,7 +42,7 @@ DOUBLED = 4
 SAME_PLACE = 0.05
 #: A curve ends in a point that is known, if it is no farther than so many steps, and its own last
 #: rows lead by there, at this part of the distance; rows that tell.
-MEETS, MISSES, ROWS = 4.0, 0.2, 4
+MEETS, MISSES, END_ROWS = 4.0, 0.2, 4
 
 #: Two neighbouring cells, the parameters of each.
 Pair = tuple[tuple[float, float], tuple[float, float]]
@@ -86,8 +87,8 @@ class Bounds:
         motions: a number for what there is in each cell, [n, m], negative where that is not known;
         left_out: cells that are not asked, [n, m].
         """
-        rows = differing(motions, left_out)
-        rows = rows[self.away(rows) > PASSES]
+        rows = neighbours_that_differ(motions, left_out)
+        rows = rows[self.away(rows) > PASSES_BY]
         untried = np.ones(len(rows), bool)
         while np.any(untried):
             away = np.where(untried, self.away(rows), -1.0)
@@ -102,7 +103,7 @@ class Bounds:
             self._follow(self._points(along, fixed, ends, BETWEEN), along, fixed, "pairs of cells")
             untried[at] = False
             if len(self.curves) > known:
-                left = self.away(rows) > PASSES
+                left = self.away(rows) > PASSES_BY
                 rows, untried = rows[left], untried[left]
             else:
                 untried &= ~_alike(rows, at, motions)
@@ -114,7 +115,7 @@ class Bounds:
             others = [other for other in self.curves if other is not curve]
             known = [point for other in others for point in other.special]
             for end in (0, -1):
-                if (point := _end_of(curve, end, known, self.step)) is not None:
+                if (point := _meeting_at_end(curve, end, known, self.step)) is not None:
                     where = (point, *curve.special) if end == 0 else (*curve.special, point)
                     curve = replace(curve, special=where)
             self.curves[number] = curve
@@ -147,7 +148,7 @@ class Bounds:
 
         if not self.curves or not len(rows):
             return np.full(len(rows), np.inf)
-        paths = [_densely(curve.path / self.cell, 1 / PER_CELL) for curve in self.curves]
+        paths = [densely(curve.path / self.cell, 1 / PER_CELL) for curve in self.curves]
         ends = np.array([self.pair(row) for row in rows.tolist()]) / self.cell
         parts = np.linspace(0, 1, PER_CELL + 1)[:, None, None]
         ways = (1 - parts) * ends[None, :, 0] + parts * ends[None, :, 1]
@@ -155,14 +156,14 @@ class Bounds:
         return np.min(away, axis=0)
 
     def pair(self, row: Sequence[int]) -> Pair:
-        """The two cells of a row of `differing`."""
+        """The two cells of a row of `neighbours_that_differ`."""
         i, j, along = row
         p, q = self.values
         other = (i + 1, j) if along == 0 else (i, j + 1)
         return (float(p[i]), float(q[j])), (float(p[other[0]]), float(q[other[1]]))
 
 
-def differing(motions: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+def neighbours_that_differ(motions: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     """Neighbouring cells that differ: row and column of the first one, and the axis, [pairs, 3]."""
     told = (motions >= 0) & ~left_out
     found = []
@@ -182,15 +183,6 @@ def _alike(rows: np.ndarray, at: int, motions: np.ndarray) -> np.ndarray:
     low, high = np.minimum(first, second), np.maximum(first, second)
     near = np.max(np.abs(rows[:, :2] - rows[at, :2]), axis=1) <= ALIKE
     return near & (low == low[at]) & (high == high[at])
-
-
-def _densely(path: np.ndarray, apart: float) -> np.ndarray:
-    """A path with points no farther apart than that."""
-    if len(path) < 2:
-        return path
-    gone = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
-    along = np.union1d(gone, np.arange(0.0, gone[-1], apart))
-    return np.column_stack([np.interp(along, gone, column) for column in path.T])
 
 
 def _without_known(
@@ -213,7 +205,7 @@ def _without_known(
         if row + DOUBLED <= len(curve) and np.all(doubled[row : row + DOUBLED]):
             last = max(row - 1, begun)
             break
-    return _cut(curve, first, last)
+    return _shortened(curve, first, last)
 
 
 def _rows_on(curve: BifurcationCurve, other: BifurcationCurve, near: float) -> np.ndarray:
@@ -229,7 +221,7 @@ def _rows_on(curve: BifurcationCurve, other: BifurcationCurve, near: float) -> n
     return found
 
 
-def _cut(curve: BifurcationCurve, first: int, last: int) -> BifurcationCurve:
+def _shortened(curve: BifurcationCurve, first: int, last: int) -> BifurcationCurve:
     """A curve from one of its rows to another."""
     if (first, last) == (0, len(curve) - 1):
         return curve
@@ -258,7 +250,7 @@ def _cut(curve: BifurcationCurve, first: int, last: int) -> BifurcationCurve:
     )
 
 
-def _end_of(
+def _meeting_at_end(
     curve: BifurcationCurve, end: int, known: Sequence[SpecialPoint], step: float
 ) -> SpecialPoint | None:
     """The point, of those known, in which a curve ends at its first row, 0, or its last one, -1, if
@@ -268,7 +260,7 @@ def _end_of(
     """
     if curve.ends[end] in (Stop.LEFT_SPAN, Stop.CLOSED) or curve.is_named(end):
         return None
-    rows = curve.values[:ROWS] if end == 0 else curve.values[::-1][:ROWS]
+    rows = curve.values[:END_ROWS] if end == 0 else curve.values[::-1][:END_ROWS]
     gone = np.append(0.0, np.cumsum(np.hypot(*np.diff(rows, axis=0).T)))
     degree = min(2, len(rows) - 1)
     # Where it was cut it may have gone a little beyond.

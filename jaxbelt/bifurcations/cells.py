@@ -32,7 +32,7 @@ from .labels import Label
 #: Velocities that differ by less are one, but for rounding.
 SAME_VELOCITY = 1e-12
 #: Tolerances of the runs.
-TOLERANCE = 1e-8
+RUN_TOLERANCE = 1e-8
 #: What names say of an equilibrium.
 LETTERS = {
     EquilibriumKind.FIXED_POINT: "f",
@@ -141,7 +141,7 @@ def look_at(
     rests = [still.kind, still.stable, still.modes.reshape(count, -1)]
     facts = np.concatenate([decided[:, None], opposite[:, None], *rests, cycles], axis=1)
     kinds, first, which = np.unique(facts, axis=0, return_index=True, return_inverse=True)
-    edged, belts = _is_edged(make(**_at(names, points[0]))), still.velocities.shape[1]
+    edged, belts = _is_edged(make(**_arguments(names, points[0]))), still.velocities.shape[1]
     named, numbers, known = [], [], {}
     for row, cell in zip(kinds.tolist(), first.tolist(), strict=True):
         here = still.kind[cell] > 0
@@ -155,7 +155,7 @@ def look_at(
     return Cells(np.array(named)[which], np.array(numbers)[which], _on_line(still.velocities))
 
 
-def _at(names: Sequence[str], point: Any) -> dict[str, float]:
+def _arguments(names: Sequence[str], point: Any) -> dict[str, float]:
     return dict(zip(names, map(float, point), strict=True))
 
 
@@ -209,9 +209,11 @@ def _cycles_at(make, names, points, still: _Still, more: np.ndarray):
     known, which = np.unique(told["signature"], return_inverse=True)
     signatures = np.array([signature(int(word) if word < 2**53 else -1, belts) for word in known])
     places = np.stack([told[name] for name in PLACE], axis=-1)
-    runs = Runs(places, signatures[which.reshape(kinds.shape)], RUN * TOLERANCE)
+    runs = Runs(places, signatures[which.reshape(kinds.shape)], RUN * RUN_TOLERANCE)
     cycles = np.where(kinds == CYCLE, kinds, UNDECIDED)
-    labels = told_apart(cycles, sticks, runs, lambda point: make(**_at(names, points[point])))
+    labels = told_apart(
+        cycles, sticks, runs, lambda point: make(**_arguments(names, points[point]))
+    )
     codes = sticks @ 2 ** np.arange(belts)
     sorts: dict[tuple[str, int], int] = {}
     count = int(labels.max(initial=-1)) + 1
@@ -241,7 +243,7 @@ def _runs_from(make, names, points, still: _Still, more: np.ndarray):
         states = begun[at, start[first:last]].T
         return np.concatenate([states, [leaf[at] for leaf in varying]])[None]
 
-    numbers = {"t1": LONG_ENOUGH, "rtol": TOLERANCE, "atol": TOLERANCE}
+    numbers = {"t1": LONG_ENOUGH, "rtol": RUN_TOLERANCE, "atol": RUN_TOLERANCE}
     told = {}
     columns = results_of(grid.program(Attractor()), grid.shared, rows_of, len(cell), **numbers)
     for name, column in columns.items():

@@ -274,7 +274,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         if end is not Stop.LEFT_SPAN and (limit := _limit(problem, track, rows, last, end)):
             rows += _towards(problem, rows[-1].values, limit)
             return _Side(rows, [*special, limit], Stop.STOPPED)
-        if end is not Stop.LEFT_SPAN and (creeping := _at_rest(problem, rows, CREEPS)):
+        if end is not Stop.LEFT_SPAN and (creeping := _end_at_rest(problem, rows, CREEPS)):
             return _Side(rows, [*special, creeping], Stop.STOPPED)
         if len(rows) >= problem.max_points or not points:
             why = Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL
@@ -303,17 +303,17 @@ def _ended(
 ) -> _Side:
     if end in (Stop.LEFT_SPAN, Stop.CLOSED):
         return _Side(rows, special, end)
-    limit = _at_rest(problem, rows, 2 * problem.step)
+    limit = _end_at_rest(problem, rows, 2 * problem.step)
     if limit is None and end is Stop.STEP_TOO_SMALL:
         last = [np.stack(column) for column in zip(*((row.values, row.place) for row in rows[-2:]))]
-        limit = where_edge_is_touched(problem.variation, *last, 1e-2 * problem.step)
+        limit = where_edge_is_touched(problem.variation, last[0], last[1], 1e-2 * problem.step)
     known = [one.values for one in special if limit and one.kind == limit.kind]
     apart = [np.hypot(*np.subtract(limit.values, one)) for one in known] if limit else [0.0]
     named = [] if min(apart, default=np.inf) < problem.step else [limit]
     return _Side(rows, [*special, *filter(None, named)], end)
 
 
-def _at_rest(problem: _Problem, rows: list[_Row], near: float) -> SpecialPoint | None:
+def _end_at_rest(problem: _Problem, rows: list[_Row], near: float) -> SpecialPoint | None:
     values = np.array([row.values for row in rows[-3:]])
     return where_belts_stop(problem.variation, values, near, 3 * problem.step)
 

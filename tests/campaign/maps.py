@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import jaxbelt as jb
-from jaxbelt.bifurcations.bounds import Bounds, differing
+from jaxbelt.bifurcations.bounds import Bounds, neighbours_that_differ
 from jaxbelt.bifurcations.cells import look_at
 from jaxbelt.bifurcations.regions import varied_by_names
 from jaxbelt.numerics.continuation import Stop
@@ -84,11 +84,11 @@ def differences(plane: Plane, told: jb.RegionMap) -> tuple[Counter, list[str]]:
 
 
 def _boundaries(plane: Plane, told: jb.RegionMap) -> np.ndarray:
-    """Pairs of neighbouring cells that differ, as `bounds.differing` has them."""
+    """Pairs of neighbouring cells that differ, as `bounds.neighbours_that_differ` has them."""
     grid = np.meshgrid(*told.values, indexing="ij")
     points = np.column_stack([axis.ravel() for axis in grid])
     cells = look_at(plane.make, told.names, points)
-    return differing(cells.motions.reshape(grid[0].shape), told.on_line)
+    return neighbours_that_differ(cells.motions.reshape(grid[0].shape), told.on_line)
 
 
 def _some_rows(curve: jb.BifurcationCurve) -> list[int]:
