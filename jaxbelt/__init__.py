@@ -24,8 +24,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     sweeps/         fractions orbit_diagram
     bifurcations/   special labels systems guesses conditions tangencies crossings rests edges folds
-    bifurcations/   meetings connections infinity path scan refine curves faces regions
-    bifurcations/   diagrams switch_folds
+    bifurcations/   meetings connections infinity path scan refine curves cells faces bounds
+    bifurcations/   regions diagrams switch_folds
     inverse/        selection record fit margins design
     si              results in SI units
     plotting/       style phase histories points diagrams regions categories sweeps orbits

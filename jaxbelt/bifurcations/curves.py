@@ -27,7 +27,7 @@ from ..numerics.continuation import Corrected, CurvePoint, Stop, continue_curve,
 from ..results import Status, draw
 from ..tables import table_of
 from .conditions import AbstractCondition, BifurcationPoint, Trail
-from .special import SpecialPoint
+from .special import CREEPS, SpecialPoint, where_belts_stop, where_edge_is_touched
 from .systems import AbstractSystem, Seen
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class BifurcationCurve(eqx.Module):
     @property
     def path(self) -> np.ndarray:
         """The values with those of the special points among them, [rows + special, 2]."""
-        at = (i.values if isinstance(i, SpecialPoint) else self.values[i] for i in self._order())
+        at = (i.values if isinstance(i, SpecialPoint) else self.values[i] for i in self.in_order())
         return np.array(list(at))
 
     def table(self, names: tuple[str, str] | None = None) -> "pandas.DataFrame":
@@ -87,7 +87,7 @@ class BifurcationCurve(eqx.Module):
         """
         belts, kinds = self.condition.belts_concerned, self.kinds
         rows, kind = [], kinds[0]
-        for item in self._order():
+        for item in self.in_order():
             if isinstance(item, SpecialPoint):
                 values, multiplier, residual = item.values, np.nan, item.residual
                 special = " ".join(map(str, (item.kind, *item.belts)))
@@ -106,7 +106,7 @@ class BifurcationCurve(eqx.Module):
             )
         return table_of(rows)
 
-    def _order(self) -> list[int | SpecialPoint]:
+    def in_order(self) -> list[int | SpecialPoint]:
         """The numbers of the rows, and the special points at their places among them."""
         path, order = self.values, list[int | SpecialPoint](range(len(self)))
         for point in self.special:
@@ -119,6 +119,10 @@ class BifurcationCurve(eqx.Module):
             path = np.insert(path, place, at, axis=0)
             order.insert(place, point)
         return order
+
+    def is_named(self, end: int) -> bool:
+        """Whether it ends, at its first row, 0, or its last one, -1, in a special point."""
+        return isinstance(self.in_order()[end], SpecialPoint)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned."""
@@ -270,10 +274,13 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         if end is not Stop.LEFT_SPAN and (limit := _limit(problem, track, rows, last, end)):
             rows += _towards(problem, rows[-1].values, limit)
             return _Side(rows, [*special, limit], Stop.STOPPED)
+        if end is not Stop.LEFT_SPAN and (creeping := _end_at_rest(problem, rows, CREEPS)):
+            return _Side(rows, [*special, creeping], Stop.STOPPED)
         if len(rows) >= problem.max_points or not points:
-            return _Side(rows, special, Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL)
+            why = Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL
+            return _ended(problem, rows, special, why)
         if beyond is None and end is not Stop.POINT_COUNT:
-            return _Side(rows, special, end)
+            return _ended(problem, rows, special, end)
         if beyond is None:
             # The same curve, its mesh spread anew.
             track, u, direction = track.remeshed(last, points[-1][0].tangent)
@@ -284,11 +291,31 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         place = track.place(last)
         further = None if is_end else _beyond(problem, last[-2:], centre, place)
         if further is None:
-            return _Side(rows, special, Stop.STOPPED)
+            return _ended(problem, rows, special)
         track, u = _Track.begun(problem, *further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
         rows.append(_row_at(problem, track, u, track.look(u)))
+
+
+def _ended(
+    problem: _Problem, rows: list[_Row], special: list[SpecialPoint], end: Stop = Stop.STOPPED
+) -> _Side:
+    if end in (Stop.LEFT_SPAN, Stop.CLOSED):
+        return _Side(rows, special, end)
+    limit = _end_at_rest(problem, rows, 2 * problem.step)
+    if limit is None and end is Stop.STEP_TOO_SMALL:
+        last = [np.stack(column) for column in zip(*((row.values, row.place) for row in rows[-2:]))]
+        limit = where_edge_is_touched(problem.variation, last[0], last[1], 1e-2 * problem.step)
+    known = [one.values for one in special if limit and one.kind == limit.kind]
+    apart = [np.hypot(*np.subtract(limit.values, one)) for one in known] if limit else [0.0]
+    named = [] if min(apart, default=np.inf) < problem.step else [limit]
+    return _Side(rows, [*special, *filter(None, named)], end)
+
+
+def _end_at_rest(problem: _Problem, rows: list[_Row], near: float) -> SpecialPoint | None:
+    values = np.array([row.values for row in rows[-3:]])
+    return where_belts_stop(problem.variation, values, near, 3 * problem.step)
 
 
 class _Leg(NamedTuple):

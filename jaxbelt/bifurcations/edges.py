@@ -34,7 +34,7 @@ from .conditions import AbstractCycleCondition, Line
 from .crossings import arrival_tests
 from .guesses import nearest, without_arcs
 from .rests import check_edge, hopf_limit
-from .systems import CycleSystem
+from .systems import CycleSystem, nearest_edge
 
 
 class EdgeContact(CycleSystem):
@@ -67,7 +67,9 @@ class EdgeContact(CycleSystem):
         return status, jnp.asarray(jnp.nan)
 
     def watch(self, osc, z, slope):
-        return arrival_tests(osc, self.chain, z, self.row), True, jnp.nan
+        tests = arrival_tests(osc, self.chain, z, self.row)
+        tests["EdgeTouch", ()] = nearest_edge(osc, self.chain, z, self.row)
+        return tests, True, jnp.nan
 
 
 class AbstractEdgeTouch(AbstractCycleCondition):

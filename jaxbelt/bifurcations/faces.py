@@ -36,7 +36,7 @@ class Faces:
         self.low, self.high = np.array(span).T
         wall = np.zeros((PIXELS, PIXELS), bool)
         for path in paths:
-            at = _densely(self._scaled(path))
+            at = densely(self._scaled(path), 0.5)
             inside = np.all((at > -0.5) & (at < PIXELS - 0.5), axis=1)
             wall[tuple(np.rint(at[inside]).astype(int).T)] = True
         found: Any = label(~wall)
@@ -91,12 +91,13 @@ class Faces:
         return np.array(known)[_filled(codes)]
 
 
-def _densely(path: np.ndarray) -> np.ndarray:
-    """A path with points half a pixel apart, so that no pixel between two is left out."""
+def densely(path: np.ndarray, apart: float) -> np.ndarray:
+    """A path with points no farther apart than that along either axis: with half a pixel no pixel
+    between two is left out."""
     if len(path) < 2:
         return path
     gone = np.append(0.0, np.cumsum(np.max(np.abs(np.diff(path, axis=0)), axis=1)))
-    along = np.union1d(gone, np.arange(0.0, gone[-1], 0.5))
+    along = np.union1d(gone, np.arange(0.0, gone[-1], apart))
     return np.column_stack([np.interp(along, gone, column) for column in path.T])
 
 

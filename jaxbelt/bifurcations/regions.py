@@ -1,21 +1,18 @@
-"""The regions of a plane of two parameters: `region_map`, and how regions are named.
+"""The regions of a plane of two parameters: `region_map`.
 
-A region map is a sweep over two parameters from several starts, each cell named by what its runs
-lead to and by the stability of its equilibria. What bounds the regions is not read off the cells:
-points are found by `scan` along a few lines across the map, and their curves are followed.
+Each cell of the plane is named by what it has (see `cells`). What bounds the regions is not read
+off the cells: curves of bifurcation points are followed, until they pass between all neighbouring
+cells that differ (see `bounds`).
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
 from ..activity import announced, tell
 from ..checks import (
@@ -27,71 +24,19 @@ from ..checks import (
     require_one_of,
     require_value,
 )
-from ..cycles.attractors import Runs, distinct, itinerary, lead_to_one_cycle, stuck_belts
-from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
-from ..model.equilibria import EquilibriumKind, equilibria
+from ..cycles.cycle import Cycle
+from ..cycles.portrait import portrait
 from ..model.oscillator import Oscillator
 from ..model.variations import Variation
-from ..numerics.compiling import jit
-from ..presets import class_b
-from ..results import Status, draw
-from ..sweeps.datasets import decoded
-from ..sweeps.sweep import sweep
+from ..results import draw
 from ..tables import table_of
-from .conditions import BifurcationPoint
-from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
+from .bounds import Bounds, Pair
+from .cells import in_plane_of_paper, look_at
+from .curves import BifurcationCurve
 from .faces import Faces
-from .labels import Label
-from .path import ParameterPath
-from .scan import search
 
 if TYPE_CHECKING:
     import pandas
-
-#: Velocities that differ by less are one, but for rounding.
-SAME_VELOCITY = 1e-12
-
-
-def region_name(osc: Oscillator, label: Label) -> str:
-    """The name of what a label tells, in the manner of the paper's Fig. 6.
-
-    A digit: 1 there is a stable equilibrium only; 2 a stable cycle, too; 3 a stable cycle only.
-    Where belts run in opposite directions these are 6, 5 and 4. With several belts a letter tells
-    what the cycle sticks to: a belt 0, b belt 1, c both (belts as binary digits, for more of them),
-    s none. Of several cycles each has its letter.
-    """
-    velocities = [float(belt.velocity) for belt in osc.belts]
-    opposite = min(velocities) < 0 < max(velocities)
-    rests = any(stable for _, stable, _ in label.equilibria)
-    return region_of(opposite, len(velocities), rests, [stuck_belts(path) for path in label.cycles])
-
-
-def region_of(opposite: bool, belts: int, rests: bool, cycles: Sequence[Collection[int]]) -> str:
-    """The name of a region, see `region_name`, by what is known of it.
-
-    opposite: whether belts run in opposite directions; belts: how many there are; rests: whether an
-    equilibrium is stable; cycles: the belts to which each of them sticks.
-    """
-    number = 2 if rests and cycles else 3 if cycles else 1
-    letters = []
-    for stuck in cycles:
-        code = sum(2**belt for belt in set(stuck))
-        letters.append(chr(ord("a") + code - 1) if code else "s")
-    tail = "".join(sorted(letters)) if belts > 1 else "s" * letters.count("s")
-    return f"{7 - number if opposite else number}{tail}"
-
-
-def in_plane_of_paper(oscillators: Sequence[Oscillator]) -> bool:
-    """Whether oscillators are those of the plane of the paper's Fig. 6, where regions have their
-    names: class (b) with its friction, loads and damping, and any velocities of the belts."""
-
-    def is_there(osc: Oscillator) -> bool:
-        paper = class_b(*([belt.velocity for belt in osc.belts] * 2)[:2])
-        same = jax.tree.structure(osc) == jax.tree.structure(paper)
-        pairs = zip(jax.tree.leaves(osc), jax.tree.leaves(paper), strict=True) if same else ()
-        return same and all(np.array_equal(one, other) for one, other in pairs)
-
-    return all(map(is_there, oscillators))
 
 
 class RegionMap(eqx.Module):
@@ -102,7 +47,9 @@ class RegionMap(eqx.Module):
     regions, see `BifurcationCurve`; cycles: by the name of a region, the cycles in its example,
     attracting ones and the unstable one; on_line: cells where a belt is at rest, or two run at one
     velocity, [n, m]: what is so on that line only is the name of these; between: (p, q, name) in
-    each part of the plane between curves in which there is no other cell; make: as given.
+    each part of the plane between curves in which there is no other cell; make: as given;
+    uncovered: pairs of neighbouring cells, ((p, q), (p, q)), that differ, though no curve passes
+    within half a cell and none was found between them.
     `words` says what the names mean; `example(name)` is a cell well inside a region; `table()` has
     the curves as rows; `plot()` draws the map, with a portrait of each region.
 
@@ -121,6 +68,7 @@ class RegionMap(eqx.Module):
     on_line: np.ndarray
     between: tuple[tuple[float, float, str], ...] = eqx.field(static=True)
     make: Callable[..., Oscillator] = eqx.field(static=True)
+    uncovered: tuple[Pair, ...] = eqx.field(static=True, default=())
 
     @property
     def regions(self) -> tuple[str, ...]:
@@ -136,7 +84,8 @@ class RegionMap(eqx.Module):
         if len(set(opposite.values())) < 2:
             opposite = dict.fromkeys(names, "")
         belts = len(self.oscillator(self.regions[0]).belts) if self.regions else 1
-        return {name: _attractors_of(name, belts) + opposite[name] for name in names}
+        heads = {name: name.partition(":")[0] for name in names}  # without equilibria
+        return {name: _attractors_of(heads[name], belts) + opposite[name] for name in names}
 
     def example(self, name: str) -> tuple[float, float]:
         """The values of the parameters in the cell of a region that is farthest from its bounds."""
@@ -182,9 +131,12 @@ class RegionMap(eqx.Module):
 
     def __repr__(self) -> str:
         sizes = " x ".join(str(len(values)) for values in self.values)
+        count = len(self.uncovered)
+        missing = f", none between {count} pairs of cells that differ" * bool(count)
         return (
             f"RegionMap({self.names[0]}, {self.names[1]}: {sizes} cells, "
-            f"regions {' '.join(self.regions)}, {len(self.curves)} curves)"
+            f"regions {' '.join(self.regions)}, {len(self.curves)} curves"
+            f"{missing})"
         )
 
 
@@ -224,17 +176,18 @@ def region_map(
     make: Callable[..., Oscillator],
     axes: Mapping[str, ArrayLike],
     *,
-    starts: Sequence[tuple[float, float]] = ((3.0, 0.0), (0.0, 0.0), (-2.0, -0.5)),
+    starts: Sequence[tuple[float, float]] = (),
     step: float = 0.01,
     lines: int = 4,
 ) -> RegionMap:
     """Which motions there are in each cell of a plane of two parameters, and what bounds them.
 
     make: gives an `Oscillator`, such as `jb.presets.class_b`; axes: two of its arguments and their
-    values, increasing. starts: where each cell is run from; what attracts none of them is not seen.
-    step: between the points of the curves, in units of the larger side of the map / 1.4; lines: on
-    how many lines parallel to each axis curves are looked for, 0 for none. `ValueError` names an
-    impossible argument.
+    values, increasing. starts: further ones, (x1, x2), from which each cell is run; those from
+    which `scan` follows orbits are always taken, and what attracts none of them is not seen. step:
+    between the points of the curves, in units of the larger side of the map / 1.4; lines: on how
+    many lines parallel to each axis curves are looked for first, then between the cells that
+    differ; 0 for no curves. `ValueError` names an impossible argument.
     """
     expected = "a dictionary, two arguments of make and their values"
     require_value(isinstance(axes, Mapping) and len(axes) == 2, "axes", expected, axes)
@@ -244,17 +197,53 @@ def region_map(
     for name, along in zip(names, values, strict=True):
         increases = along.size > 1 and np.all(np.diff(along) > 0)
         require_value(increases, name, "two values or more that increase", along)
-    starts = _checked_starts(starts)
+    further = _checked_starts(starts)
     step = as_positive(step, "step")
     lines = as_whole(lines, "lines", 0)
+    span = names[0], names[1]
+    bounds = Bounds(varied_by_names(make, span, values), values, step)
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:
-        cells = beside.submit(_cells, make, names, values, dict(axes), starts)
-        curves = _bounds(make, names, values, step, lines) if lines else ()
-        label, cycles, on_line = cells.result()
-    pair = (names[0], names[1]), (values[0], values[1])
-    between = _names_between(make, names, pair[1], label, on_line, curves, starts)
-    return RegionMap(*pair, label, tuple(curves), cycles, on_line, between, make)
+        seen = beside.submit(_look_at_all, make, span, values, further)
+        if lines:
+            bounds.search_lines(lines)
+        label, motions, on_line = seen.result()
+    uncovered = bounds.search_between(motions, on_line) if lines else ()
+    bounds.name_ends()
+    curves = tuple(bounds.curves)
+    cycles = _cycles_of_examples(make, span, values, label)
+    between = _names_between(make, span, values, label, on_line, curves, further)
+    pair = values[0], values[1]
+    return RegionMap(span, pair, label, curves, cycles, on_line, between, make, uncovered)
+
+
+def varied_by_names(make, names: tuple[str, str], values: Sequence[np.ndarray]) -> Variation:
+    """What is varied in a plane of two arguments of `make`; values: of both, possible ones."""
+
+    def at(p, q):
+        return make(**dict(zip(names, (p, q), strict=True)))
+
+    corner = [float(along[0]) for along in values]
+    return replace(Variation.of_function(at, corner, "make"), names=names)
+
+
+def _look_at_all(make, names, values, starts):
+    """The names of all cells, numbers of what there is in them, and which lie on a line where
+    velocities meet, [n, m] each."""
+    grid = np.meshgrid(*values, indexing="ij")
+    cells = look_at(make, names, np.column_stack([axis.ravel() for axis in grid]), starts)
+    shape = grid[0].shape
+    return cells.names.reshape(shape), cells.motions.reshape(shape), cells.on_line.reshape(shape)
+
+
+def _cycles_of_examples(make, names, values, label) -> dict[str, tuple[Cycle, ...]]:
+    """The cycles in the example of each region."""
+    cycles = {}
+    for name in sorted(set(np.unique(label).tolist()) - {""}):
+        tell(f"the portrait of region {name}")
+        found = portrait(_at(make, names, _example(values, label == name)))
+        cycles[name] = (*found.cycles, *found.unstable)
+    return cycles
 
 
 def _at(make, names, pair) -> Oscillator:
@@ -274,21 +263,17 @@ def _names_between(make, names, values, label, on_line, curves, starts):
     if not curves:
         return ()
     faces, points, _ = _faces_of(values, label, on_line, curves)
-    found = []
-    for p, q in faces.unnamed(points):
-        osc = _at(make, names, (p, q))
-        cycles = [cycle for cycle in _cycles(osc, starts) if bool(cycle.stable)]
-        rests, velocities = _at_cells(make, names, jnp.asarray([[p, q]]))
-        opposite = bool(jnp.min(velocities) < 0 < jnp.max(velocities))
-        stuck = [stuck_belts(itinerary(osc, cycle.chain)) for cycle in cycles]
-        if bool(rests[0]) or stuck:
-            name = region_of(opposite, len(osc.belts), bool(rests[0]), stuck)
-            found.append((p, q, name))
-    return tuple(found)
+    unnamed = faces.unnamed(points)
+    if not unnamed:
+        return ()
+    told = look_at(make, names, np.array(unnamed), starts).names.tolist()
+    return tuple((*point, name) for point, name in zip(unnamed, told, strict=True) if name)
 
 
 def _checked_starts(starts: Any) -> tuple[tuple[float, float], ...]:
     expected = "a list of (x1, x2), such as [(3.0, 0.0)]"
+    if isinstance(starts, tuple | list) and not starts:
+        return ()
     shape = np.shape(starts) if isinstance(starts, tuple | list | np.ndarray) else ()
     require_value(len(shape) == 2 and shape[0] and shape[1] == 2, "starts", expected, starts)
     rows = as_array(starts, "starts", (None, 2))
@@ -296,128 +281,6 @@ def _checked_starts(starts: Any) -> tuple[tuple[float, float], ...]:
     return tuple((float(x1), float(x2)) for x1, x2 in np.asarray(rows))
 
 
-def _cells(make, names, values, axes, starts):
-    """The names of all cells, the cycles in the example of each region, and which cells lie on a
-    line where velocities meet."""
-    label, on_line = _cell_names(make, names, values, axes, starts)
-    cycles = {}
-    for name in sorted(set(np.unique(label).tolist()) - {""}):
-        osc = _at(make, names, _example(values, label == name))
-        cycles[name] = _cycles(osc, starts)
-    return label, cycles, on_line
-
-
 def _example(values, inside: np.ndarray) -> tuple[float, float]:
     row, column = interior(inside)
     return float(values[0][row]), float(values[1][column])
-
-
-def _cycles(osc: Oscillator, starts) -> tuple[Cycle, ...]:
-    """The cycles that the starts lead to, and the unstable ones, each once."""
-    rests = equilibria(osc)
-    foci = int(np.sum(rests.stable & (rests.kind != EquilibriumKind.SEGMENT)))
-    repelling = (unstable_cycle(osc, around=number) for number in range(foci))
-    return tuple(distinct([*(find_cycle(osc, start) for start in starts), *repelling]))
-
-
-def _cell_names(make, names, values, axes, starts) -> tuple[np.ndarray, np.ndarray]:
-    runs = [sweep(make, axes, y0=start, observe="attractor") for start in starts]
-    grid = np.meshgrid(*values, indexing="ij")
-    rests, velocities = _at_cells(make, names, jnp.asarray(np.stack([g.ravel() for g in grid], 1)))
-    shape = grid[0].shape
-    stable = np.asarray(rests).reshape(shape)
-    velocities = np.asarray(velocities).reshape(*shape, -1)
-    n = velocities.shape[-1]
-    seen = np.zeros((*shape, len(runs)), dtype=int)  # 0 no cycle, else 1 + the belts stuck to
-    decided = np.ones(shape, dtype=bool)
-    for i, run in enumerate(runs):
-        kind = decoded(run[["kind"]]).kind.transpose(*names).values
-        sticks = run.sticks.transpose(*names, "belt").values
-        seen[..., i] = np.where(kind == "cycle", 1 + sticks @ 2 ** np.arange(n), 0)
-        decided &= kind != "undecided"
-    # Each cycle once.
-    tell = [Runs.of(run, names) for run in runs]
-    for i, j in combinations(range(len(runs)), 2):
-        both = (seen[..., i] > 0) & (seen[..., j] > 0)
-        same, doubtful = tell[i].same(tell[j])
-        for row, column in np.argwhere(both & doubtful):
-            osc = _at(make, names, (values[0][row], values[1][column]))
-            same[row, column] = lead_to_one_cycle(osc, starts[i], starts[j])
-        seen[..., j] = np.where(both & same, 0, seen[..., j])
-    opposite = (velocities.min(-1) < 0) & (velocities.max(-1) > 0)
-    facts = np.concatenate([stable[..., None], opposite[..., None], decided[..., None], seen], -1)
-    kinds, which = np.unique(facts.reshape(-1, facts.shape[-1]), axis=0, return_inverse=True)
-    found = []
-    for rest, against, known, *codes in kinds.tolist():
-        cycles = [[b for b in range(n) if (code - 1) >> b & 1] for code in codes if code]
-        name = region_of(bool(against), n, bool(rest), cycles)
-        found.append(name if known and (rest or cycles) else "")
-    # A belt is at rest where it runs at the velocity of one that does not.
-    others = np.append(velocities, np.zeros((*shape, 1)), axis=-1)
-    apart = velocities[..., :, None] - others[..., None, :]
-    meet = np.abs(apart) < SAME_VELOCITY
-    on_line = np.any(meet & ~np.eye(n, n + 1, dtype=bool), axis=(-2, -1))
-    return np.array(found)[which.reshape(shape)], on_line
-
-
-@jit
-def _at_cells(make, names, cells: Array) -> tuple[Array, Array]:
-    def one(pair):
-        osc = make(**dict(zip(names, pair, strict=True)))
-        rests = equilibria(osc)
-        stable = jnp.any((rests.kind > 0) & rests.stable)
-        return stable, jnp.stack([belt.velocity for belt in osc.belts])
-
-    return jax.vmap(one)(cells)
-
-
-def _bounds(make, names, values, step, lines) -> list[BifurcationCurve]:
-    """The curve of every point on a few lines, each curve once."""
-
-    def at(p, q):
-        return make(**dict(zip(names, (p, q), strict=True)))
-
-    span = tuple((float(along[0]), float(along[-1])) for along in values)
-    step = step * max(b - a for a, b in span) / 1.4
-    across = [
-        (along, float(fixed))
-        for along in (0, 1)
-        for a, b in [span[1 - along]]
-        for fixed in a + (b - a) * (np.arange(lines) + 0.37) / lines
-    ]
-
-    def points_on(along: int, fixed: float) -> tuple[BifurcationPoint, ...]:
-        return search(ParameterPath(variation.held(1 - along, fixed), None, span[along]))
-
-    limits, corner = np.array(span), [ends[0] for ends in span]
-    variation = replace(Variation.of_function(at, corner, "make"), names=names)
-    curves: list[BifurcationCurve] = []
-    # The next lines are searched while curves are followed from those before.
-    with ThreadPoolExecutor(1) as ahead:
-        searches = [(line, ahead.submit(points_on, *line)) for line in across]
-        for count, ((along, fixed), found) in enumerate(searches, 1):
-            for point in found.result():
-                tell(f"{len(curves)} curves from {count} of {len(across)} lines")
-                pair = np.empty(2)
-                pair[along], pair[1 - along] = float(point.value), fixed
-                if point.status == Status.OK and not any(
-                    _lies_on(point, pair, curve, step) for curve in curves
-                ):
-                    curves.append(follow_point(variation, point, pair, limits, step=step))
-    return curves
-
-
-def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, step: float) -> bool:
-    """Whether a point is on a curve that is known."""
-    if point.condition.lineage != curve.condition.lineage:
-        return False
-    a, b = curve.values[:-1], curve.values[1:]
-    chord = b - a
-    along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
-    along = np.clip(along, 0, 1)[:, None]
-    away = np.hypot(*(at - a - along * chord).T)
-    places = curve.places[:-1] + along * (curve.places[1:] - curve.places[:-1])
-    own = point.place
-    return any(
-        not is_elsewhere(own, places[i], FAR) for i in np.flatnonzero(away < 0.3 * step).tolist()
-    )

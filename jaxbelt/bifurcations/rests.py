@@ -282,8 +282,15 @@ class EdgeBalance(_EdgeSystem):
         return trace_right * a_left - trace_left * a_right
 
     def exists(self, osc, x):
-        # Whether there is a pseudo-focus, and no belt at rest touches.
-        return (self.meets_hopf(osc) > 0) & ~self.left.any_stuck & ~self.right.any_stuck
+        # Whether there is a pseudo-focus between these contacts, and no belt at rest touches.
+        same = [
+            jnp.all(jnp.stack(here.codes) == jnp.stack(mode.codes))
+            for here, mode in zip(
+                _beside_edge(osc, jnp.stack(edges(osc))[self.edge]), (self.left, self.right)
+            )
+        ]
+        moves = ~self.left.any_stuck & ~self.right.any_stuck
+        return (self.meets_hopf(osc) > 0) & moves & same[0] & same[1]
 
     def meets_hopf(self, osc):
         # The weaker of the two pushes towards the edge, negative where one pushes away.

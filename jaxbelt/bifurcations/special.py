@@ -13,6 +13,11 @@ from ..tables import table_of
 if TYPE_CHECKING:
     import pandas
 
+#: A curve that comes so near to a belt at rest comes no nearer in any number of steps.
+CREEPS = 1e-6
+#: A cycle that reaches less far beyond an edge all but touches it; by less is rounding.
+TOUCHES, TOUCHED = 1e-5, 1e-13
+
 
 class SpecialPoint(NamedTuple):
     """A point of codimension two on a curve.
@@ -20,12 +25,13 @@ class SpecialPoint(NamedTuple):
     kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
     "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
     point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too),
+    "EdgeTouch" (on an edge a cycle turns back, is tangent to a boundary, or begins to slip),
     "BoundaryHopf" (a Hopf point on a contact edge: there the curves of boundary equilibria and of
     pseudo-Hopf points meet its own), "BoundaryEquilibrium" (a side of a saddle ceases to push away,
     and its connection ends), "MeetingEdges" (the saddles of a connection come together),
     "BeltAtRest", "EqualVelocities", or what a condition of your own watches; belts: concerned;
-    values: of the two parameters; residual: the largest error in all
-    equations.
+    values: of the two parameters; residual: the largest error in all equations; where the end of a
+    curve is extrapolated, of that.
     """
 
     kind: str
@@ -43,6 +49,71 @@ class SpecialPoint(NamedTuple):
         """Draw it as a dot with its name in the plane of the two parameters, into the axes `ax`
         (None: new ones), which are returned."""
         return draw(self, ax)
+
+
+def where_belts_stop(
+    variation: Variation, values: np.ndarray, near: float, far: float
+) -> SpecialPoint | None:
+    """Where belts come to rest at the end of a curve, if a parameter is so near to that.
+
+    variation: of both; values: of the last rows, [rows, 2]; far: the point is not so far from the
+    last one. The time that the mass sticks goes to infinity there, so no step leads there. Where
+    two belts come to rest both parameters are known, else one: what the other comes to is
+    extrapolated, and the residual is by how much a parabola and a line differ there.
+    """
+    if len(values) < 3:
+        return None
+    family = variation.family(values[-1])
+    belts = range(len(family.oscillator.belts))
+    slopes = np.array([family.belt_slopes(belt, "velocity") for belt in belts], float)
+    oscs = [variation.oscillator(row) for row in values[-3:]]
+    v = np.array([[float(osc.belts[belt].velocity) for osc in oscs] for belt in belts])
+    size = np.abs(v)
+    falls = (0 < size[:, 2]) & (size[:, 2] < size[:, 1]) & (size[:, 1] < size[:, 0])
+    stop = np.flatnonzero(falls & (size[:, 2] < near * np.linalg.norm(slopes, axis=1)))
+    if not stop.size:
+        return None
+    if np.linalg.matrix_rank(slopes[stop]) == 2:
+        at = values[-1] - np.linalg.lstsq(slopes[stop], v[stop, 2], rcond=None)[0]
+        error = 0.0
+    else:
+        part = v[stop[0]] / v[stop[0], 2]
+        line, at = (
+            np.array([np.polyval(np.polyfit(part[-n:], row[-n:], n - 1), 0.0) for row in values.T])
+            for n in (2, 3)
+        )
+        error = float(np.max(np.abs(at - line)))
+    if np.linalg.norm(at - values[-1]) > far:
+        return None
+    return SpecialPoint("BeltAtRest", tuple(stop.tolist()), (float(at[0]), float(at[1])), error)
+
+
+def where_edge_is_touched(
+    variation: Variation, values: np.ndarray, places: np.ndarray, far: float
+) -> SpecialPoint | None:
+    """Where the part of a cycle that is beyond a contact edge vanishes at the end of a curve.
+
+    values, places: of its last rows, [rows, 2] and [rows, 5]; far: the point is not so far from the
+    last one. That part takes a time that goes like the square root of how far it reaches, so no
+    step leads there; the parameters are linear in that root. The residual is how far the point is
+    from the last row.
+    """
+    belts = variation.oscillator(values[-1]).belts
+    edges = {float(edge) for belt in belts for edge in (belt.lower, belt.upper)}
+    reaches = [
+        reach
+        for edge in edges - {np.inf, -np.inf}
+        for reach in (places[-2:, 1] - edge, edge - places[-2:, 0])
+        if len(reach) == 2 and TOUCHED < reach[1] < min(reach[0], TOUCHES)
+    ]
+    if not reaches:
+        return None
+    before, last = np.sqrt(min(reaches, key=lambda reach: reach[1]))
+    at = values[-1] + (values[-1] - values[-2]) * last / (before - last)
+    error = float(np.max(np.abs(at - values[-1])))
+    if error > far:
+        return None
+    return SpecialPoint("EdgeTouch", (), (float(at[0]), float(at[1])), error)
 
 
 class Trail(NamedTuple):

@@ -23,6 +23,7 @@ from jaxtyping import Array
 from ..cycles.attractors import extent
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import Chain, Loop, jacobian, meshed, residual, residual_and_blocks
+from ..model.modes import edge_guards, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
@@ -257,6 +258,25 @@ def contact_tests(name: str, nearest: Array, watched: Array) -> Tests:
     """Those distances of the belts that are watched, under a name."""
     known = jnp.where(watched & jnp.isfinite(nearest), nearest, jnp.nan)
     return {(name, (belt,)): known[belt] for belt in range(nearest.size)}
+
+
+def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: int | Array = -1) -> Array:
+    """How near a cycle is to passing a contact edge otherwise, NaN where there is none: the least
+    distance of an extremum of x1, of a place where it is tangent to a boundary, or of a slip onset,
+    from an edge of its mode. without: an arc whose end is not asked."""
+    kinds = Ends(chain.codes.shape[-1])
+    following = jnp.roll(z, -1, axis=0)
+    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
+    following = jnp.where(last[:, None], z[0], following)
+
+    def distance(codes, x1):
+        return jnp.min(jnp.stack(edge_guards(osc, mode_of(codes), x1)))
+
+    told = (chain.ends == kinds.extremum_x1) | (chain.ends == kinds.onset)
+    told = chain.used & (told | (chain.ends >= kinds.tangent))
+    told = told & (jnp.arange(chain.ends.size) != without)
+    nearest = jnp.min(jnp.where(told, jax.vmap(distance)(chain.codes, following[:, 0]), jnp.inf))
+    return jnp.where(jnp.isfinite(nearest), nearest, jnp.nan)
 
 
 # --- Newton's method ------------------------------------------------------------------------------

@@ -39,6 +39,7 @@ from .systems import (
     CycleSystem,
     contact_tests,
     nearest_contacts,
+    nearest_edge,
     stick_phase_from,
     velocity_of,
 )
@@ -94,6 +95,7 @@ class Encounter(CycleSystem):
         tests = contact_tests("DoubleSliding", nearest, stuck | self.is_tangency)
         alone = self.is_tangency & ~jnp.any(sticks)
         tests["FoldGrazing", ()] = jnp.where(alone, slope - 1, jnp.nan)
+        tests["EdgeTouch", ()] = nearest_edge(osc, self.chain, z)
         return tests, True, jnp.where(self.is_tangency, slope, jnp.nan)
 
 

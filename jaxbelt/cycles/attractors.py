@@ -21,7 +21,7 @@ from ..model.events import of_one_loop
 from ..model.modes import ABOVE
 from ..model.oscillator import Oscillator
 from ..results import Status
-from .cycle import Cycle, find_cycle
+from .cycle import Cycle
 from .shooting import Chain, Ends, Loop, modes_of
 
 if TYPE_CHECKING:
@@ -103,12 +103,6 @@ def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:
         if int(cycle.status) == Status.OK and not known:
             found.append(cycle)
     return found
-
-
-def lead_to_one_cycle(osc: Oscillator, start: Sequence[float], other: Sequence[float]) -> bool:
-    """Whether two starts lead to one cycle."""
-    one, another = (find_cycle(osc, (float(y0[0]), float(y0[1]))) for y0 in (start, other))
-    return is_same(one, another)
 
 
 # --- what a sweep tells of attractors -------------------------------------------------------------

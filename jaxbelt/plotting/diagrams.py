@@ -236,7 +236,8 @@ def _name_regions(ax: Axes, diagram: BifurcationDiagram) -> None:
 
 
 def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> Axes:
-    """Curves of bifurcation points in the plane of their parameters, special points as dots.
+    """Curves of bifurcation points in the plane of their parameters, special points as dots, open
+    ones where they are no points of double sliding.
 
     Each kind has its line; where a fold turns into a grazing point the line changes. Returns the
     axes.
@@ -254,7 +255,10 @@ def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> A
         for point in curve.special:
             if point.kind not in ("EqualVelocities", "BeltAtRest"):
                 dot = {"marker": "o", "markersize": 3.5, "color": "black", "zorder": 5}
-                ax.plot(*point.values, linestyle="none", label="double sliding", **dot)
+                label = "double sliding"
+                if point.kind != "DoubleSliding":
+                    label, dot["markerfacecolor"] = "codimension two", "white"
+                ax.plot(*point.values, linestyle="none", label=label, **dot)
     if curves:
         first, second = map(parameter_label, curves[0].names)
         ax.set(xlabel=first, ylabel=second)

@@ -26,20 +26,27 @@ from .style import (
     parameter_label,
 )
 
-#: Pixels of the coarse raster around the name of a region: half a letter's height.
+#: Pixels of the coarse raster around the name of a region: half a letter's height, or its width.
 ROOM_FOR_NAME = 3
 #: Colours of regions that have none by the belts that their cycle sticks to (pale).
 SPARE_COLOURS = ("#DDDDDD", "#F5E9A9", "#BFE3D0", "#F3D0E2", "#D9CBEA", "#C5D9E8", "#E8D5B9")
+#: Rows of sketches for which there is room on a page.
+MOST_ROWS = 4
+#: What the names say of equilibria.
+EQUILIBRIA_TOLD = (
+    "after the colon:\nf fixed point\np pseudo-focus\nh held at rest\n(in brackets: unstable)"
+)
 
 
 def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
     """The regions of a plane of two parameters, and the curves that bound them.
 
     Every point has the colour of its own side of each curve. The colour tells what the stable cycle
-    sticks to (that of the belt; both: violet; none: white), paler where an equilibrium is stable,
-    too. In the plane of the paper's Fig. 6 the regions have the paper's names, elsewhere the key
-    tells what there is. Without `ax` a figure is made that shows the portrait of every region below
-    the map, as the paper's Fig. 6 does. Returns the axes of the map.
+    sticks to (that of the belt; both: violet; none: grey; of several cycles mixed), paler where an
+    equilibrium is stable, too; white where there is no cycle. In the plane of the paper's Fig. 6,
+    and where there are contact edges, the regions have their names, elsewhere the key tells what
+    there is. Without `ax` a figure is made that shows the portrait of every region below the map,
+    as the paper's Fig. 6 does. Returns the axes of the map.
     """
     if ax is None:
         figure = new_figure()
@@ -47,23 +54,27 @@ def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
         return draw_region_map(regions, figure)
     (x, y), raster = regions.values, regions.raster()
     known = np.unique(raster).tolist()
-    paint = map(_region_colour, known) if regions.as_paper else _colours_of(known)
-    colours = dict(zip(known, paint, strict=True))
-    image = np.array([colours[name] for name in known])[np.searchsorted(known, raster)]
+    heads = {name: _head(name) for name in known}
+    unique = sorted(set(heads.values()))
+    paint = map(_region_colour, unique) if regions.as_paper else _colours_of(unique)
+    colours = dict(zip(unique, paint, strict=True))
+    image = np.array([colours[heads[name]] for name in known])[np.searchsorted(known, raster)]
     # Half a pixel beyond the ends: pixels stand for points.
     margins = [0.5 * (v[-1] - v[0]) / (size - 1) for v, size in zip((x, y), raster.shape)]
     extent = (x[0] - margins[0], x[-1] + margins[0], y[0] - margins[1], y[-1] + margins[1])
     style: dict[str, Any] = {"origin": "lower", "aspect": "auto", "interpolation": "nearest"}
     ax.imshow(np.swapaxes(image, 0, 1), extent=extent, zorder=0, **style)
     plot_curves(regions.curves, ax)
-    if regions.as_paper:
+    if regions.as_paper or _tells_equilibria(regions):
         _name_areas(ax, regions, raster)
-    else:
-        words = regions.words
-        for name in filter(None, known):
-            label = words[name].replace(f"; {OPPOSITE}", f"\n{OPPOSITE}")
-            patch = {"facecolor": colours[name], "edgecolor": "0.4", "label": label}
+    if not regions.as_paper:
+        entries = {heads[name]: regions.words[name] for name in filter(None, known)}
+        for head, told in entries.items():
+            label = told.replace(f"; {OPPOSITE}", f"\n{OPPOSITE}")
+            patch = {"facecolor": colours[head], "edgecolor": "0.4", "label": label}
             ax.add_patch(Rectangle((x[0], y[0]), 0, 0, **patch))
+    if _tells_equilibria(regions):
+        ax.add_patch(Rectangle((x[0], y[0]), 0, 0, visible=False, label=EQUILIBRIA_TOLD))
     ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     first, second = map(parameter_label, regions.names)
     ax.set(xlabel=first, ylabel=second)
@@ -79,11 +90,17 @@ def _name_areas(ax: Axes, regions: RegionMap, raster: np.ndarray) -> None:
         parts: Any = ndimage.label(coarse == name)[0]  # type: ignore[index]
         for part in range(1, int(np.max(parts)) + 1):
             inside = parts == part
-            if not np.any(ndimage.binary_erosion(inside, iterations=ROOM_FOR_NAME)):
+            size = (
+                ROOM_FOR_NAME * len(name) if ":" in name else 2 * ROOM_FOR_NAME,
+                2 * ROOM_FOR_NAME,
+            )
+            room: Any = ndimage.binary_erosion(inside, np.ones(size))
+            if not np.any(room):
                 continue
-            row, column = interior(inside)
+            row, column = interior(room)
             halo = [withStroke(linewidth=2.5, foreground="white")]
             style = {"ha": "center", "va": "center", "path_effects": halo, "zorder": 6}
+            style["fontsize"] = "small" if ":" in name else None
             ax.text(x[row], y[column], name, **style)
 
 
@@ -97,24 +114,37 @@ def _colours_of(names: Sequence[str]) -> list[tuple[float, float, float]]:
     return colours
 
 
+def _head(name: str) -> str:
+    """The name of a region without what it says of equilibria."""
+    return name.partition(":")[0]
+
+
+def _tells_equilibria(regions: RegionMap) -> bool:
+    return any(":" in name for name in regions.regions)
+
+
 def _region_colour(name: str) -> tuple[float, float, float]:
     """Pale for cycles, paler where an equilibrium is stable beside them; white for no cycle."""
     letters = {"a": BELT_COLOURS[0], "b": BELT_COLOURS[1], "c": "#7F5FA8"}
     if not name or name[0] in "16":
         return (1.0, 1.0, 1.0)
-    colour = np.array(matplotlib.colors.to_rgb(letters.get(name[1:2], "#555555")))
+    mixed = [matplotlib.colors.to_rgb(letters.get(letter, "#555555")) for letter in name[1:] or "s"]
     strength = 0.18 if name[0] in "25" else 0.38
-    red, green, blue = 1 - strength * (1 - colour)
+    red, green, blue = 1 - strength * (1 - np.mean(mixed, axis=0))
     return float(red), float(green), float(blue)
 
 
 def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
     """The map above, below it a sketch of the phase portrait of each region, in its example."""
     names = [name for name in regions.regions if _has_area(regions, name)]
-    columns = 5 if regions.as_paper else 4
+    named = regions.as_paper or _tells_equilibria(regions)
+    columns = 5 if named else 4
     rows = -(-len(names) // columns)
+    if rows > MOST_ROWS:
+        figure.set_size_inches(7.2, 5.6 + 1.15 * rows)
     # Grids of their own: what the key takes beside the map leaves the sketches alone.
-    whole = figure.add_gridspec(2, 1, height_ratios=(6, 1.25 * rows))
+    heights = (6, 1.25 * rows) if rows <= MOST_ROWS else (5.6, 1.15 * rows)
+    whole = figure.add_gridspec(2, 1, height_ratios=heights)
     upper = whole[0].subgridspec(1, 2, width_ratios=(3.2, 1) if regions.as_paper else (2.2, 1))
     ax, beside = figure.add_subplot(upper[0]), figure.add_subplot(upper[1])
     plot_region_map(regions, ax)
@@ -126,7 +156,7 @@ def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
     beside.legend(entries.values(), entries.keys(), **key)
     lower = whole[1].subgridspec(rows, columns)
     titles = {name: name for name in names}
-    if not regions.as_paper:
+    if not named:
         titles = {name: words.replace("; ", ";\n") for name, words in regions.words.items()}
     for place, name in enumerate(names):
         axis = figure.add_subplot(lower[place // columns, place % columns])
@@ -143,7 +173,6 @@ def _has_area(regions: RegionMap, name: str) -> bool:
 def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle], name: str) -> None:
     loops = [path_around(cycle) for cycle in cycles]
     rests = find_equilibria(osc)
-    x1 = float(rests.x1[0])
     for i, belt in enumerate(osc.belts):
         level = float(belt.velocity / osc.omega)
         ax.axhline(level, color=belt_colour(i), linewidth=0.9, zorder=1, label=f"belt {i}")
@@ -154,6 +183,8 @@ def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle], name: str) 
         ax.plot(*loop.T, color="black", zorder=3, **style)
     for row in rests:
         draw_equilibrium(ax, row)
-    reach = max([0.5, *(1.2 * float(np.max(np.abs(loop[:, 0] - x1))) for loop in loops)])
-    ax.set(xlim=(x1 - reach, x1 + reach), ylim=(-0.85, 0.85), xticks=[], yticks=[])
+    x1 = [float(value) for rest in rests for value in (rest.x1_lower, rest.x1_upper)]
+    x1 += [float(value) for loop in loops for value in (loop[:, 0].min(), loop[:, 0].max())]
+    middle, reach = 0.5 * (min(x1) + max(x1)), max(0.5, 0.6 * (max(x1) - min(x1)))
+    ax.set(xlim=(middle - reach, middle + reach), ylim=(-0.85, 0.85), xticks=[], yticks=[])
     ax.set_title(name, pad=2, fontsize="medium" if len(name) < 5 else "x-small")

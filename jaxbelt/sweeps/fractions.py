@@ -243,7 +243,8 @@ def _attractors_met(
     sticks = np.nan_to_num(told["sticks"]).astype(int)
     runs = Runs(places, told["signature"], error)
     kinds[_closed_only(osc, (kinds == CYCLE) & ~np.any(sticks, axis=1), runs)] = UNDECIDED
-    labels = told_apart(kinds, np.column_stack([sticks, segment]), runs, lambda: osc)
+    held = np.column_stack([sticks, segment])
+    labels = told_apart(kinds[None], held[None], runs.at((None,)), lambda _: osc)[0]
     met = []
     for number in range(int(np.max(labels)) + 1):
         of_it = labels == number

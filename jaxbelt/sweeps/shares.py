@@ -145,18 +145,18 @@ def _labels_of(kinds: np.ndarray, sticks: np.ndarray, runs: Runs) -> np.ndarray:
 
 
 def told_apart(
-    kinds: np.ndarray, sticks: np.ndarray, runs: Runs, oscillator: Callable[[], Oscillator]
+    kinds: np.ndarray, sticks: np.ndarray, runs: Runs, oscillator: Callable[[int], Oscillator]
 ) -> np.ndarray:
-    """Numbers of what the runs of one oscillator lead to, [runs], in the order in which they are
-    met, or -1.
+    """Numbers of what the runs at each point lead to, [points, runs], in the order in which they
+    are met, or -1.
 
-    kinds: codes, [runs]; sticks: whatever else tells apart what is stuck for ever, [runs, ..];
-    oscillator: gives it, where shooting has to tell.
+    kinds: codes, [points, runs]; sticks: whatever else tells apart what is stuck for ever, [points,
+    runs, ..]; oscillator: gives that of a point, where shooting has to tell.
     """
-    here = runs.at((None,))
-    labels = _labels_of(kinds[None], sticks[None], here)
-    doubts = _doubts(kinds[None], labels, here)
-    return _settled(oscillator(), labels[0], runs.places, doubts[0]) if doubts else labels[0]
+    labels = _labels_of(kinds, sticks, runs)
+    for point, pairs in _doubts(kinds, labels, runs).items():
+        labels[point] = _settled(oscillator(point), labels[point], runs.places[point], pairs)
+    return labels
 
 
 # --- cycles that the runs do not tell apart -------------------------------------------------------

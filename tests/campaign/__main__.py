@@ -1,5 +1,5 @@
 """Campaigns: `python -m tests.campaign WHAT`, WHAT being final, simulate, derivatives, attractors,
-grazing, paths, refine, portraits, shocks or fractions."""
+grazing, paths, refine, portraits, shocks, fractions or maps."""
 
 import argparse
 import functools
@@ -19,7 +19,7 @@ def main(arguments=None):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from . import cases, compare, fractions, package, paths, portraits, refine, shocks
+    from . import cases, compare, fractions, maps, package, paths, portraits, refine, shocks
 
     if options.what == "paths":
         return paths.run(options.seed, options.paths)
@@ -31,6 +31,8 @@ def main(arguments=None):
         return shocks.run(options.seed, options.runs, verbose=options.verbose)
     if options.what == "fractions":
         return fractions.run(options.seed, options.runs, options.threads)
+    if options.what == "maps":
+        return maps.run(options.show or 20)
     rng = np.random.default_rng(options.seed)
     began = time.monotonic()
     verdicts, disagreements, right, done = Counter(), [], [], 0
@@ -101,7 +103,7 @@ def _parser():
         "what",
         choices=(
             *("final", "simulate", "derivatives", "attractors", "grazing", "paths", "refine"),
-            *("portraits", "shocks", "fractions"),
+            *("portraits", "shocks", "fractions", "maps"),
         ),
     )
     parser.add_argument("--seed", type=int, default=0)

@@ -1,0 +1,292 @@
+"""The curves that bound the regions of a plane of two parameters: `Bounds`.
+
+Points are found by `scan` along a few lines across the plane, and their curves are followed. What
+no line meets is missing then. So cells are asked: where two neighbours differ and no curve passes
+by, the points between these two are looked for, their curves followed, until no such pair is left,
+or only those between which nothing is found. Every end of a curve has a name at last: where it has
+none of its own, the point of codimension two in which it meets another curve.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from ..activity import tell
+from ..model.variations import Variation
+from ..numerics.continuation import Stop
+from ..results import Status
+from .conditions import BifurcationPoint
+from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
+from .faces import densely
+from .path import ParameterPath
+from .scan import search
+from .special import SpecialPoint
+
+#: A curve bounds two neighbouring cells if it passes the way between them so near, in cells: chords
+#: of a bent curve are off by less.
+PASSES_BY = 0.1
+#: A pair between which nothing is found stands for others of the same two motions so near, in
+#: cells.
+ALIKE = 3.0
+#: Points on the way between two cells, and on a curve, so many a cell, whose distances are taken.
+PER_CELL = 8
+#: Values looked at first between two cells.
+BETWEEN = 6
+
+#: So many rows of a curve in succession on another one tell that they are one from there.
+DOUBLED = 4
+#: Places of one cycle in rows of two curves that are a step apart differ by less, relative to its
+#: size.
+SAME_PLACE = 0.05
+#: A curve ends in a point that is known, if it is no farther than so many steps, and its own last
+#: rows lead by there, at this part of the distance; rows that tell.
+MEETS, MISSES, END_ROWS = 4.0, 0.2, 4
+
+#: Two neighbouring cells, the parameters of each.
+Pair = tuple[tuple[float, float], tuple[float, float]]
+
+
+class Bounds:
+    """The curves in a plane, found so far.
+
+    variation: of both parameters; values: of each, increasing; step: between the points of curves,
+    in units of the larger side / 1.4.
+    """
+
+    def __init__(self, variation: Variation, values: Sequence[np.ndarray], step: float):
+        self.variation, self.values = variation, values
+        self.limits = np.array([(float(along[0]), float(along[-1])) for along in values])
+        self.step = step * float(np.max(self.limits[:, 1] - self.limits[:, 0])) / 1.4
+        #: The mean size of a cell.
+        self.cell = np.array([np.ptp(ends) for ends in self.limits])
+        self.cell = self.cell / [len(along) - 1 for along in values]
+        self.curves: list[BifurcationCurve] = []
+
+    def search_lines(self, lines: int) -> None:
+        """Follow the curve of every point on so many lines parallel to each axis."""
+        across = [
+            (along, float(fixed))
+            for along in (0, 1)
+            for a, b in [self.limits[1 - along]]
+            for fixed in a + (b - a) * (np.arange(lines) + 0.37) / lines
+        ]
+        # The next lines are searched while curves are followed from those before.
+        with ThreadPoolExecutor(1) as ahead:
+            searches = [
+                (line, ahead.submit(self._points, *line, self.limits[line[0]])) for line in across
+            ]
+            for count, ((along, fixed), found) in enumerate(searches, 1):
+                told = f"{count} of {len(across)} lines"
+                self._follow(found.result(), along, fixed, told)
+
+    def search_between(self, motions: np.ndarray, left_out: np.ndarray) -> tuple[Pair, ...]:
+        """Follow the curves between neighbouring cells that differ; returns the pairs without any.
+
+        motions: a number for what there is in each cell, [n, m], negative where that is not known;
+        left_out: cells that are not asked, [n, m].
+        """
+        rows = neighbours_that_differ(motions, left_out)
+        rows = rows[self.away(rows) > PASSES_BY]
+        untried = np.ones(len(rows), bool)
+        while np.any(untried):
+            away = np.where(untried, self.away(rows), -1.0)
+            # Far from curves that are known, and so from points of codimension two on them.
+            at = int(np.argmax(away))
+            row, column, along = rows[at].tolist()
+            tell(f"{len(self.curves)} curves, {int(untried.sum())} pairs of cells without one")
+            fixed = float(self.values[1 - along][(row, column)[1 - along]])
+            first = (row, column)[along]
+            ends = self.values[along][first : first + 2]
+            known = len(self.curves)
+            self._follow(self._points(along, fixed, ends, BETWEEN), along, fixed, "pairs of cells")
+            untried[at] = False
+            if len(self.curves) > known:
+                left = self.away(rows) > PASSES_BY
+                rows, untried = rows[left], untried[left]
+            else:
+                untried &= ~_alike(rows, at, motions)
+        return tuple(self.pair(row) for row in rows.tolist())
+
+    def name_ends(self) -> None:
+        """Give ends without a name that of the point in which they meet another curve."""
+        for number, curve in enumerate(self.curves):
+            others = [other for other in self.curves if other is not curve]
+            known = [point for other in others for point in other.special]
+            for end in (0, -1):
+                if (point := _meeting_at_end(curve, end, known, self.step)) is not None:
+                    where = (point, *curve.special) if end == 0 else (*curve.special, point)
+                    curve = replace(curve, special=where)
+            self.curves[number] = curve
+
+    def _points(self, along: int, fixed: float, ends, resolution: int = 0):
+        """The points on a line parallel to an axis, the other parameter being fixed."""
+        span = float(ends[0]), float(ends[1])
+        path = ParameterPath(self.variation.held(1 - along, fixed), None, span)
+        # From farther off, too, where the line is short.
+        return search(path, resolution, near=1.0) if resolution else search(path)
+
+    def _follow(
+        self, points: Sequence[BifurcationPoint], along: int, fixed: float, told: str
+    ) -> None:
+        """Follow the curves of points that are on none that is known."""
+        for point in points:
+            tell(f"{len(self.curves)} curves from {told}")
+            pair = np.empty(2)
+            pair[along], pair[1 - along] = float(point.value), fixed
+            if point.status == Status.OK and not any(
+                _lies_on(point, pair, curve, self.step) for curve in self.curves
+            ):
+                limits, step = self.limits, self.step
+                curve = follow_point(self.variation, point, pair, limits, step=step)
+                self.curves.append(_without_known(curve, pair, self.curves, step))
+
+    def away(self, rows: np.ndarray) -> np.ndarray:
+        """How far from the way between the two cells the next curve passes, in cells, [pairs]."""
+        from scipy.spatial import KDTree  # late, as only maps need it
+
+        if not self.curves or not len(rows):
+            return np.full(len(rows), np.inf)
+        paths = [densely(curve.path / self.cell, 1 / PER_CELL) for curve in self.curves]
+        ends = np.array([self.pair(row) for row in rows.tolist()]) / self.cell
+        parts = np.linspace(0, 1, PER_CELL + 1)[:, None, None]
+        ways = (1 - parts) * ends[None, :, 0] + parts * ends[None, :, 1]
+        away, _ = KDTree(np.concatenate(paths)).query(ways)
+        return np.min(away, axis=0)
+
+    def pair(self, row: Sequence[int]) -> Pair:
+        """The two cells of a row of `neighbours_that_differ`."""
+        i, j, along = row
+        p, q = self.values
+        other = (i + 1, j) if along == 0 else (i, j + 1)
+        return (float(p[i]), float(q[j])), (float(p[other[0]]), float(q[other[1]]))
+
+
+def neighbours_that_differ(motions: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+    """Neighbouring cells that differ: row and column of the first one, and the axis, [pairs, 3]."""
+    told = (motions >= 0) & ~left_out
+    found = []
+    for along in (0, 1):
+        a, b = (np.moveaxis(array, along, 0) for array in (motions, told))
+        differ = (a[1:] != a[:-1]) & b[1:] & b[:-1]
+        first, other = np.nonzero(differ)
+        places = (first, other) if along == 0 else (other, first)
+        found.append(np.column_stack([*places, np.full(len(first), along)]))
+    return np.concatenate(found)
+
+
+def _alike(rows: np.ndarray, at: int, motions: np.ndarray) -> np.ndarray:
+    """Which pairs are of the same two motions as that one, and near to it."""
+    first = motions[rows[:, 0], rows[:, 1]]
+    second = motions[rows[:, 0] + (rows[:, 2] == 0), rows[:, 1] + (rows[:, 2] == 1)]
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    near = np.max(np.abs(rows[:, :2] - rows[at, :2]), axis=1) <= ALIKE
+    return near & (low == low[at]) & (high == high[at])
+
+
+def _without_known(
+    curve: BifurcationCurve, start: np.ndarray, known: Sequence[BifurcationCurve], step: float
+) -> BifurcationCurve:
+    """The part of a curve, around where it began, that is on no other one: where curves of one kind
+    meet in a point of codimension two, they may go on as one."""
+    doubled = np.zeros(len(curve), bool)
+    for other in known:
+        if other.condition.lineage == curve.condition.lineage and len(other) > 1:
+            doubled |= _rows_on(curve, other, 0.02 * step)
+    begun = int(np.argmin(np.hypot(*(curve.values - start).T)))
+    first, last = 0, len(curve) - 1
+    # A few rows may be near where two curves cross.
+    for row in range(begun, -1, -1):
+        if row >= DOUBLED and np.all(doubled[row - DOUBLED + 1 : row + 1]):
+            first = min(row + 1, begun)
+            break
+    for row in range(begun, len(curve)):
+        if row + DOUBLED <= len(curve) and np.all(doubled[row : row + DOUBLED]):
+            last = max(row - 1, begun)
+            break
+    return _shortened(curve, first, last)
+
+
+def _rows_on(curve: BifurcationCurve, other: BifurcationCurve, near: float) -> np.ndarray:
+    """Which rows of a curve are on another one, in the same place, [rows]."""
+    path = other.path
+    a, chord = path[:-1], np.diff(path, axis=0)
+    found = np.zeros(len(curve), bool)
+    for row, (at, place) in enumerate(zip(curve.values, curve.places, strict=True)):
+        along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
+        away = np.hypot(*(at - a - np.clip(along, 0, 1)[:, None] * chord).T)
+        there = other.places[int(np.argmin(np.hypot(*(other.values - at).T)))]
+        found[row] = np.min(away) < near and not is_elsewhere(place, there, SAME_PLACE)
+    return found
+
+
+def _shortened(curve: BifurcationCurve, first: int, last: int) -> BifurcationCurve:
+    """A curve from one of its rows to another."""
+    if (first, last) == (0, len(curve) - 1):
+        return curve
+    special, row = [], -1
+    for item in curve.in_order():
+        if isinstance(item, SpecialPoint):
+            # Those between the last row left out and the first one kept are its ends.
+            if first - 1 <= row <= last:
+                special.append(item)
+        else:
+            row = item
+    kept = slice(first, last + 1)
+    ends = [
+        end if row == whole else Stop.STOPPED
+        for end, row, whole in zip(curve.ends, (first, last), (0, len(curve) - 1), strict=True)
+    ]
+    return replace(
+        curve,
+        values=curve.values[kept],
+        classes=curve.classes[kept],
+        multiplier=curve.multiplier[kept],
+        residual=curve.residual[kept],
+        places=curve.places[kept],
+        special=tuple(special),
+        ends=(ends[0], ends[1]),
+    )
+
+
+def _meeting_at_end(
+    curve: BifurcationCurve, end: int, known: Sequence[SpecialPoint], step: float
+) -> SpecialPoint | None:
+    """The point, of those known, in which a curve ends at its first row, 0, or its last one, -1, if
+    it stops there for no reason that is known.
+
+    It is near, and the curve goes there: as far as a parabola through its last rows tells.
+    """
+    if curve.ends[end] in (Stop.LEFT_SPAN, Stop.CLOSED) or curve.is_named(end):
+        return None
+    rows = curve.values[:END_ROWS] if end == 0 else curve.values[::-1][:END_ROWS]
+    gone = np.append(0.0, np.cumsum(np.hypot(*np.diff(rows, axis=0).T)))
+    degree = min(2, len(rows) - 1)
+    # Where it was cut it may have gone a little beyond.
+    ahead = np.linspace(step, -MEETS * step, 200)
+    fits = [np.polyfit(gone, column, degree) for column in rows.T]
+    path = np.column_stack([np.polyval(fit, ahead) for fit in fits])
+    found = []
+    for point in known:
+        gap = float(np.hypot(*(point.values - rows[0])))
+        miss = float(np.min(np.hypot(*(path - point.values).T)))
+        if gap < MEETS * step and miss < MISSES * max(gap, 0.1 * step):
+            found.append((gap, point))
+    return min(found, key=lambda one: one[0])[1] if found else None
+
+
+def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, step: float) -> bool:
+    """Whether a point is on a curve that is known."""
+    if point.condition.lineage != curve.condition.lineage:
+        return False
+    a, b = curve.values[:-1], curve.values[1:]
+    chord = b - a
+    along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
+    along = np.clip(along, 0, 1)[:, None]
+    away = np.hypot(*(at - a - along * chord).T)
+    places = curve.places[:-1] + along * (curve.places[1:] - curve.places[:-1])
+    own = point.place
+    return any(
+        not is_elsewhere(own, places[i], FAR) for i in np.flatnonzero(away < 0.3 * step).tolist()
+    )

@@ -1,0 +1,252 @@
+"""What there is in the cells of a map: `look_at`; and how regions are named.
+
+A cell is a point of a plane of two parameters. Its equilibria are known in closed form. Its cycles
+are those that runs lead to, from the starts from which `scan` follows orbits: where stick phases
+end, for a cycle that sticks comes by there, and at several distances from an equilibrium. So a cell
+knows what a path through it does.
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..cycles.attractors import RUN, Runs, stuck_belts
+from ..model.equilibria import EquilibriumKind, candidates
+from ..model.oscillator import Oscillator
+from ..numerics.compiling import jit
+from ..presets import class_b
+from ..results import Status
+from ..sweeps.attractor import CYCLE, UNDECIDED, Attractor, signature
+from ..sweeps.fractions import PLACE
+from ..sweeps.grid import Grid
+from ..sweeps.question import LONG_ENOUGH
+from ..sweeps.shares import told_apart
+from ..sweeps.work import results_of
+from .guesses import starts as starts_of_scan
+from .labels import Label
+
+#: Velocities that differ by less are one, but for rounding.
+SAME_VELOCITY = 1e-12
+#: Tolerances of the runs.
+RUN_TOLERANCE = 1e-8
+#: What names say of an equilibrium.
+LETTERS = {
+    EquilibriumKind.FIXED_POINT: "f",
+    EquilibriumKind.PSEUDO_FOCUS: "p",
+    EquilibriumKind.SEGMENT: "h",
+}
+
+
+# --- names ----------------------------------------------------------------------------------------
+
+
+def region_name(osc: Oscillator, label: Label) -> str:
+    """The name of what a label tells, in the manner of the paper's Fig. 6.
+
+    A digit: 1 there is a stable equilibrium only; 2 a stable cycle, too; 3 a stable cycle only.
+    Where belts run in opposite directions these are 6, 5 and 4. With several belts a letter tells
+    what the cycle sticks to: a belt 0, b belt 1, c both (belts as binary digits, for more of them),
+    s none. Of several cycles each has its letter.
+
+    With contact edges there may be several equilibria, of several kinds. There the digit is 1, 2 or
+    3 wherever belts run to, and after a colon the equilibria follow from left to right: f a fixed
+    point, p a pseudo-focus, h a segment that holds; in brackets those that do not attract.
+    """
+    velocities = [float(belt.velocity) for belt in osc.belts]
+    opposite = min(velocities) < 0 < max(velocities)
+    rests = [(kind, stable) for kind, stable, _ in label.equilibria]
+    stuck = [stuck_belts(path) for path in label.cycles]
+    return _name(_is_edged(osc), opposite, len(velocities), rests, stuck)
+
+
+def _is_edged(osc: Oscillator) -> bool:
+    return bool(np.any(np.isfinite([(belt.lower, belt.upper) for belt in osc.belts])))
+
+
+def _name(
+    edged: bool,
+    opposite: bool,
+    belts: int,
+    equilibria: Sequence[tuple[int, bool]],
+    cycles: Sequence[Collection[int]],
+) -> str:
+    """As `region_name`, by what is known: whether there are contact edges, whether belts run in
+    opposite directions, how many there are; (kind, stable) of the equilibria from left to right;
+    the belts to which each cycle sticks. "" where nothing attracts."""
+    rests = any(stable for _, stable in equilibria)
+    if not rests and not cycles:
+        return ""
+    number = 2 if rests and cycles else 3 if cycles else 1
+    letters = []
+    for stuck in cycles:
+        code = sum(2**belt for belt in set(stuck))
+        letters.append(chr(ord("a") + code - 1) if code else "s")
+    tail = "".join(sorted(letters)) if belts > 1 else "s" * letters.count("s")
+    if not edged:
+        return f"{7 - number if opposite else number}{tail}"
+    kinds = ((LETTERS[EquilibriumKind(kind)], stable) for kind, stable in equilibria)
+    words = (letter if stable else f"({letter})" for letter, stable in kinds)
+    return f"{number}{tail}:{''.join(words)}"
+
+
+def in_plane_of_paper(oscillators: Sequence[Oscillator]) -> bool:
+    """Whether oscillators are those of the plane of the paper's Fig. 6, where regions have their
+    names: class (b) with its friction, loads and damping, and any velocities of the belts."""
+
+    def is_there(osc: Oscillator) -> bool:
+        paper = class_b(*([belt.velocity for belt in osc.belts] * 2)[:2])
+        same = jax.tree.structure(osc) == jax.tree.structure(paper)
+        pairs = zip(jax.tree.leaves(osc), jax.tree.leaves(paper), strict=True) if same else ()
+        return same and all(np.array_equal(one, other) for one, other in pairs)
+
+    return all(map(is_there, oscillators))
+
+
+# --- what there is --------------------------------------------------------------------------------
+
+
+class Cells(NamedTuple):
+    """What there is in each cell, arrays [cells].
+
+    names: of the regions, "" where runs were undecided, or nothing attracts. motions: a number for
+    all that there is: kind, stability and contacts of each equilibrium, the events of each cycle
+    and the belts that it sticks to; equal where that is equal, -1 where runs were undecided.
+    on_line: whether a belt is at rest there, or two run at one velocity.
+    """
+
+    names: np.ndarray
+    motions: np.ndarray
+    on_line: np.ndarray
+
+
+def look_at(
+    make: Callable[..., Oscillator],
+    names: Sequence[str],
+    points: np.ndarray,
+    starts: Sequence[tuple[float, float]] = (),
+) -> Cells:
+    """What there is at points of a plane, [cells, 2], the values of two arguments of `make`.
+
+    starts: further ones, (x1, x2), from which each cell is run.
+    """
+    points = np.asarray(points, float)
+    still: Any = jax.tree.map(np.asarray, _still_at(make, tuple(names), jnp.asarray(points)))
+    decided, cycles, sticks = _cycles_at(make, names, points, still, np.reshape(starts, (-1, 2)))
+    opposite = (still.velocities.min(-1) < 0) & (still.velocities.max(-1) > 0)
+    count = len(points)
+    rests = [still.kind, still.stable, still.modes.reshape(count, -1)]
+    facts = np.concatenate([decided[:, None], opposite[:, None], *rests, cycles], axis=1)
+    kinds, first, which = np.unique(facts, axis=0, return_index=True, return_inverse=True)
+    edged, belts = _is_edged(make(**_arguments(names, points[0]))), still.velocities.shape[1]
+    named, numbers, known = [], [], {}
+    for row, cell in zip(kinds.tolist(), first.tolist(), strict=True):
+        here = still.kind[cell] > 0
+        pairs = zip(still.kind[cell][here].tolist(), still.stable[cell][here].tolist(), strict=True)
+        stuck = [sticks[number] for number in row[-cycles.shape[1] :] if number >= 0]
+        name = _name(edged, bool(row[1]), belts, list(pairs), stuck)
+        named.append(name if row[0] else "")
+        number = known.setdefault(tuple(row[2:]), len(known))
+        numbers.append(number if row[0] else -1)
+    which = which.reshape(count)
+    return Cells(np.array(named)[which], np.array(numbers)[which], _on_line(still.velocities))
+
+
+def _arguments(names: Sequence[str], point: Any) -> dict[str, float]:
+    return dict(zip(names, map(float, point), strict=True))
+
+
+def _on_line(velocities: np.ndarray) -> np.ndarray:
+    """Where a belt is at rest, or two run at one velocity; velocities: [cells, belts]."""
+    # A belt is at rest where it runs at the velocity of one that does not.
+    count, n = velocities.shape
+    others = np.append(velocities, np.zeros((count, 1)), axis=-1)
+    meet = np.abs(velocities[:, :, None] - others[:, None, :]) < SAME_VELOCITY
+    return np.any(meet & ~np.eye(n, n + 1, dtype=bool), axis=(-2, -1))
+
+
+class _Still(NamedTuple):
+    """What is known of the cells before anything is run: of the equilibria kind, stable, [cells,
+    equilibria], and modes, [.., belts]; velocities, [cells, belts]; the starts of `scan`, [cells,
+    starts, 2]; the leaves of the oscillators, [cells] each."""
+
+    kind: Array
+    stable: Array
+    modes: Array
+    velocities: Array
+    starts: Array
+    leaves: list[Array]
+
+
+@jit
+def _still_at(make, names, points: Array) -> _Still:
+    def one(pair):
+        osc = make(**dict(zip(names, pair, strict=True)))
+        rests = candidates(osc)
+        velocities = jnp.stack([belt.velocity for belt in osc.belts])
+        starts = starts_of_scan(osc, rests)
+        # Contacts of a belt without load, which does nothing, are no difference.
+        idle = jnp.stack([belt.load for belt in osc.belts]) == 0
+        modes = jnp.where(idle, 0, rests.modes)
+        leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(osc)]
+        return _Still(rests.kind, rests.stable, modes, velocities, starts, leaves)
+
+    return jax.vmap(one)(points)
+
+
+def _cycles_at(make, names, points, still: _Still, more: np.ndarray):
+    """Which cells are decided, [cells], the numbers of the sorts of cycles that each has, in order,
+    -1 where it has no more, [cells, cycles]; and the belts to which each sort sticks."""
+    belts = still.velocities.shape[1]
+    told, ran = _runs_from(make, names, points, still, more)
+    kinds = told["kind"].astype(int)
+    escapes = told["status"] == Status.NOT_FINITE
+    decided = ~np.any(ran & (kinds == UNDECIDED) & ~escapes, axis=1)
+    sticks = told["sticks"].astype(int)
+    known, which = np.unique(told["signature"], return_inverse=True)
+    signatures = np.array([signature(int(word) if word < 2**53 else -1, belts) for word in known])
+    places = np.stack([told[name] for name in PLACE], axis=-1)
+    runs = Runs(places, signatures[which.reshape(kinds.shape)], RUN * RUN_TOLERANCE)
+    cycles = np.where(kinds == CYCLE, kinds, UNDECIDED)
+    labels = told_apart(
+        cycles, sticks, runs, lambda point: make(**_arguments(names, points[point]))
+    )
+    codes = sticks @ 2 ** np.arange(belts)
+    sorts: dict[tuple[str, int], int] = {}
+    count = int(labels.max(initial=-1)) + 1
+    found = np.full((len(points), max(count, 1)), -1)
+    for number in range(count):
+        has, first = np.any(labels == number, axis=1), np.argmax(labels == number, axis=1)
+        for at in np.flatnonzero(has):
+            sort = str(runs.signatures[at, first[at]]), int(codes[at, first[at]])
+            found[at, number] = sorts.setdefault(sort, len(sorts))
+    stuck = [[belt for belt in range(belts) if code >> belt & 1] for _, code in sorts]
+    return decided, np.sort(found, axis=1), stuck
+
+
+def _runs_from(make, names, points, still: _Still, more: np.ndarray):
+    """What the observer of attractors tells of the runs, by name, [cells, starts, ..], and which
+    there are."""
+    grid = Grid(make, {name: points[:1, i] for i, name in enumerate(names)}, (0.0, 0.0))
+    begun = np.broadcast_to(more, (len(points), *more.shape))
+    begun = np.concatenate([still.starts, begun], axis=1)
+    ran = np.all(np.isfinite(begun), axis=-1)
+    cell, start = np.nonzero(ran)
+    pairs = zip(still.leaves, grid.mapped, strict=True)
+    varying = [leaf for leaf, varies in pairs if varies]
+
+    def rows_of(first: int, last: int) -> np.ndarray:
+        at = cell[first:last]
+        states = begun[at, start[first:last]].T
+        return np.concatenate([states, [leaf[at] for leaf in varying]])[None]
+
+    numbers = {"t1": LONG_ENOUGH, "rtol": RUN_TOLERANCE, "atol": RUN_TOLERANCE}
+    told = {}
+    columns = results_of(grid.program(Attractor()), grid.shared, rows_of, len(cell), **numbers)
+    for name, column in columns.items():
+        told[name] = np.zeros((*ran.shape, *column.shape[1:]))
+        told[name][ran] = np.nan_to_num(column)
+    return told, ran

@@ -1,0 +1,164 @@
+"""Maps: what `region_map` draws of classes (c) and (d), and what it leaves out.
+
+Of each map are counted: neighbouring cells that have different motions with no curve within one
+cell; curves that bound nothing, that is, beside no row of which motions differ; ends of curves
+without a name; rows with a residual that is not small; and rows of which the mirror image is no
+point of the mirrored oscillator: x1 to -x1 exchanges (nu0, nu1) with (-nu1, -nu0) and (sigma0,
+sigma1) with (-sigma1, -sigma0), where both belts are alike.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+import jaxbelt as jb
+from jaxbelt.bifurcations.bounds import Bounds, neighbours_that_differ
+from jaxbelt.bifurcations.cells import look_at
+from jaxbelt.bifurcations.regions import varied_by_names
+from jaxbelt.numerics.continuation import Stop
+
+#: Cells along the axes: other numbers, lest cells lie where both parameters are the same.
+CELLS = 64, 65
+#: Rows of a curve that are asked; so far from a row both its sides are, in units of the map's side.
+ROWS, BESIDE = 7, 2e-3
+#: Residuals of rows, and how far an image may be from a point that is refined there.
+SMALL, SAME = 1e-8, 1e-9
+
+NU, SIGMA = (-0.7, 0.7), (-1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A map: (p, q) to the four numbers (nu0, nu1, sigma0, sigma1); its axes, (from, to) each."""
+
+    name: str
+    numbers: Callable
+    axes: dict[str, tuple[float, float]]
+
+    def make(self, **values):
+        return jb.presets.class_d(*self.numbers(*values.values()))
+
+    def mirrored(self, p, q):
+        nu0, nu1, sigma0, sigma1 = self.numbers(p, q)
+        return jb.presets.class_d(-nu1, -nu0, -sigma1, -sigma0)
+
+
+def _velocities(name: str, sigma0: float, sigma1: float) -> Plane:
+    return Plane(name, lambda p, q: (p, q, sigma0, sigma1), {"nu0": NU, "nu1": NU})
+
+
+PLANES = (
+    *(_velocities(f"(c) sigma = {sigma:g}", sigma, sigma) for sigma in (-0.5, 0.0, 0.3)),
+    Plane("(c) nu1 = 0.3", lambda p, q: (p, 0.3, q, q), {"nu0": NU, "sigma": SIGMA}),
+    *(_velocities(f"(d) {ends}", *ends) for ends in ((-0.3, 0.3), (-1.0, 0.2), (0.2, 0.9))),
+)
+
+
+def differences(plane: Plane, told: jb.RegionMap) -> tuple[Counter, list[str]]:
+    """What a map leaves out, counted, and in words."""
+    counts, wrong = Counter(curves=len(told.curves)), []
+    counts["special points"] = sum(len(curve.special) for curve in told.curves)
+    variation = varied_by_names(plane.make, told.names, told.values)
+    pairs = _boundaries(plane, told)
+    counts["boundaries"] = len(pairs)
+    bounds = Bounds(variation, told.values, 0.01)
+    bounds.curves = list(told.curves)
+    for row, gap in zip(pairs, bounds.away(pairs)):
+        if gap > 1.0:
+            wrong.append(f"no curve within a cell: {bounds.pair(row)}")
+    wrong += [f"no curve between: {pair}" for pair in told.uncovered]
+    for curve in told.curves:
+        counts["ends"] += 2
+        for end in (0, -1):
+            if curve.ends[end] not in (Stop.LEFT_SPAN, Stop.CLOSED) and not curve.is_named(end):
+                wrong.append(f"end without a name: {curve}, {curve.ends[end].value}")
+        if np.max(curve.residual) > SMALL:
+            wrong.append(f"residual {np.max(curve.residual):.1e}: {curve}")
+        if not _bounds_something(plane, told, curve):
+            wrong.append(f"bounds nothing: {curve}")
+        wrong += _not_mirrored(plane, curve, counts)
+    return counts, wrong
+
+
+def _boundaries(plane: Plane, told: jb.RegionMap) -> np.ndarray:
+    """Pairs of neighbouring cells that differ, as `bounds.neighbours_that_differ` has them."""
+    grid = np.meshgrid(*told.values, indexing="ij")
+    points = np.column_stack([axis.ravel() for axis in grid])
+    cells = look_at(plane.make, told.names, points)
+    return neighbours_that_differ(cells.motions.reshape(grid[0].shape), told.on_line)
+
+
+def _some_rows(curve: jb.BifurcationCurve) -> list[int]:
+    """Numbers of rows spread along a curve, its ends left out."""
+    inner = np.linspace(0, len(curve) - 1, ROWS + 2)[1:-1]
+    return sorted({int(row) for row in inner})
+
+
+def _bounds_something(plane: Plane, told: jb.RegionMap, curve: jb.BifurcationCurve) -> bool:
+    """Whether motions differ on the two sides of some of its rows."""
+    if len(curve) < 3:
+        return True
+    sides = np.array([along[-1] - along[0] for along in told.values])
+    points = []
+    for row in _some_rows(curve):
+        chord = (curve.values[min(row + 1, len(curve) - 1)] - curve.values[max(row - 1, 0)]) / sides
+        normal = np.array([-chord[1], chord[0]]) / np.linalg.norm(chord)
+        points += [curve.values[row] + side * BESIDE * normal * sides for side in (-1, 1)]
+    motions = look_at(plane.make, told.names, np.array(points)).motions
+    return bool(
+        np.any((motions[::2] != motions[1::2]) & (motions[::2] >= 0) & (motions[1::2] >= 0))
+    )
+
+
+def _not_mirrored(plane: Plane, curve: jb.BifurcationCurve, counts: Counter) -> list[str]:
+    """Rows of which the mirror image is no point of the mirrored oscillator."""
+    wrong = []
+    for row in _some_rows(curve)[1::3]:
+        condition = _for_mirror(curve.classes[row], curve.condition)
+        chord = np.abs(curve.values[min(row + 1, len(curve) - 1)] - curve.values[max(row - 1, 0)])
+        free = int(np.argmin(chord))
+        held, at = float(curve.values[row, 1 - free]), float(curve.values[row, free])
+
+        def make(value, held=held, free=free):
+            return plane.mirrored(*((value, held) if free == 0 else (held, value)))
+
+        counts["mirrored"] += 1
+        # A cycle may be there on one side only.
+        found = [jb.refine(condition, make, at=at + side) for side in (1e-4, -1e-4)]
+        away = [abs(float(one.value) - at) for one in found if int(one.status) == jb.Status.OK]
+        if min(away, default=np.inf) > SAME:
+            wrong.append(f"not mirrored: {curve} at {curve.values[row]}: {found}")
+    return wrong
+
+
+def _for_mirror(kind: type, condition):
+    """The condition of a row on the mirror image, where belts have changed places."""
+    names = [name for name in ("belt", "belts") if hasattr(condition, name)]
+    belts = tuple(1 - belt for belt in condition.belts_concerned)
+    return kind(belts[0] if names == ["belt"] else belts) if names else kind()
+
+
+def run(show: int = 20) -> int:
+    """Draw the maps twice, the second time warm, and print what they leave out."""
+    failed = 0
+    for plane in PLANES:
+        axes = {name: np.linspace(*ends, n) for (name, ends), n in zip(plane.axes.items(), CELLS)}
+        spent = []
+        for _ in range(2):
+            began = time.monotonic(), time.process_time()
+            told = jb.region_map(plane.make, axes)
+            spent.append((time.monotonic() - began[0], time.process_time() - began[1]))
+        (cold, _), (warm, processor) = spent
+        counts, wrong = differences(plane, told)
+        print(
+            f"{plane.name}: {dict(counts)}, {len(wrong)} wrong; {cold:.0f} s, then {warm:.0f} s "
+            f"({processor:.0f} s of processors)",
+            *wrong[:show],
+            sep="\n  ",
+            flush=True,
+        )
+        failed += bool(wrong)
+    return int(bool(failed))
