@@ -178,7 +178,7 @@ def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Arr
 
 def _searched(columns: Array, values: Array, side: str) -> Array:
     """`searchsorted` in each of the columns [.., lanes], for values [.., lanes or 1]."""
-    find = functools.partial(jnp.searchsorted, side=side, method="scan_unrolled")
+    find = functools.partial(jnp.searchsorted, side=side, method="scan")
     values = jnp.broadcast_to(values, (values.shape[0], columns.shape[1]))
     return jax.vmap(find, (1, 1), 1)(columns, values)
 
