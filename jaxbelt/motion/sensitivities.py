@@ -50,6 +50,8 @@ SIDE_BY_SIDE = 64
 #: Runs, at most, and arcs of each, that are sorted by their numbers of steps together; and how many
 #: arcs these are, at most.
 RUNS, ROWS, CHUNK = 128, 128, 2048
+#: Groups into which these are divided, at least.
+GROUPS_OF_CHUNK = 16
 #: Largest density of steps, so that all numbers stay finite.
 DENSEST = 1e4
 #: Along an arc the steps vary by the ratio of the densities at its ends to this power: between the
@@ -290,7 +292,9 @@ def _slopes(function, by_run, varied, rest, run, row, numbers, steps) -> tuple[A
     many are made side by side; -1: it is not wanted.
     """
     flights, columns = steps.size, len(numbers) + sum(_sizes(by_run, varied))
-    size = max(1, min(SIDE_BY_SIDE, flights, _power_of_two(max(1, LARGEST // columns))))
+    most = min(SIDE_BY_SIDE, _power_of_two(max(1, LARGEST // columns)))
+    # A few groups at least, for all of a group wait for the longest.
+    size = min(most, max(1, flights // GROUPS_OF_CHUNK))
     short = jnp.clip(steps, -1, MOST_STEPS).astype(jnp.int32) + 1
     # Sorted with their places as one number: a sort of pairs takes ten times as long.
     in_order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32))
@@ -460,7 +464,7 @@ def _past_rows(entry: Sensitivity, rows):
         moved = before.x1 - x2 * before.t, before.x2 - a * before.t
         fixed = Sensitivity(*moved, jnp.zeros_like(before.t))
         before = select(creeps[:, None], fixed, before)
-        is_t1 = jnp.where(jnp.arange(before.t.shape[1]) == 3, 1.0, 0.0)
+        is_t1 = jnp.where(jnp.arange(before.t.shape[1]) == 3, 1.0, 0.0)[None]
 
         def through(slopes):
             by_entry = slopes[:, :1] * before.x1 + slopes[:, 1:2] * before.x2
