@@ -102,7 +102,7 @@ class Sensitivity(eqx.Module):
 class _Steps(NamedTuple):
     """Steps that are fixed beforehand: how many, and how they are graded, see `_steps_of`."""
 
-    count: Array
+    number: Array
     is_even: Array
     ratio: Array
 
@@ -382,23 +382,23 @@ def _sensitivities(by_run, varied, rest, arcs: Arc, remaining: Array) -> Sensiti
 
     def block(ends, number):
         of_block = jax.tree.map(lambda leaf: _part(leaf, (number * width, width)), own)
-        parts = eqx.combine(shared, of_block)
+        varied, rest = eqx.combine(shared, of_block)
 
         def chunk(state, k):
             entry, ends = state
             place = number * width, k * depth
-            some = jax.tree.map(
+            some, left = jax.tree.map(
                 lambda leaf: _part(leaf, (place[0], width), (place[1], depth)), (arcs, remaining)
             )
 
             def work():
-                return _past_chunk(by_run, *parts, *some, entry)
+                return _past_chunk(by_run, varied, rest, some, left, entry)
 
             def nothing():
                 told = jnp.zeros((width, depth, inputs))
                 return entry, Sensitivity(told, told, told)
 
-            entry, told = lax.cond(any_lane(jnp.any(some[0].used)), work, nothing)
+            entry, told = lax.cond(any_lane(jnp.any(some.used)), work, nothing)
             ends = jax.tree.map(
                 lambda a, b: lax.dynamic_update_slice(a, b, (*place, 0)), ends, told
             )
@@ -433,12 +433,12 @@ def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, entry: Sensitivity):
     of_runs = jax.tree.map(lambda leaf, flag: leaf[run] if flag else leaf, (varied, rest), by_run)
     axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
 
-    def looked(varied, rest, arc):
-        osc, mode = eqx.combine(varied, rest), arc.mode
-        steps = _steps_of(osc, mode, arc.entry, arc.duration, arc.end).count
+    def looked(parts, arc):
+        osc, mode = eqx.combine(*parts), arc.mode
+        steps = _steps_of(osc, mode, arc.entry, arc.duration, arc.end).number
         return jnp.where(mode.any_stuck, 0.0, steps), _creep(osc, mode, *arc.entry)
 
-    steps, creeps = jax.vmap(looked, (*axes, 0))(*of_runs, arcs)
+    steps, creeps = jax.vmap(looked, (axes, 0))(of_runs, arcs)
     steps = jnp.where(arcs.used, steps, -1.0)
     numbers = *arcs.entry, remaining
     slopes = _slopes(_passed, by_run, varied, rest, run, arcs, numbers, steps)
@@ -468,7 +468,8 @@ def _past_rows(entry: Sensitivity, rows):
 
         def through(slopes):
             by_entry = slopes[:, :1] * before.x1 + slopes[:, 1:2] * before.x2
-            by_parameters = jnp.pad(slopes[:, 3:], ((0, 0), (4, 0)))
+            nothing = jnp.zeros((slopes.shape[0], 4))
+            by_parameters = jnp.concatenate([nothing, slopes[:, 3:]], axis=1)
             return by_entry + slopes[:, 2:3] * (is_t1 - before.t) + by_parameters
 
         x1, x2, duration = (through(part) for part in slopes)
@@ -546,15 +547,15 @@ def _slopes_of_samples(by_run, varied, rest, entries: Array, since: Array, codes
     def of_chunk(rows):
         run, entries, since, codes, ends = rows
 
-        def steps_of(varied, rest, entry, since, codes, end):
-            osc, mode = eqx.combine(varied, rest), mode_of(codes.astype(float))
-            steps = _steps_of(osc, mode, (entry[0], entry[1]), since, (end[0], end[1])).count
+        def steps_of(parts, entry, since, codes, end):
+            osc, mode = eqx.combine(*parts), mode_of(codes.astype(float))
+            steps = _steps_of(osc, mode, (entry[0], entry[1]), since, (end[0], end[1])).number
             return jnp.where(mode.any_stuck, 0.0, steps)
 
         of_runs = jax.tree.map(
             lambda leaf, flag: leaf[run] if flag else leaf, (varied, rest), by_run
         )
-        steps = jax.vmap(steps_of, (*axes, 0, 0, 0, 0))(*of_runs, entries, since, codes, ends)
+        steps = jax.vmap(steps_of, (axes, 0, 0, 0, 0))(of_runs, entries, since, codes, ends)
         steps = jnp.where(jnp.isnan(since), -1.0, jnp.nan_to_num(steps))
         numbers = entries[:, 0], entries[:, 1], since
         slopes = _slopes(carried, by_run, varied, rest, run, (codes, ends), numbers, steps)
