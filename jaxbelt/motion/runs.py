@@ -338,7 +338,7 @@ def _(primals, tangents):
     # The first entry moves as the start does, the others as the ends before them.
     entries = jax.tree.map(
         lambda first, rows: jnp.append(first, rows[:-1]),
-        Sensitivity(*start[0], start[1]),
+        Sensitivity(start[0][0], start[0][1], start[1]),
         ends,
     )
     nothing = jax.tree.map(lambda _: None, (final, records, samples))
