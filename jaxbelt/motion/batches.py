@@ -17,15 +17,17 @@ from jax import lax
 from jaxtyping import Array
 
 from ..kernel.lanes import Lanes, are_finite, codes_in
-from ..kernel.rounds import STEPS_PER_ROUND, Round, flown_on, lanes_at_start, one_round
+from ..kernel.rounds import Round, flown_on, lanes_at_start, one_round
 from ..model.events import event_between
 from ..model.modes import Mode
 from ..model.oscillator import Oscillator
-from ..numerics.compiling import one_kernel
+from ..numerics.compiling import any_lane, one_kernel
 from ..results import Status
 
 #: Lanes of a group, at most, and rounds that one piece of machine code makes.
 LANES_AT_ONCE, PAGE = 128, 8
+#: Arcs of each run that are looked up at once: most have far fewer than there is room for.
+ARCS_AT_ONCE = 64
 #: Rounds of all lanes for which a book has room, of 180 bytes each; a group of fewer lanes where it
 #: has to have more for each.
 BOOK = 2**20
@@ -137,8 +139,28 @@ def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Arr
     first, last = book.ts[0], book.ts[-1]
     slips = inside & ((last > first) | fires)
     exists = jnp.stack([book.stuck & inside, slips], axis=1).reshape(-1, batch.width)
-    count = jnp.cumsum(exists, axis=0)
-    wanted, total = jnp.arange(1, batch.rows + 1), count[-1]
+    count = jnp.cumsum(exists, axis=0, dtype=jnp.int32)
+    total, size = count[-1], min(ARCS_AT_ONCE, batch.rows)
+
+    def some(first):
+        return _arcs_from(first, size, book, fires, count, batch)
+
+    def nothing(first):
+        shapes = jax.eval_shape(some, first)
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    def looked_up(first):
+        return lax.cond(any_lane(jnp.any(first < total)), some, nothing, first)
+
+    parts = lax.map(looked_up, jnp.arange(0, batch.rows, size, dtype=jnp.int32))
+    arcs, used = jax.tree.map(lambda leaf: leaf.reshape(-1, batch.width)[: batch.rows], parts)
+    return arcs, used, (total > 0) & (total <= batch.rows)
+
+
+def _arcs_from(first, size: int, book: Round, fires, count, batch: Batch):
+    """So many arcs of the lanes from that number on, and which of them there are; fires: whether
+    the steps of a round end on a guard; count: of arcs, behind each phase of the rounds."""
+    wanted, total = first + jnp.arange(1, size + 1, dtype=jnp.int32), count[-1]
     there = wanted[:, None] <= total[None]
     places = jnp.where(there, _searched(count, wanted[:, None], "left"), 0)
     row, is_slip = places // 2, places % 2 == 1
@@ -150,12 +172,13 @@ def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Arr
     def either(slip, stick):
         return jnp.where(is_slip, slip, stick)
 
+    begins, last = book.ts[0], book.ts[-1]
     fires, leaves = is_slip & at(fires), ~is_slip & at(book.released)
     happens = fires | leaves
     codes = codes_in(either(at(book.mode_after), at(book.mode)), batch.belts)
     next_codes = codes_in(either(at(book.mode, after), at(book.mode_after)), batch.belts)
     kind, belt = event_between(tuple(codes), tuple(next_codes))
-    t, t_end = either(at(first), at(book.t)), either(at(last), at(first))
+    t, t_end = either(at(begins), at(book.t)), either(at(last), at(begins))
     x2_end = either(at(book.x2s[-1]), at(book.x2s[0]))
     arcs = dict(
         t=t,
@@ -173,12 +196,12 @@ def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Arr
         in_time=(wanted[:, None] == total[None]) & ~happens,
         captured=fires & at(book.captured, after),
     )
-    return arcs, there, (total > 0) & (total <= batch.rows)
+    return arcs, there
 
 
 def _searched(columns: Array, values: Array, side: str) -> Array:
     """`searchsorted` in each of the columns [.., lanes], for values [.., lanes or 1]."""
-    find = functools.partial(jnp.searchsorted, side=side, method="scan_unrolled")
+    find = functools.partial(jnp.searchsorted, side=side, method="scan")
     values = jnp.broadcast_to(values, (values.shape[0], columns.shape[1]))
     return jax.vmap(find, (1, 1), 1)(columns, values)
 
@@ -186,21 +209,28 @@ def _searched(columns: Array, values: Array, side: str) -> Array:
 def _samples(osc, book: Round, inside: Array, ones, ts, batch: Batch) -> Array:
     """The states of the lanes at some times, each from the step that it lies in."""
 
-    def rows(*columns):
-        return jnp.stack(columns, axis=1).reshape(-1, batch.width)
+    passed = _searched(jnp.where(inside, book.t, jnp.inf), ts, "right")
+    row = jnp.maximum(passed - 1, 0)
 
-    begins, ends = rows(book.t, *book.ts[:-1]), rows(*book.ts)
-    known = jnp.repeat(inside, STEPS_PER_ROUND + 1, axis=0)
-    places = jnp.maximum(_searched(jnp.where(known, begins, jnp.inf), ts, "right") - 1, 0)
-    row, is_first = places // (STEPS_PER_ROUND + 1), places % (STEPS_PER_ROUND + 1) == 0
+    def at(column):
+        return jnp.take_along_axis(column, row, axis=0)
 
-    def at(column, places=places):
-        return jnp.take_along_axis(column, places, axis=0)
+    begins = [at(column) for column in (book.t, *book.ts[:-1])]
+    # In the round: while it sticks, or in which of its steps.
+    place = sum((begin <= ts).astype(jnp.int32) for begin in begins[1:])
+    is_first = place == 0
 
-    x1, x2 = at(rows(book.x1, *book.x1s[:-1])), at(rows(book.x2, *book.x2s[:-1]))
-    begin_t = at(begins)
-    since = jnp.clip(ts - begin_t, 0.0, at(ends) - begin_t)
-    mode = at(book.mode_after, row)
+    def in_place(columns):
+        found = columns[0]
+        for i, column in enumerate(columns[1:], 1):
+            found = jnp.where(place == i, column, found)
+        return found
+
+    x1 = in_place([at(column) for column in (book.x1, *book.x1s[:-1])])
+    x2 = in_place([at(column) for column in (book.x2, *book.x2s[:-1])])
+    begin_t, ends = in_place(begins), in_place([at(column) for column in book.ts])
+    since = jnp.clip(ts - begin_t, 0.0, ends - begin_t)
+    mode = at(book.mode_after)
 
     @one_kernel
     def sample(osc, ones, x1, x2, since, mode, is_first):

@@ -36,13 +36,13 @@ from ..model.modes import (
 )
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.rest import is_at_rest
-from ..numerics.compiling import any_lane, in_turn, of_lane, one_kernel, with_batches
+from ..numerics.compiling import any_lane, of_lane, one_kernel, with_batches
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
 from .batches import BOOK, LANES_AT_ONCE, PAGE, Batch, Group, blank_book, followed_together
 from .integrators import Adaptive, State
 from .sampling import arcs_at, sampled
-from .sensitivities import Arc, in_one_row, sensitivities, split, with_derivatives
+from .sensitivities import Arc, Sensitivity, in_one_row, sensitivities, split, with_derivatives
 
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
 #: because near-grazing events amplify them.
@@ -329,13 +329,18 @@ def _(primals, tangents):
         captured=records.captured,
         used=used,
     )
-    entries, ends = in_turn(sensitivities)(varied, rest, arcs, t1 - records.t)
     start = [
         jnp.zeros_like(value) if slope is None else slope
         for value, slope in zip((y0, t0, t1), tangents[1:4], strict=True)
     ]
     inputs = in_one_row(*start, tangents[0])
-    entries, ends = entries.along(inputs), ends.along(inputs)
+    ends = sensitivities(varied, rest, arcs, t1 - records.t).along(inputs)
+    # The first entry moves as the start does, the others as the ends before them.
+    entries = jax.tree.map(
+        lambda first, rows: jnp.append(first, rows[:-1]),
+        Sensitivity(start[0][0], start[0][1], start[1]),
+        ends,
+    )
     nothing = jax.tree.map(lambda _: None, (final, records, samples))
     last = jax.tree.map(lambda leaf: leaf[-1], ends)
 

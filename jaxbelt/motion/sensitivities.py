@@ -11,7 +11,9 @@ transposes; so both modes, and any number of derivatives by one run, cost about 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -32,7 +34,7 @@ from ..model.modes import (
 )
 from ..model.oscillator import Oscillator
 from ..model.rest import is_slow
-from ..numerics.compiling import any_lane, in_turn, one_kernel
+from ..numerics.compiling import LARGEST, any_lane, one_kernel, with_batches
 from ..numerics.extrapolation import increments, scheme
 from .arcs import stick_arc
 from .integrators import State, density, slip_field
@@ -43,8 +45,13 @@ LENGTH = 0.3
 #: Most steps of an arc, in groups of groups: most arcs need a few, stiff ones thousands.
 GROUPS = (32, 16, 4)
 MOST_STEPS = math.prod(GROUPS)
-#: Arcs that are flown at once.
-ROWS = 32
+#: Arcs that are flown side by side, at most.
+SIDE_BY_SIDE = 64
+#: Runs, at most, and arcs of each, that are sorted by their numbers of steps together; and how many
+#: arcs these are, at most.
+RUNS, ROWS, CHUNK = 128, 128, 2048
+#: Groups into which these are divided, at least.
+GROUPS_OF_CHUNK = 16
 #: Largest density of steps, so that all numbers stay finite.
 DENSEST = 1e4
 #: Along an arc the steps vary by the ratio of the densities at its ends to this power: between the
@@ -92,21 +99,33 @@ class Sensitivity(eqx.Module):
         return jax.tree.map(lambda slopes: slopes @ inputs, self)
 
 
-def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State) -> State:
-    """The state after a time in the field of a slip mode, by steps that are fixed beforehand.
+class _Steps(NamedTuple):
+    """Steps that are fixed beforehand: how many, and how they are graded, see `_steps_of`."""
 
-    Their number and their grading follow from the density of steps that is wanted at y and at the
-    end, which is known already. NaN where MOST_STEPS are too few.
+    number: Array
+    is_even: Array
+    ratio: Array
+
+
+def _steps_of(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State) -> _Steps:
+    """The steps from y to `end` in the field of a slip mode; they have no derivatives.
+
+    Their number and their grading follow from the density of steps that is wanted at both.
     """
-    given = lax.stop_gradient((osc, mode))
+    osc, mode, y, duration, end = lax.stop_gradient((osc, mode, y, duration, end))
     first, last = (
-        jnp.clip(jnp.nan_to_num(density(*given, *lax.stop_gradient(at)), nan=1.0), 1.0, DENSEST)
-        for at in (y, end)
+        jnp.clip(jnp.nan_to_num(density(osc, mode, *at), nan=1.0), 1.0, DENSEST) for at in (y, end)
     )
     is_even = jnp.abs(last - first) < 1e-3 * first
     ratio = jnp.where(is_even, 2.0, last / first)
     mean = jnp.where(is_even, first, (last - first) / jnp.log(ratio))
-    steps = jnp.ceil(jnp.abs(lax.stop_gradient(duration)) * mean / LENGTH)
+    return _Steps(jnp.ceil(jnp.abs(duration) * mean / LENGTH), is_even, ratio)
+
+
+def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State) -> State:
+    """The state after a time in the field of a slip mode, by steps that are fixed beforehand; end:
+    that state, which is known already. NaN where MOST_STEPS are too few."""
+    steps, is_even, ratio = _steps_of(osc, mode, y, duration, end)
 
     def place(number):
         # As if the logarithm of the density were linear: of that density the integral up to s is
@@ -150,12 +169,12 @@ def _carried(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State)
     return select(stuck, (y[0] + v * duration, v), slipped)
 
 
-def _passed(osc: Oscillator, arc: Arc, y: State, remaining: Array) -> tuple[Array, Array, Array]:
+def _passed(osc: Oscillator, arc: Arc, x1: Array, x2: Array, remaining: Array) -> tuple[Array, ...]:
     """Where the orbit goes on after an arc that is known, x1 and x2, and the arc's duration.
 
-    As functions of the oscillator, of the entry y, and of the time left, near those of the arc.
+    As functions of the oscillator, of the entry, and of the time left, near those of the arc.
     """
-    mode = arc.mode
+    y, mode = (x1, x2), arc.mode
     stuck = mode.any_stuck
     end = flown(osc, mode, y, jnp.where(stuck, 0.0, arc.duration), arc.end)
     # The numbers of the run itself, so that the field is the same here and at the next entry.
@@ -189,76 +208,10 @@ def _with_numbers_of(known: Array, found: Array) -> Array:
     return lax.stop_gradient(known) + (found - lax.stop_gradient(found))
 
 
-@one_kernel
-def _sensitivities_at_ends(
-    varied, rest, arcs: Arc, remaining: Array, entry: Sensitivity
-) -> Sensitivity:
-    """Sensitivities at the ends of some arcs, [arcs, inputs], from that at the entry of the first.
-
-    varied, rest: leaves of the oscillator.
-    """
-
-    def jacobian(row):
-        arc, remaining = row
-
-        def passed(varied, x1, x2, remaining):
-            return _passed(eqx.combine(varied, rest), arc, (x1, x2), remaining)
-
-        return _slopes_of(passed, varied, *arc.entry, remaining)
-
-    is_t1 = jnp.where(jnp.arange(entry.t.size) == 3, 1.0, 0.0)
-
-    def creep(arc):
-        return _creep(eqx.combine(varied, rest), arc.mode, *arc.entry)
-
-    def advance(before, row):
-        jacobian, used, (creeps, x2, a) = row
-        moved = before.x1 - x2 * before.t, before.x2 - a * before.t
-        fixed = Sensitivity(*moved, jnp.zeros_like(before.t))
-        before = select(creeps, fixed, before)
-
-        def through(slopes):
-            by_entry = slopes[0] * before.x1 + slopes[1] * before.x2
-            by_parameters = jnp.concatenate([jnp.zeros(4), slopes[3:]])
-            return by_entry + slopes[2] * (is_t1 - before.t) + by_parameters
-
-        x1, x2, duration = (through(slopes) for slopes in jacobian)
-        after = select(used, Sensitivity(x1, x2, before.t + duration), before)
-        return after, after
-
-    # One arc after another, for they need different numbers of steps.
-    rows = lax.map(jacobian, (arcs, remaining)), arcs.used, jax.vmap(creep)(arcs)
-    return lax.scan(advance, entry, rows)[1]
-
-
 def _creep(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array, Array]:
     """Whether the mass slips but hardly moves, see `rest.is_slow`; and the field, (x2, x2')."""
     _, a = slip_field(osc, mode, (x1, x2))
     return ~mode.any_stuck & is_slow(x2, a), x2, a
-
-
-def _slopes_of(function, varied, *numbers):
-    """The derivatives of a function's results, scalars: of each by the numbers and then by what
-    varies, [numbers + varied]."""
-    first, total = len(numbers), len(numbers) + count(varied)
-    basis = jnp.eye(total)
-
-    def column(direction):
-        slopes = [direction[i] for i in range(first)]
-        along = _like(varied, direction[first:]), *slopes
-        return jax.jvp(function, (varied, *numbers), along)[1]
-
-    return jax.vmap(column)(basis)
-
-
-def _like(varied, numbers: Array):
-    """A tree like the first one, of these numbers."""
-    leaves, structure = jax.tree.flatten(varied)
-    parts, before = [], 0
-    for leaf in leaves:
-        parts.append(numbers[before : before + leaf.size].reshape(leaf.shape))
-        before += leaf.size
-    return jax.tree.unflatten(structure, parts)
 
 
 def count(varied) -> int:
@@ -281,45 +234,249 @@ def in_one_row(*slopes) -> Array:
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(slopes)])
 
 
-def _in_blocks(rows):
-    """Arrays [rows, ...] as blocks, [blocks, ROWS, ...]; the last one is filled up with zeros."""
-
-    def blocks(leaf):
-        padding = jnp.zeros((-leaf.shape[0] % ROWS, *leaf.shape[1:]), leaf.dtype)
-        return jnp.concatenate([leaf, padding]).reshape(-1, ROWS, *leaf.shape[1:])
-
-    return jax.tree.map(blocks, rows)
+# --- many runs side by side -----------------------------------------------------------------------
 
 
-def _in_rows(blocks, count: int):
-    """The first rows of what is in blocks."""
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], blocks)
+def _side_by_side(function: Callable, by_run) -> Callable:
+    """function(by_run, varied, rest, *rows) of runs side by side, as a function of the others.
 
-
-def sensitivities(varied, rest, arcs: Arc, remaining: Array) -> tuple[Sensitivity, Sensitivity]:
-    """Sensitivities of a run at the entries and at the ends of its arcs, [arcs, inputs].
-
-    varied, rest: leaves of the oscillator, see `split`; left: the time from each entry to t1.
+    rows are arrays [runs, ..], and so are the leaves of the oscillator for which by_run, a tree of
+    flags like (varied, rest), says it. A batch of it is so many more runs.
     """
-    first = jnp.eye(4 + count(varied))
-    start = Sensitivity(first[0], first[1], first[2])
 
-    def advance(entry, block):
-        arcs, remaining = block
+    def call(varied, rest, *rows):
+        return function(by_run, varied, rest, *rows)
 
-        def work():
-            return _sensitivities_at_ends(varied, rest, arcs, remaining, entry)
+    def batch(_, size, batched, *args):
+        flags = *by_run, *jax.tree.map(lambda _: True, args[2:])
+        leaf, is_batched = jax.tree.leaves(args[2:])[0], jax.tree.leaves(batched[2:])[0]
+        runs = leaf.shape[1 if is_batched else 0]
 
-        def nothing():
-            return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (ROWS, *leaf.shape)), entry)
+        def merged(leaf, by_run, is_batched):
+            if is_batched and not by_run:
+                return jnp.repeat(leaf, runs, axis=0)
+            if by_run and not is_batched:
+                leaf = jnp.broadcast_to(leaf, (size, *leaf.shape))
+            return leaf.reshape(-1, *leaf.shape[2:]) if by_run else leaf
 
-        ends = lax.cond(any_lane(jnp.any(arcs.used)), work, nothing)
-        return jax.tree.map(lambda leaf: leaf[-1], ends), ends
+        differ = jax.tree.map(lambda a, b: a or b, by_run, tuple(batched[:2]))
+        out = _side_by_side(function, differ)(*jax.tree.map(merged, args, flags, tuple(batched)))
+        return jax.tree.map(lambda leaf: leaf.reshape(size, runs, *leaf.shape[1:]), out)
 
-    _, ends = lax.scan(advance, start, _in_blocks((_made_safe(arcs), remaining)))
-    ends = _in_rows(ends, remaining.size)
-    entries = jax.tree.map(lambda one, rows: jnp.concatenate([one[None], rows[:-1]]), start, ends)
-    return entries, ends
+    return with_batches(call, batch)
+
+
+def _of_one_run(function: Callable, varied, rest, *rows):
+    """The function of runs side by side, see `_side_by_side`, for one run."""
+    call = _side_by_side(function, jax.tree.map(lambda _: False, (varied, rest)))
+    out = call(varied, rest, *jax.tree.map(lambda leaf: leaf[None], rows))
+    return jax.tree.map(lambda leaf: leaf[0], out)
+
+
+def _sizes(by_run, varied) -> list[int]:
+    """How many numbers each leaf has for one run."""
+    pairs = zip(jax.tree.leaves(varied), jax.tree.leaves(by_run[0]), strict=True)
+    return [leaf.size // leaf.shape[0] if flag else leaf.size for leaf, flag in pairs]
+
+
+def _power_of_two(number: int) -> int:
+    """The largest that is not above the number, 1 or more."""
+    return 1 << (number.bit_length() - 1)
+
+
+def _slopes(function, by_run, varied, rest, run, row, numbers, steps) -> tuple[Array, ...]:
+    """Derivatives of flights, arrays [flights, numbers + varied] for each result of the function.
+
+    function(osc, row, *numbers): of one flight, scalars; row: a tree of arrays [flights, ..];
+    numbers: arrays [flights]; run: to which run each belongs; steps: of each, for those of about as
+    many are made side by side; -1: it is not wanted.
+    """
+    flights, columns = steps.size, len(numbers) + sum(_sizes(by_run, varied))
+    most = min(SIDE_BY_SIDE, _power_of_two(max(1, LARGEST // columns)))
+    # A few groups at least, for all of a group wait for the longest.
+    size = min(most, max(1, flights // GROUPS_OF_CHUNK))
+    short = jnp.clip(steps, -1, MOST_STEPS).astype(jnp.int32) + 1
+    # Sorted with their places as one number: a sort of pairs takes ten times as long.
+    in_order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32))
+    order, wanted = in_order % flights, in_order >= flights
+    places = jnp.zeros_like(order).at[order].set(jnp.arange(flights, dtype=jnp.int32))
+    own, shared = eqx.partition((varied, rest), by_run)
+    own = jax.tree.map(lambda leaf: leaf[run], own)
+    rows = jax.tree.map(lambda leaf: leaf[order], (own, row, numbers))
+    rows = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), (*rows, wanted))
+
+    @one_kernel
+    def made(shared, own, row, numbers):
+        varied, rest = eqx.combine(shared, own)
+        axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
+
+        def of_one(varied, rest, row, *numbers):
+            return function(eqx.combine(varied, rest), row, *numbers)
+
+        def of_all(varied, *numbers):
+            return jax.vmap(of_one, (*axes, 0, *[0] * len(numbers)))(varied, rest, row, *numbers)
+
+        def column(direction):
+            along = _directed(by_run[0], varied, direction[len(numbers) :])
+            slopes = [jnp.full_like(a, 1.0) * b for a, b in zip(numbers, direction, strict=False)]
+            return jax.jvp(of_all, (varied, *numbers), (along, *slopes))[1]
+
+        return jax.vmap(column)(jnp.eye(columns))
+
+    def group(rows):
+        *rows, wanted = rows
+        shapes = jax.eval_shape(made, shared, *rows)
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
+        # A kernel that is not in a branch of its own has no second derivatives in a loop (JAX
+        # 0.10).
+        return lax.cond(any_lane(jnp.any(wanted)), lambda: made(shared, *rows), lambda: nothing)
+
+    # In one array, so that a flight's numbers stand side by side.
+    slopes = jnp.concatenate(lax.map(group, rows), axis=1)
+    slopes = jnp.moveaxis(slopes, 1, 2).reshape(flights, -1)[places]
+    return tuple(jnp.split(slopes, slopes.shape[1] // columns, axis=1))
+
+
+def _directed(by_run, varied, numbers: Array):
+    """A tree like `varied`, of these numbers, the same for all runs."""
+    leaves, structure = jax.tree.flatten(varied)
+    parts, before = [], 0
+    for leaf, flag in zip(leaves, jax.tree.leaves(by_run), strict=True):
+        shape = leaf.shape[1:] if flag else leaf.shape
+        part = numbers[before : before + math.prod(shape)].reshape(shape)
+        parts.append(jnp.broadcast_to(part, leaf.shape))
+        before += math.prod(shape)
+    return jax.tree.unflatten(structure, parts)
+
+
+# --- from arc to arc ------------------------------------------------------------------------------
+
+
+def sensitivities(varied, rest, arcs: Arc, remaining: Array) -> Sensitivity:
+    """Sensitivities of a run at the ends of its arcs, [arcs, inputs].
+
+    varied, rest: leaves of the oscillator, see `split`; remaining: the time from each entry to t1.
+    Behind the arcs that were used nothing is told, but in the last row that of the last one.
+    """
+    return _of_one_run(_sensitivities, varied, rest, arcs, remaining)
+
+
+def _sensitivities(by_run, varied, rest, arcs: Arc, remaining: Array) -> Sensitivity:
+    """`sensitivities` of runs side by side, [runs, arcs, inputs]."""
+    runs, rows = remaining.shape
+    inputs = 4 + sum(_sizes(by_run, varied))
+    width = min(_power_of_two(2 * runs - 1), _power_of_two(max(1, LARGEST // inputs)), RUNS)
+    depth = min(ROWS, max(1, CHUNK // width))
+    blocks, chunks = -(-runs // width), -(-rows // depth)
+    padding = (0, blocks * width - runs), (0, chunks * depth - rows)
+
+    def padded(leaf):
+        return jnp.pad(leaf, (*padding, *[(0, 0)] * (leaf.ndim - 2)))
+
+    arcs, remaining = jax.tree.map(padded, (arcs, remaining))
+    own, shared = eqx.partition((varied, rest), by_run)
+    own = jax.tree.map(
+        lambda leaf: jnp.pad(leaf, (padding[0], *[(0, 0)] * (leaf.ndim - 1)), "edge"), own
+    )
+    first = jnp.broadcast_to(jnp.eye(inputs)[:3, None], (3, width, inputs))
+
+    def block(ends, number):
+        of_block = jax.tree.map(lambda leaf: _part(leaf, (number * width, width)), own)
+        varied, rest = eqx.combine(shared, of_block)
+
+        def chunk(state, k):
+            entry, ends = state
+            place = number * width, k * depth
+            some, left = jax.tree.map(
+                lambda leaf: _part(leaf, (place[0], width), (place[1], depth)), (arcs, remaining)
+            )
+
+            def work():
+                return _past_chunk(by_run, varied, rest, some, left, entry)
+
+            def nothing():
+                told = jnp.zeros((width, depth, inputs))
+                return entry, Sensitivity(told, told, told)
+
+            entry, told = lax.cond(any_lane(jnp.any(some.used)), work, nothing)
+            ends = jax.tree.map(
+                lambda a, b: lax.dynamic_update_slice(a, b, (*place, 0)), ends, told
+            )
+            return (entry, ends), None
+
+        (entry, ends), _ = lax.scan(chunk, (Sensitivity(*first), ends), jnp.arange(chunks))
+        last = number * width, rows - 1, 0
+        ends = jax.tree.map(lambda a, b: lax.dynamic_update_slice(a, b[:, None], last), ends, entry)
+        return ends, None
+
+    blank = jnp.zeros((blocks * width, chunks * depth, inputs))
+    ends, _ = lax.scan(block, Sensitivity(blank, blank, blank), jnp.arange(blocks))
+    return jax.tree.map(lambda leaf: leaf[:runs, :rows], ends)
+
+
+def _part(leaf: Array, *spans) -> Array:
+    """Of each of the first axes the part (first, how many)."""
+    for axis, (first, size) in enumerate(spans):
+        leaf = lax.dynamic_slice_in_dim(leaf, first, size, axis)
+    return leaf
+
+
+def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, entry: Sensitivity):
+    """Sensitivities of runs side by side after some arcs, [runs, inputs], and at their ends, [runs,
+    arcs, inputs]; entry: before the first one."""
+    width, depth = remaining.shape
+    flat = jax.tree.map(
+        lambda leaf: jnp.swapaxes(leaf, 0, 1).reshape(-1, *leaf.shape[2:]), (arcs, remaining)
+    )
+    arcs, remaining = _made_safe(flat[0]), flat[1]
+    run = jnp.arange(remaining.size) % width
+    of_runs = jax.tree.map(lambda leaf, flag: leaf[run] if flag else leaf, (varied, rest), by_run)
+    axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
+
+    def looked(parts, arc):
+        osc, mode = eqx.combine(*parts), arc.mode
+        steps = _steps_of(osc, mode, arc.entry, arc.duration, arc.end).number
+        return jnp.where(mode.any_stuck, 0.0, steps), _creep(osc, mode, *arc.entry)
+
+    steps, creeps = jax.vmap(looked, (axes, 0))(of_runs, arcs)
+    steps = jnp.where(arcs.used, steps, -1.0)
+    numbers = *arcs.entry, remaining
+    slopes = _slopes(_passed, by_run, varied, rest, run, arcs, numbers, steps)
+    # As many rows at once as fit into one piece of machine code.
+    size = min(depth, _power_of_two(max(1, LARGEST // entry.x1.size)))
+    rows = jax.tree.map(
+        lambda leaf: leaf.reshape(depth // size, size, width, *leaf.shape[1:]),
+        (slopes, arcs.used, creeps),
+    )
+    entry, ends = lax.scan(lambda entry, rows: _past_rows(entry, rows), entry, rows)
+    ends = jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(depth, width, -1), 0, 1), ends)
+    return entry, ends
+
+
+@one_kernel
+def _past_rows(entry: Sensitivity, rows):
+    """The sensitivities past some arcs, [runs, inputs], and at the end of each, [arcs, runs,
+    inputs]; rows: of each the derivatives, whether it was used, and `_creep`."""
+
+    def advance(before, row):
+        slopes, used, (creeps, x2, a) = row
+        x2, a = x2[:, None], a[:, None]
+        moved = before.x1 - x2 * before.t, before.x2 - a * before.t
+        fixed = Sensitivity(*moved, jnp.zeros_like(before.t))
+        before = select(creeps[:, None], fixed, before)
+        is_t1 = jnp.where(jnp.arange(before.t.shape[1]) == 3, 1.0, 0.0)[None]
+
+        def through(slopes):
+            by_entry = slopes[:, :1] * before.x1 + slopes[:, 1:2] * before.x2
+            nothing = jnp.zeros((slopes.shape[0], 4))
+            by_parameters = jnp.concatenate([nothing, slopes[:, 3:]], axis=1)
+            return by_entry + slopes[:, 2:3] * (is_t1 - before.t) + by_parameters
+
+        x1, x2, duration = (through(part) for part in slopes)
+        after = select(used[:, None], Sensitivity(x1, x2, before.t + duration), before)
+        return after, after
+
+    return lax.scan(advance, entry, rows)
 
 
 def _made_safe(arcs: Arc) -> Arc:
@@ -349,7 +506,7 @@ def _(primals, tangents):
     along, entries_along, since_along, *_ = tangents
     varied, rest = split(osc, along)
     rows = entries, since, codes, lax.stop_gradient(states)
-    slopes = in_turn(_slopes_of_samples)(varied, rest, *rows)
+    slopes = _of_one_run(_slopes_of_samples, varied, rest, *rows)
     by_x1, by_x2, by_time, *by_parameters = jnp.moveaxis(slopes, -1, 0)
     if since_along is not None:
         modes = mode_of(jnp.moveaxis(codes.astype(float), -1, 0))
@@ -368,35 +525,41 @@ def _(primals, tangents):
     return with_derivatives(*primals), moved
 
 
-def _slopes_of_samples(varied, rest, entries: Array, since: Array, codes: Array, ends: Array):
-    """Derivatives of samples, [samples, 2, 3 + parameters]: by the entry, the time since it, and
-    the parameters."""
+def _slopes_of_samples(by_run, varied, rest, entries: Array, since: Array, codes: Array, ends):
+    """Derivatives of samples, [runs, samples, 2, 3 + parameters]: by the entry, the time since it,
+    and the parameters."""
+    runs, samples = since.shape
+    total = runs * samples
+    size = min(CHUNK, _power_of_two(2 * total - 1))
 
-    def slopes_of(block):
-        def work():
-            return _slopes_of_some(varied, rest, *block)
+    def chunks(leaf):
+        leaf = leaf.reshape(total, *leaf.shape[2:])
+        padding = (0, -total % size), *[(0, 0)] * (leaf.ndim - 1)
+        return jnp.pad(leaf, padding, "edge").reshape(-1, size, *leaf.shape[1:])
 
-        # Never skipped but where no sample is known. A kernel that is not in a branch of its own
-        # has no second derivatives in a loop (JAX 0.10).
-        nothing = jnp.zeros((ROWS, 2, 3 + count(varied)))
-        return lax.cond(any_lane(jnp.any(~jnp.isnan(block[1]))), work, lambda: nothing)
+    run = jnp.broadcast_to(jnp.arange(runs)[:, None], since.shape)
+    axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
 
-    blocks = _in_blocks((entries, since, codes, ends))
-    return _in_rows(lax.map(slopes_of, blocks), since.size)
+    def carried(osc, row, x1, x2, since):
+        codes, end = row
+        return _carried(osc, mode_of(codes.astype(float)), (x1, x2), since, (end[0], end[1]))
 
+    def of_chunk(rows):
+        run, entries, since, codes, ends = rows
 
-@one_kernel
-def _slopes_of_some(varied, rest, entries: Array, since: Array, codes: Array, ends: Array) -> Array:
-    """`_slopes_of_samples` of as many as fit into one piece of machine code."""
+        def steps_of(parts, entry, since, codes, end):
+            osc, mode = eqx.combine(*parts), mode_of(codes.astype(float))
+            steps = _steps_of(osc, mode, (entry[0], entry[1]), since, (end[0], end[1])).number
+            return jnp.where(mode.any_stuck, 0.0, steps)
 
-    def of_sample(row):
-        entry, since, codes, end = row
-        mode = mode_of(codes.astype(float))
+        of_runs = jax.tree.map(
+            lambda leaf, flag: leaf[run] if flag else leaf, (varied, rest), by_run
+        )
+        steps = jax.vmap(steps_of, (axes, 0, 0, 0, 0))(of_runs, entries, since, codes, ends)
+        steps = jnp.where(jnp.isnan(since), -1.0, jnp.nan_to_num(steps))
+        numbers = entries[:, 0], entries[:, 1], since
+        slopes = _slopes(carried, by_run, varied, rest, run, (codes, ends), numbers, steps)
+        return jnp.where(jnp.isnan(since)[:, None, None], 0.0, jnp.stack(slopes, axis=1))
 
-        def carried(varied, x1, x2, since):
-            osc = eqx.combine(varied, rest)
-            return _carried(osc, mode, (x1, x2), since, (end[0], end[1]))
-
-        return jnp.stack(_slopes_of(carried, varied, entry[0], entry[1], since))
-
-    return lax.map(of_sample, (entries, since, codes, ends))
+    slopes = lax.map(of_chunk, tuple(map(chunks, (run, entries, since, codes, ends))))
+    return slopes.reshape(-1, *slopes.shape[2:])[:total].reshape(runs, samples, *slopes.shape[2:])

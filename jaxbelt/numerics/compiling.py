@@ -1,7 +1,7 @@
 """All that leans on what JAX, XLA and Equinox do not promise, behind one switch.
 
-- `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `in_turn`, `with_batches`,
-  `wide` and `any_lane` save time of running.
+- `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `with_batches`, `wide` and
+  `any_lane` save time of running.
 - `depends` and `is_affine` look at what a function does with its arguments.
 - `require_own_threads` looks at whether JAX was in use before a process was forked.
 
@@ -151,22 +151,6 @@ def each(function: Callable) -> Callable:
     return lambda *rows: lax.map(lambda row: function(*row), rows)
 
 
-def in_turn(function: Callable) -> Callable:
-    """The same function of arrays, that closes over none; on the CPU a batch of it is done lane
-    after lane.
-
-    A lane by itself runs in one piece of machine code (see `one_kernel`), waits for no other, and
-    gives the same to the last bit as outside of a batch. Its derivatives, and all of it on other
-    devices, are as they were.
-    """
-
-    def turns(lane, axis_size, batched, *args):
-        one, rows = of_lane(lane, batched, args)
-        return lax.map(one, rows)
-
-    return with_batches(function, turns, everywhere=False)
-
-
 def of_lane(function: Callable, batched, args) -> tuple[Callable, list[Any]]:
     """A function of the leaves that are batched, a list, and all of these: what the function gives
     for one lane."""
@@ -181,19 +165,17 @@ def of_lane(function: Callable, batched, args) -> tuple[Callable, list[Any]]:
     return one, [leaf for flag, leaf in zip(flags, leaves, strict=True) if flag]
 
 
-def with_batches(function: Callable, batch: Callable, *, everywhere: bool = True) -> Callable:
+def with_batches(function: Callable, batch: Callable) -> Callable:
     """The same function of arrays, that closes over none; a batch of it is what
     batch(function, axis_size, batched, *args) gives.
 
-    batched: a tree of flags like args. Derivatives of batches are as they were. everywhere: on
-    other devices than the CPU, too.
+    batched: a tree of flags like args. Derivatives of batches are as they were.
     """
     lanes = _as_lanes(function, batch)
 
     @functools.wraps(function)
     def call(*args):
-        here = everywhere or jax.default_backend() == "cpu"
-        usable = here and _usable("batches by a rule of one's own", _try_lanes)
+        usable = _usable("batches by a rule of one's own", _try_lanes)
         return (lanes if usable else function)(*args)
 
     return call
