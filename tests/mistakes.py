@@ -126,6 +126,7 @@ MISTAKES = [
     ("jb.refine(jb.Hopf, osc, where=nu0)", "condition must be such as .*, got the class Hopf"),
     ("jb.refine(osc, jb.Hopf(), where=nu0)", r"condition must be such as .*, got Oscillator\("),
     ("jb.refine(jb.Hopf(), osc)", SELECTS + ".*, got None"),
+    ("jb.refine(jb.HopfAtInfinity(), osc)", SELECTS + ".*, got None"),
     ("jb.refine(jb.Hopf(), osc, where='nu0')", SELECTS + ".*, got 'nu0'"),
     ("jb.refine(jb.Hopf(), osc, where=nu2)", SELECTS + ".*, got one of a belt that is not there"),
     ("jb.refine(jb.Hopf(), osc, where=both)", SELECTS + r".*, got \(belts\[0\]\.v.*, belts\[1\]"),

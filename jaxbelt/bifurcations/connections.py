@@ -169,12 +169,12 @@ class SaddleConnection(AbstractCondition):
         return self == other or self == other.sought
 
     def check(self, osc):
+        n = len(osc.belts)
+        there = self.to is None or isinstance(self.to, int) and 0 <= self.to < n
+        require_value(there, "to", f"0 to {n - 1}, or None", self.to)
         super().check(osc)
         check_edge(osc, self.belt)
         if self.to is not None:
-            n = len(osc.belts)
-            there = isinstance(self.to, int) and 0 <= self.to < n
-            require_value(there, "to", f"0 to {n - 1}, or None", self.to)
             check_edge(osc, self.to, "to")
 
     def as_data(self):
