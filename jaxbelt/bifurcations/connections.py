@@ -170,7 +170,7 @@ class SaddleConnection(AbstractCondition):
 
     def check(self, osc):
         n = len(osc.belts)
-        there = self.to is None or isinstance(self.to, int) and 0 <= self.to < n
+        there = self.to is None or (isinstance(self.to, int) and 0 <= self.to < n)
         require_value(there, "to", f"0 to {n - 1}, or None", self.to)
         super().check(osc)
         check_edge(osc, self.belt)
