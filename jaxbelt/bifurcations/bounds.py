@@ -123,7 +123,7 @@ class Bounds:
     def _points(self, along: int, fixed: float, ends, resolution: int = 0):
         """The points on a line parallel to an axis, the other parameter being fixed."""
         span = float(ends[0]), float(ends[1])
-        path = ParameterPath(self.variation.held(1 - along, fixed), None, span)
+        path = ParameterPath(self.variation.held(1 - along, fixed), None, span, basins=False)
         # From farther off, too, where the line is short.
         return search(path, resolution, near=1.0) if resolution else search(path)
 

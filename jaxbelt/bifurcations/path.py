@@ -63,7 +63,11 @@ EXPECTED = 1e-3
 class ParameterPath:
     """A path in one parameter: its labels, each computed once, and loops of the cycles in them."""
 
-    def __init__(self, osc, where, span, conditions: Sequence[AbstractCondition] = ()):
+    def __init__(
+        self, osc, where, span, conditions: Sequence[AbstractCondition] = (), *, basins: bool = True
+    ):
+        #: Whether labels tell what changes basins only, and nothing that attracts.
+        self.basins = basins
         # `where` first: where it is left out, the span stands in its place.
         if isinstance(osc, Oscillator):
             leaf_index(osc, where)
@@ -136,7 +140,7 @@ class ParameterPath:
             filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
             oscs = self.variation.oscillators(filled[:, None])
             seen = jax.tree.map(np.asarray, _motions(oscs))
-            courses = courses_of(oscs) if self.edged else [()] * BATCH
+            courses = courses_of(oscs) if self.basins and self.edged else [()] * BATCH
             for lane, value in enumerate(batch.tolist()):
                 self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen), courses[lane])
         self._share()
@@ -175,7 +179,7 @@ class ParameterPath:
         cycles = sorted(self.cycles[value], key=lambda one: one.path)
         loops, osc = [one.loop for one in cycles if one.path], self.at(value)
         marks = tuple(condition.mark(osc, loops) for condition in self.conditions)
-        bounded = bool(is_bounded(osc))
+        bounded = not self.basins or bool(is_bounded(osc))
         paths = tuple(one.path for one in cycles)
         self.labels[value] = Label(rests, paths, marks, courses, bounded)
 
