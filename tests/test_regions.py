@@ -7,8 +7,6 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
-from campaign import engine
-from campaign.cases import PAPER
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.bounds import Bounds, _without_known, neighbours_that_differ
@@ -16,6 +14,8 @@ from jaxbelt.bifurcations.cells import look_at, region_name
 from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.regions import varied_by_names
 from jaxbelt.numerics.continuation import Stop
+from tests.campaign import engine
+from tests.campaign.cases import PAPER
 
 NUS = ("nu0", "nu1")
 class_c, class_d = jb.presets.class_c, jb.presets.class_d
