@@ -8,7 +8,8 @@ more, and the cycles: the modes of one loop, and where they are. Three things mu
 - Every cycle of the engine is among those of the label that `scan` goes by, and the other way
   round, where the engine starts on the cycle that `scan` has.
 - Where the engine's labels differ, by bisection to a small part of the interval, there is a point.
-- On the two sides of a point the engine's labels differ.
+- On the two sides of a point the engine's labels differ; of a connection of saddles, the ways that
+  the engine's runs take from it.
 """
 
 import time
@@ -40,6 +41,8 @@ NARROW = 1e-4
 SAME = 1e-6
 #: Smaller cycles than this one around a pseudo-focus are not told from it.
 TINY = 1e-3
+#: Time after which orbits that part at a saddle are looked at.
+PARTED = 1.0
 #: Time until the engine gives a run up.
 PATIENCE = 3000.0
 
@@ -425,6 +428,12 @@ def _both_sides(path: ParameterPath, point, special, brute: Brute, report: Repor
     away = min([1e-4 * (last - first), *(gap / 3 for gap in others)])
     if away < 1e-9 or at - away < first or at + away > last:
         return
+    if point.kind == "HopfAtInfinity":
+        return  # tests/test_infinity.py has its closed forms
+    if point.kind == "SaddleConnection":
+        if not _part(brute.case, point, away):
+            report.wrong.append(f"no orbits part at {point!r}")
+        return
     path.look([at - away, at + away])
     sides = [brute.look(side, _starts_on_cycles(path, side)) for side in (at - away, at + away)]
     for label, other, value in ((*sides, at + away), (*sides[::-1], at - away)):
@@ -433,6 +442,21 @@ def _both_sides(path: ParameterPath, point, special, brute: Brute, report: Repor
                 brute.learn(value, cycle.state)
     if all(side.decided for side in sides) and sides[0].name == sides[1].name:
         report.wrong.append(f"nothing changes at {point!r}: {_words(sides[0])}")
+
+
+def _part(case: Case, point, away: float) -> bool:
+    """Whether the engine's runs from the saddle, on the two sides of a connection, part where that
+    ends: they go two ways from there, in a time that is not small."""
+    orbit, at = point.condition.orbit(point), float(point.value)
+    upward = np.sign(orbit[1, 1])
+    beyond = []
+    for value in (at - away, at + away):
+        osc = case.at(value)
+        ends = [x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)]
+        edge = min(ends, key=lambda x: abs(x - orbit[0, 0]))
+        run = engine.simulate(osc, (edge, 1e-10 * upward), point.place[4] + PARTED)
+        beyond.append(run.y_end)
+    return float(np.max(np.abs(np.subtract(*beyond)))) > 100 * away
 
 
 def _starts_on_cycles(path: ParameterPath, value: float) -> list[tuple[float, float]]:
