@@ -295,7 +295,7 @@ def _slopes(function, by_run, varied, rest, run, row, numbers, steps) -> tuple[A
     most = min(SIDE_BY_SIDE, _power_of_two(max(1, LARGEST // columns)))
     # A few groups at least, for all of a group wait for the longest.
     size = min(most, max(1, flights // GROUPS_OF_CHUNK))
-    short = jnp.clip(steps, -1, MOST_STEPS).astype(jnp.int32) + 1
+    short = jnp.clip(jnp.nan_to_num(steps), -1, MOST_STEPS).astype(jnp.int32) + 1
     # Sorted with their places as one number: a sort of pairs takes ten times as long.
     in_order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32))
     order, wanted = in_order % flights, in_order >= flights
