@@ -8,6 +8,7 @@ import pytest
 from compilations import compilations
 
 import jaxbelt as jb
+from jaxbelt.model.variations import varied
 from jaxbelt.sweeps import fractions as module
 from jaxbelt.sweeps.attractor import CYCLE, EQUILIBRIUM, STUCK_FOR_EVER
 from jaxbelt.sweeps.basins import starts_in
@@ -23,6 +24,11 @@ HOPF, FOLD = 0.263654916039, 0.538734800481
 
 def nu0(osc):
     return osc.belts[0].velocity
+
+
+def by_nu0():
+    """What is varied where that does not matter."""
+    return varied(jb.presets.class_b(0.3, NU1), nu0, (0.3,))
 
 
 def along(osc, span, rows, **options):
@@ -140,7 +146,7 @@ def met(kind, x1, fraction=0.5, size=0.0):
 
 def names_at(*rows, moves=0.2):
     """The names of the attractors at each value, in their order there."""
-    found = _matched(list(rows), np.arange(float(len(rows))), moves, 100, "nu0")
+    found = _matched(list(rows), np.arange(float(len(rows))), moves, 100, by_nu0())
     told = []
     for row, attractors in enumerate(rows):
         column = {float(x): name for x, name in zip(found.x1_min[row], found.attractors)}
@@ -192,10 +198,10 @@ def test_what_was_not_met_at_a_value_is_known_again():
 def test_bands_end_half_way_to_where_an_attractor_is_not():
     rows = [[met(EQUILIBRIUM, 0.0, 1.0)]] * 2
     rows += [[met(CYCLE, 0.0, 0.75, size=0.5), met(EQUILIBRIUM, 0.0, 0.25)]] * 2
-    ax = _matched(rows, np.arange(4.0), 0.2, 100, "belts[0].velocity").plot()
+    ax = _matched(rows, np.arange(4.0), 0.2, 100, by_nu0()).plot()
     labels = ax.get_legend_handles_labels()
     bands = {name: band.get_paths() for band, name in zip(*labels)}
-    assert sorted(bands) == ["cycle 0", "equilibrium 0"]
+    assert sorted(bands) == ["cycle 0", "equilibrium 0", "two standard errors"]
     (cycle,) = bands["cycle 0"]
     np.testing.assert_allclose(cycle.get_extents().extents, [1.5, 0.25, 3.0, 1.0])
     assert ax.get_ylabel() == "fraction of 100 starts" and ax.get_ylim() == (0, 1)

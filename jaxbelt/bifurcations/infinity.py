@@ -71,8 +71,8 @@ def _has_limit(law: AbstractFriction) -> Array:
 
 @jit
 def is_bounded(osc: Oscillator) -> Array:
-    """Whether loops far out shrink."""
-    return contraction_far_out(osc) > 0
+    """Whether loops far out shrink: where these rates are in balance, too, by what D(A) is more."""
+    return contraction_far_out(osc) >= 0
 
 
 class FarOut(RestSystem):

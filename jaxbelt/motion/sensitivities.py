@@ -49,9 +49,9 @@ MOST_STEPS = math.prod(GROUPS)
 SIDE_BY_SIDE = 64
 #: Runs, at most, and arcs of each, that are sorted by their numbers of steps together; and how many
 #: arcs these are, at most.
-RUNS, ROWS, CHUNK = 128, 128, 2048
+RUNS, ROWS, MOST_FLIGHTS = 128, 128, 2048
 #: Groups into which these are divided, at least.
-GROUPS_OF_CHUNK = 16
+LEAST_GROUPS = 16
 #: Largest density of steps, so that all numbers stay finite.
 DENSEST = 1e4
 #: Along an arc the steps vary by the ratio of the densities at its ends to this power: between the
@@ -279,7 +279,7 @@ def _sizes(by_run, varied) -> list[int]:
     return [leaf.size // leaf.shape[0] if flag else leaf.size for leaf, flag in pairs]
 
 
-def _power_of_two(number: int) -> int:
+def _largest_power(number: int) -> int:
     """The largest that is not above the number, 1 or more."""
     return 1 << (number.bit_length() - 1)
 
@@ -292,9 +292,9 @@ def _slopes(function, by_run, varied, rest, run, row, numbers, steps) -> tuple[A
     many are made side by side; -1: it is not wanted.
     """
     flights, columns = steps.size, len(numbers) + sum(_sizes(by_run, varied))
-    most = min(SIDE_BY_SIDE, _power_of_two(max(1, LARGEST // columns)))
+    most = min(SIDE_BY_SIDE, _largest_power(max(1, LARGEST // columns)))
     # A few groups at least, for all of a group wait for the longest.
-    size = min(most, max(1, flights // GROUPS_OF_CHUNK))
+    size = min(most, max(1, flights // LEAST_GROUPS))
     short = jnp.clip(jnp.nan_to_num(steps), -1, MOST_STEPS).astype(jnp.int32) + 1
     # Sorted with their places as one number: a sort of pairs takes ten times as long.
     in_order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32))
@@ -365,8 +365,8 @@ def _sensitivities(by_run, varied, rest, arcs: Arc, remaining: Array) -> Sensiti
     """`sensitivities` of runs side by side, [runs, arcs, inputs]."""
     runs, rows = remaining.shape
     inputs = 4 + sum(_sizes(by_run, varied))
-    width = min(_power_of_two(2 * runs - 1), _power_of_two(max(1, LARGEST // inputs)), RUNS)
-    depth = min(ROWS, max(1, CHUNK // width))
+    width = min(_largest_power(2 * runs - 1), _largest_power(max(1, LARGEST // inputs)), RUNS)
+    depth = min(ROWS, max(1, MOST_FLIGHTS // width))
     blocks, chunks = -(-runs // width), -(-rows // depth)
     padding = (0, blocks * width - runs), (0, chunks * depth - rows)
 
@@ -443,7 +443,7 @@ def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, entry: Sensitivity):
     numbers = *arcs.entry, remaining
     slopes = _slopes(_passed, by_run, varied, rest, run, arcs, numbers, steps)
     # As many rows at once as fit into one piece of machine code.
-    size = min(depth, _power_of_two(max(1, LARGEST // entry.x1.size)))
+    size = min(depth, _largest_power(max(1, LARGEST // entry.x1.size)))
     rows = jax.tree.map(
         lambda leaf: leaf.reshape(depth // size, size, width, *leaf.shape[1:]),
         (slopes, arcs.used, creeps),
@@ -530,7 +530,7 @@ def _slopes_of_samples(by_run, varied, rest, entries: Array, since: Array, codes
     and the parameters."""
     runs, samples = since.shape
     total = runs * samples
-    size = min(CHUNK, _power_of_two(2 * total - 1))
+    size = min(MOST_FLIGHTS, _largest_power(2 * total - 1))
 
     def chunks(leaf):
         leaf = leaf.reshape(total, *leaf.shape[2:])
