@@ -6,7 +6,7 @@ result of an observable of one's own, stays as it is.
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Union
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +57,16 @@ SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energ
 
 
 def in_si(
-    result: "Trajectory | Cycle | Basins | Fit | AlongParameter | xarray.Dataset",
+    result: Union[
+        Trajectory,
+        Cycle,
+        Basins,
+        Fit,
+        BifurcationDiagram,
+        OrbitDiagram,
+        BasinFractions,
+        "xarray.Dataset",
+    ],
     machine: Machine | Callable[..., Machine],
 ) -> "xarray.Dataset":
     """A result in SI units, as a dataset whose variables carry their units.
