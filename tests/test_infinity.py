@@ -11,6 +11,7 @@ from jaxbelt import Status
 LAW = jb.Conti(1.0, 0.6, 10.0)
 QUADRATIC = jb.Conti(1.0, 0.6, 10.0, 0.05)
 CONDITION = jb.HopfAtInfinity()
+SLOW = pytest.mark.slow
 
 
 class Viscous(jb.AbstractFriction):
@@ -64,9 +65,11 @@ def test_without_damping():
             {"lower": 0.0, "upper": 2.0},
             -2 / np.pi * 0.0125 * 2,
         ),
-        (Viscous(1.0, 0.02), 1.0, {"load": 2.0}, -0.04),
-        (Viscous(1.0, 0.02), 0.5, {"lower": 0.4}, -0.005),
-        (Viscous(1.0, 0.02), 1.0, {"lower": 0.4, "upper": 2.0}, 0.0),
+        pytest.param(*(Viscous(1.0, 0.02), 1.0, {"load": 2.0}, -0.04), marks=SLOW),
+        pytest.param(*(Viscous(1.0, 0.02), 0.5, {"lower": 0.4}, -0.005), marks=SLOW),
+        pytest.param(
+            *(Viscous(1.0, 0.02), 1.0, {"lower": 0.4, "upper": 2.0}, 0.0), marks=pytest.mark.slow
+        ),
     ],
 )
 def test_with_friction_that_grows(law, omega, changes, at):
@@ -102,7 +105,11 @@ def test_nothing_comes_from_infinity():
     assert point.status != Status.OK and jnp.isnan(point.value)
     point = jb.refine(CONDITION, lambda damping: one_belt(damping, load=0.0), at=-0.1)
     assert point.status == Status.NOT_TOUCHED
-    # What grows neither as r nor as r^2 is not known.
+
+
+@pytest.mark.slow
+def test_growth_that_is_not_told():
+    """What grows neither as r nor as r^2; and a scan where nothing comes from infinity."""
     point = jb.refine(CONDITION, lambda damping: one_belt(damping, Root(1.0, 0.1)), at=-0.1)
     assert point.status == Status.NOT_TOUCHED
     assert jb.scan(lambda d: one_belt(d, QUADRATIC), span=(-0.2, 0.15), resolution=8) == ()

@@ -32,6 +32,7 @@ def letters_seen_by_engine(osc):
     return "".join(sorted(cycles.values()))
 
 
+@pytest.mark.slow(first=True)
 def test_cells_have_the_attractors_that_an_engine_finds_from_a_grid_of_starts():
     """Three cycles at once, three fixed points, a cycle around a pseudo-focus among them."""
     points = np.array([(-0.05, 0.1), (-0.5, 0.6), (0.2, -0.25), (-0.22, 0.23), (0.3, -0.65)])
@@ -83,7 +84,7 @@ def test_curves_are_found_where_no_line_meets_them(corner_of_map):
     assert missing > 0 and np.all(bounds.away(pairs) < 0.5)
 
 
-@pytest.mark.slow(first=True)
+@pytest.mark.slow
 def test_pairs_that_no_curve_explains_are_told():
     """Cells that are said to differ, where nothing happens."""
     make = functools.partial(class_c, sigma=0.0)
@@ -104,7 +105,7 @@ def over_sigma(nu0, sigma):
     return class_c(nu0, 0.3, sigma=sigma)
 
 
-@pytest.mark.slow(first=True)
+@pytest.mark.slow
 def test_a_fold_ends_where_its_cycle_touches_an_edge():
     """On the left that is the fold cycle of class (a) with the edge at its largest x1; on the right
     the edge comes to where the cycle is tangent to the boundary, slip onset, x1 = 1 - zeta nu0."""
