@@ -9,7 +9,7 @@ from ..model.modes import Mode, at_focus, mode_acceleration, mode_of_state
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..results import Status
 from .events import pass_events
-from .lanes import Lanes, code_of
+from .lanes import Lanes, code_of, without_edges
 from .step import STEP_SAFETY, attempt, first_step, take_step, window_of
 
 #: Steps between two looks at the events: these cost about as much as a step, and a lane that waits
@@ -71,6 +71,7 @@ class Round(eqx.Module):
 
 def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol, *, edges: bool):
     """The lanes past the events and STEPS_PER_ROUND steps further, and the `Round`."""
+    osc = osc if edges else without_edges(osc)
     lanes, passage = pass_events(
         osc, lanes, t1, rtol, edges=edges, captures=True, derivatives=False
     )
@@ -104,6 +105,7 @@ def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol, *, edges: boo
 
 def flown_on(osc: Oscillator, ones, mode: Mode, x1, x2, h, *, edges: bool) -> tuple[Array, Array]:
     """The states (x1, x2) one step of size h later, in the field of a slip mode, arrays [lanes]."""
+    osc = osc if edges else without_edges(osc)
     run = jnp.zeros(x1.shape, jnp.int32)
     lanes = lanes_at_start(osc, run, x1, x2, jnp.zeros((), jnp.int32), jnp.ones(()), edges=edges)
     a = mode_acceleration(osc, mode, x1, x2)

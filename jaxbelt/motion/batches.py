@@ -26,6 +26,9 @@ from ..results import Status
 
 #: Lanes of a group, at most, and rounds that one piece of machine code makes.
 LANES_AT_ONCE, PAGE = 128, 8
+#: An arc of a batch ends where a multiple of this time is passed: longer ones would take more steps
+#: for their derivatives, of the whole and of samples within.
+LONGEST_ARC = 2.0
 #: Arcs of each run that are looked up at once: most have far fewer than there is room for.
 ARCS_AT_ONCE = 64
 #: Rounds of all lanes for which a book has room, of 180 bytes each; a group of fewer lanes where it
@@ -128,22 +131,59 @@ def _written(osc, lanes, ones, span, tolerances, batch: Batch, book) -> tuple[La
     return lax.while_loop(unfinished, turn, (lanes, book, jnp.asarray(0)))
 
 
-def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Array, Array]:
-    """The arcs of the lanes, which rows are used, and whether there was room for all.
+class _Chains(NamedTuple):
+    """The arcs of the lanes, as chains of the phases of their rounds.
 
-    In each round there may be two: the phase in which a lane sticks, and its steps.
+    In each round there may be two: the phase in which a lane sticks, and its steps. begun, ended:
+    how many arcs had begun, and ended, behind each phase, [2 rounds, lanes]; fires: whether the
+    steps of a round end on a guard, [rounds, lanes].
     """
+
+    begun: Array
+    ended: Array
+    fires: Array
+
+
+def _chains(book: Round, inside: Array) -> _Chains:
+    """Which phases belong to one arc: steps in one mode, while x2 moves one way."""
     # What ended the steps is written in the round after.
-    next_inside = jnp.append(inside[1:], inside[:1] & False, axis=0)
-    fires = jnp.roll(book.fired, -1, axis=0) & next_inside
+    fires = _next(book.fired & inside)
     first, last = book.ts[0], book.ts[-1]
-    slips = inside & ((last > first) | fires)
-    exists = jnp.stack([book.stuck & inside, slips], axis=1).reshape(-1, batch.width)
-    count = jnp.cumsum(exists, axis=0, dtype=jnp.int32)
-    total, size = count[-1], min(ARCS_AT_ONCE, batch.rows)
+    slips, sticks = inside & ((last > first) | fires), book.stuck & inside
+    # Between two extrema of x2, so that the law bends most at one of the ends.
+    way, part = book.x2s[-1] >= book.x2s[0], jnp.floor(first / LONGEST_ARC)
+    goes_on = (way == _next(way)) & (part == _next(part)) & _next(slips & ~sticks)
+    goes_on = slips & ~fires & goes_on
+    goes_on = goes_on.at[-1].set(False)
+    follows = jnp.roll(goes_on, 1, axis=0)
+
+    def counted(sticks, slips):
+        phases = jnp.stack([sticks, slips], axis=1).reshape(-1, sticks.shape[1])
+        return _running_total(phases.astype(jnp.int32))
+
+    return _Chains(counted(sticks, slips & ~follows), counted(sticks, slips & ~goes_on), fires)
+
+
+def _next(rows: Array) -> Array:
+    """Each row's next one; of the last, which is never used, the first."""
+    return jnp.roll(rows, -1, axis=0)
+
+
+def _running_total(rows: Array) -> Array:
+    """The sum of the rows up to each, [rows, lanes]; in pages, for XLA sums long columns slowly."""
+    pages = rows.reshape(-1, 2 * PAGE, rows.shape[1])
+    within = jnp.cumsum(pages, axis=1)
+    before = jnp.cumsum(within[:, -1], axis=0) - within[:, -1]
+    return (within + before[:, None]).reshape(rows.shape)
+
+
+def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Array, Array]:
+    """The arcs of the lanes, which rows are used, and whether there was room for all."""
+    chains = _chains(book, inside)
+    total, size = chains.begun[-1], min(ARCS_AT_ONCE, batch.rows)
 
     def some(first):
-        return _arcs_from(first, size, book, fires, count, batch)
+        return _arcs_from(first, size, book, chains, batch)
 
     def nothing(first):
         shapes = jax.eval_shape(some, first)
@@ -157,39 +197,43 @@ def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Arr
     return arcs, used, (total > 0) & (total <= batch.rows)
 
 
-def _arcs_from(first, size: int, book: Round, fires, count, batch: Batch):
-    """So many arcs of the lanes from that number on, and which of them there are; fires: whether
-    the steps of a round end on a guard; count: of arcs, behind each phase of the rounds."""
-    wanted, total = first + jnp.arange(1, size + 1, dtype=jnp.int32), count[-1]
+def _arcs_from(first, size: int, book: Round, chains: _Chains, batch: Batch):
+    """So many arcs of the lanes from that number on, and which of them there are."""
+    wanted, total = first + jnp.arange(1, size + 1, dtype=jnp.int32), chains.begun[-1]
     there = wanted[:, None] <= total[None]
-    places = jnp.where(there, _searched(count, wanted[:, None], "left"), 0)
-    row, is_slip = places // 2, places % 2 == 1
-    after = jnp.minimum(row + 1, batch.rounds - 1)
 
-    def at(column, row=row):
+    def place(counts):
+        return jnp.where(there, _searched(counts, wanted[:, None], "left"), 0)
+
+    begin, end = place(chains.begun), place(chains.ended)
+    row, last_row, is_slip = begin // 2, end // 2, begin % 2 == 1
+    after = jnp.minimum(last_row + 1, batch.rounds - 1)
+
+    def at(column, row):
         return jnp.take_along_axis(column, row, axis=0)
 
     def either(slip, stick):
         return jnp.where(is_slip, slip, stick)
 
-    begins, last = book.ts[0], book.ts[-1]
-    fires, leaves = is_slip & at(fires), ~is_slip & at(book.released)
+    fires, leaves = is_slip & at(chains.fires, last_row), ~is_slip & at(book.released, row)
     happens = fires | leaves
-    codes = codes_in(either(at(book.mode_after), at(book.mode)), batch.belts)
-    next_codes = codes_in(either(at(book.mode, after), at(book.mode_after)), batch.belts)
+    codes = codes_in(either(at(book.mode_after, row), at(book.mode, row)), batch.belts)
+    next_codes = codes_in(either(at(book.mode, after), at(book.mode_after, row)), batch.belts)
     kind, belt = event_between(tuple(codes), tuple(next_codes))
-    t, t_end = either(at(begins), at(book.t)), either(at(last), at(begins))
-    x2_end = either(at(book.x2s[-1]), at(book.x2s[0]))
+    begins = at(book.ts[0], row)
+    t, t_end = either(begins, at(book.t, row)), either(at(book.ts[-1], last_row), begins)
+    x1_start, x2_start = at(book.x1s[0], row), at(book.x2s[0], row)
+    x2_end = either(at(book.x2s[-1], last_row), x2_start)
     arcs = dict(
         t=t,
-        y=(either(at(book.x1s[0]), at(book.x1)), either(at(book.x2s[0]), at(book.x2))),
+        y=(either(x1_start, at(book.x1, row)), either(x2_start, at(book.x2, row))),
         mode=codes,
         duration=t_end - t,
         kind=jnp.where(happens, kind, 0),
         belt=jnp.where(happens, belt, 0),
         event_t=t_end,
         event_y=(
-            either(at(book.x1s[-1]), at(book.x1s[0])),
+            either(at(book.x1s[-1], last_row), x1_start),
             jnp.where(fires, at(book.x2, after), x2_end),
         ),
         ended_by=jnp.where(fires, at(book.number, after), -1),

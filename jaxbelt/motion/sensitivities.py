@@ -107,48 +107,52 @@ class _Steps(NamedTuple):
     ratio: Array
 
 
-def _steps_of(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State) -> _Steps:
-    """The steps from y to `end` in the field of a slip mode; they have no derivatives.
+def _steps_of(osc: Oscillator, arc: Arc) -> _Steps:
+    """The steps from the entry of an arc to its end; they have no derivatives.
 
     Their number and their grading follow from the density of steps that is wanted at both.
     """
-    osc, mode, y, duration, end = lax.stop_gradient((osc, mode, y, duration, end))
+    osc, arc = lax.stop_gradient((osc, arc))
+    mode, duration, y, end = arc.mode, arc.duration, arc.entry, arc.end
     first, last = (
         jnp.clip(jnp.nan_to_num(density(osc, mode, *at), nan=1.0), 1.0, DENSEST) for at in (y, end)
     )
     is_even = jnp.abs(last - first) < 1e-3 * first
     ratio = jnp.where(is_even, 2.0, last / first)
     mean = jnp.where(is_even, first, (last - first) / jnp.log(ratio))
-    return _Steps(jnp.ceil(jnp.abs(duration) * mean / LENGTH), is_even, ratio)
+    number = jnp.ceil(jnp.abs(duration) * mean / LENGTH)
+    return _Steps(jnp.where(mode.any_stuck, 0.0, number), is_even, ratio)
 
 
-def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State) -> State:
-    """The state after a time in the field of a slip mode, by steps that are fixed beforehand; end:
-    that state, which is known already. NaN where MOST_STEPS are too few."""
-    steps, is_even, ratio = _steps_of(osc, mode, y, duration, end)
+def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, steps: _Steps) -> State:
+    """The state after a time in the field of a slip mode, by steps that are fixed beforehand.
 
-    def place(number):
+    NaN where MOST_STEPS are too few.
+    """
+    number, is_even, ratio = steps
+
+    def place(passed):
         # As if the logarithm of the density were linear: of that density the integral up to s is
         # proportional to ratio^s - 1.
-        share = jnp.minimum(number / jnp.maximum(steps, 1.0), 1.0)
+        share = jnp.minimum(passed / jnp.maximum(number, 1.0), 1.0)
         graded = jnp.log1p(share * (ratio**POWER - 1)) / jnp.log(ratio**POWER)
         return jnp.where(is_even, share, graded)
 
     def field(y):
         return slip_field(osc, mode, y)
 
-    def advance(number, y, groups):
-        """Past the steps from that number on, as many as fit into the groups."""
+    def advance(passed, y, groups):
+        """Past the steps behind those that are passed, as many as fit into the groups."""
         if not groups:
-            h = duration * (place(number + 1) - place(number))
+            h = duration * (place(passed + 1) - place(passed))
             (change,) = increments(field, y, h, _ORDER_12)
             return y[0] + change[0], y[1] + change[1]
         size, *parts = groups
 
         def some(i, y):
-            begin = number + i * math.prod(parts)
+            begin = passed + i * math.prod(parts)
             # In groups, for stepping over the steps that an arc does not need is not free.
-            return lax.cond(any_lane(begin < steps), advance_some, lambda *_: y, begin, y)
+            return lax.cond(any_lane(begin < number), advance_some, lambda *_: y, begin, y)
 
         def advance_some(begin, y):
             return advance(begin, y, parts)
@@ -157,32 +161,41 @@ def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State) ->
         return lax.fori_loop(0, size, jax.checkpoint(some, prevent_cse=False), y)
 
     x1, x2 = advance(0, y, GROUPS)
-    known = jnp.where(steps <= MOST_STEPS, 1.0, jnp.nan)
+    known = jnp.where(number <= MOST_STEPS, 1.0, jnp.nan)
     return x1 * known, x2 * known
 
 
-def _carried(osc: Oscillator, mode: Mode, y: State, duration: Array, end: State) -> State:
-    """The state after a time in a mode, slip or stick, near `end`."""
-    stuck = mode.any_stuck
+def _flown_again(osc: Oscillator, arc: Arc, steps: _Steps, x1: Array, x2: Array) -> State:
+    """The end of an arc that is known, where it slips, by oscillator and entry near those of it."""
+    return flown(osc, arc.mode, (x1, x2), jnp.where(arc.mode.any_stuck, 0.0, arc.duration), steps)
+
+
+def _carried(osc: Oscillator, arc: Arc, end: State, y: State, since: Array) -> State:
+    """The state a time after the entry y, in the mode of an arc, near its end.
+
+    end: as `_flown_again` gives it.
+    """
+    mode = arc.mode
+    late, slopes = since - arc.duration, slip_field(osc, mode, end)
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
-    slipped = flown(osc, mode, y, jnp.where(stuck, 0.0, duration), end)
-    return select(stuck, (y[0] + v * duration, v), slipped)
+    slipped = end[0] + late * slopes[0], end[1] + late * slopes[1]
+    return select(mode.any_stuck, (y[0] + v * since, v), slipped)
 
 
-def _passed(osc: Oscillator, arc: Arc, x1: Array, x2: Array, remaining: Array) -> tuple[Array, ...]:
+def _passed(osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array) -> tuple[Array, ...]:
     """Where the orbit goes on after an arc that is known, x1 and x2, and the arc's duration.
 
-    As functions of the oscillator, of the entry, and of the time left, near those of the arc.
+    As functions of the oscillator, of the entry y, and of the time left, near those of the arc;
+    end: as `_flown_again` gives it.
     """
-    y, mode = (x1, x2), arc.mode
+    mode = arc.mode
     stuck = mode.any_stuck
-    end = flown(osc, mode, y, jnp.where(stuck, 0.0, arc.duration), arc.end)
     # The numbers of the run itself, so that the field is the same here and at the next entry.
     end = _with_numbers_of(arc.end[0], end[0]), _with_numbers_of(arc.end[1], end[1])
 
-    def fired_guard(*y):
+    def fired_guard(x1, x2):
         n = len(osc.belts)
-        guards = [*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])]
+        guards = [*boundary_guards(osc, mode, x2), *edge_guards(osc, mode, x1)]
         hit = first_of([arc.ended_by == i for i in range(3 * n)], guards, jnp.zeros(()))
         same = [
             (guard == hit) & ((arc.ended_by < n) == (i < n)) & (arc.ended_by >= 0)
@@ -284,44 +297,71 @@ def _largest_power(number: int) -> int:
     return 1 << (number.bit_length() - 1)
 
 
-def _slopes(function, by_run, varied, rest, run, row, numbers, steps) -> tuple[Array, ...]:
-    """Derivatives of flights, arrays [flights, numbers + varied] for each result of the function.
+def _slopes(result, by_run, varied, rest, run, arcs: Arc, times, steps: _Steps):
+    """Derivatives of flights, arrays [flights, 3 + varied] for each number of the result: by x1 and
+    x2 of the entry, by a time, and by the parameters.
 
-    function(osc, row, *numbers): of one flight, scalars; row: a tree of arrays [flights, ..];
-    numbers: arrays [flights]; run: to which run each belongs; steps: of each, for those of about as
-    many are made side by side; -1: it is not wanted.
+    result(osc, arc, end, y, time): of one flight, scalars, see `_carried`; arcs: the flights, their
+    leaves arrays [flights, ..]; times: arrays [flights]; run: to which run each belongs; steps: of
+    each, for those of about as many are made side by side; a number of -1: it is not wanted.
     """
-    flights, columns = steps.size, len(numbers) + sum(_sizes(by_run, varied))
+    flights, columns = times.size, 3 + sum(_sizes(by_run, varied))
     most = min(SIDE_BY_SIDE, _largest_power(max(1, LARGEST // columns)))
     # A few groups at least, for all of a group wait for the longest.
     size = min(most, max(1, flights // LEAST_GROUPS))
-    short = jnp.clip(jnp.nan_to_num(steps), -1, MOST_STEPS).astype(jnp.int32) + 1
+    short = jnp.clip(jnp.nan_to_num(steps.number), -1, MOST_STEPS).astype(jnp.int32) + 1
     # Sorted with their places as one number: a sort of pairs takes ten times as long.
     in_order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32))
     order, wanted = in_order % flights, in_order >= flights
     places = jnp.zeros_like(order).at[order].set(jnp.arange(flights, dtype=jnp.int32))
     own, shared = eqx.partition((varied, rest), by_run)
     own = jax.tree.map(lambda leaf: leaf[run], own)
-    rows = jax.tree.map(lambda leaf: leaf[order], (own, row, numbers))
+    rows = jax.tree.map(lambda leaf: leaf[order], (own, arcs, steps, times))
     rows = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), (*rows, wanted))
 
     @one_kernel
-    def made(shared, own, row, numbers):
+    def made(shared, own, arcs, steps, times):
         varied, rest = eqx.combine(shared, own)
         axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
 
-        def of_one(varied, rest, row, *numbers):
-            return function(eqx.combine(varied, rest), row, *numbers)
+        def each(function, varied, *rows):
+            def of_one(varied, rest, *rows):
+                return function(eqx.combine(varied, rest), *rows)
 
-        def of_all(varied, *numbers):
-            return jax.vmap(of_one, (*axes, 0, *[0] * len(numbers)))(varied, rest, row, *numbers)
+            return jax.vmap(of_one, (*axes, *[0] * len(rows)))(varied, rest, *rows)
 
-        def column(direction):
-            along = _directed(by_run[0], varied, direction[len(numbers) :])
-            slopes = [jnp.full_like(a, 1.0) * b for a, b in zip(numbers, direction, strict=False)]
-            return jax.jvp(of_all, (varied, *numbers), (along, *slopes))[1]
+        def ends(varied, x1, x2):
+            return each(_flown_again, varied, arcs, steps, x1, x2)
 
-        return jax.vmap(column)(jnp.eye(columns))
+        def results(varied, end, x1, x2, times):
+            def of_one(osc, arc, end, x1, x2, time):
+                return result(osc, arc, end, (x1, x2), time)
+
+            return each(of_one, varied, arcs, end, x1, x2, times)
+
+        def parts(direction):
+            by_entry = [jnp.full_like(a, 1.0) * b for a, b in zip(arcs.entry, direction[:2])]
+            return _directed(by_run[0], varied, direction[2:]), *by_entry
+
+        def flight(direction):
+            return jax.jvp(ends, (varied, *arcs.entry), parts(direction))
+
+        def column(moved, direction, time):
+            along, *by_entry = parts(direction)
+            slopes = along, moved, *by_entry, jnp.full_like(times, 1.0) * time
+            return jax.jvp(results, (varied, end, *arcs.entry, times), slopes)[1]
+
+        # The time has no part in the flight itself.
+        directions = jnp.eye(columns - 1)
+        end, moved = jax.vmap(flight, out_axes=(None, 0))(directions)
+
+        def with_time(leaf, own):
+            row = jnp.broadcast_to(own, (1, *leaf.shape[1:]))
+            return jnp.concatenate([leaf[:2], row, leaf[2:]])
+
+        moved = jax.tree.map(lambda leaf: with_time(leaf, 0.0), moved)
+        is_time = jnp.where(jnp.arange(columns) == 2, 1.0, 0.0)
+        return jax.vmap(column)(moved, with_time(directions, 0.0), is_time)
 
     def group(rows):
         *rows, wanted = rows
@@ -434,14 +474,12 @@ def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, entry: Sensitivity):
     axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
 
     def looked(parts, arc):
-        osc, mode = eqx.combine(*parts), arc.mode
-        steps = _steps_of(osc, mode, arc.entry, arc.duration, arc.end).number
-        return jnp.where(mode.any_stuck, 0.0, steps), _creep(osc, mode, *arc.entry)
+        osc = eqx.combine(*parts)
+        return _steps_of(osc, arc), _creep(osc, arc.mode, *arc.entry)
 
     steps, creeps = jax.vmap(looked, (axes, 0))(of_runs, arcs)
-    steps = jnp.where(arcs.used, steps, -1.0)
-    numbers = *arcs.entry, remaining
-    slopes = _slopes(_passed, by_run, varied, rest, run, arcs, numbers, steps)
+    steps = steps._replace(number=jnp.where(arcs.used, steps.number, -1.0))
+    slopes = _slopes(_passed, by_run, varied, rest, run, arcs, remaining, steps)
     # As many rows at once as fit into one piece of machine code.
     size = min(depth, _largest_power(max(1, LARGEST // entry.x1.size)))
     rows = jax.tree.map(
@@ -540,26 +578,31 @@ def _slopes_of_samples(by_run, varied, rest, entries: Array, since: Array, codes
     run = jnp.broadcast_to(jnp.arange(runs)[:, None], since.shape)
     axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
 
-    def carried(osc, row, x1, x2, since):
-        codes, end = row
-        return _carried(osc, mode_of(codes.astype(float)), (x1, x2), since, (end[0], end[1]))
-
     def of_chunk(rows):
         run, entries, since, codes, ends = rows
+        known = ~jnp.isnan(since)
+        never = jnp.zeros_like(known)
+        arcs = Arc(
+            entry=(entries[:, 0], entries[:, 1]),
+            end=(ends[:, 0], ends[:, 1]),
+            codes=codes,
+            duration=since,
+            ended_by=jnp.full(since.shape, -1),
+            in_time=never,
+            captured=never,
+            used=known,
+        )
 
-        def steps_of(parts, entry, since, codes, end):
-            osc, mode = eqx.combine(*parts), mode_of(codes.astype(float))
-            steps = _steps_of(osc, mode, (entry[0], entry[1]), since, (end[0], end[1])).number
-            return jnp.where(mode.any_stuck, 0.0, steps)
+        def looked(parts, arc):
+            return _steps_of(eqx.combine(*parts), arc)
 
         of_runs = jax.tree.map(
             lambda leaf, flag: leaf[run] if flag else leaf, (varied, rest), by_run
         )
-        steps = jax.vmap(steps_of, (axes, 0, 0, 0, 0))(of_runs, entries, since, codes, ends)
-        steps = jnp.where(jnp.isnan(since), -1.0, jnp.nan_to_num(steps))
-        numbers = entries[:, 0], entries[:, 1], since
-        slopes = _slopes(carried, by_run, varied, rest, run, (codes, ends), numbers, steps)
-        return jnp.where(jnp.isnan(since)[:, None, None], 0.0, jnp.stack(slopes, axis=1))
+        steps = jax.vmap(looked, (axes, 0))(of_runs, arcs)
+        steps = steps._replace(number=jnp.where(known, steps.number, -1.0))
+        slopes = _slopes(_carried, by_run, varied, rest, run, arcs, since, steps)
+        return jnp.where(known[:, None, None], jnp.stack(slopes, axis=1), 0.0)
 
     slopes = lax.map(of_chunk, tuple(map(chunks, (run, entries, since, codes, ends))))
     return slopes.reshape(-1, *slopes.shape[2:])[:total].reshape(runs, samples, *slopes.shape[2:])

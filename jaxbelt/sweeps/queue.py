@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..kernel.events import pass_events
-from ..kernel.lanes import Lanes, Program, are_finite, choose
+from ..kernel.lanes import Lanes, Program, are_finite, choose, without_edges
 from ..kernel.rounds import STEPS_PER_ROUND, lanes_at_start
 from ..kernel.step import take_step, window_of
 from ..model.modes import start_at_focus
@@ -46,15 +46,7 @@ def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> Oscillato
         else:
             leaves.append(next(others))
     osc = jax.tree.unflatten(program.structure, leaves)
-    if program.edges:
-        return osc
-    # Infinite as constants of the compiled kernel; see `modes.has_edges`.
-    with jax.ensure_compile_time_eval():
-        lower, upper = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
-    belts = tuple(
-        eqx.tree_at(lambda b: (b.lower, b.upper), belt, (lower, upper)) for belt in osc.belts
-    )
-    return eqx.tree_at(lambda o: o.belts, osc, belts)
+    return osc if program.edges else without_edges(osc)
 
 
 def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
