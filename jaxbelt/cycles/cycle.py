@@ -32,7 +32,7 @@ from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import Arcs
 from ..numerics.compiling import any_lane, each, jit
-from ..numerics.newton import HOLDS, solve
+from ..numerics.newton import HOLDS
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
@@ -40,7 +40,6 @@ from .shooting import (
     ARC_STEPS,
     SIZES,
     Chain,
-    ClosedChain,
     Ends,
     Loop,
     admissible,
@@ -49,6 +48,7 @@ from .shooting import (
     loop_events,
     meshed,
     room_of,
+    solve_closed,
 )
 
 if TYPE_CHECKING:
@@ -311,10 +311,10 @@ def _finer_where_needed(osc: Oscillator, loop: Loop, status: Array, cycle: Cycle
 def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[Cycle, Array]:
     """The cycle that a loop nearly is, and the error in its equations with halved steps."""
     chain, guess = meshed(lax.stop_gradient(osc), loop, steps)
-    solved = solve(ClosedChain(chain), osc, guess)
-    error, _ = closure(osc, chain.halved, solved.z)
+    z, iterations = solve_closed(osc, chain, guess)
+    error, _ = closure(osc, chain.halved, z)
     status = _first_failure(status, error < HOLDS, Status.NO_CONVERGENCE)
-    return cycle_of(osc, chain, solved.z, solved.iterations, status)[0], error
+    return cycle_of(osc, chain, z, iterations, status)[0], error
 
 
 def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -> Cycle:
