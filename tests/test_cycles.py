@@ -215,6 +215,43 @@ def test_a_belt_that_creeps_brings_the_mass_to_no_rest(nu):
     assert run.kind in ("cycle", "undecided") and (run.kind == "cycle") == (run.status == "ok")
 
 
+FLAT = jb.Coulomb(static=0.5, kinetic=0.5)
+CENTRES = {
+    "one belt": lambda nu: jb.Oscillator(0.0, (jb.Belt(nu, FLAT),)),
+    "opposite belts": lambda nu: jb.Oscillator(0.0, (jb.Belt(nu, FLAT), jb.Belt(-nu, FLAT))),
+    # Halves of two circles.
+    "an edge": lambda nu: jb.Oscillator(
+        0.0, (jb.Belt(nu, FLAT, upper=0.25), jb.Belt(-nu, FLAT, lower=0.25))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CENTRES)
+def test_circles_around_a_centre_are_no_cycle(name):
+    """Friction is constant below the speed of the belts, and nothing damps: every orbit with
+    |x2| < nu closes, and outer ones stick until they are on the largest of these."""
+    make = CENTRES[name]
+    starts = (0.75, 0.0), (0.25, 0.5), (0.5, 1.0), (3.0, 0.0)
+    for start in starts:
+        cycle = jb.find_cycle(make(1.0), start)
+        assert cycle.status == Status.NEUTRAL and jnp.isnan(cycle.period), start
+    told = jb.basins(make(1.0), x1=[0.4, 0.75, 3.0], x2=[0.1, 0.5])
+    assert np.all(np.asarray(told.label) < 0) and not told.attractors
+    run = jb.decoded(jb.sweep(make, {"nu": [1.0]}, y0=(0.75, 0.0), observe="attractor"))
+    assert run.kind == "undecided" and run.status == "neutral" and np.isnan(run.period)
+
+
+def test_beside_circles_a_cycle_that_sticks_is_one():
+    """Static friction beyond the kinetic one: it sticks from x1 = 0.2 to 0.8, on a circle around
+    0.5 of radius sqrt(1.09), and then slips along the rest of it."""
+    law = jb.Coulomb(static=0.8, kinetic=0.5)
+    osc = jb.Oscillator(0.0, (jb.Belt(1.0, law),))
+    cycle = jb.find_cycle(osc, START)
+    slip = 2 * np.pi - 2 * np.arctan2(0.3, 1.0)
+    assert cycle.period == pytest.approx(0.6 + slip, abs=1e-12)
+    assert jb.find_cycle(osc, (1.0, 0.0)).status == Status.NEUTRAL
+
+
 def test_a_start_that_comes_to_rest_leads_to_no_cycle():
     cycle = jb.find_cycle(jb.presets.class_b(0.6, 0.35), START)
     assert cycle.status == Status.EQUILIBRIUM and jnp.isnan(cycle.period)

@@ -309,10 +309,10 @@ def _equations_and_blocks(
     more = 0 if along is None else jax.tree.leaves(along)[0].size
 
     def one(row):
-        *arc, unknown = row
+        codes, end, mesh, back, unknown = row
 
         def equations(osc, u):
-            return _arc_equations(osc, *arc, u)
+            return _arc_equations(osc, codes, end, mesh, back, u)
 
         def column(direction):
             if along is None:
