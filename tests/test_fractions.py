@@ -124,6 +124,22 @@ def test_without_damping_all_starts_are_undecided():
     assert found.plot().get_legend_handles_labels()[1] == ["undecided"]
 
 
+def test_a_steep_branch_is_one_and_a_jump_is_two():
+    """The cycle grows with the load, by a factor of ten in two steps: from 3 to 10 it moves by more
+    than a quarter of all. Where belt 0 changes its direction another cycle appears elsewhere."""
+
+    def growing(exponent):
+        law = jb.Conti(1.0, 0.6, 10.0)
+        return jb.Oscillator(0.1, (jb.Belt(0.05, law, load=10.0**exponent),))
+
+    options = {"box": ((-1.0, 1.0), (-1.0, 1.0)), "n": 20, "key": KEY}
+    grown = jb.basin_fractions(growing, span=(0.0, 1.0), rows=3, **options)
+    assert grown.attractors == ("cycle 0",)
+    assert np.ptp(grown.x1_max[1:, 0]) > 0.5 * np.max(grown.x1_max)
+    jump = along(jb.presets.class_b(0.1, NU1), (-0.01, 0.01), 2, n=20, moves=0.5)
+    assert jump.attractors == ("cycle 0", "cycle 1")
+
+
 def test_where_there_is_no_oscillator_nothing_is_decided():
     def make(s):
         return jb.presets.class_b(jnp.sqrt(s**2 - 0.01), NU1)
