@@ -42,6 +42,8 @@ class Status(enum.IntEnum):
     NO_FOLD = 19
     # A portrait, and shocks in it.
     INCOMPLETE = 20
+    # A cycle, and a run of a sweep.
+    NEUTRAL = 21
 
 
 ADVICE = {
@@ -112,6 +114,10 @@ ADVICE = {
         "cycles about to merge, orbits that settle too slowly), or a separatrix is missing, of a "
         "node on a contact edge, or was not followed far enough for the shock asked for. Move away "
         "from the bifurcation point."
+    ),
+    Status.NEUTRAL: (
+        "The orbit closes, and so do those beside it, as around a centre: no cycle that attracts, "
+        "but one of a continuum, and which one depends on the start. simulate follows it."
     ),
     Status.UNEXPLAINED: (
         "What the oscillator does changes here, and no condition known to the search explains how. "

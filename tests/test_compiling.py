@@ -354,3 +354,12 @@ def test_without_the_list_of_backends(untried):
     compiling._note_fork()
     with pytest.raises(RuntimeError, match="forked after JAX was used"):
         compiling.require_own_threads()
+
+
+@needs_tricks
+@pytest.mark.parametrize("trace", [jax.vmap, lambda f: jax.jit(jax.vmap(f))])
+def test_what_is_tried_inside_of_a_batch_is_no_part_of_it(trace, monkeypatch):
+    monkeypatch.setattr(compiling, "_works", {})
+    product = compiling.with_batches(lambda x: 2 * x, lambda one, size, batched, x: 2 * x)
+    assert trace(product)(jnp.ones(3)).tolist() == [2.0, 2.0, 2.0]
+    assert compiling._works and all(compiling._works.values())

@@ -9,7 +9,6 @@ from compilations import compilations
 
 import jaxbelt as jb
 from jaxbelt.model.variations import varied
-from jaxbelt.sweeps import fractions as module
 from jaxbelt.sweeps.attractor import CYCLE, EQUILIBRIUM, STUCK_FOR_EVER
 from jaxbelt.sweeps.basins import starts_in
 from jaxbelt.sweeps.fractions import _matched, _Met
@@ -111,11 +110,9 @@ def test_at_a_hopf_point_the_equilibrium_attracts_nothing():
     assert found.fractions[1, 1] > 0
 
 
-@pytest.mark.parametrize("most", [3, pytest.param(50, marks=pytest.mark.slow)])
-def test_without_damping_all_starts_are_undecided(most, monkeypatch):
+def test_without_damping_all_starts_are_undecided():
     """Two belts with constant friction, one to each side of the motion: circles, for ever. They
-    close, and attract nothing; beyond so many they are not even looked into."""
-    monkeypatch.setattr(module, "MOST_CYCLES", most)
+    close, and attract nothing."""
     law = jb.Conti(1.0, 1.0, 10.0)
     osc = jb.Oscillator(0.0, (jb.Belt(0.5, law), jb.Belt(-0.5, law)))
     found = along(osc, (0.5, 0.6), 2, n=20, box=((-0.2, 0.2), (-0.2, 0.2)), t1=100.0)
@@ -125,6 +122,22 @@ def test_without_damping_all_starts_are_undecided(most, monkeypatch):
     assert table.attractor.tolist() == ["undecided"] * 2 and table.x1_min.isna().all()
     assert repr(found).endswith("no attractor; up to 100.0% undecided)")
     assert found.plot().get_legend_handles_labels()[1] == ["undecided"]
+
+
+def test_a_steep_branch_is_one_and_a_jump_is_two():
+    """The cycle grows with the load, by a factor of ten in two steps: from 3 to 10 it moves by more
+    than a quarter of all. Where belt 0 changes its direction another cycle appears elsewhere."""
+
+    def growing(exponent):
+        law = jb.Conti(1.0, 0.6, 10.0)
+        return jb.Oscillator(0.1, (jb.Belt(0.05, law, load=10.0**exponent),))
+
+    options = {"box": ((-1.0, 1.0), (-1.0, 1.0)), "n": 20, "key": KEY}
+    grown = jb.basin_fractions(growing, span=(0.0, 1.0), rows=3, **options)
+    assert grown.attractors == ("cycle 0",)
+    assert np.ptp(grown.x1_max[1:, 0]) > 0.5 * np.max(grown.x1_max)
+    jump = along(jb.presets.class_b(0.1, NU1), (-0.01, 0.01), 2, n=20, moves=0.5)
+    assert jump.attractors == ("cycle 0", "cycle 1")
 
 
 def test_where_there_is_no_oscillator_nothing_is_decided():

@@ -30,9 +30,10 @@ from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.events import Signature, signature_name
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
+from ..model.rest import is_neutral
 from ..motion.simulate import Arcs
 from ..numerics.compiling import any_lane, each, jit
-from ..numerics.newton import HOLDS, solve
+from ..numerics.newton import HOLDS
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
@@ -40,7 +41,6 @@ from .shooting import (
     ARC_STEPS,
     SIZES,
     Chain,
-    ClosedChain,
     Ends,
     Loop,
     admissible,
@@ -49,6 +49,7 @@ from .shooting import (
     loop_events,
     meshed,
     room_of,
+    solve_closed,
 )
 
 if TYPE_CHECKING:
@@ -240,6 +241,9 @@ def cycle_of(
         status = _first_failure(status, error < HOLDS, Status.NO_CONVERGENCE)
     status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
+    # An equilibrium solves the equations, too, with arcs of any duration.
+    moves = sticks | (jnp.max(z[:, 1]) - jnp.min(z[:, 1]) > HOLDS)
+    status = _first_failure(status, moves, Status.NO_CONVERGENCE)
     known = functools.partial(jnp.where, status == Status.OK)
     cycle = Cycle(
         oscillator=osc,
@@ -267,7 +271,17 @@ def _loop_reached(osc: Oscillator, y0: Array, size: int) -> tuple[Loop, Array, A
     loop = select(orbit.status == Status.OK, loop, (jnp.asarray(-1), jnp.asarray(1)))
     orbit = eqx.tree_at(lambda orbit: (orbit.repeats, orbit.count), orbit, loop)
     _, count = last_loop(orbit)
-    return loop_of(orbit, size, len(osc.belts)), count, _if_it_fits(orbit.status, count, size)
+    loop = loop_of(orbit, size, len(osc.belts))
+    status = _first_failure(orbit.status, ~_is_neutral(osc, loop), Status.NEUTRAL)
+    return loop, count, _if_it_fits(status, count, size)
+
+
+def _is_neutral(osc: Oscillator, loop: Loop) -> Array:
+    """Whether a loop is one of a continuum of closed orbits."""
+    x1, x2 = loop.entries.T
+    held = jnp.sum(jnp.where(jnp.any(loop.codes == 0, axis=-1), loop.durations, 0.0))
+    extent = (jnp.min(x1), jnp.max(x1)), (jnp.min(x2), jnp.max(x2))
+    return is_neutral(osc, *extent, held / jnp.sum(loop.durations))
 
 
 def _if_it_fits(status: Array, count: Array, size: int) -> Array:
@@ -311,10 +325,10 @@ def _finer_where_needed(osc: Oscillator, loop: Loop, status: Array, cycle: Cycle
 def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[Cycle, Array]:
     """The cycle that a loop nearly is, and the error in its equations with halved steps."""
     chain, guess = meshed(lax.stop_gradient(osc), loop, steps)
-    solved = solve(ClosedChain(chain), osc, guess)
-    error, _ = closure(osc, chain.halved, solved.z)
+    z, iterations = solve_closed(osc, chain, guess)
+    error, _ = closure(osc, chain.halved, z)
     status = _first_failure(status, error < HOLDS, Status.NO_CONVERGENCE)
-    return cycle_of(osc, chain, solved.z, solved.iterations, status)[0], error
+    return cycle_of(osc, chain, z, iterations, status)[0], error
 
 
 def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -> Cycle:
@@ -332,7 +346,8 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     The orbit is followed until a loop repeats; then all arcs are polished together by Newton's
     method. Differentiable with respect to the parameters (the derivative with respect to y0 is
     zero: a cycle does not depend on where it was approached from), forward and reverse, and under
-    `jax.vmap`. Where the start leads to an equilibrium, or nothing repeats, the status says so.
+    `jax.vmap`. Where the start leads to an equilibrium, to one of a continuum of closed orbits, or
+    nothing repeats, the status says so.
     `ValueError` names an argument that is impossible.
     """
     check_oscillator(osc)

@@ -34,11 +34,10 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
-from ..numerics.newton import solve
 from .backwards import BackwardCycle
 from .cycle import Cycle
 from .separatrices import Separatrix, tangencies
-from .shooting import Chain, ClosedChain, Loop, end_guard, flow, meshed
+from .shooting import Chain, Loop, end_guard, flow, meshed, solve_closed
 
 #: Integration steps in an arc of a separatrix.
 STEPS = 16
@@ -204,7 +203,7 @@ class ClosedOutline(Outline):
 
 @jit
 def _solved_anew(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    return solve(ClosedChain(chain), osc, lax.stop_gradient(z)).z
+    return solve_closed(osc, chain, z)[0]
 
 
 class OpenOutline(Outline):

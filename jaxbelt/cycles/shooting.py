@@ -13,8 +13,9 @@ for N arcs:
 The number N is padded to a few fixed sizes and modes are data, so that one compiled program serves
 all signatures. Slip arcs are integrated by a fixed number of steps of a scheme of order
 twelve, spread over the arc so that they are short where the friction law bends; all arcs at
-once, each step smooth in everything. Derivatives of a solution come from the implicit function
-theorem and work in forward and reverse mode and under `jax.vmap`.
+once, each step smooth in everything. An arc that magnifies is followed backwards, see
+`solve_closed`. Derivatives of a solution come from the implicit function theorem and work in
+forward and reverse mode and under `jax.vmap`.
 """
 
 import functools
@@ -39,6 +40,7 @@ from ..model.modes import (
     mode_acceleration,
     mode_of,
     onset_position,
+    select,
     stick_velocity,
 )
 from ..model.oscillator import Oscillator
@@ -46,12 +48,14 @@ from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, one_kernel
 from ..numerics.extrapolation import Scheme, increments, scheme
-from ..numerics.newton import HOLDS, Equations
+from ..numerics.newton import HOLDS, Equations, solve
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 ARC_STEPS = 8
+#: An arc magnifies, if its end moves so much faster than its entry.
+MAGNIFIED = 1e4
 
 
 class Chain(eqx.Module):
@@ -228,21 +232,48 @@ def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     return sum((jnp.where(end == i, value, 0.0) for i, value in enumerate(values)), jnp.zeros(()))
 
 
-def _arc_equations(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
+def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """Divergence of the field of a slip mode, d(x2')/d(x2), as a vector of one."""
+    _, slope = jax.jvp(lambda v: mode_acceleration(osc, mode, x1, v), (x2,), (jnp.ones_like(x2),))
+    return slope[None]
+
+
+def _magnifies(osc: Oscillator, codes: Array, entry: Array, exit_: Array) -> Array:
+    """Whether an arc leads away from a place where the orbit hardly moves, and lingers.
+
+    A mass that a slow belt leaves is such: where it ends is lost in the rounding of where it began,
+    magnified by the ratio of the two velocities in the plane. Backwards this is the ratio over the
+    growth of areas, so it is done where these grow.
+    """
+    osc, entry, exit_ = lax.stop_gradient((osc, entry, exit_))
+    mode = mode_of(codes)
+    slow, fast = (jnp.max(jnp.abs(_slip_slopes(osc, codes, y))) for y in (entry, exit_))
+    grows = trace_of(osc, mode, entry[0], entry[1])[0] > 0
+    return ~mode.any_stuck & grows & (fast > MAGNIFIED * slow)
+
+
+def _magnifying(osc: Oscillator, chain: Chain, z: Array) -> Array:
+    """Which of the arcs, [N], magnify an error at their entry; see `_magnifies`."""
+    exits = jnp.roll(z[:, :2], -1, axis=0)
+    return jax.vmap(functools.partial(_magnifies, osc))(chain.codes, z[:, :2], exits)
+
+
+def _arc_equations(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> Array:
     """(x1, x2, guard, 0) at the end of one arc, from its unknowns (x1, x2, T).
 
-    An unused arc ends as it begins, and its guard is its duration. One that is to end tangent to
-    the boundary of a belt ends at the point of it with x2' = 0. Trial arcs that run past there meet
-    the pole of the friction law, so this one is followed backwards, from that point, to where it
-    begins: (x1, x2) are the point's, the last two the misses of x1 and of x2. That is one equation
-    more, a condition on the oscillator.
+    Backwards: (x1, x2) are the state in which it ends; of the four numbers the first two are its
+    entry. An unused arc ends as it begins, and its guard is its duration. One that is to end
+    tangent to the boundary of a belt ends at the point of it with x2' = 0. Trial arcs that run past
+    there meet the pole of the friction law, so this one is followed backwards, from that point, to
+    where it begins: (x1, x2) are the point's, the last two the misses of x1 and of x2. That is one
+    equation more, a condition on the oscillator.
     """
     is_unused = end == Ends(len(osc.belts)).unused
-    follow = functools.partial(_followed, osc, codes, end, mesh)
+    follow = functools.partial(_followed, osc, codes, end, mesh, backwards)
     return lax.cond(is_unused, lambda u: jnp.append(u, 0.0), follow, unknown)
 
 
-def _followed(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
+def _followed(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> Array:
     """`_arc_equations` of an arc that is used."""
     names = Ends(len(osc.belts))
     is_tangent = end >= names.tangent
@@ -252,34 +283,36 @@ def _followed(osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
     x1 = mode_acceleration(osc, mode_of(codes), jnp.zeros(()), velocity)
     point = jnp.stack([x1, velocity])
     start = jnp.where(is_tangent, point, unknown[:2])
-    duration = jnp.where(is_tangent, -unknown[2], unknown[2])
-    after = flow(osc, codes, jnp.where(is_tangent, jnp.flip(mesh), mesh), start, duration)
-    guard = end_guard(osc, codes, end, after)
+    back = is_tangent | backwards
+    duration = jnp.where(back, -unknown[2], unknown[2])
+    after = flow(osc, codes, jnp.where(back, jnp.flip(mesh), mesh), start, duration)
+    guard = end_guard(osc, codes, end, jnp.where(backwards, unknown[:2], after))
     ordinary = jnp.concatenate([after, guard[None], jnp.zeros(1)])
     return jnp.where(is_tangent, jnp.concatenate([point, after - unknown[:2]]), ordinary)
 
 
 @one_kernel
-def _all_arc_equations(osc: Oscillator, chain: Chain, z: Array) -> Array:
+def _all_arc_equations(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
     """`_arc_equations` of all arcs, [N, 4]."""
 
     def one(row):
-        codes, end, mesh, unknown = row
-        return _arc_equations(osc, codes, end, mesh, unknown)
+        return _arc_equations(osc, *row)
 
-    return lax.map(one, (chain.codes, chain.ends, chain.mesh, z))
+    return lax.map(one, (chain.codes, chain.ends, chain.mesh, backwards, z))
 
 
 @one_kernel
-def _equations_and_blocks(osc: Oscillator, along: Oscillator | None, chain: Chain, z: Array):
+def _equations_and_blocks(
+    osc: Oscillator, along: Oscillator | None, chain: Chain, backwards: Array, z: Array
+):
     """`_arc_equations` of all arcs, [N, 4], and their derivatives, [N, 4, 3 + k]."""
     more = 0 if along is None else jax.tree.leaves(along)[0].size
 
     def one(row):
-        codes, end, mesh, unknown = row
+        codes, end, mesh, back, unknown = row
 
         def equations(osc, u):
-            return _arc_equations(osc, codes, end, mesh, u)
+            return _arc_equations(osc, codes, end, mesh, back, u)
 
         def column(direction):
             if along is None:
@@ -290,56 +323,97 @@ def _equations_and_blocks(osc: Oscillator, along: Oscillator | None, chain: Chai
 
         return jax.vmap(column, out_axes=(None, -1))(jnp.eye(3 + more))
 
-    return lax.map(one, (chain.codes, chain.ends, chain.mesh, z))
+    return lax.map(one, (chain.codes, chain.ends, chain.mesh, backwards, z))
 
 
-def residual(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
+def residual(
+    osc: Oscillator, chain: Chain, z: Array, backwards: Array | None = None
+) -> tuple[Array, Array]:
     """The 3N equations at the unknowns z, [N, 3]: mismatch of x1, of x2, guard, for every arc; and
-    the miss of the tangent arcs, zero where there is none."""
-    out = _all_arc_equations(osc, chain, z)
-    return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3])
+    the miss of the tangent arcs, zero where there is none. backwards: arcs that are followed so,
+    none unless told, [N]."""
+    backwards = _none(z) if backwards is None else backwards
+    out = _all_arc_equations(osc, chain, backwards, z)
+    return _mismatch(out, z, backwards), jnp.sum(out[:, 3])
 
 
-def _next_entries(z):
-    return jnp.roll(z, -1, axis=0).at[:, 2].set(0.0)
+def _none(z: Array) -> Array:
+    return jnp.zeros(len(z), bool)
+
+
+def _mismatch(out: Array, z: Array, backwards: Array) -> Array:
+    exits = jnp.where(backwards[:, None], z[:, :2], out[:, :2])
+    entries = jnp.where(backwards[:, None], out[:, :2], z[:, :2])
+    return jnp.concatenate([exits - jnp.roll(entries, -1, axis=0), out[:, 2:3]], axis=1)
 
 
 def residual_and_blocks(
-    osc: Oscillator, along: Oscillator | None, chain: Chain, z: Array
+    osc: Oscillator,
+    along: Oscillator | None,
+    chain: Chain,
+    z: Array,
+    backwards: Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """`residual`, and its derivatives: those of the equations of each arc with respect to its
     (x1, x2, T), and along the k directions `along` in the space of oscillators, if they are given
     (an oscillator of arrays [k]), [N, 4, 3 + k]."""
-    out, blocks = _equations_and_blocks(osc, along, chain, z)
-    return out[:, :3] - _next_entries(z), jnp.sum(out[:, 3]), blocks
+    backwards = _none(z) if backwards is None else backwards
+    out, blocks = _equations_and_blocks(osc, along, chain, backwards, z)
+    return _mismatch(out, z, backwards), jnp.sum(out[:, 3]), blocks
 
 
-def jacobian(blocks: Array) -> Array:
-    """The 3N x 3N matrix of the system: the blocks, and minus one at the next arc's entry."""
+def jacobian(blocks: Array, backwards: Array | None = None) -> Array:
+    """The 3N x 3N matrix of the system: the slopes of each arc's end and guard, and minus those of
+    the next arc's entry, of which one is its unknown."""
     n = blocks.shape[0]
+    own, entry = blocks, jnp.asarray(np.diag([1.0, 1.0, 0.0]))[None]
+    if backwards is not None:
+        back, state = backwards[:, None, None], jnp.asarray([True, True, False])[None, :, None]
+        own = jnp.where(back & state, entry, blocks)
+        entry = jnp.where(back, jnp.where(state, blocks, 0.0), entry)
     following = jnp.asarray(np.roll(np.eye(n), 1, axis=1))
-    same = jnp.eye(n)[:, None, :, None] * blocks[:, :, None, :]
-    then = following[:, None, :, None] * jnp.asarray(np.diag([1.0, 1.0, 0.0]))[None, :, None, :]
+    same = jnp.eye(n)[:, None, :, None] * own[:, :, None, :]
+    then = following[:, None, :, None] * jnp.swapaxes(entry, 0, 1)[None]
     return (same - then).reshape(3 * n, 3 * n)
 
 
 class ClosedChain(Equations):
-    """The 3N equations of a chain in the unknowns z, [N, 3], for an oscillator."""
+    """The 3N equations of a chain in the unknowns z, [N, 3], for an oscillator.
+
+    backwards: the arcs that are followed so, [N].
+    """
 
     chain: Chain
+    backwards: Array
 
     def residual(self, given: Oscillator, z: Array) -> Array:
-        return residual(given, self.chain, z)[0].reshape(-1)
+        return residual(given, self.chain, z, self.backwards)[0].reshape(-1)
 
     def linearized(self, given: Oscillator, z: Array) -> tuple[Array, Array]:
-        value, _, blocks = residual_and_blocks(given, None, self.chain, z)
-        return value.reshape(-1), jacobian(blocks[:, :3])
+        value, _, blocks = residual_and_blocks(given, None, self.chain, z, self.backwards)
+        return value.reshape(-1), jacobian(blocks[:, :3], self.backwards)
 
 
-def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
-    """Divergence of the field of a slip mode, d(x2')/d(x2), as a vector of one."""
-    _, slope = jax.jvp(lambda v: mode_acceleration(osc, mode, x1, v), (x2,), (jnp.ones_like(x2),))
-    return slope[None]
+def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Array]:
+    """The unknowns of a closed chain near a guess of them, [N, 3], differentiable with respect to
+    the oscillator, and the number of Newton steps.
+
+    An arc that magnifies is followed backwards from the state in which it ends, which is then its
+    unknown: forwards its rounding would be larger than what equations may leave.
+    """
+    guess = lax.stop_gradient(guess)
+    backwards = _magnifying(osc, chain, guess)
+    state = jnp.asarray([True, True, False])[None]
+    ends = backwards[:, None] & state
+    start = jnp.where(ends, jnp.roll(guess, -1, axis=0), guess)
+    solved = solve(ClosedChain(chain, backwards), osc, start)
+
+    def entered():
+        out = _all_arc_equations(osc, chain, backwards, solved.z)
+        return jnp.where(ends, out[:, :3], solved.z)
+
+    z = lax.cond(any_lane(jnp.any(backwards)), entered, lambda: solved.z)
+    return z, solved.iterations
 
 
 def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
@@ -365,15 +439,20 @@ def _errors_and_factors(osc: Oscillator, chain: Chain, following: Array, z: Arra
 
 
 def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, entry):
-    after = flow(osc, codes, mesh, unknown[:2], unknown[2], trace_of)
-    guard = end_guard(osc, codes, end, after[:2])
-    before_crossing = mode_acceleration(osc, mode_of(codes), after[0], after[1])
+    back = _magnifies(osc, codes, unknown[:2], entry)
+    start, target = select(back, (entry, unknown[:2]), (unknown[:2], entry))
+    way = jnp.where(back, -1.0, 1.0)
+    steps = jnp.where(back, jnp.flip(mesh), mesh)
+    after = flow(osc, codes, steps, start, way * unknown[2], trace_of)
+    last = jnp.where(back, entry, after[:2])
+    guard = end_guard(osc, codes, end, last)
+    before_crossing = mode_acceleration(osc, mode_of(codes), last[0], last[1])
     after_crossing = mode_acceleration(osc, mode_of(following), entry[0], entry[1])
     slips = jnp.all(codes != 0) & (unknown[2] != 0)
     crosses = (end < len(osc.belts)) & jnp.all(following != 0)
     ratio = after_crossing / jnp.where(crosses, before_crossing, 1.0)
-    growth = jnp.where(slips, jnp.exp(jnp.where(slips, after[2], 0.0)), 1.0)
-    error = jnp.maximum(jnp.max(jnp.abs(after[:2] - entry)), jnp.abs(guard))
+    growth = jnp.where(slips, jnp.exp(jnp.where(slips, way * after[2], 0.0)), 1.0)
+    error = jnp.maximum(jnp.max(jnp.abs(after[:2] - target)), jnp.abs(guard))
     return error, growth * jnp.where(crosses, ratio, 1.0)
 
 

@@ -64,6 +64,43 @@ def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     return ~mode.any_stuck & (settling_margin(osc, mode, x1, x2)[0] > 0)
 
 
+#: So much of the range of speeds, and of the time, may a loop touch or stick to a belt by the
+#: error of an integrated orbit: that of the largest circle, which is tangent to the boundary.
+TOUCHES, STICKS = 1e-6, 1e-3
+
+
+def is_neutral(
+    osc: Oscillator, x1: tuple[Array, Array], x2: tuple[Array, Array], stuck: Array
+) -> Array:
+    """Whether a closed orbit is one of a continuum of such.
+
+    It is where no force depends on the speed, so that energy is kept: without damping, for
+    constant friction of belts that no speed of the loop reaches. x1, x2: the smallest and the
+    largest of the loop; stuck: how much of the time it sticks.
+    """
+    zero = jnp.zeros_like(x2[0])
+    speeds = [x2[0] + j / 8 * (x2[1] - x2[0]) for j in range(9)]
+    always = [-osc.damping * v for v in speeds]
+    neutral = stuck < STICKS
+    slack = TOUCHES * osc.omega * (x2[1] - x2[0])
+    for belt in osc.belts:
+        pulls = belt.load != 0
+        touches = pulls & (belt.lower < x1[1]) & (belt.upper > x1[0])
+        within = pulls & (belt.lower <= x1[0]) & (belt.upper >= x1[1])
+        r = [belt.velocity - osc.omega * v for v in speeds]
+        sign = jnp.sign(r[4])
+        reached = jnp.minimum(sign * r[0], sign * r[8]) < -slack
+        forces = [belt.load * sign * belt.friction.mu(jnp.abs(one)) for one in r]
+        kept = _spread(forces) <= force_rounding(zero, belt.load)
+        neutral = neutral & ~(touches & (reached | ~within & ~kept))
+        always = [a + jnp.where(within, f, 0.0) for a, f in zip(always, forces, strict=True)]
+    return neutral & (_spread(always) <= force_rounding(zero))
+
+
+def _spread(values: list[Array]) -> Array:
+    return functools.reduce(jnp.maximum, values) - functools.reduce(jnp.minimum, values)
+
+
 def _losses(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> list[Array]:
     """-v f(v) at the speeds of `DISC`."""
     speeds = [fraction * radius for fraction in DISC]

@@ -16,6 +16,7 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,9 @@ def _usable(name: str, trial: Callable[[], bool]) -> bool:
 
 def _try(name: str, trial: Callable[[], bool]) -> None:
     try:
-        # Now, also where the first use is inside of a trace.
-        with jax.ensure_compile_time_eval():
-            _works[name] = trial()
+        # Now, also where the first use is inside of a trace: those of JAX belong to their thread.
+        with ThreadPoolExecutor(1) as apart:
+            _works[name] = apart.submit(trial).result()
         reason = "its result is wrong"
     except Exception as error:
         _works[name] = False

@@ -29,13 +29,17 @@ LONGEST_NEWTON_STEP = 0.5
 HOLDS = 1e-9
 #: Steps of this length are rounding: unknowns are of size one.
 STEP_ROUNDING = 1e-13
+#: Larger unknowns are of another size, such as the time stuck to a belt that hardly moves: steps
+#: are measured in parts of them.
+LARGE = 100.0
 
 
 class Newton(eqx.Module):
     """What Newton's method ends with.
 
     z: the unknowns; residual: the largest one before the last step; iterations: steps made;
-    lengths: how long each was, [NEWTON_STEPS], NaN where there was none; matrix: of the last one.
+    lengths: how long each was, [NEWTON_STEPS], NaN where there was none, of unknowns beyond LARGE
+    in units of |z| / LARGE; matrix: of the last one.
     """
 
     z: Any
@@ -78,7 +82,7 @@ def newton(
     def improve(n):
         value, matrix = linearized(unravel(n.z))
         change = jnp.linalg.solve(matrix, -value)
-        length = jnp.max(jnp.abs(change))
+        length = jnp.max(jnp.abs(change) / jnp.maximum(1.0, jnp.abs(n.z) / LARGE))
         z = n.z + jnp.minimum(1.0, longest / length) * change
         lengths = n.lengths.at[n.iterations].set(length)
         return Newton(z, jnp.max(jnp.abs(value)), n.iterations + 1, lengths, matrix)

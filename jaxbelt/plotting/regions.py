@@ -158,10 +158,13 @@ def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
     titles = {name: name for name in names}
     if not named:
         titles = {name: words.replace("; ", ";\n") for name, words in regions.words.items()}
+    long = max((len(titles[name]) for name in names), default=0)
+    size = "medium" if long < 5 else "x-small"
     for place, name in enumerate(names):
         axis = figure.add_subplot(lower[place // columns, place % columns])
         cycles = regions.cycles[name]
-        _draw_sketch(axis, regions.oscillator(name), cycles, titles[name])
+        _draw_sketch(axis, regions.oscillator(name), cycles)
+        axis.set_title(titles[name], pad=2, fontsize=size)
     draw_key(figure, leave_out=ax)
     return ax
 
@@ -170,7 +173,7 @@ def _has_area(regions: RegionMap, name: str) -> bool:
     return bool(np.any((regions.label == name) & ~regions.on_line))
 
 
-def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle], name: str) -> None:
+def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle]) -> None:
     loops = [path_around(cycle) for cycle in cycles]
     rests = find_equilibria(osc)
     for i, belt in enumerate(osc.belts):
@@ -187,4 +190,3 @@ def _draw_sketch(ax: Axes, osc: Oscillator, cycles: Sequence[Cycle], name: str) 
     x1 += [float(value) for loop in loops for value in (loop[:, 0].min(), loop[:, 0].max())]
     middle, reach = 0.5 * (min(x1) + max(x1)), max(0.5, 0.6 * (max(x1) - min(x1)))
     ax.set(xlim=(middle - reach, middle + reach), ylim=(-0.85, 0.85), xticks=[], yticks=[])
-    ax.set_title(name, pad=2, fontsize="medium" if len(name) < 5 else "x-small")

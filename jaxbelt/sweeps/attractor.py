@@ -1,5 +1,6 @@
 """The observer of attractors: where each run leads, found as early as it is certain."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
@@ -14,13 +15,15 @@ from ..kernel.lanes import Lanes, Observer, Passage, Variable, materialise
 from ..model.events import signature_name
 from ..model.modes import begins_at_rest, select
 from ..model.oscillator import Oscillator
-from ..model.rest import settling_margin
+from ..model.rest import is_neutral, settling_margin
 from ..results import Status
 from .marks import Mark
 
 #: What a run leads to, in the order of their codes.
 KINDS = ("undecided", "equilibrium", "cycle", "stuck")
 UNDECIDED, EQUILIBRIUM, CYCLE, STUCK_FOR_EVER = range(4)
+#: What repeats, but is one of a continuum of closed orbits: undecided, in the end.
+NEUTRAL = len(KINDS)
 
 
 def signature(word: int, belts: int) -> str:
@@ -76,6 +79,8 @@ class Attractor(Observer):
     - An equilibrium: the run begins on one, or the orbit has entered a disc that is attracted by a
       fixed point, see `rest.settling_margin`. A pseudo-focus is recognised by `modes.is_captured`.
     - Stuck for ever: on a belt at rest.
+    - None of these: a closed orbit beside others, as around a centre, see `rest.is_neutral`. It
+      attracts nothing, and the run ends undecided with the status NEUTRAL.
 
     The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
     What a run tells of its attractor is NaN where it is undecided, and `sticks` false.
@@ -211,9 +216,14 @@ class Attractor(Observer):
         margin, x1_rest, lost = settling_margin(osc, lanes.mode, lanes.x1, lanes.x2)
         slips = ~lanes.mode.any_stuck & ~lanes.done
         found = materialise(jnp.where(slips, margin, 0.0), ones) > 0
+        extent = (loop.x1_min, loop.x1_max), (lanes.lower, lanes.upper)
+        time = jnp.where(loop.period > 0, loop.period, 1.0)
+        stuck = functools.reduce(jnp.maximum, loop.sticks) / time
+        neutral = (loop.kind == CYCLE) & is_neutral(osc, *extent, stuck)
+        kind = jnp.where(neutral, NEUTRAL, jnp.where(found, EQUILIBRIUM, loop.kind))
         memory = replace(
             loop,
-            kind=jnp.where(found, EQUILIBRIUM, loop.kind).astype(loop.kind.dtype),
+            kind=kind.astype(loop.kind.dtype),
             x1_min=jnp.where(found, x1_rest, loop.x1_min),
             x1_max=jnp.where(found, x1_rest, loop.x1_max),
             sticks=tuple(jnp.where(found, 0.0, total) for total in loop.sticks),
@@ -230,9 +240,11 @@ class Attractor(Observer):
 
     def finish(self, osc, lanes):
         loop: _LoopSoFar = lanes.memory
-        undecided = loop.kind == UNDECIDED
+        neutral = loop.kind == NEUTRAL
+        undecided = (loop.kind == UNDECIDED) | neutral
         unsettled = undecided & (lanes.status == Status.OK.value)
-        status = jnp.where(unsettled, Status.NOT_SETTLED.value, lanes.status)
+        reason = jnp.where(neutral, Status.NEUTRAL.value, Status.NOT_SETTLED.value)
+        status = jnp.where(unsettled, reason, lanes.status)
         word = jnp.where(jnp.isinf(loop.word), -1.0, loop.word)
 
         def of_attractor(value):
@@ -240,16 +252,16 @@ class Attractor(Observer):
             return jnp.where(undecided, jnp.nan, value)
 
         return {
-            "kind": loop.kind,
+            "kind": jnp.where(neutral, UNDECIDED, loop.kind).astype(loop.kind.dtype),
             "signature": jnp.where(loop.kind == CYCLE, word, 0.0),
             "sticks": tuple((total > 0) & ~undecided for total in loop.sticks),
-            "period": loop.period,
+            "period": of_attractor(loop.period),
             "stick_duration": tuple(of_attractor(total) for total in loop.sticks),
             "x1_min": of_attractor(loop.x1_min),
             "x1_max": of_attractor(loop.x1_max),
             "x2_min": of_attractor(lanes.lower),
             "x2_max": of_attractor(lanes.upper),
-            "transient": loop.transient,
+            "transient": of_attractor(loop.transient),
             "n_events": jnp.where(loop.kind == CYCLE, loop.loop_events, lanes.events),
             "status": status,
         }

@@ -18,8 +18,9 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, tell
 from ..checks import as_positive, as_whole
-from ..cycles.attractors import RUN, Runs
+from ..cycles.attractors import APART, RUN, Runs, place_of
 from ..cycles.cycle import find_cycle
+from ..model.equilibria import equilibria
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
@@ -45,6 +46,8 @@ MOVES = 0.25
 ATTRACTS = 1e-9
 #: Of more cycles at one value that do not stick none is looked into: they are a continuum.
 MOST_CYCLES = 50
+#: An attractor that moves too far from value to value is followed by parts of the way down to this.
+SMALLEST_PART = 1 / 64
 #: Where an attractor is: its smallest and largest x1 and x2; and how long a loop takes.
 PLACE = ("x1_min", "x1_max", "x2_min", "x2_max", "period")
 
@@ -152,9 +155,11 @@ def basin_fractions(
     largest of the four moves. So a cycle that comes to stick to another belt keeps its name. An
     attractor that pairs with none there is compared in the same way with those that were met
     before, where they were met last: a small basin may have no start in it at a value in between.
-    What moves by more than `moves` in one step, as a cycle on a steep branch may, is two attractors
-    by this rule, one that ends and one that begins: with more rows, or a larger `moves`, it is one.
-    The other way round, `moves` that is too large joins what only lies near to one another.
+    What moves by more in one step, as a cycle on a steep branch may, is followed through values in
+    between, from the state in which it was: it keeps its name if it gets to one that is left alone
+    without such a move in less than a 64th of the step. What jumps is two attractors, one that ends
+    and one that begins. The other way round, `moves` that is too large joins what only lies near to
+    one another.
 
     The attractors are those that starts lead to: one with a basin that no start is in is not seen.
     Starts on closed orbits that do not attract, such as those around a centre, are undecided, and
@@ -277,13 +282,20 @@ def _matched(
     names: list[str] = []
     last: list[_Met] = []  # each of them, where it was met last
     numbers: list[list[int]] = []  # of the attractors at each value, in `names`
-    for met in found:
-        here: dict[int, int] = {}
+    for row, met in enumerate(found):
         just_before = numbers[-1] if numbers else []
-        for known in (just_before, [k for k in range(len(last)) if k not in just_before]):
-            new = [i for i in range(len(met)) if i not in here]
-            pairs = _partners([last[k] for k in known], [met[i] for i in new], moves)
-            here |= {new[i]: known[j] for i, j in pairs.items()}
+        pairs = _partners([last[k] for k in just_before], met, moves)
+        here = {i: just_before[j] for i, j in pairs.items()}
+        for known in just_before:
+            alone = [i for i in range(len(met)) if i not in here]
+            if known in here.values() or all(met[i].kind != last[known].kind for i in alone):
+                continue
+            there = _followed(variation, values[row - 1 : row + 1], last[known], moves)
+            here |= {i: known for i in alone if there is not None and _is_at(met[i], there)}
+        missed = [k for k in range(len(last)) if k not in just_before]
+        new = [i for i in range(len(met)) if i not in here]
+        pairs = _partners([last[k] for k in missed], [met[i] for i in new], moves)
+        here |= {new[i]: missed[j] for i, j in pairs.items()}
         for i, one in enumerate(met):
             if i not in here:
                 here[i] = len(names)
@@ -315,6 +327,49 @@ def _matched(
         name=variation.names[0],
         is_argument=not variation.varies_leaves,
     )
+
+
+def _followed(variation: Variation, way: np.ndarray, one: _Met, moves: float) -> _Met | None:
+    """What an attractor at the first of two values is at the second, where it gets there without a
+    move of more than `moves` in a SMALLEST_PART of the way."""
+    done, part = 0.0, 0.5
+    while done < 1:
+        to = min(1.0, done + part)
+        value = (1 - to) * way[:1] + to * way[1:]
+        there = _seeded(variation.oscillator(value), one)
+        if there is not None and _move_between(one, there) <= moves:
+            done, one = to, there
+        elif part > SMALLEST_PART:
+            part /= 2
+        else:
+            return None
+    return one
+
+
+def _seeded(osc: Oscillator, one: _Met) -> _Met | None:
+    """The attractor of an oscillator that is reached from one of another: from the state in which a
+    cycle turns back; of points of rest the nearest."""
+    place = np.zeros(len(PLACE))
+    if one.kind == CYCLE:
+        cycle = find_cycle(osc, (float(one.place[1]), 0.0))
+        if int(cycle.status) != Status.OK or not bool(cycle.stable):
+            return None
+        place = place_of(cycle)
+    elif one.kind == EQUILIBRIUM:
+        rests = equilibria(osc)
+        x1 = np.asarray(rests.x1)[np.asarray(rests.stable) & ~np.isnan(rests.rate)]
+        if not x1.size:
+            return None
+        place[:2] = x1[np.argmin(np.abs(x1 - one.place[0]))]
+    else:
+        return None
+    return _Met(one.kind, place, one.fraction)
+
+
+def _is_at(one: _Met, other: _Met) -> bool:
+    """Whether two attractors of one kind, at one value, are at one place."""
+    size = max(float(np.max(np.abs(one.place[:4]))), 1.0)
+    return _move_between(one, other) < APART * size
 
 
 def _partners(before: list[_Met], met: list[_Met], moves: float) -> dict[int, int]:
