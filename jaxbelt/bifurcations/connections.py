@@ -49,6 +49,7 @@ from ..numerics.compiling import each, jit
 from ..numerics.newton import HOLDS, newton
 from ..results import Status
 from .conditions import AbstractCondition, Line, point_of
+from .crossings import has_jump
 from .rests import check_edge
 from .systems import (
     CycleSystem,
@@ -201,6 +202,9 @@ class SaddleConnection(AbstractCondition):
         osc, data = point.oscillator, self.as_data()
         system, x, _ = data.prepared(osc, data.guess(osc, self.room))
         return system, _solved_at(osc, system, x)
+
+    def type_of(self, point):
+        return "homoclinic" if int(point.cycle.status) == Status.OK else "heteroclinic"
 
     def place(self, point):
         system, x = self.followed(point)
@@ -378,7 +382,7 @@ def _courses_of(oscs: Oscillator) -> _Courses:
     def at(row):
         osc = lax.stop_gradient(eqx.combine(row, rest))
         n, parts = len(osc.belts), saddles(osc)
-        smooth = [(belt.velocity != 0) & ~_has_jump(belt) for belt in osc.belts]
+        smooth = [(belt.velocity != 0) & ~has_jump(belt) for belt in osc.belts]
         parts = parts & jnp.all(jnp.stack(smooth))
 
         def one(start):
@@ -394,12 +398,6 @@ def _courses_of(oscs: Oscillator) -> _Courses:
         return _Courses(jnp.stack(edges(osc)), parts, *found)
 
     return each(at)(rows)
-
-
-def _has_jump(belt: Any) -> Array:
-    """Whether the static limit of a belt exceeds mu(0)."""
-    law = belt.friction
-    return belt.load * (law.static - law.mu(jnp.zeros(()))) > 0
 
 
 def courses_of(oscs: Oscillator) -> list[tuple[SaddleCourse, ...]]:

@@ -32,16 +32,19 @@ from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.modes import (
+    EdgeFocus,
     Mode,
     boundary_guards,
     capacity,
     contact,
+    edge_focus,
     edge_guards,
     edges,
     field_at_rest,
     mode_acceleration,
     mode_of,
     select,
+    settle,
 )
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
@@ -56,10 +59,12 @@ from .conditions import (
 )
 from .guesses import HINT_BUDGET, orbit_after_stick
 from .special import SpecialPoint, Trail
-from .systems import RestSystem, small_newton, velocity_of
+from .systems import RestSystem, Tests, small_newton, velocity_of
 
 #: The unknowns of a state of rest of which all is known.
 NOTHING = np.zeros(0)
+#: Coefficients smaller than this part of their terms are zero: points are good to some 1e-12.
+DEGENERATE = 1e-9
 #: Where sudden sliding is looked for, relative to where the belt is at rest: orbits that settle
 #: soon first; other points may be nearer than where they do.
 BESIDE = (1e-2, -1e-2, 1e-4, -1e-4)
@@ -158,9 +163,34 @@ class Hopf(AbstractRestCondition):
     def between(cls, before, after, edged):
         return [cls()] if before.equilibria != after.equilibria else []
 
+    def type_of(self, point):
+        return criticality(*_hopf_growth(point.oscillator))
+
+    def coefficient(self, osc):
+        return _hopf_growth(osc)[0]
+
     def place(self, point):
         system, x = self.followed(point)
         return system.place(np.asarray(x))
+
+
+def criticality(coefficient: Array, size: Array) -> str:
+    """The type of a point at which a cycle is born; size: of the terms of the coefficient."""
+    if not abs(coefficient) > DEGENERATE * size:
+        return "degenerate"
+    return "subcritical" if coefficient > 0 else "supercritical"
+
+
+@jit
+def _hopf_growth(osc: Oscillator) -> tuple[Array, Array]:
+    """The first Lyapunov coefficient at a Hopf point, and the size of its terms."""
+    system, x1, _ = Hopf().system(osc, candidates(osc))
+    sizes = []
+    for belt, code in zip(osc.belts, system.codes, strict=True):
+        alone = eqx.tree_at(lambda o: o.belts, osc, (belt,))
+        third = third_derivative(alone, code[None], x1[0])
+        sizes.append(jnp.where(jnp.abs(code) == 1, jnp.abs(third), 0.0))
+    return third_derivative(osc, system.codes, x1[0]) / 16, sum(sizes) / 16
 
 
 def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
@@ -232,7 +262,11 @@ class _EdgeSystem(RestSystem):
         return self.balance(osc)[None]
 
     def tests(self, osc, x):
-        return {("BoundaryHopf", ()): self.meets_hopf(osc)}
+        return {("BoundaryHopf", ()): self.meets_hopf(osc), **self.type_tests(osc)}
+
+    def type_tests(self, osc: Oscillator) -> Tests:
+        """What to watch along its curve where the type changes."""
+        raise NotImplementedError
 
 
 class EdgeRest(_EdgeSystem):
@@ -258,6 +292,26 @@ class EdgeRest(_EdgeSystem):
         _, trace, *_ = field_at_rest(osc, mode, jnp.stack(edges(osc))[self.edge])
         return jnp.where(mode.any_stuck, jnp.nan, trace)
 
+    def type_tests(self, osc):
+        push, persists = self.across(osc)
+        return {("DoubleBoundaryEquilibrium", ()): jnp.where(persists, jnp.nan, push)}
+
+    def across(self, osc: Oscillator) -> tuple[Array, Array]:
+        """How hard the other side pushes to the edge, and whether an equilibrium is at the edge on
+        both sides of the point whatever this is.
+
+        So it is where belts at rest hold the mass on the other side, and where it is the end of a
+        segment that comes to the edge first.
+        """
+        at, rest = jnp.stack(edges(osc))[self.edge], jnp.zeros(())
+        left, right = (settle(osc, mode, at, rest) for mode in _beside_edge(osc, at))
+        other = select(self.rightward, left, right)
+        push = select(self.rightward, 1.0, -1.0) * mode_acceleration(osc, other, at, rest)
+        # A segment to the right has its lower end where the needed force is what the belts hold.
+        rests = capacity(osc, mode_of(self.codes)) > 0
+        stays = rests & (self.limit == select(self.rightward, -1.0, 1.0))
+        return push, stays | other.any_stuck
+
     def exists(self, osc, x):
         # Whether the contacts on that side are those.
         at = jnp.stack(edges(osc))[self.edge]
@@ -277,7 +331,7 @@ class EdgeBalance(_EdgeSystem):
         return field_at_rest(osc, self.left, at)[:2], field_at_rest(osc, self.right, at)[:2]
 
     def balance(self, osc):
-        # The contraction of `modes.edge_focus` times both pushes: regular where one of them is 0.
+        # The rate of `modes.edge_focus` but for factors: regular where one of the pushes is 0.
         (a_left, trace_left), (a_right, trace_right) = self._sides(osc)
         return trace_right * a_left - trace_left * a_right
 
@@ -296,6 +350,15 @@ class EdgeBalance(_EdgeSystem):
         # The weaker of the two pushes towards the edge, negative where one pushes away.
         (a_left, _), (a_right, _) = self._sides(osc)
         return jnp.minimum(a_left, -a_right)
+
+
+    def type_tests(self, osc):
+        return {("DegeneratePseudoHopf", ()): self.focus(osc).coefficient}
+
+    def focus(self, osc: Oscillator) -> EdgeFocus:
+        """The pseudo-focus, NaN where there is none."""
+        focus = edge_focus(osc, self.left, self.right, jnp.stack(edges(osc))[self.edge])
+        return jax.tree.map(lambda leaf: jnp.where(focus.exists, leaf, jnp.nan), focus)
 
 
 class _EdgeCondition(AbstractRestCondition):
@@ -332,6 +395,12 @@ class BoundaryEquilibrium(_EdgeCondition):
     def _system_at_edge(self, osc):
         return _edge_rest(osc, self.belt)
 
+    def type_of(self, point):
+        push, persists = _across_edge(point.oscillator, self.belt)
+        if not persists and abs(push) < HOLDS:
+            return "degenerate"
+        return "persistence" if persists or push > 0 else "annihilation"
+
 
 class PseudoHopf(_EdgeCondition):
     """The pseudo-focus at a contact edge of a belt changes its stability."""
@@ -341,6 +410,12 @@ class PseudoHopf(_EdgeCondition):
 
     def _system_at_edge(self, osc):
         return _edge_balance(osc, self.belt)
+
+    def type_of(self, point):
+        return criticality(*_pseudo_growth(point.oscillator, self.belt))
+
+    def coefficient(self, osc):
+        return _pseudo_growth(osc, self.belt)[0]
 
 
 def check_edge(osc: Oscillator, belt: Any, field: str = "belt") -> None:
@@ -374,6 +449,18 @@ def _edge_rest(osc: Oscillator, belt: int | Array) -> EdgeRest:
     missing = jnp.stack([jnp.abs(case.balance(osc)) for case in cases])
     at = jnp.argmin(jnp.where(jnp.isfinite(missing), missing, jnp.inf))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
+
+
+@jit
+def _across_edge(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
+    return _edge_rest(osc, belt).across(osc)
+
+
+@jit
+def _pseudo_growth(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
+    """The coefficient of a pseudo-Hopf point, and the size of its terms."""
+    focus = _edge_balance(osc, belt).focus(osc)
+    return focus.coefficient, focus.bend
 
 
 def _edge_balance(osc: Oscillator, belt: int | Array) -> EdgeBalance:
