@@ -334,13 +334,13 @@ class BifurcationPoint(eqx.Module):
     def type(self) -> str:
         """Which sort of its kind it is, "" where the kind has but one or no point was found.
 
-        "supercritical" or "subcritical" of `Hopf` and `PseudoHopf`: the cycle that is born attracts,
+        "supercritical" or "subcritical" of `Hopf` and `PseudoHopf`: the cycle that is born attracts
         or repels ("degenerate": the coefficient is zero). "persistence" or "annihilation" of
         `BoundaryEquilibrium`: there is an equilibrium on both sides of the point, or two meet and
         vanish ("degenerate": another one lies there, too). "crossing" or "buckling" of
         `CrossingSliding`: a stick phase ceases to be there, or the boundary is crossed once more
-        before it ("jump": a long one ceases at once). "homoclinic" or "heteroclinic" of `SaddleConnection`: it leads back to the same
-        saddle, or to another one.
+        before it ("jump": a long one ceases at once). "homoclinic" or "heteroclinic" of
+        `SaddleConnection`: it leads back to the same saddle or to another one.
         """
         require_single(self, self.value, 0)
         return self.condition.type_of(self) if int(self.status) == Status.OK else ""
@@ -350,8 +350,8 @@ class BifurcationPoint(eqx.Module):
         """The coefficient a of `Hopf` and `PseudoHopf`, else NaN; with derivatives by parameters.
 
         The amplitude r of small oscillations, of x1 around a fixed point, of x2 at the edge around
-        a pseudo-focus, obeys r' = rate r + a r^3, with the `rate` of `Equilibria`. So near the point
-        there is a cycle with r^2 = -rate/a, which attracts where a < 0.
+        a pseudo-focus, obeys r' = rate r + a r^3, with the `rate` of `Equilibria`. So near the
+        point there is a cycle with r^2 = -rate/a, which attracts where a < 0.
         """
         found = self.condition.coefficient(self.oscillator)
         return jnp.where(self.status == Status.OK, found, jnp.nan)

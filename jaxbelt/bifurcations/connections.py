@@ -46,11 +46,13 @@ from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit
+from ..numerics.continuation import Stop
 from ..numerics.newton import HOLDS, newton
 from ..results import Status
 from .conditions import AbstractCondition, Line, point_of
 from .crossings import has_jump
-from .rests import check_edge
+from .edge_rests import check_edge
+from .rests import hopf_limit
 from .systems import (
     CycleSystem,
     Seen,
@@ -215,10 +217,20 @@ class SaddleConnection(AbstractCondition):
         states = np.asarray(_states_along(point.oscillator, system, x))
         return states[np.asarray(system.chain.used)].reshape(-1, 2)
 
+    def limit(self, trail):
+        """Where it has shrunk with its saddle to a Hopf point on the edge."""
+        if trail.end is Stop.POINT_COUNT:
+            return None
+        return hopf_limit("BoundaryHopf", trail, _from_edge, trail.system.leaves)
+
     @classmethod
     def between(cls, before, after, edged):
         differ = len(before.courses) == len(after.courses) and before.courses != after.courses
         return [cls(belt) for belt in edged] if differ else []
+
+
+def _from_edge(osc: Oscillator, codes: Array, x1: Array, edge: Array) -> Array:
+    return x1 - jnp.stack(edges(osc))[edge]
 
 
 @jit

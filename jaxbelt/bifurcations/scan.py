@@ -29,12 +29,13 @@ from ..results import Status
 from .conditions import AbstractCondition, BifurcationPoint, unexplained_point
 from .connections import SaddleConnection
 from .crossings import CrossingSliding, SlidingExchange
+from .edge_rests import BoundaryEquilibrium, PseudoHopf
 from .edges import GrazingEdge
 from .folds import FoldOfCycles
 from .infinity import HopfAtInfinity
 from .meetings import EdgeExchange, MeetingEdges
 from .path import ROOM, ParameterPath
-from .rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
+from .rests import BeltAtRest, Hopf, SuddenSliding
 from .tangencies import GrazingSliding
 
 #: The kinds that are looked for, those first that are likelier or whose programs compile sooner.
