@@ -38,12 +38,14 @@ from ..model.modes import (
     settle,
 )
 from ..model.oscillator import Oscillator
+from ..model.variations import Family
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status
 from .conditions import Line
 from .rests import NOTHING, AbstractRestCondition, criticality
-from .systems import RestSystem, Tests
+from .special import SpecialPoint, Trail
+from .systems import RestSystem, Tests, small_newton
 
 
 class _EdgeSystem(RestSystem):
@@ -159,6 +161,42 @@ class EdgeBalance(_EdgeSystem):
         """The pseudo-focus, NaN where there is none."""
         focus = edge_focus(osc, self.left, self.right, jnp.stack(edges(osc))[self.edge])
         return jax.tree.map(lambda leaf: jnp.where(focus.exists, leaf, jnp.nan), focus)
+
+
+def pseudo_hopf_limit(trail: Trail) -> SpecialPoint | None:
+    """Where the cycle of a curve has shrunk to a pseudo-focus at which the rate and the coefficient
+    are zero, if that is near: its own equations are singular there."""
+    chain, x1 = trail.system.chain, trail.x[:, 0]
+    n, ends = chain.codes.shape[-1], np.asarray(chain.ends)
+    passed = ends[(ends >= n) & (ends < 3 * n)] - n
+    if np.ptp(x1) > 5 * trail.step or not passed.size:
+        return None
+    edge = jnp.asarray(passed[0])
+
+    def attempt(family, unknowns):
+        found, residual = _degenerate_focus(family, edge, jnp.asarray(unknowns[0]))
+        return (found, residual), (found,)
+
+    (found, residual), settled = trail.variation.settle(attempt, (trail.values[-1],))
+    values = np.asarray(found)
+    near = np.linalg.norm(values - trail.values[-1]) < 2 * trail.step
+    if not (settled and residual < HOLDS and near):
+        return None
+    values = float(values[0]), float(values[1])
+    return SpecialPoint("DegeneratePseudoHopf", (), values, float(residual))
+
+
+@jit
+def _degenerate_focus(family: Family, edge: Array, guess: Array) -> tuple[Array, Array]:
+    """Both parameters of such a pseudo-focus, and the error."""
+
+    def equations(family, p):
+        osc = family.at(p)
+        system = EdgeBalance(edge, *_beside_edge(osc, jnp.stack(edges(osc))[edge]))
+        return jnp.stack([system.balance(osc), system.focus(osc).coefficient])
+
+    found, _, residual, _ = small_newton(equations, family, guess)
+    return found, residual
 
 
 class _EdgeCondition(AbstractRestCondition):
