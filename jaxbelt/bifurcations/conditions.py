@@ -339,7 +339,7 @@ class BifurcationPoint(eqx.Module):
         `BoundaryEquilibrium`: there is an equilibrium on both sides of the point, or two meet and
         vanish ("degenerate": another one lies there, too). "crossing" or "buckling" of
         `CrossingSliding`: a stick phase ceases to be there, or the boundary is crossed once more
-        before it ("jump": a long one ceases at once). "homoclinic" or "heteroclinic" of
+        before it ("jump": for long at once). "homoclinic" or "heteroclinic" of
         `SaddleConnection`: it leads back to the same saddle or to another one.
         """
         require_single(self, self.value, 0)

@@ -73,7 +73,9 @@ class CrossingSliding(AbstractCycleCondition):
 
     It arrives at one end of where the mass sticks: that of slip onset, at which a stick phase
     begins with no duration (crossing), or the other one, from which it then sticks all the way, and
-    before which it crosses the boundary, comes back soon and sticks then (buckling).
+    before which it crosses the boundary, comes back soon and sticks then (buckling). Where the
+    static limit exceeds mu(0), it goes far beyond the boundary at once, and may not come back
+    (jump).
     """
 
     belt: int | Array

@@ -15,6 +15,7 @@ Boundary equilibria and the pseudo-Hopf point are those of M. di Bernardo, C. Bu
 Kowalczyk, Piecewise-smooth Dynamical Systems, 2008.
 """
 
+import functools
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -25,7 +26,6 @@ from jaxtyping import Array
 
 from ..checks import is_concrete, require_value
 from ..model.modes import (
-    EdgeFocus,
     Mode,
     capacity,
     contact,
@@ -155,12 +155,13 @@ class EdgeBalance(_EdgeSystem):
         return jnp.minimum(a_left, -a_right)
 
     def type_tests(self, osc):
-        return {("DegeneratePseudoHopf", ()): self.focus(osc).coefficient}
+        return {("DegeneratePseudoHopf", ()): self.growth(osc)[0]}
 
-    def focus(self, osc: Oscillator) -> EdgeFocus:
-        """The pseudo-focus, NaN where there is none."""
+    def growth(self, osc: Oscillator) -> tuple[Array, Array]:
+        """The coefficient of third order, and the size of its terms; NaN without a pseudo-focus."""
         focus = edge_focus(osc, self.left, self.right, jnp.stack(edges(osc))[self.edge])
-        return jax.tree.map(lambda leaf: jnp.where(focus.exists, leaf, jnp.nan), focus)
+        known = functools.partial(jnp.where, focus.exists)
+        return known(focus.coefficient, jnp.nan), known(focus.bend, jnp.nan)
 
 
 def pseudo_hopf_limit(trail: Trail) -> SpecialPoint | None:
@@ -193,7 +194,7 @@ def _degenerate_focus(family: Family, edge: Array, guess: Array) -> tuple[Array,
     def equations(family, p):
         osc = family.at(p)
         system = EdgeBalance(edge, *_beside_edge(osc, jnp.stack(edges(osc))[edge]))
-        return jnp.stack([system.balance(osc), system.focus(osc).coefficient])
+        return jnp.stack([system.balance(osc), system.growth(osc)[0]])
 
     found, _, residual, _ = small_newton(equations, family, guess)
     return found, residual
@@ -296,9 +297,7 @@ def _across_edge(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
 
 @jit
 def _pseudo_growth(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
-    """The coefficient of a pseudo-Hopf point, and the size of its terms."""
-    focus = _edge_balance(osc, belt).focus(osc)
-    return focus.coefficient, focus.bend
+    return _edge_balance(osc, belt).growth(osc)
 
 
 def _edge_balance(osc: Oscillator, belt: int | Array) -> EdgeBalance:
