@@ -91,6 +91,7 @@ class Branch(eqx.Module):
         return {
             "kind": [self.kind] * len(self),
             "belts": [""] * len(self),
+            "type": [""] * len(self),
             "value": self.values,
             **{name: getattr(self, name) for name in (*names, "multiplier")},
             **per_belt("stick_duration", self.stick_durations),
@@ -131,8 +132,8 @@ class BifurcationDiagram(eqx.Module):
         """A row for each row of each branch, in order, and then for each special point.
 
         Columns: branch (its number; missing for a point), kind ("equilibrium", "cycle", or the
-        condition of a point), belts (of a point), value (of the parameter), stable (missing for a
-        point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests), amplitude (half the
+        condition of a point), belts and type (of a point), value (of the parameter), stable (missing
+        for a point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests), amplitude (half the
         range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each belt (NaN where it
         does not stick to that), signature (the events of a cycle, as in `Cycle.table`).
         """
@@ -223,7 +224,7 @@ def _row_of_point(point: BifurcationPoint) -> dict[str, Any]:
     names = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
     return {
         "branch": None,
-        **{name: row[name] for name in ("kind", "belts", "value")},
+        **{name: row[name] for name in ("kind", "belts", "type", "value")},
         "stable": None,
         **{name: row[name] for name in names},
         "amplitude": 0.5 * (row["x1_max"] - row["x1_min"]),
