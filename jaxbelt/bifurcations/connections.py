@@ -383,16 +383,13 @@ class _Courses(eqx.Module):
 
 @jit
 def _all_saddles(oscs: Oscillator) -> Array:
-    rows, rest = eqx.partition(oscs, eqx.is_array)
-    return jax.vmap(lambda row: saddles(eqx.combine(row, rest)))(rows)
+    return eqx.filter_vmap(saddles)(oscs)
 
 
 @jit
 def _courses_of(oscs: Oscillator) -> _Courses:
-    rows, rest = eqx.partition(oscs, eqx.is_array)
-
-    def at(row):
-        osc = lax.stop_gradient(eqx.combine(row, rest))
+    def at(osc):
+        osc = lax.stop_gradient(osc)
         n, parts = len(osc.belts), saddles(osc)
         smooth = [(belt.velocity != 0) & ~has_jump(belt) for belt in osc.belts]
         parts = parts & jnp.all(jnp.stack(smooth))
@@ -409,7 +406,7 @@ def _courses_of(oscs: Oscillator) -> _Courses:
         )
         return _Courses(jnp.stack(edges(osc)), parts, *found)
 
-    return each(at)(rows)
+    return each(at)(oscs)
 
 
 def courses_of(oscs: Oscillator) -> list[tuple[SaddleCourse, ...]]:

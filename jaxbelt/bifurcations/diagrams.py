@@ -132,10 +132,10 @@ class BifurcationDiagram(eqx.Module):
         """A row for each row of each branch, in order, and then for each special point.
 
         Columns: branch (its number; missing for a point), kind ("equilibrium", "cycle", or the
-        condition of a point), belts and type (of a point), value (of the parameter), stable (missing
-        for a point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests), amplitude (half the
-        range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each belt (NaN where it
-        does not stick to that), signature (the events of a cycle, as in `Cycle.table`).
+        condition of a point), belts and type (of a point), value (of the parameter), stable
+        (missing for a point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests), amplitude
+        (half the range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each belt (NaN
+        where it does not stick to that), signature (the events of a cycle, as in `Cycle.table`).
         """
         rows = [
             {"branch": number, **row}

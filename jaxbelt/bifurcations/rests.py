@@ -177,7 +177,7 @@ def _hopf_growth(osc: Oscillator) -> tuple[Array, Array]:
         alone = eqx.tree_at(lambda o: o.belts, osc, (belt,))
         third = third_derivative(alone, code[None], x1[0])
         sizes.append(jnp.where(jnp.abs(code) == 1, jnp.abs(third), 0.0))
-    return third_derivative(osc, system.codes, x1[0]) / 16, sum(sizes) / 16
+    return third_derivative(osc, system.codes, x1[0]) / 16, jnp.sum(jnp.stack(sizes)) / 16
 
 
 def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
