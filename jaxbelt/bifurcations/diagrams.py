@@ -12,7 +12,7 @@ back on the same side, from stable to unstable.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from itertools import combinations, groupby, pairwise
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -34,7 +34,7 @@ from .cells import in_plane_of_paper, region_name
 from .conditions import BifurcationPoint
 from .labels import Label
 from .path import ParameterPath
-from .scan import by_value, edges_touched, search
+from .scan import by_value, edges_touched, is_at_one_value, search
 
 if TYPE_CHECKING:
     import pandas
@@ -190,8 +190,11 @@ def bifurcation_diagram(
     points = search(path, resolution)
     # A point on an end of the span has one side only.
     inner = [point for point in points if path.first < float(point.value) < path.last]
-    by_place = groupby(inner, key=lambda point: float(point.value))
-    special = {value: list(here) for value, here in by_place}
+    special: dict[float, list[BifurcationPoint]] = {}
+    for point in inner:
+        known = next(reversed(special), np.nan)
+        shared = known in special and is_at_one_value(special[known][0], point)
+        special.setdefault(known if shared else float(point.value), []).append(point)
     ends = [path.first, *special, path.last]
     stretches = list(pairwise(ends))
     nodes = [_nodes(path, a, b, rows) for a, b in stretches]
