@@ -77,7 +77,7 @@ def test_scan_finds_what_changes_no_attractor():
 
 def test_two_connections_at_one_value():
     """With both edges in a symmetric place: from the left one to the right one, and back."""
-    wanted = brentq(lambda s: miss(s, sigma0=-s), 0.5, 0.51, xtol=1e-15)
+    wanted = brentq(lambda s: miss(s, sigma0=-s), 0.5, 0.506, xtol=1e-15)
     points = jb.scan(lambda s: over(s, -s), span=(0.48, 0.51), resolution=4)
     connections = [jb.SaddleConnection(0, to=1), jb.SaddleConnection(1, to=0)]
     assert sorted((one.condition for one in points), key=repr) == connections
