@@ -13,13 +13,14 @@ from .bifurcations.connections import SaddleConnection
 from .bifurcations.crossings import CrossingSliding, SlidingExchange
 from .bifurcations.curves import BifurcationCurve, bifurcation_curve
 from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
+from .bifurcations.edge_rests import BoundaryEquilibrium, PseudoHopf
 from .bifurcations.edges import CornerCollision, GrazingEdge
 from .bifurcations.folds import FoldOfCycles
 from .bifurcations.infinity import HopfAtInfinity
 from .bifurcations.meetings import EdgeExchange, MeetingEdges
 from .bifurcations.refine import refine
 from .bifurcations.regions import RegionMap, region_map
-from .bifurcations.rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
+from .bifurcations.rests import BeltAtRest, Hopf, SuddenSliding
 from .bifurcations.scan import scan
 from .bifurcations.special import SpecialPoint
 from .bifurcations.tangencies import GrazingSliding, NonsmoothFold

@@ -62,6 +62,7 @@ def test_from_one_saddle_to_another():
     assert point.status == Status.OK and point.value == pytest.approx(wanted, abs=1e-12)
     assert point.residual < 1e-13 and point.error < 1e-12
     # It is no cycle.
+    assert point.type == "heteroclinic"
     assert point.cycle.status == Status.EQUILIBRIUM and jnp.isnan(point.cycle.period)
     orbit = point.condition.orbit(point)
     assert orbit[0] == pytest.approx((-0.4, 0.0), abs=1e-12)
@@ -72,6 +73,15 @@ def test_scan_finds_what_changes_no_attractor():
     (point,) = jb.scan(over, span=(0.2, 0.4), resolution=12)
     assert point.condition == jb.SaddleConnection(1, to=0)
     assert point.value == pytest.approx(brentq(miss, 0.2, 0.4, xtol=1e-15), abs=1e-12)
+
+
+def test_two_connections_at_one_value():
+    """With both edges in a symmetric place: from the left one to the right one, and back."""
+    wanted = brentq(lambda s: miss(s, sigma0=-s), 0.5, 0.506, xtol=1e-15)
+    points = jb.scan(lambda s: over(s, -s), span=(0.48, 0.51), resolution=4)
+    connections = [jb.SaddleConnection(0, to=1), jb.SaddleConnection(1, to=0)]
+    assert sorted((one.condition for one in points), key=repr) == connections
+    assert [one.value for one in points] == pytest.approx([wanted] * 2, abs=1e-12)
 
 
 def test_back_to_the_same_saddle():
@@ -87,6 +97,7 @@ def test_back_to_the_same_saddle():
         point = jb.refine(jb.SaddleConnection(0), beside, at=guess)
         assert point.status == Status.OK and point.value == pytest.approx(wanted, abs=1e-12)
     # The cycle that ends there, beside the point.
+    assert point.type == "homoclinic"
     assert point.cycle.multiplier > 1
     near = jb.unstable_cycle(beside(wanted + 1e-7))
     assert near.period == pytest.approx(float(point.cycle.period), abs=1e-5)
@@ -154,6 +165,22 @@ def test_curve_from_one_saddle_to_another():
     assert ends.values[0] == pytest.approx(-2 / 3, abs=1e-12)
     assert ends.values[1] == pytest.approx(sticks.values[1], abs=1e-11)
     assert -0.51 < sticks.values[0] < -0.50
+
+
+@pytest.mark.slow
+def test_a_connection_that_shrinks_to_its_saddle():
+    """It ends where the fixed point beside the saddle comes to it with a trace of zero."""
+
+    def make(nu0, sigma):
+        return jb.presets.class_c(nu0, 0.3, sigma)
+
+    point = jb.refine(jb.SaddleConnection(0), lambda s: make(-0.25, s), at=-0.52)
+    curve = jb.bifurcation_curve(point, make, ((-0.3, -0.1), (-0.9, -0.4)))
+    end = curve.special[-1]
+    assert end.kind == "BoundaryHopf" and curve.is_named(-1) and end.residual < 1e-13
+    hopf = -(np.sqrt(8) - 1) / 10  # eq. (28) of the paper
+    expected = hopf, -(0.4 / (1 - 10 * hopf) + 0.6)
+    assert end.values == pytest.approx(expected, abs=1e-12)
 
 
 def test_no_courses_where_orbits_depend_on_the_parameter_with_jumps():

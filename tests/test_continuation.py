@@ -65,6 +65,18 @@ def test_folds_are_passed_and_the_span_is_met_exactly():
     assert points[0].end is None
 
 
+@pytest.mark.parametrize("side", [0.5, 0.5 + 1e-14])
+def test_a_point_on_a_side_of_the_span_is_told_once(side):
+    """Steps of a quarter come to it by themselves, up to rounding."""
+    line, ahead = linearized(lambda u, _: u[:1]), np.array([0.0, 1.0])
+    span, steps = (-1.0, side), {"step": 0.25, "max_step": 0.25}
+    points = list(continue_curve(line, np.zeros(2), ahead, span=span, **steps))
+    assert [float(point.u[1]) for point in points] == pytest.approx([0.0, 0.25, 0.5], abs=1e-13)
+    assert [point.end for point in points] == [None, None, Stop.LEFT_SPAN]
+    (only,) = continue_curve(line, side * ahead, ahead, span=span, **steps)
+    assert only.end is Stop.LEFT_SPAN
+
+
 def test_a_pitchfork_off_its_axis_is_followed_round_the_bend():
     branch = continue_curve(
         imperfect_pitchfork, (-0.7, 0.49), (0.0, -1.0), args=-1e-4, span=(-1, 1)

@@ -146,6 +146,7 @@ def test_crossing_sliding(crossing):
         )
         assert point.value == pytest.approx(expected, abs=1e-11)
         assert point.residual < 1e-12 and point.error < 1e-11
+    assert [point.type for point in crossing] == ["crossing", "buckling"]
     cross, stick, slip = EventKind.CROSS, EventKind.STICK, EventKind.SLIP
     expected = [
         {(cross, 1): 2, (stick, 0): 1, (slip, 0): 1},

@@ -210,15 +210,20 @@ def _without_known(
 
 def _rows_on(curve: BifurcationCurve, other: BifurcationCurve, near: float) -> np.ndarray:
     """Which rows of a curve are on another one, in the same place, [rows]."""
-    path = other.path
-    a, chord = path[:-1], np.diff(path, axis=0)
-    found = np.zeros(len(curve), bool)
+    path, found = other.path, np.zeros(len(curve), bool)
     for row, (at, place) in enumerate(zip(curve.values, curve.places, strict=True)):
-        along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
-        away = np.hypot(*(at - a - np.clip(along, 0, 1)[:, None] * chord).T)
+        away, _ = _from_chords(at, path)
         there = other.places[int(np.argmin(np.hypot(*(other.values - at).T)))]
         found[row] = np.min(away) < near and not is_elsewhere(place, there, SAME_PLACE)
     return found
+
+
+def _from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far a point is from each chord of a path, and at which part of it that is, [chords]."""
+    a, chord = path[:-1], np.diff(path, axis=0)
+    along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
+    along = np.clip(along, 0, 1)
+    return np.hypot(*(at - a - along[:, None] * chord).T), along
 
 
 def _shortened(curve: BifurcationCurve, first: int, last: int) -> BifurcationCurve:
@@ -280,12 +285,8 @@ def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, s
     """Whether a point is on a curve that is known."""
     if point.condition.lineage != curve.condition.lineage:
         return False
-    a, b = curve.values[:-1], curve.values[1:]
-    chord = b - a
-    along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
-    along = np.clip(along, 0, 1)[:, None]
-    away = np.hypot(*(at - a - along * chord).T)
-    places = curve.places[:-1] + along * (curve.places[1:] - curve.places[:-1])
+    away, along = _from_chords(at, curve.values)
+    places = curve.places[:-1] + along[:, None] * np.diff(curve.places, axis=0)
     own = point.place
     return any(
         not is_elsewhere(own, places[i], FAR) for i in np.flatnonzero(away < 0.3 * step).tolist()

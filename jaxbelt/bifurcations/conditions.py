@@ -288,6 +288,14 @@ class AbstractCondition(eqx.Module):
         """Where the motion at a point is, see `place_of`; NaN where there is none."""
         return place_of(point.cycle) if int(point.cycle.status) == Status.OK else NOWHERE
 
+    def type_of(self, point: "BifurcationPoint") -> str:
+        """Of a kind that has several types that of a point, "" where there is but one."""
+        return ""
+
+    def coefficient(self, osc: Oscillator) -> Array:
+        """Of a kind where a cycle is born the coefficient that tells which way, at the point."""
+        return jnp.asarray(jnp.nan)
+
     def orbit(self, point: "BifurcationPoint") -> np.ndarray | None:
         """States of the motion at a point that is no cycle, [samples, 2]; None: there is none."""
         return None
@@ -323,6 +331,32 @@ class BifurcationPoint(eqx.Module):
         return type(self.condition).__name__
 
     @property
+    def type(self) -> str:
+        """Which sort of its kind it is, "" where the kind has but one or no point was found.
+
+        "supercritical" or "subcritical" of `Hopf` and `PseudoHopf`: the cycle that is born attracts
+        or repels ("degenerate": the coefficient is zero). "persistence" or "annihilation" of
+        `BoundaryEquilibrium`: there is an equilibrium on both sides of the point, or two meet and
+        vanish ("degenerate": another one lies there, too). "crossing" or "buckling" of
+        `CrossingSliding`: a stick phase ceases to be there, or the boundary is crossed once more
+        before it ("jump": for long at once). "homoclinic" or "heteroclinic" of
+        `SaddleConnection`: it leads back to the same saddle or to another one.
+        """
+        require_single(self, self.value, 0)
+        return self.condition.type_of(self) if int(self.status) == Status.OK else ""
+
+    @property
+    def coefficient(self) -> Array:
+        """The coefficient a of `Hopf` and `PseudoHopf`, else NaN; with derivatives by parameters.
+
+        The amplitude r of small oscillations, of x1 around a fixed point, of x2 at the edge around
+        a pseudo-focus, obeys r' = rate r + a r^3, with the `rate` of `Equilibria`. So near the
+        point there is a cycle with r^2 = -rate/a, which attracts where a < 0.
+        """
+        found = self.condition.coefficient(self.oscillator)
+        return jnp.where(self.status == Status.OK, found, jnp.nan)
+
+    @property
     def place(self) -> np.ndarray:
         """Where the motion is, see `place_of`; NaN where there is none."""
         return self.condition.place(self)
@@ -335,17 +369,20 @@ class BifurcationPoint(eqx.Module):
         return {
             "kind": self.kind,
             "belts": " ".join(map(str, self.condition.belts_concerned)),
+            "type": self.type,
             **{name: float(getattr(self, name)) for name in ("value", "error", "residual")},
             "iterations": int(self.iterations),
             **dict(zip(("x1_min", "x1_max", "x2_min", "x2_max"), extent, strict=True)),
             "period": period,
             "multiplier": float(self.multiplier),
+            "coefficient": float(self.coefficient),
             "status": Status(int(self.status)).name,
         }
 
     def table(self) -> "pandas.DataFrame":
-        """One row: kind, belts, value, error, residual, iterations, x1_min, x1_max, x2_min, x2_max
-        and period of the motion there, multiplier, status. Points of a scan: `pandas.concat`."""
+        """One row: kind, belts, type, value, error, residual, iterations, x1_min, x1_max, x2_min,
+        x2_max and period of the motion there, multiplier, coefficient, status. Points of a scan:
+        `pandas.concat`."""
         return table_of([self.row()])
 
     def plot(self, ax: Any = None) -> Any:
@@ -361,8 +398,9 @@ class BifurcationPoint(eqx.Module):
             if "jb.scan" not in advice:
                 advice += " Every bifurcation point in an interval is found by jb.scan."
             return f"BifurcationPoint({self.condition!r}, {name}: {advice})"
+        sort = f"{self.type}, " if self.type else ""
         return (
-            f"BifurcationPoint({self.condition!r}, value {number(self.value)}, "
+            f"BifurcationPoint({self.condition!r}, {sort}value {number(self.value)}, "
             f"residual {float(self.residual):.1e}, {int(self.iterations)} iterations, "
             f"error < {float(self.error):.1e})"
         )

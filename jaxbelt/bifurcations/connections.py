@@ -46,10 +46,13 @@ from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit
+from ..numerics.continuation import Stop
 from ..numerics.newton import HOLDS, newton
 from ..results import Status
 from .conditions import AbstractCondition, Line, point_of
-from .rests import check_edge
+from .crossings import has_jump
+from .edge_rests import check_edge
+from .rests import hopf_limit
 from .systems import (
     CycleSystem,
     Seen,
@@ -202,6 +205,9 @@ class SaddleConnection(AbstractCondition):
         system, x, _ = data.prepared(osc, data.guess(osc, self.room))
         return system, _solved_at(osc, system, x)
 
+    def type_of(self, point):
+        return "homoclinic" if int(point.cycle.status) == Status.OK else "heteroclinic"
+
     def place(self, point):
         system, x = self.followed(point)
         return system.place(np.asarray(x))
@@ -211,10 +217,20 @@ class SaddleConnection(AbstractCondition):
         states = np.asarray(_states_along(point.oscillator, system, x))
         return states[np.asarray(system.chain.used)].reshape(-1, 2)
 
+    def limit(self, trail):
+        """Where it has shrunk with its saddle to a Hopf point on the edge."""
+        if trail.end is Stop.POINT_COUNT:
+            return None
+        return hopf_limit("BoundaryHopf", trail, _from_edge, trail.system.leaves)
+
     @classmethod
     def between(cls, before, after, edged):
         differ = len(before.courses) == len(after.courses) and before.courses != after.courses
         return [cls(belt) for belt in edged] if differ else []
+
+
+def _from_edge(osc: Oscillator, codes: Array, x1: Array, edge: Array) -> Array:
+    return x1 - jnp.stack(edges(osc))[edge]
 
 
 @jit
@@ -367,18 +383,15 @@ class _Courses(eqx.Module):
 
 @jit
 def _all_saddles(oscs: Oscillator) -> Array:
-    rows, rest = eqx.partition(oscs, eqx.is_array)
-    return jax.vmap(lambda row: saddles(eqx.combine(row, rest)))(rows)
+    return eqx.filter_vmap(saddles)(oscs)
 
 
 @jit
 def _courses_of(oscs: Oscillator) -> _Courses:
-    rows, rest = eqx.partition(oscs, eqx.is_array)
-
-    def at(row):
-        osc = lax.stop_gradient(eqx.combine(row, rest))
+    def at(osc):
+        osc = lax.stop_gradient(osc)
         n, parts = len(osc.belts), saddles(osc)
-        smooth = [(belt.velocity != 0) & ~_has_jump(belt) for belt in osc.belts]
+        smooth = [(belt.velocity != 0) & ~has_jump(belt) for belt in osc.belts]
         parts = parts & jnp.all(jnp.stack(smooth))
 
         def one(start):
@@ -393,13 +406,7 @@ def _courses_of(oscs: Oscillator) -> _Courses:
         )
         return _Courses(jnp.stack(edges(osc)), parts, *found)
 
-    return each(at)(rows)
-
-
-def _has_jump(belt: Any) -> Array:
-    """Whether the static limit of a belt exceeds mu(0)."""
-    law = belt.friction
-    return belt.load * (law.static - law.mu(jnp.zeros(()))) > 0
+    return each(at)(oscs)
 
 
 def courses_of(oscs: Oscillator) -> list[tuple[SaddleCourse, ...]]:

@@ -16,15 +16,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..cycles.cycle import Cycle
 from ..cycles.shooting import SIZES, Chain, Loop, meshed
-from ..model.modes import mode_of, stick_limit
-from ..model.oscillator import Oscillator
+from ..model.modes import any_of, mode_of, stick_limit
+from ..model.oscillator import Belt, Oscillator
 from ..motion.arcs import Ends
+from ..numerics.compiling import jit
 from ..results import EventKind, Status
 from .conditions import AbstractCycleCondition, Line, check_two_belts
 from .guesses import nearest, orbit_after_stick, repeated_loop, without_arcs
 from .special import SpecialPoint
-from .systems import CycleSystem, contact_tests, nearest_contacts, stick_phase_from
+from .systems import (
+    CycleSystem,
+    contact_tests,
+    nearest_contacts,
+    stick_phase_from,
+    velocity_of,
+)
 from .tangencies import Encounter
 
 # --- crossing a boundary, or sticking to it -------------------------------------------------------
@@ -64,7 +72,10 @@ class CrossingSliding(AbstractCycleCondition):
     """The cycle crosses the boundary of a belt, and begins to stick to it where it did.
 
     It arrives at one end of where the mass sticks: that of slip onset, at which a stick phase
-    begins with no duration, or the other one, from which it then sticks all the way.
+    begins with no duration (crossing), or the other one, from which it then sticks all the way, and
+    before which it crosses the boundary, comes back soon and sticks then (buckling). Where the
+    static limit exceeds mu(0), it goes far beyond the boundary at once, and may not come back
+    (jump).
     """
 
     belt: int | Array
@@ -98,6 +109,13 @@ class CrossingSliding(AbstractCycleCondition):
         loop, row = jax.tree.map(lambda a, b: jnp.where(returns, a, b), shorter, (loop, near.row))
         chain, z = meshed(osc, loop)
         return StickLimit(chain, row, near.codes, near.side), z, status
+
+    def type_of(self, point):
+        side, jumps = _limit_met(point.cycle, self.belt)
+        # The mass leaves where it sticks in the direction in which the belt moves.
+        if side * velocity_of(point.oscillator, self.belt) > 0:
+            return "crossing"
+        return "jump" if jumps else "buckling"
 
     @classmethod
     def between(cls, before, after, edged):
@@ -134,6 +152,23 @@ def arrival_near_limit(osc: Oscillator, loop: Loop, belt: int | Array) -> Arriva
     distance, held, side = jax.vmap(one)(loop.codes, loop.ends, loop.exits[:, 0])
     row = jnp.argmin(distance)
     return Arrival(distance[row], row, held[row], side[row])
+
+
+@jit
+def _limit_met(cycle: Cycle, belt: int | Array) -> tuple[Array, Array]:
+    """At which end of where the mass sticks a cycle arrives, see `StickLimit.side`, and whether a
+    law jumps there."""
+    osc, chain, z = cycle.oscillator, cycle.chain, cycle.unknowns
+    loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
+    near = arrival_near_limit(osc, loop, belt)
+    jumps = [(near.codes[i] == 0) & has_jump(one) for i, one in enumerate(osc.belts)]
+    return near.side, any_of(jumps)
+
+
+def has_jump(belt: Belt) -> Array:
+    """Whether the static limit of a belt exceeds mu(0)."""
+    law = belt.friction
+    return belt.load * (law.static - law.mu(jnp.zeros(()))) > 0
 
 
 # --- belts that change places ---------------------------------------------------------------------

@@ -12,7 +12,7 @@ back on the same side, from stable to unstable.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from itertools import combinations, groupby, pairwise
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -34,7 +34,7 @@ from .cells import in_plane_of_paper, region_name
 from .conditions import BifurcationPoint
 from .labels import Label
 from .path import ParameterPath
-from .scan import by_value, edges_touched, search
+from .scan import by_value, edges_touched, is_at_one_value, search
 
 if TYPE_CHECKING:
     import pandas
@@ -91,6 +91,7 @@ class Branch(eqx.Module):
         return {
             "kind": [self.kind] * len(self),
             "belts": [""] * len(self),
+            "type": [""] * len(self),
             "value": self.values,
             **{name: getattr(self, name) for name in (*names, "multiplier")},
             **per_belt("stick_duration", self.stick_durations),
@@ -131,10 +132,10 @@ class BifurcationDiagram(eqx.Module):
         """A row for each row of each branch, in order, and then for each special point.
 
         Columns: branch (its number; missing for a point), kind ("equilibrium", "cycle", or the
-        condition of a point), belts (of a point), value (of the parameter), stable (missing for a
-        point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests), amplitude (half the
-        range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each belt (NaN where it
-        does not stick to that), signature (the events of a cycle, as in `Cycle.table`).
+        condition of a point), belts and type (of a point), value (of the parameter), stable
+        (missing for a point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests), amplitude
+        (half the range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each belt (NaN
+        where it does not stick to that), signature (the events of a cycle, as in `Cycle.table`).
         """
         rows = [
             {"branch": number, **row}
@@ -189,8 +190,11 @@ def bifurcation_diagram(
     points = search(path, resolution)
     # A point on an end of the span has one side only.
     inner = [point for point in points if path.first < float(point.value) < path.last]
-    by_place = groupby(inner, key=lambda point: float(point.value))
-    special = {value: list(here) for value, here in by_place}
+    special: dict[float, list[BifurcationPoint]] = {}
+    for point in inner:
+        known = next(reversed(special), np.nan)
+        shared = known in special and is_at_one_value(special[known][0], point)
+        special.setdefault(known if shared else float(point.value), []).append(point)
     ends = [path.first, *special, path.last]
     stretches = list(pairwise(ends))
     nodes = [_nodes(path, a, b, rows) for a, b in stretches]
@@ -223,7 +227,7 @@ def _row_of_point(point: BifurcationPoint) -> dict[str, Any]:
     names = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
     return {
         "branch": None,
-        **{name: row[name] for name in ("kind", "belts", "value")},
+        **{name: row[name] for name in ("kind", "belts", "type", "value")},
         "stable": None,
         **{name: row[name] for name in names},
         "amplitude": 0.5 * (row["x1_max"] - row["x1_min"]),

@@ -32,8 +32,9 @@ from ..numerics.newton import HOLDS
 from ..results import Status
 from .conditions import AbstractCycleCondition, Line
 from .crossings import arrival_tests
+from .edge_rests import check_edge
 from .guesses import nearest, without_arcs
-from .rests import check_edge, hopf_limit
+from .rests import hopf_limit
 from .systems import CycleSystem, nearest_edge
 
 

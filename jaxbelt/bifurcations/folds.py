@@ -22,6 +22,7 @@ from ..numerics.compiling import each, jit
 from ..numerics.continuation import Stop
 from ..results import Status
 from .conditions import AbstractCycleCondition, Line
+from .edge_rests import pseudo_hopf_limit
 from .rests import hopf_limit, third_derivative
 from .systems import CycleSystem, contact_tests, nearest_contacts
 
@@ -91,10 +92,12 @@ class FoldOfCycles(AbstractCycleCondition):
         return [*(one.loop for one in cycles if one.path and not sticks(one.path)), None]
 
     def limit(self, trail):
-        """Where the cycle has shrunk to an equilibrium, at a degenerate Hopf point."""
+        """Where the cycle has shrunk to an equilibrium, at a degenerate Hopf or pseudo-Hopf
+        point."""
         if trail.end is Stop.POINT_COUNT:
             return None
-        return hopf_limit("DegenerateHopf", trail, third_derivative)
+        limit = hopf_limit("DegenerateHopf", trail, third_derivative)
+        return limit or pseudo_hopf_limit(trail)
 
 
 @jit

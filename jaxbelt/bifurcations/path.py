@@ -318,8 +318,7 @@ class _Motions(NamedTuple):
 
 @jit
 def _motions(oscs: Oscillator) -> _Motions:
-    rows, rest = eqx.partition(oscs, eqx.is_array)
-    return each(lambda row: _motions_at(eqx.combine(row, rest)))(rows)
+    return each(_motions_at)(oscs)
 
 
 def _motions_at(osc: Oscillator) -> _Motions:

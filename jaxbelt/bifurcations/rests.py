@@ -3,17 +3,13 @@
 There is no cycle at these points, and few equations: in x1 of the state of rest, or in none.
 
 - `Hopf`: trace zero at a fixed point (its determinant is always one).
-- `BoundaryEquilibrium`: at rest on an edge, the force on one of its sides is zero, or as large as
-  belts at rest there can hold: a fixed point, or the end of a segment, comes to lie on the edge.
-- `PseudoHopf`: at a pseudo-focus the leading term by which loops grow or shrink is zero.
 - `SuddenSliding`: nu_k = 0, with the mass at rest on the belt, x2' = x2 = 0: an equilibrium lies on
   the boundary. No cycle can be an unknown here: as nu_k goes to zero the stick phase lasts ever
   longer, the slip arc takes ever longer to leave the equilibrium, and in the limit there is none.
 - `BeltAtRest`: the same, if no cycle sticks to the belt: an equilibrium jumps.
 
-Hopf's points are eqs. (27), (28) of the paper, and sudden sliding is its name; boundary equilibria
-and the pseudo-Hopf point are those of M. di Bernardo, C. Budd, A. Champneys, P. Kowalczyk,
-Piecewise-smooth Dynamical Systems, 2008.
+Hopf's points are eqs. (27), (28) of the paper, and sudden sliding is its name. What happens on
+contact edges is in `edge_rests`.
 """
 
 import abc
@@ -27,21 +23,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import is_concrete, require_value
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.modes import (
-    Mode,
     boundary_guards,
     capacity,
-    contact,
     edge_guards,
-    edges,
-    field_at_rest,
     mode_acceleration,
     mode_of,
-    select,
 )
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
@@ -60,6 +50,8 @@ from .systems import RestSystem, small_newton, velocity_of
 
 #: The unknowns of a state of rest of which all is known.
 NOTHING = np.zeros(0)
+#: Coefficients smaller than this part of their terms are zero: points are good to some 1e-12.
+DEGENERATE = 1e-9
 #: Where sudden sliding is looked for, relative to where the belt is at rest: orbits that settle
 #: soon first; other points may be nearer than where they do.
 BESIDE = (1e-2, -1e-2, 1e-4, -1e-4)
@@ -158,9 +150,34 @@ class Hopf(AbstractRestCondition):
     def between(cls, before, after, edged):
         return [cls()] if before.equilibria != after.equilibria else []
 
+    def type_of(self, point):
+        return criticality(*_hopf_growth(point.oscillator))
+
+    def coefficient(self, osc):
+        return _hopf_growth(osc)[0]
+
     def place(self, point):
         system, x = self.followed(point)
         return system.place(np.asarray(x))
+
+
+def criticality(coefficient: Array, size: Array) -> str:
+    """The type of a point at which a cycle is born; size: of the terms of the coefficient."""
+    if not abs(coefficient) > DEGENERATE * size:
+        return "degenerate"
+    return "subcritical" if coefficient > 0 else "supercritical"
+
+
+@jit
+def _hopf_growth(osc: Oscillator) -> tuple[Array, Array]:
+    """The first Lyapunov coefficient at a Hopf point, and the size of its terms."""
+    system, x1, _ = Hopf().system(osc, candidates(osc))
+    sizes = []
+    for belt, code in zip(osc.belts, system.codes, strict=True):
+        alone = eqx.tree_at(lambda o: o.belts, osc, (belt,))
+        third = third_derivative(alone, code[None], x1[0])
+        sizes.append(jnp.where(jnp.abs(code) == 1, jnp.abs(third), 0.0))
+    return third_derivative(osc, system.codes, x1[0]) / 16, jnp.sum(jnp.stack(sizes)) / 16
 
 
 def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
@@ -210,184 +227,6 @@ def _special_hopf(family: Family, codes, guess: Array, vanishes, *args):
 
     u, _, residual, _ = small_newton(equations, family, guess)
     return u, residual
-
-
-# --- equilibria on a contact edge -----------------------------------------------------------------
-
-
-class _EdgeSystem(RestSystem):
-    """One equation, of what lies at rest on the edge of this number."""
-
-    edge: eqx.AbstractVar[Array]
-
-    def balance(self, osc: Oscillator) -> Array:
-        """What vanishes."""
-        raise NotImplementedError
-
-    def meets_hopf(self, osc: Oscillator) -> Array:
-        """What vanishes where its curve meets that of a Hopf point, else NaN."""
-        raise NotImplementedError
-
-    def residual(self, osc, x):
-        return self.balance(osc)[None]
-
-    def tests(self, osc, x):
-        return {("BoundaryHopf", ()): self.meets_hopf(osc)}
-
-
-class EdgeRest(_EdgeSystem):
-    """What vanishes where an equilibrium lies on an edge.
-
-    The needed force at rest on one side of it, less what belts at rest there can hold, in one of
-    the two directions (0 where none is at rest).
-    """
-
-    edge: Array
-    rightward: Array
-    limit: Array
-    codes: Array
-
-    def balance(self, osc):
-        at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
-        needed = mode_acceleration(osc, mode, at, jnp.zeros(()))
-        return needed + self.limit * capacity(osc, mode)
-
-    def meets_hopf(self, osc):
-        # There is none for the end of a segment.
-        mode = mode_of(self.codes)
-        _, trace, *_ = field_at_rest(osc, mode, jnp.stack(edges(osc))[self.edge])
-        return jnp.where(mode.any_stuck, jnp.nan, trace)
-
-    def exists(self, osc, x):
-        # Whether the contacts on that side are those.
-        at = jnp.stack(edges(osc))[self.edge]
-        left, right = _beside_edge(osc, at)
-        return jnp.all(jnp.stack(select(self.rightward, right, left).codes) == self.codes)
-
-
-class EdgeBalance(_EdgeSystem):
-    """What vanishes where the pseudo-focus at an edge is neither stable nor unstable."""
-
-    edge: Array
-    left: Mode
-    right: Mode
-
-    def _sides(self, osc: Oscillator):
-        at = jnp.stack(edges(osc))[self.edge]
-        return field_at_rest(osc, self.left, at)[:2], field_at_rest(osc, self.right, at)[:2]
-
-    def balance(self, osc):
-        # The contraction of `modes.edge_focus` times both pushes: regular where one of them is 0.
-        (a_left, trace_left), (a_right, trace_right) = self._sides(osc)
-        return trace_right * a_left - trace_left * a_right
-
-    def exists(self, osc, x):
-        # Whether there is a pseudo-focus between these contacts, and no belt at rest touches.
-        same = [
-            jnp.all(jnp.stack(here.codes) == jnp.stack(mode.codes))
-            for here, mode in zip(
-                _beside_edge(osc, jnp.stack(edges(osc))[self.edge]), (self.left, self.right)
-            )
-        ]
-        moves = ~self.left.any_stuck & ~self.right.any_stuck
-        return (self.meets_hopf(osc) > 0) & moves & same[0] & same[1]
-
-    def meets_hopf(self, osc):
-        # The weaker of the two pushes towards the edge, negative where one pushes away.
-        (a_left, _), (a_right, _) = self._sides(osc)
-        return jnp.minimum(a_left, -a_right)
-
-
-class _EdgeCondition(AbstractRestCondition):
-    """A condition on what lies at rest on a contact edge of a belt."""
-
-    belt: int | Array
-
-    def check(self, osc):
-        super().check(osc)
-        check_edge(osc, self.belt)
-
-    def guess(self, osc, size):
-        return None
-
-    def _system_at_edge(self, osc: Oscillator) -> _EdgeSystem:
-        raise NotImplementedError
-
-    def system(self, osc, guess):
-        system = self._system_at_edge(osc)
-        has_edge = jnp.isfinite(jnp.stack(edges(osc))[system.edge])
-        return system, NOTHING, jnp.where(has_edge, Status.OK.value, Status.NOT_TOUCHED.value)
-
-    @classmethod
-    def between(cls, before, after, edged):
-        return [cls(belt) for belt in edged] if before.equilibria != after.equilibria else []
-
-
-class BoundaryEquilibrium(_EdgeCondition):
-    """A fixed point, or the end of a segment, lies on a contact edge of a belt."""
-
-    caption: ClassVar[str] = "rest on edge, belt {belt}"
-    line: ClassVar[Line] = Line("rest on edge", "#D55E00")
-
-    def _system_at_edge(self, osc):
-        return _edge_rest(osc, self.belt)
-
-
-class PseudoHopf(_EdgeCondition):
-    """The pseudo-focus at a contact edge of a belt changes its stability."""
-
-    caption: ClassVar[str] = "pseudo-Hopf, belt {belt}"
-    line: ClassVar[Line] = Line("pseudo-Hopf", "#D55E00", (0, (5, 1.5)))
-
-    def _system_at_edge(self, osc):
-        return _edge_balance(osc, self.belt)
-
-
-def check_edge(osc: Oscillator, belt: Any, field: str = "belt") -> None:
-    """`ValueError` where a belt has no finite contact edge."""
-    if is_concrete(osc):
-        ends = [osc.belts[belt].lower, osc.belts[belt].upper]
-        require_value(np.any(np.isfinite(ends)), field, "one with a finite edge", belt)
-
-
-def _edges_of(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
-    """The numbers of the lower and the upper edge of a belt."""
-    return jnp.asarray(belt), jnp.asarray(belt + len(osc.belts))
-
-
-def _beside_edge(osc: Oscillator, at: Array) -> tuple[Mode, Mode]:
-    """The contacts at rest to the left and to the right of an edge."""
-    rest = jnp.zeros_like(at)
-    return contact(osc, at, rest, rightward=False), contact(osc, at, rest, rightward=True)
-
-
-def _edge_rest(osc: Oscillator, belt: int | Array) -> EdgeRest:
-    """The equation of a boundary equilibrium at an edge of a belt that is nearest to hold."""
-    cases = []
-    for edge in _edges_of(osc, belt):
-        sides = _beside_edge(osc, jnp.stack(edges(osc))[edge])
-        cases += [
-            EdgeRest(edge, jnp.asarray(rightward), jnp.asarray(limit), jnp.stack(mode.codes))
-            for rightward, mode in zip((False, True), sides, strict=True)
-            for limit in (-1.0, 1.0)
-        ]
-    missing = jnp.stack([jnp.abs(case.balance(osc)) for case in cases])
-    at = jnp.argmin(jnp.where(jnp.isfinite(missing), missing, jnp.inf))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
-
-
-def _edge_balance(osc: Oscillator, belt: int | Array) -> EdgeBalance:
-    """The equation of the pseudo-focus at an edge of a belt, of two the one nearer to balance."""
-    positions = jnp.stack(edges(osc))
-    cases = [
-        EdgeBalance(edge, *_beside_edge(osc, positions[edge])) for edge in _edges_of(osc, belt)
-    ]
-    size = [
-        jnp.where(case.exists(osc, jnp.asarray(NOTHING)), jnp.abs(case.balance(osc)), jnp.inf)
-        for case in cases
-    ]
-    at = jnp.argmin(jnp.stack(size))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
 
 
 # --- belts that come to rest ----------------------------------------------------------------------

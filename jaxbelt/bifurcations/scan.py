@@ -29,12 +29,13 @@ from ..results import Status
 from .conditions import AbstractCondition, BifurcationPoint, unexplained_point
 from .connections import SaddleConnection
 from .crossings import CrossingSliding, SlidingExchange
+from .edge_rests import BoundaryEquilibrium, PseudoHopf
 from .edges import GrazingEdge
 from .folds import FoldOfCycles
 from .infinity import HopfAtInfinity
 from .meetings import EdgeExchange, MeetingEdges
 from .path import ROOM, ParameterPath
-from .rests import BeltAtRest, BoundaryEquilibrium, Hopf, PseudoHopf, SuddenSliding
+from .rests import BeltAtRest, Hopf, SuddenSliding
 from .tangencies import GrazingSliding
 
 #: The kinds that are looked for, those first that are likelier or whose programs compile sooner.
@@ -112,8 +113,9 @@ def search(
             point = _explained(path, a, b) if b - a <= near * path.length else None
             if point is not None:
                 # The interval on the other side of a fold may have led to it already.
-                if not any(_is_same_point(point, other) for other in points):
-                    points.append(point)
+                for one in (point, *_beside_it(path, a, b, point)):
+                    if not any(_is_same_point(one, other) for other in points):
+                        points.append(one)
                 before, after = path.beside(float(point.value), slow=point.condition.slow)
                 settled.append((before, after))
                 values += [max(a, before), min(b, after)]
@@ -126,10 +128,15 @@ def search(
     return by_value(points)
 
 
+def is_at_one_value(point: BifurcationPoint, other: BifurcationPoint) -> bool:
+    """Whether the values of two points are the same, as far as is known."""
+    error = float(point.error) + float(other.error)
+    return abs(float(point.value) - float(other.value)) <= error
+
+
 def _is_same_point(point: BifurcationPoint, other: BifurcationPoint) -> bool:
     """Whether two points are of one condition, at one value, and of one cycle."""
-    at, error = float(point.value), float(point.error) + float(other.error)
-    if point.condition != other.condition or not abs(at - float(other.value)) <= error:
+    if point.condition != other.condition or not is_at_one_value(point, other):
         return False
     is_rest = int(point.cycle.status) != Status.OK
     return is_rest or is_same(point.cycle, other.cycle)
@@ -189,13 +196,28 @@ def edges_touched(
 
 def _explained(path: ParameterPath, a: float, b: float) -> BifurcationPoint | None:
     """A bifurcation point between two values that differ, or None."""
-    before, after = path.label(a), path.label(b)
-    marks = zip(path.conditions, before.marks, after.marks, strict=True)
+    marks = zip(path.conditions, path.label(a).marks, path.label(b).marks, strict=True)
     own = [condition for condition, mark, other in marks if mark != other]
-    kinds = [
-        condition for kind in LOOKED_FOR for condition in kind.between(before, after, path.edged)
+    return _first_found(path, a, b, [*own, *_possible_kinds(path, a, b)])
+
+
+def _possible_kinds(path: ParameterPath, a: float, b: float) -> list[AbstractCondition]:
+    """Those that could make the difference between two values."""
+    labels = path.label(a), path.label(b)
+    return [condition for kind in LOOKED_FOR for condition in kind.between(*labels, path.edged)]
+
+
+def _beside_it(
+    path: ParameterPath, a: float, b: float, point: BifurcationPoint
+) -> list[BifurcationPoint]:
+    """What happens to other belts at the value of a point, as it does where there is a symmetry."""
+    sought = point.condition.sought
+    found = [
+        _first_found(path, a, b, [condition])
+        for condition in _possible_kinds(path, a, b)
+        if type(condition.sought) is type(sought) and condition.sought != sought
     ]
-    return _first_found(path, a, b, [*own, *kinds])
+    return [one for one in found if one is not None and is_at_one_value(one, point)]
 
 
 def _first_found(

@@ -23,6 +23,8 @@ class SpecialPoint(NamedTuple):
     """A point of codimension two on a curve.
 
     kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
+    "DegeneratePseudoHopf" (the same at a pseudo-focus), "DoubleBoundaryEquilibrium" (both sides of
+    the edge have their equilibrium on it: persistence turns into annihilation),
     "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
     point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too),
     "EdgeTouch" (on an edge a cycle turns back, is tangent to a boundary, or begins to slip),

@@ -37,7 +37,7 @@ from .options import (
 EDGES = ("sigma", "sigma0", "sigma1")
 #: What a diagram shows.
 QUANTITIES = ("amplitude", "x1", "x2", "period")
-POINT_COLUMNS = ("value", "kind", "belts", "error", "status")
+POINT_COLUMNS = ("value", "kind", "belts", "type", "error", "status")
 
 
 def diagram(
@@ -82,7 +82,8 @@ def diagram(
     - **OUT.csv**: the branches: branch, kind, value, stable, x1_min, x1_max, x2_min, x2_max,
       period, multiplier, stick_duration of each belt.
 
-    - **OUT_points.csv**: value, kind, belts, error (a bound), status of every bifurcation point.
+    - **OUT_points.csv**: value, kind, belts, type (such as subcritical, "" where the kind has but
+      one), error (a bound), status of every bifurcation point.
 
     An oscillator is described as for **simulate**; what is varied needs no value.
 
@@ -148,7 +149,7 @@ def _where(osc: "jb.Oscillator", path: str) -> Any:
 
 
 def write_points(points, path: Path) -> None:
-    """value, kind, belts, error and status, a row a bifurcation point."""
+    """value, kind, belts, type, error and status, a row a bifurcation point."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(POINT_COLUMNS)
@@ -158,7 +159,7 @@ def write_points(points, path: Path) -> None:
 def _row_of_point(point: "jb.BifurcationPoint") -> list[Any]:
     belts = " ".join(map(str, point.condition.belts_concerned))
     status = jb.Status(int(point.status)).name
-    return [float(point.value), point.kind, belts, float(point.error), status]
+    return [float(point.value), point.kind, belts, point.type, float(point.error), status]
 
 
 def _as_data(points) -> list[dict[str, Any]]:

@@ -515,17 +515,16 @@ def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
 
 
 class EdgeFocus(eqx.Module):
-    """Leading-order motion around a point (edge, 0) with the field a_L on its left, a_R right.
+    """Motion around a point (edge, 0) with the field a_L on its left, a_R on its right.
 
     exists: a_L > 0 > a_R, so that the mass at rest there is pushed back from both sides. The
-    velocity at successive crossings behaves like exp(rate t). With u = 1/|x2| at the crossings a
-    loop leads from u to u - contraction - bend/u^2 + O(1/u^3); bend is a bound of that
-    coefficient's size.
+    velocity r = |x2| at the crossings obeys r' = rate r + coefficient r^3 + O(r^4); bend is a bound
+    of the coefficient's size.
     """
 
     exists: Array
     rate: Array
-    contraction: Array
+    coefficient: Array
     bend: Array
 
 
@@ -550,19 +549,19 @@ def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFoc
     Of the half-loop on one side, from (edge, v) to (edge, -w), with x2' = -a - (x1 - edge) +
     b x2 + c x2^2 + d x2^3 there: 1/w = 1/v - k - e v^2 + O(v^3), where k = 2 b / (3 a) and
     e = 2 d/(5 a) + 2 b c/(15 a^2) + 4 b^3/(135 a^3) - 2 b/(15 a^3), with -c for c on the left, by
-    inserting the series into the orbit x1(x2). Both sides add up. A loop takes
-    (2/a_L + 2/|a_R|) |x2|; rate is the sum of k over that factor.
+    inserting the series into the orbit x1(x2). Both sides add up, and a loop takes
+    (2/a_L + 2/|a_R|) |x2|: rate and coefficient are the sums of k and of e over that factor.
     """
     sides = [field_at_rest(osc, mode, edge) for mode in (left, right)]
     exists = (sides[0][0] > 0) & (sides[1][0] < 0)
-    contraction, slowness, bend = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
-    for a, b, c, d in sides:
+    k, e, bend, slowness = (jnp.zeros(()),) * 4
+    for (a, b, c, d), turn in zip(sides, (-1.0, 1.0), strict=True):
         a = jnp.where(exists, jnp.abs(a), 1.0)
-        contraction = contraction + 2 * b / (3 * a)
-        slowness = slowness + 1 / a
-        terms = (2 * d / (5 * a), 2 * b * c / (15 * a**2), 4 * (b / a) ** 3 / 135, b / (7.5 * a**3))
-        bend = bend + sum(map(jnp.abs, terms))
-    return EdgeFocus(exists, contraction / (2 * slowness), contraction, bend)
+        k, slowness = k + 2 * b / (3 * a), slowness + 2 / a
+        even = turn * b * c / (7.5 * a**2)
+        terms = (2 * d / (5 * a), even, 4 * (b / a) ** 3 / 135, -b / (7.5 * a**3))
+        e, bend = e + sum(terms), bend + sum(map(jnp.abs, terms))
+    return EdgeFocus(exists, k / slowness, e / slowness, bend / slowness)
 
 
 def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array) -> Array:
@@ -580,8 +579,8 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
         nearest = jnp.minimum(nearest, jnp.where(rubs, jnp.abs(belt.velocity), jnp.inf))
     captured = (
         focus.exists
-        & (focus.contraction < 0)
-        & (10 * size**2 * focus.bend < -focus.contraction)
+        & (focus.rate < 0)
+        & (10 * size**2 * focus.bend < -focus.rate)
         & (size < FOCUS_RADIUS)
         & (2 * osc.omega * size < nearest)
     )

@@ -112,11 +112,16 @@ def continue_curve(
         if new is None:
             yield point._replace(end=Stop.STEP_TOO_SMALL)
             return
-        yield point
-        if np.any(new.u < limits[0]) or np.any(new.u > limits[1]):
-            yield _at_limit(solve, point, new, limits)._replace(end=Stop.LEFT_SPAN)
-            return
+        leaves = np.any(new.u < limits[0]) or np.any(new.u > limits[1])
+        if leaves:
+            new = _at_limit(solve, point, new, limits)
+        # A point that lies on the side is the last one itself.
+        if not leaves or np.max(np.abs(new.u - point.u)) > SMALLEST_CORRECTION:
+            yield point
         point = new
+        if leaves:
+            yield point._replace(end=Stop.LEFT_SPAN)
+            return
     yield point._replace(end=Stop.POINT_COUNT)
 
 

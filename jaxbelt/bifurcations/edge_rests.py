@@ -1,0 +1,314 @@
+"""Equilibria on contact edges that change: `BoundaryEquilibrium` and `PseudoHopf`.
+
+There is no cycle at these points, and no unknown but the parameter.
+
+- `BoundaryEquilibrium`: at rest on an edge, the force on one of its sides is zero, or as large as
+  belts at rest there can hold: a fixed point, or the end of a segment, comes to lie on the edge. It
+  goes on beyond the point (persistence) if the other side of the edge pushes to it, as a
+  pseudo-focus, or holds the mass; if that pushes away, it meets the saddle of the edge and both
+  vanish (annihilation).
+- `PseudoHopf`: at a pseudo-focus the leading term by which loops grow or shrink is zero. With the
+  next one, of third order, |x2| at the edge obeys r' = rate r + a r^3, see `modes.edge_focus`, and
+  the cycle that is born has r^2 = -rate/a.
+
+Boundary equilibria and the pseudo-Hopf point are those of M. di Bernardo, C. Budd, A. Champneys, P.
+Kowalczyk, Piecewise-smooth Dynamical Systems, 2008.
+"""
+
+import functools
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..checks import is_concrete, require_value
+from ..model.modes import (
+    Mode,
+    capacity,
+    contact,
+    edge_focus,
+    edges,
+    field_at_rest,
+    mode_acceleration,
+    mode_of,
+    select,
+    settle,
+)
+from ..model.oscillator import Oscillator
+from ..model.variations import Family
+from ..numerics.compiling import jit
+from ..numerics.newton import HOLDS
+from ..results import Status
+from .conditions import Line
+from .rests import NOTHING, AbstractRestCondition, criticality
+from .special import SpecialPoint, Trail
+from .systems import RestSystem, Tests, small_newton
+
+
+class _EdgeSystem(RestSystem):
+    """One equation, of what lies at rest on the edge of this number."""
+
+    edge: eqx.AbstractVar[Array]
+
+    def balance(self, osc: Oscillator) -> Array:
+        """What vanishes."""
+        raise NotImplementedError
+
+    def meets_hopf(self, osc: Oscillator) -> Array:
+        """What vanishes where its curve meets that of a Hopf point, else NaN."""
+        raise NotImplementedError
+
+    def residual(self, osc, x):
+        return self.balance(osc)[None]
+
+    def tests(self, osc, x):
+        return {("BoundaryHopf", ()): self.meets_hopf(osc), **self.type_tests(osc)}
+
+    def type_tests(self, osc: Oscillator) -> Tests:
+        """What to watch along its curve where the type changes."""
+        raise NotImplementedError
+
+
+class EdgeRest(_EdgeSystem):
+    """What vanishes where an equilibrium lies on an edge.
+
+    The needed force at rest on one side of it, less what belts at rest there can hold, in one of
+    the two directions (0 where none is at rest).
+    """
+
+    edge: Array
+    rightward: Array
+    limit: Array
+    codes: Array
+
+    def balance(self, osc):
+        at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
+        needed = mode_acceleration(osc, mode, at, jnp.zeros(()))
+        return needed + self.limit * capacity(osc, mode)
+
+    def meets_hopf(self, osc):
+        # There is none for the end of a segment.
+        mode = mode_of(self.codes)
+        _, trace, *_ = field_at_rest(osc, mode, jnp.stack(edges(osc))[self.edge])
+        return jnp.where(mode.any_stuck, jnp.nan, trace)
+
+    def type_tests(self, osc):
+        push, persists = self.across(osc)
+        return {("DoubleBoundaryEquilibrium", ()): jnp.where(persists, jnp.nan, push)}
+
+    def across(self, osc: Oscillator) -> tuple[Array, Array]:
+        """How hard the other side pushes to the edge, and whether an equilibrium is at the edge on
+        both sides of the point whatever this is.
+
+        So it is where belts at rest hold the mass on the other side, and where it is the end of a
+        segment that comes to the edge first.
+        """
+        at, rest = jnp.stack(edges(osc))[self.edge], jnp.zeros(())
+        left, right = (settle(osc, mode, at, rest) for mode in _beside_edge(osc, at))
+        other = select(self.rightward, left, right)
+        push = select(self.rightward, 1.0, -1.0) * mode_acceleration(osc, other, at, rest)
+        # A segment to the right has its lower end where the needed force is what the belts hold.
+        rests = capacity(osc, mode_of(self.codes)) > 0
+        stays = rests & (self.limit == select(self.rightward, -1.0, 1.0))
+        return push, stays | other.any_stuck
+
+    def exists(self, osc, x):
+        # Whether the contacts on that side are those.
+        at = jnp.stack(edges(osc))[self.edge]
+        left, right = _beside_edge(osc, at)
+        return jnp.all(jnp.stack(select(self.rightward, right, left).codes) == self.codes)
+
+
+class EdgeBalance(_EdgeSystem):
+    """What vanishes where the pseudo-focus at an edge is neither stable nor unstable."""
+
+    edge: Array
+    left: Mode
+    right: Mode
+
+    def _sides(self, osc: Oscillator):
+        at = jnp.stack(edges(osc))[self.edge]
+        return field_at_rest(osc, self.left, at)[:2], field_at_rest(osc, self.right, at)[:2]
+
+    def balance(self, osc):
+        # The rate of `modes.edge_focus` but for factors: regular where one of the pushes is 0.
+        (a_left, trace_left), (a_right, trace_right) = self._sides(osc)
+        return trace_right * a_left - trace_left * a_right
+
+    def exists(self, osc, x):
+        # Whether there is a pseudo-focus between these contacts, and no belt at rest touches.
+        same = [
+            jnp.all(jnp.stack(here.codes) == jnp.stack(mode.codes))
+            for here, mode in zip(
+                _beside_edge(osc, jnp.stack(edges(osc))[self.edge]), (self.left, self.right)
+            )
+        ]
+        moves = ~self.left.any_stuck & ~self.right.any_stuck
+        return (self.meets_hopf(osc) > 0) & moves & same[0] & same[1]
+
+    def meets_hopf(self, osc):
+        # The weaker of the two pushes towards the edge, negative where one pushes away.
+        (a_left, _), (a_right, _) = self._sides(osc)
+        return jnp.minimum(a_left, -a_right)
+
+    def type_tests(self, osc):
+        return {("DegeneratePseudoHopf", ()): self.growth(osc)[0]}
+
+    def growth(self, osc: Oscillator) -> tuple[Array, Array]:
+        """The coefficient of third order, and the size of its terms; NaN without a pseudo-focus."""
+        focus = edge_focus(osc, self.left, self.right, jnp.stack(edges(osc))[self.edge])
+        known = functools.partial(jnp.where, focus.exists)
+        return known(focus.coefficient, jnp.nan), known(focus.bend, jnp.nan)
+
+
+def pseudo_hopf_limit(trail: Trail) -> SpecialPoint | None:
+    """Where the cycle of a curve has shrunk to a pseudo-focus at which the rate and the coefficient
+    are zero, if that is near: its own equations are singular there."""
+    chain, x1 = trail.system.chain, trail.x[:, 0]
+    n, ends = chain.codes.shape[-1], np.asarray(chain.ends)
+    passed = ends[(ends >= n) & (ends < 3 * n)] - n
+    if np.ptp(x1) > 5 * trail.step or not passed.size:
+        return None
+    edge = jnp.asarray(passed[0])
+
+    def attempt(family, unknowns):
+        found, residual = _degenerate_focus(family, edge, jnp.asarray(unknowns[0]))
+        return (found, residual), (found,)
+
+    (found, residual), settled = trail.variation.settle(attempt, (trail.values[-1],))
+    values = np.asarray(found)
+    near = np.linalg.norm(values - trail.values[-1]) < 2 * trail.step
+    if not (settled and residual < HOLDS and near):
+        return None
+    values = float(values[0]), float(values[1])
+    return SpecialPoint("DegeneratePseudoHopf", (), values, float(residual))
+
+
+@jit
+def _degenerate_focus(family: Family, edge: Array, guess: Array) -> tuple[Array, Array]:
+    """Both parameters of such a pseudo-focus, and the error."""
+
+    def equations(family, p):
+        osc = family.at(p)
+        system = EdgeBalance(edge, *_beside_edge(osc, jnp.stack(edges(osc))[edge]))
+        return jnp.stack([system.balance(osc), system.growth(osc)[0]])
+
+    found, _, residual, _ = small_newton(equations, family, guess)
+    return found, residual
+
+
+class _EdgeCondition(AbstractRestCondition):
+    """A condition on what lies at rest on a contact edge of a belt."""
+
+    belt: int | Array
+
+    def check(self, osc):
+        super().check(osc)
+        check_edge(osc, self.belt)
+
+    def guess(self, osc, size):
+        return None
+
+    def _system_at_edge(self, osc: Oscillator) -> _EdgeSystem:
+        raise NotImplementedError
+
+    def system(self, osc, guess):
+        system = self._system_at_edge(osc)
+        has_edge = jnp.isfinite(jnp.stack(edges(osc))[system.edge])
+        return system, NOTHING, jnp.where(has_edge, Status.OK.value, Status.NOT_TOUCHED.value)
+
+    @classmethod
+    def between(cls, before, after, edged):
+        return [cls(belt) for belt in edged] if before.equilibria != after.equilibria else []
+
+
+class BoundaryEquilibrium(_EdgeCondition):
+    """A fixed point, or the end of a segment, lies on a contact edge of a belt."""
+
+    caption: ClassVar[str] = "rest on edge, belt {belt}"
+    line: ClassVar[Line] = Line("rest on edge", "#D55E00")
+
+    def _system_at_edge(self, osc):
+        return _edge_rest(osc, self.belt)
+
+    def type_of(self, point):
+        push, persists = _across_edge(point.oscillator, self.belt)
+        if not persists and abs(push) < HOLDS:
+            return "degenerate"
+        return "persistence" if persists or push > 0 else "annihilation"
+
+
+class PseudoHopf(_EdgeCondition):
+    """The pseudo-focus at a contact edge of a belt changes its stability."""
+
+    caption: ClassVar[str] = "pseudo-Hopf, belt {belt}"
+    line: ClassVar[Line] = Line("pseudo-Hopf", "#D55E00", (0, (5, 1.5)))
+
+    def _system_at_edge(self, osc):
+        return _edge_balance(osc, self.belt)
+
+    def type_of(self, point):
+        return criticality(*_pseudo_growth(point.oscillator, self.belt))
+
+    def coefficient(self, osc):
+        return _pseudo_growth(osc, self.belt)[0]
+
+
+def check_edge(osc: Oscillator, belt: Any, field: str = "belt") -> None:
+    """`ValueError` where a belt has no finite contact edge."""
+    if is_concrete(osc):
+        ends = [osc.belts[belt].lower, osc.belts[belt].upper]
+        require_value(np.any(np.isfinite(ends)), field, "one with a finite edge", belt)
+
+
+def _edges_of(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
+    """The numbers of the lower and the upper edge of a belt."""
+    return jnp.asarray(belt), jnp.asarray(belt + len(osc.belts))
+
+
+def _beside_edge(osc: Oscillator, at: Array) -> tuple[Mode, Mode]:
+    """The contacts at rest to the left and to the right of an edge."""
+    rest = jnp.zeros_like(at)
+    return contact(osc, at, rest, rightward=False), contact(osc, at, rest, rightward=True)
+
+
+def _edge_rest(osc: Oscillator, belt: int | Array) -> EdgeRest:
+    """The equation of a boundary equilibrium at an edge of a belt that is nearest to hold."""
+    cases = []
+    for edge in _edges_of(osc, belt):
+        sides = _beside_edge(osc, jnp.stack(edges(osc))[edge])
+        cases += [
+            EdgeRest(edge, jnp.asarray(rightward), jnp.asarray(limit), jnp.stack(mode.codes))
+            for rightward, mode in zip((False, True), sides, strict=True)
+            for limit in (-1.0, 1.0)
+        ]
+    missing = jnp.stack([jnp.abs(case.balance(osc)) for case in cases])
+    at = jnp.argmin(jnp.where(jnp.isfinite(missing), missing, jnp.inf))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
+
+
+@jit
+def _across_edge(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
+    return _edge_rest(osc, belt).across(osc)
+
+
+@jit
+def _pseudo_growth(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
+    return _edge_balance(osc, belt).growth(osc)
+
+
+def _edge_balance(osc: Oscillator, belt: int | Array) -> EdgeBalance:
+    """The equation of the pseudo-focus at an edge of a belt, of two the one nearer to balance."""
+    positions = jnp.stack(edges(osc))
+    cases = [
+        EdgeBalance(edge, *_beside_edge(osc, positions[edge])) for edge in _edges_of(osc, belt)
+    ]
+    size = [
+        jnp.where(case.exists(osc, jnp.asarray(NOTHING)), jnp.abs(case.balance(osc)), jnp.inf)
+        for case in cases
+    ]
+    at = jnp.argmin(jnp.stack(size))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
