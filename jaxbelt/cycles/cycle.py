@@ -272,11 +272,11 @@ def _loop_reached(osc: Oscillator, y0: Array, size: int) -> tuple[Loop, Array, A
     orbit = eqx.tree_at(lambda orbit: (orbit.repeats, orbit.count), orbit, loop)
     _, count = last_loop(orbit)
     loop = loop_of(orbit, size, len(osc.belts))
-    status = _first_failure(orbit.status, ~_is_neutral(osc, loop), Status.NEUTRAL)
+    status = _first_failure(orbit.status, ~_loop_is_neutral(osc, loop), Status.NEUTRAL)
     return loop, count, _if_it_fits(status, count, size)
 
 
-def _is_neutral(osc: Oscillator, loop: Loop) -> Array:
+def _loop_is_neutral(osc: Oscillator, loop: Loop) -> Array:
     """Whether a loop is one of a continuum of closed orbits."""
     x1, x2 = loop.entries.T
     held = jnp.sum(jnp.where(jnp.any(loop.codes == 0, axis=-1), loop.durations, 0.0))

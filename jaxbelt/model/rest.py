@@ -66,7 +66,7 @@ def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 
 #: So much of the range of speeds, and of the time, may a loop touch or stick to a belt by the
 #: error of an integrated orbit: that of the largest circle, which is tangent to the boundary.
-TOUCHES, STICKS = 1e-6, 1e-3
+TOUCH_SHARE, STICK_SHARE = 1e-6, 1e-3
 
 
 def is_neutral(
@@ -81,8 +81,8 @@ def is_neutral(
     zero = jnp.zeros_like(x2[0])
     speeds = [x2[0] + j / 8 * (x2[1] - x2[0]) for j in range(9)]
     always = [-osc.damping * v for v in speeds]
-    neutral = stuck < STICKS
-    slack = TOUCHES * osc.omega * (x2[1] - x2[0])
+    neutral = stuck < STICK_SHARE
+    slack = TOUCH_SHARE * osc.omega * (x2[1] - x2[0])
     for belt in osc.belts:
         pulls = belt.load != 0
         touches = pulls & (belt.lower < x1[1]) & (belt.upper > x1[0])
@@ -91,13 +91,13 @@ def is_neutral(
         sign = jnp.sign(r[4])
         reached = jnp.minimum(sign * r[0], sign * r[8]) < -slack
         forces = [belt.load * sign * belt.friction.mu(jnp.abs(one)) for one in r]
-        kept = _spread(forces) <= force_rounding(zero, belt.load)
+        kept = _range_of(forces) <= force_rounding(zero, belt.load)
         neutral = neutral & ~(touches & (reached | ~within & ~kept))
         always = [a + jnp.where(within, f, 0.0) for a, f in zip(always, forces, strict=True)]
-    return neutral & (_spread(always) <= force_rounding(zero))
+    return neutral & (_range_of(always) <= force_rounding(zero))
 
 
-def _spread(values: list[Array]) -> Array:
+def _range_of(values: list[Array]) -> Array:
     return functools.reduce(jnp.maximum, values) - functools.reduce(jnp.minimum, values)
 
 

@@ -147,12 +147,12 @@ class _Chains(NamedTuple):
 def _chains(book: Round, inside: Array) -> _Chains:
     """Which phases belong to one arc: steps in one mode, while x2 moves one way."""
     # What ended the steps is written in the round after.
-    fires = _next(book.fired & inside)
+    fires = _row_after(book.fired & inside)
     first, last = book.ts[0], book.ts[-1]
     slips, sticks = inside & ((last > first) | fires), book.stuck & inside
     # Between two extrema of x2, so that the law bends most at one of the ends.
     way, part = book.x2s[-1] >= book.x2s[0], jnp.floor(first / LONGEST_ARC)
-    goes_on = (way == _next(way)) & (part == _next(part)) & _next(slips & ~sticks)
+    goes_on = (way == _row_after(way)) & (part == _row_after(part)) & _row_after(slips & ~sticks)
     goes_on = slips & ~fires & goes_on
     goes_on = goes_on.at[-1].set(False)
     follows = jnp.roll(goes_on, 1, axis=0)
@@ -164,7 +164,7 @@ def _chains(book: Round, inside: Array) -> _Chains:
     return _Chains(counted(sticks, slips & ~follows), counted(sticks, slips & ~goes_on), fires)
 
 
-def _next(rows: Array) -> Array:
+def _row_after(rows: Array) -> Array:
     """Each row's next one; of the last, which is never used, the first."""
     return jnp.roll(rows, -1, axis=0)
 

@@ -23,7 +23,7 @@ from .marks import Mark
 KINDS = ("undecided", "equilibrium", "cycle", "stuck")
 UNDECIDED, EQUILIBRIUM, CYCLE, STUCK_FOR_EVER = range(4)
 #: What repeats, but is one of a continuum of closed orbits: undecided, in the end.
-NEUTRAL = len(KINDS)
+IN_CONTINUUM = len(KINDS)
 
 
 def signature(word: int, belts: int) -> str:
@@ -220,7 +220,7 @@ class Attractor(Observer):
         time = jnp.where(loop.period > 0, loop.period, 1.0)
         stuck = functools.reduce(jnp.maximum, loop.sticks) / time
         neutral = (loop.kind == CYCLE) & is_neutral(osc, *extent, stuck)
-        kind = jnp.where(neutral, NEUTRAL, jnp.where(found, EQUILIBRIUM, loop.kind))
+        kind = jnp.where(neutral, IN_CONTINUUM, jnp.where(found, EQUILIBRIUM, loop.kind))
         memory = replace(
             loop,
             kind=kind.astype(loop.kind.dtype),
@@ -240,7 +240,7 @@ class Attractor(Observer):
 
     def finish(self, osc, lanes):
         loop: _LoopSoFar = lanes.memory
-        neutral = loop.kind == NEUTRAL
+        neutral = loop.kind == IN_CONTINUUM
         undecided = (loop.kind == UNDECIDED) | neutral
         unsettled = undecided & (lanes.status == Status.OK.value)
         reason = jnp.where(neutral, Status.NEUTRAL.value, Status.NOT_SETTLED.value)

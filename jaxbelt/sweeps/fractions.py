@@ -290,7 +290,7 @@ def _matched(
             alone = [i for i in range(len(met)) if i not in here]
             if known in here.values() or all(met[i].kind != last[known].kind for i in alone):
                 continue
-            there = _followed(variation, values[row - 1 : row + 1], last[known], moves)
+            there = _followed_to(variation, values[row - 1 : row + 1], last[known], moves)
             here |= {i: known for i in alone if there is not None and _is_at(met[i], there)}
         missed = [k for k in range(len(last)) if k not in just_before]
         new = [i for i in range(len(met)) if i not in here]
@@ -329,7 +329,7 @@ def _matched(
     )
 
 
-def _followed(variation: Variation, way: np.ndarray, one: _Met, moves: float) -> _Met | None:
+def _followed_to(variation: Variation, way: np.ndarray, one: _Met, moves: float) -> _Met | None:
     """What an attractor at the first of two values is at the second, where it gets there without a
     move of more than `moves` in a SMALLEST_PART of the way."""
     done, part = 0.0, 0.5
