@@ -11,8 +11,6 @@ For an oscillator at random, one of its attractors and a direction, four things 
   bisection: a difference of four oscillators beside, extrapolated.
 """
 
-import time
-from collections import Counter
 from math import inf
 
 import jax
@@ -23,6 +21,7 @@ import jaxbelt as jb
 
 from . import derivatives, engine, package
 from .cases import Case
+from .outcome import Outcome
 from .portraits import PATIENCE, _number_of, random_oscillator
 
 #: Errors of distances, and of derivatives relative to 1 and their size.
@@ -163,36 +162,40 @@ def random_shock(rng: np.random.Generator):
             return kind, osc, y0, direction, shock
 
 
-def run(seed: int, runs: int, *, verbose: bool = False) -> int:
-    """Compare so many random shocks, and print what differs."""
-    rng = np.random.default_rng(seed)
-    began = time.monotonic()
-    counts, bad, largest, steepest = Counter(), 0, 0.0, 0.0
-    for number in range(runs):
-        kind, osc, y0, direction, told = random_shock(rng)
-        along = derivatives.directions(Case(osc, y0), rng)
-        wrong, error = differences(osc, y0, direction, told)
-        slopes = slope_error(osc, y0, direction, along)
-        if slopes is None:
-            counts["another boundary beside"] += 1
-        else:
-            off, size = slopes
-            if not off < SAME_SLOPE * (1 + size):
-                wrong.append(f"derivative off by {off} of {size}")
-            steepest = max(steepest, off / (1 + size))
-        largest = max(largest, error)
-        what = told.boundary.rpartition(" ")[0]
-        counts[f"{told.attractor.split()[0]} to {what}, {direction}"] += 1
-        if verbose:
-            print(
-                f"{number}, {kind}: {told.attractor} to {told.boundary}, {direction}, "
-                f"{float(told.distance):.9f} off by {error:.1e}, slope {slopes}",
-                flush=True,
-            )
-        if wrong:
-            bad += 1
-            print(f"\n{number}, {kind}, from {y0}, along {along}")
-            print(f"{package.oscillator(osc)!r}\n{told}", *wrong[:6], sep="\n", flush=True)
-    print(f"seed {seed}, {time.monotonic() - began:.0f} s, {dict(counts)}")
-    print(f"largest errors: {largest:.1e} of distances, {steepest:.1e} of derivatives; {bad} wrong")
-    return int(bool(bad))
+def settings(options) -> dict:
+    return {}
+
+
+def numbers(options) -> range:
+    return range(options.runs)
+
+
+def outcome(options, number: int) -> Outcome:
+    """Compare one random shock."""
+    rng = np.random.default_rng((options.seed, number))
+    kind, osc, y0, direction, told = random_shock(rng)
+    along = derivatives.directions(Case(osc, y0), rng)
+    wrong, error = differences(osc, y0, direction, told)
+    slopes = slope_error(osc, y0, direction, along)
+    one = Outcome(
+        f"{kind}: {told.attractor} to {told.boundary}, {direction}, "
+        f"{float(told.distance):.9f} off by {error:.1e}, slope {slopes}",
+        wrong,
+    )
+    one.largest["error of distances"] = error
+    if slopes is None:
+        one.counts["another boundary beside"] += 1
+    else:
+        off, size = slopes
+        one.largest["error of derivatives"] = off / (1 + size)
+        if not off < SAME_SLOPE * (1 + size):
+            wrong.append(f"derivative off by {off} of {size}")
+    what = told.boundary.rpartition(" ")[0]
+    one.counts[f"{told.attractor.split()[0]} to {what}, {direction}"] += 1
+    if wrong:
+        wrong.insert(0, f"from {y0}, along {along}\n{package.oscillator(osc)!r}\n{told}")
+    return one
+
+
+def said(counts, largest) -> list[str]:
+    return [f"{dict(counts)}", *(f"largest {name}: {x:.1e}" for name, x in largest.items())]
