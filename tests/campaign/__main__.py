@@ -43,8 +43,8 @@ def main(arguments=None):
     results = Results(options.results, header)
     numbers = campaign.numbers(options)
     began = time.monotonic()
-    with _stopping():
-        _go_through(campaign, options, numbers, results)
+    with _stopping() as was_asked:
+        _go_through(campaign, options, numbers, results, was_asked)
     done = [results.outcomes[n] for n in numbers if n in results.outcomes]
     wrong = sum(bool(one.wrong) for one in done)
     counts, largest = summed(done)
@@ -59,7 +59,7 @@ def main(arguments=None):
     return int(wrong > 0 or len(done) < len(numbers) or not holds)
 
 
-def _go_through(campaign, options, numbers, results):
+def _go_through(campaign, options, numbers, results, was_asked):
     """Compare the cases that have no result yet."""
     began = told = time.monotonic()
     wrong = 0
@@ -69,6 +69,8 @@ def _go_through(campaign, options, numbers, results):
         try:
             one = campaign.outcome(options, number)
         except Exception:
+            if was_asked():
+                raise KeyboardInterrupt from None
             one = Outcome("raises", wrong=[traceback.format_exc()])
         results.add(number, one)
         wrong += bool(one.wrong)
@@ -86,18 +88,26 @@ def _go_through(campaign, options, numbers, results):
 
 @contextlib.contextmanager
 def _stopping():
-    """Let Ctrl-C and a signal to terminate end what is done inside, and go on behind it."""
+    """Let Ctrl-C and a signal to terminate end what is done inside, and go on behind it; gives a
+    function that says whether there was one.
 
-    def stop(*_):
+    Inside of the engine's compiled code the interrupt becomes another exception.
+    """
+    asked = []
+
+    def stop(number, _):
+        asked.append(number)
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, stop)
+    signals = signal.SIGINT, signal.SIGTERM
+    before = [signal.signal(one, stop) for one in signals]
     try:
-        yield
+        yield lambda: bool(asked)
     except KeyboardInterrupt:
         print("stopped; this is what is done:", flush=True)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for one, handler in zip(signals, before):
+            signal.signal(one, handler)
 
 
 class Results:

@@ -35,6 +35,8 @@ REPEATS = 1e-11
 #: Changes of parameters for the differences: the first with which nothing else becomes the nearest
 #: and the two differences that are extrapolated are as near to one another.
 STEPS, ALIKE = (3e-4, 3e-5, 3e-6), 1e-4
+#: Starts that are farther apart than this beside one another are of two ways.
+ELSEWHERE = 0.1
 #: Number of what goes to infinity; of what is told nowhere.
 INFINITY, UNKNOWN = 1000, -1
 
@@ -123,8 +125,8 @@ def _smaller_ones(osc, told: jb.FatalShock, end: int, direction: str) -> list[st
 
 def slope_error(osc, y0, direction: str, along) -> tuple[float, float] | None:
     """The error of the derivative along a direction of the parameters, and that of bisection; None
-    if beside the oscillator, on one side at least, another boundary is the nearest: at round
-    numbers, where things coincide."""
+    if beside the oscillator, on one side at least, another boundary is the nearest, or the same one
+    elsewhere: at round numbers, where things coincide, or where the motion is point-symmetric."""
 
     def shock(by):
         oscillator = package.oscillator(derivatives.moved(osc, along, by))
@@ -138,7 +140,8 @@ def slope_error(osc, y0, direction: str, along) -> tuple[float, float] | None:
     for step in STEPS:
         told = {by: shock(by) for by in (-step, -0.5 * step, 0.5 * step, step)}
         sorts = {(one.attractor, one.boundary, one.beyond) for one in (*told.values(), shock(0.0))}
-        if len(sorts) == 1:
+        apart = np.ptp([np.asarray(one.start) for one in told.values()], axis=0)
+        if len(sorts) == 1 and np.max(apart) < ELSEWHERE:
             values = {by: by_bisection(by, one) for by, one in told.items()}
             whole = (values[step] - values[-step]) / (2 * step)
             half = (values[0.5 * step] - values[-0.5 * step]) / step
