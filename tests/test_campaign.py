@@ -3,6 +3,10 @@
 The whole campaigns are `python -m tests.campaign`; what they found is in docs/checked.md.
 """
 
+import importlib
+import os
+import signal
+from collections import Counter
 from dataclasses import replace
 from math import acos, atan, inf, pi, sqrt
 
@@ -13,6 +17,7 @@ import pytest
 from tests.campaign import __main__ as command
 from tests.campaign import cases, compare, derivatives, engine, package
 from tests.campaign.engine import CROSS, EDGE, SLIP, STICK, Belt, Oscillator
+from tests.campaign.outcome import Outcome
 
 #: The engine integrates at 1e-13, with events of order-one normal speed in these tests.
 EXACT = dict(rel=0, abs=1e-11)
@@ -209,8 +214,71 @@ def test_derivatives_are_those_of_differences():
 def test_rows_take_the_place_of_those_of_the_same_campaign(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("text\n| x | random | 3 | 1e-08 | 0 | 0 | 7 |\n<!-- campaigns -->\n")
-    command._put_rows(page, ["| x | random | 9 | 1e-08 | 0 | 0 | 0 |"])
+    command.put_rows(page, ["| x | random | 9 | 1e-08 | 0 | 0 | 0 |"])
     assert page.read_text() == "text\n| x | random | 9 | 1e-08 | 0 | 0 | 0 |\n<!-- campaigns -->\n"
+
+
+class Stub:
+    """A campaign of five cases; of the third something is wrong, the fourth raises."""
+
+    def __init__(self, stops_at=None, swallows=False):
+        self.stops_at, self.swallows, self.asked = stops_at, swallows, []
+
+    def settings(self, options):
+        return {"runs": options.runs}
+
+    def numbers(self, options):
+        return range(5)
+
+    def outcome(self, options, number):
+        if number == self.stops_at:
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+            except KeyboardInterrupt as error:
+                # As the engine's compiled code does.
+                raise (SystemError("an exception set") if self.swallows else error) from error
+        self.asked.append(number)
+        if number == 3:
+            raise ValueError("no such belt")
+        one = Outcome(f"the case {number}", ["not parted"] if number == 2 else [])
+        one.counts["sum"] += number
+        one.largest["error"] = float(number)
+        return one
+
+    def said(self, counts, largest):
+        return [f"sum {counts['sum']}, error {largest.get('error')}"]
+
+
+def campaign_of(monkeypatch, stub):
+    monkeypatch.setattr(command.importlib, "import_module", lambda *_: stub)
+    monkeypatch.setattr(command, "_commit", lambda: f"by {id(stub)}")
+    return stub
+
+
+@pytest.mark.parametrize("swallows", [False, True])
+def test_a_campaign_that_is_stopped_goes_on(swallows, monkeypatch, tmp_path, capsys):
+    call = ["final", "--runs", "9", "--results", str(tmp_path / "results")]
+    first = campaign_of(monkeypatch, Stub(2, swallows))
+    assert command.main(call) == 1 and first.asked == [0, 1]
+    said = capsys.readouterr().out
+    assert "stopped" in said and "sum 1, error 1.0" in said and "2 of 5 cases, 0 wrong" in said
+    # Killed while it wrote the next one.
+    with open(tmp_path / "results", "a") as file:
+        file.write('{"number": 2, "com')
+    second = campaign_of(monkeypatch, Stub())
+    assert command.main(call) == 1 and second.asked == [2, 3, 4]
+    said = capsys.readouterr().out
+    assert "not parted" in said and "ValueError: no such belt" in said
+    assert "sum 7, error 4.0" in said and "5 of 5 cases, 2 wrong" in said
+    assert f"by {id(first)}" in said and f"by {id(second)}" in said
+    with pytest.raises(SystemExit, match="of another campaign"):
+        command.main([*call, "--seed", "1"])
+
+
+@pytest.mark.parametrize("module", sorted(set(command.CAMPAIGNS.values())))
+def test_nothing_done_is_summed_up(module):
+    campaign = importlib.import_module(f"tests.campaign.{module}")
+    assert all(isinstance(line, str) for line in campaign.said(Counter(), {}))
 
 
 # ---------------------------------------------------------------- small campaigns
@@ -224,7 +292,7 @@ def test_rows_take_the_place_of_those_of_the_same_campaign(tmp_path):
     ],
 )
 def test_small_campaign(arguments, capsys):
-    wrong = command.main([*arguments.split(), "--show", "3"])
+    wrong = command.main(arguments.split())
     assert wrong == 0, capsys.readouterr().out
 
 
@@ -238,11 +306,11 @@ def test_small_campaign(arguments, capsys):
         "derivatives --by sweep --runs 500 --tol 1e-11 --seed 26",
         "grazing --runs 1000 --tol 1e-13 --seed 24",
         "grazing --runs 1000 --seed 25",
-        "paths --paths 14 --seed 3",
+        "paths --runs 14 --seed 3",
     ],
 )
 def test_campaign(arguments, capsys):
-    wrong = command.main([*arguments.split(), "--show", "3"])
+    wrong = command.main(arguments.split())
     assert wrong == 0, capsys.readouterr().out
 
 

@@ -13,6 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
+from jaxbelt.cycles.outlines import outline_of_separatrix
 from tests.campaign import engine, package, portraits
 from tests.campaign.cases import PAPER
 
@@ -188,6 +189,30 @@ def test_orbits_that_touch_a_boundary_with_a_jump_bound_basins():
     # needed = -x1 - zeta x2 balances the kinetic friction, -u0 0.5, at x2 = nu/omega.
     assert np.asarray(one.point) == pytest.approx([-0.75 + 0.1, -0.4], abs=1e-14)
     assert portraits.differences(osc, told)[0] == []
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_edge_cuts_off_what_only_the_static_limit_holds(sign):
+    """Found by a campaign: the orbit that comes to the corner of edge and boundary, above which the
+    mass comes to be held and below which it slips away, bounds basins."""
+
+    def between(*ends):
+        return sorted(sign * end for end in ends)
+
+    laws = ("coulomb", 1.2, 0.72), ("coulomb", 0.5, 0.3)
+    belts = (
+        engine.Belt(-0.65 * sign, laws[0], 2.0, *between(-np.inf, -0.55)),
+        engine.Belt(0.85 * sign, laws[1], 2.0, *between(-0.9, np.inf)),
+    )
+    osc = engine.Oscillator(0.5, belts, 2.0)
+    told = jb.portrait(package.oscillator(osc))
+    assert portraits.differences(osc, told)[0] == []
+    corner = (-0.9 * sign, 0.425 * sign)
+    (one,) = [one for one in told.separatrices if tuple(np.asarray(one.point)) == corner]
+    assert one.stable and one.end == "outside"
+    # As shocks follow it, backwards from its point.
+    pieces = outline_of_separatrix(told.oscillator, one).pieces(told.oscillator)
+    np.testing.assert_array_equal(pieces.entries[0], [corner[0], -corner[1]])
 
 
 @pytest.mark.slow

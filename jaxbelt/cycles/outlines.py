@@ -210,9 +210,9 @@ class OpenOutline(Outline):
     """A stable separatrix, followed backwards from its point.
 
     chain: its arcs, of which the last may end by nothing ("unused"); durations: theirs. origin: of
-    which sort its point is, "edge", "segment" or "boundary", and numbers that say which: that of
-    the edge; of the row of `equilibria`, and 0 for its lower and 1 for its upper end; of the belt,
-    and of the zone between edges.
+    which sort its point is and numbers that say which: "edge", its number; "segment", the row of
+    `equilibria`, and 0 for its lower and 1 for its upper end; "boundary", the belt, and the zone
+    between edges; "corner", the belt, and the edge.
     """
 
     chain: Chain
@@ -232,6 +232,9 @@ class OpenOutline(Outline):
         if sort == "boundary":
             belt, zone = numbers
             return tangencies(osc, jnp.asarray(np.array(belt)))[0][zone]
+        if sort == "corner":
+            belt, number = numbers
+            return jnp.stack([edges(osc)[number], osc.belts[belt].velocity / osc.omega])
         if sort == "edge":
             x1 = edges(osc)[numbers[0]]
         else:
@@ -305,6 +308,9 @@ def _origin_of(osc: Oscillator, separatrix: Separatrix) -> tuple[Any, ...]:
             if zones.size:
                 return "boundary", belt, int(zones[0])
     places = np.asarray(edges(osc))
+    if x2 != 0:
+        levels = [float(belt.velocity / osc.omega) for belt in osc.belts]
+        return "corner", levels.index(x2), int(np.flatnonzero(places == x1)[0])
     rests = equilibria(osc)
     for end, ends in enumerate((rests.x1_lower, rests.x1_upper)):
         rows = np.flatnonzero((np.asarray(ends) == x1) & (np.asarray(rests.kind) == 2))

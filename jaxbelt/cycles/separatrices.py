@@ -69,7 +69,8 @@ ARC_SAMPLES = 16
 
 class Separatrix(eqx.Module):
     """An orbit that leaves, or ends in, a point: (sigma, 0) of a contact edge, an end of a segment,
-    or where it touches the boundary of a belt whose static limit exceeds mu(0).
+    where it touches the boundary of a belt whose static limit exceeds mu(0), or where an edge cuts
+    off the piece of such a boundary on which only that limit holds the mass.
 
     - point: (x1, x2). side: "left" or "right", on which side of it the orbit is there. stable:
       whether it ends in the point, and so may bound basins, or leaves it.
@@ -155,11 +156,12 @@ def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[TracedSep
             if x1 not in parting and _repels(osc, *_as_arrays(x1, side == "right")):
                 found.append(_at_rest(osc, x1, side, True, reach))
     for belt in range(len(osc.belts)):
-        points, codes = map(np.asarray, tangencies(osc, *_as_arrays(belt)))
-        for (x1, x2), mode in zip(points.tolist(), codes, strict=True):
-            if np.isfinite(x1):
-                side = "left" if x2 > 0 else "right"
-                found.append(_branch(osc, (x1, x2), mode, side, True, reach))
+        for ends_of in (tangencies, corners):
+            points, codes = map(np.asarray, ends_of(osc, *_as_arrays(belt)))
+            for (x1, x2), mode in zip(points.tolist(), codes, strict=True):
+                if np.isfinite(x1):
+                    side = "left" if x2 > 0 else "right"
+                    found.append(_branch(osc, (x1, x2), mode, side, True, reach))
     unique = {(b.point, b.side, b.stable): b for b in found if b is not None}
     return sorted(unique.values(), key=lambda branch: branch.point)
 
@@ -216,6 +218,50 @@ def tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     exists = exists & (capacity(osc, stuck) - kinetic > force_rounding(x1))
     x1, x2 = jnp.where(exists, x1, jnp.nan), jnp.full_like(x1, v)
     return jnp.stack([x1, x2], axis=-1), jnp.stack(slips.codes, axis=-1)
+
+
+@jit
+def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
+    """Where a contact edge cuts off a piece of a belt's boundary on which only a static limit that
+    exceeds mu(0) holds the mass, where the mass comes in: one point for each zone between edges,
+    [zones, 2], NaN where there is none; and the modes of the orbits that come to them, [zones,
+    belts].
+
+    On one side of such an orbit the mass comes to be held, on the other it slips away.
+    """
+    v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
+    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
+    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    x1 = jnp.where(v > 0, lower, upper)
+    inside, before = (_beside(osc, x1, v, rightward=side) for side in (v > 0, v < 0))
+    slips = _slipping(inside, jnp.sign(v))
+    pull = mode_acceleration(osc, inside, x1, v)
+    kinetic = jnp.abs(mode_acceleration(osc, slips, x1, v) - pull)
+    exists = (jnp.stack(inside.codes)[belt] == STUCK) & (v != 0) & (lower < upper)
+    exists = exists & jnp.isfinite(x1) & (jnp.abs(pull) - kinetic > force_rounding(x1))
+    exists = exists & (capacity(osc, inside) - jnp.abs(pull) > force_rounding(x1))
+    # It comes from the side to which the mass slips away; or, where it crosses there, from the
+    # other one.
+    away = -jnp.sign(pull)
+    modes = [_slipping(before, sign) for sign in (away, -away)]
+    comes = [
+        sign * mode_acceleration(osc, mode, x1, v) > 0 for sign, mode in zip((away, -away), modes)
+    ]
+    free = ~jnp.any(jnp.stack(before.codes) == STUCK, axis=0)
+    exists = exists & (free | comes[0] | comes[1])
+    mode = select(free | comes[0], *modes)
+    x1, x2 = jnp.where(exists, x1, jnp.nan), jnp.full_like(x1, v)
+    return jnp.stack([x1, x2], axis=-1), jnp.stack(mode.codes, axis=-1)
+
+
+def _beside(osc: Oscillator, x1: Array, x2: Array, *, rightward: Array) -> Mode:
+    sides = (contact(osc, x1, x2, rightward=side) for side in (True, False))
+    return select(rightward, *sides)
+
+
+def _slipping(mode: Mode, sign: Array) -> Mode:
+    """The mode with the belts that hold the mass slipping with a sign."""
+    return Mode(tuple(jnp.where(code == STUCK, sign, code) for code in mode.codes))
 
 
 def _at_rest(

@@ -400,16 +400,3 @@ def _mode_beside(osc, x1, side, x2, given):
         else:
             mode.append(given.get(i, 1 if b.velocity > osc.omega * x2 else -1))
     return tuple(mode)
-
-
-def grazing_batches(rng, options):
-    """Lists of grazing cases, one structure each; T is the same for all of a list."""
-    smallest = 1e-11 if options.tol <= 1e-12 else 1e-8
-    if options.by == "find_cycle":
-        yield [grazing_cycle(rng, smallest) for _ in range(options.runs)]
-        return
-    chosen = structures(rng, options.programs)
-    for structure in chosen:
-        yield [
-            grazing_case(rng, structure, smallest) for _ in range(-(-options.runs // len(chosen)))
-        ]

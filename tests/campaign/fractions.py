@@ -14,7 +14,7 @@ The last holds for 100,000 starts of the engine or more: the error of a grid fal
 of random starts, and has to be small beside it.
 """
 
-import time
+import functools
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -27,6 +27,7 @@ import jaxbelt as jb
 
 from . import engine
 from .cases import PAPER
+from .outcome import Outcome
 
 #: The path, and the box of starts; six of the values have two attractors.
 NU1, SPAN, VALUES, BOX = 0.35, (-0.55, 0.53), 10, ((-1.0, 3.0), (-1.0, 1.0))
@@ -111,43 +112,64 @@ def differences(told: jb.BasinFractions, row: int, seen: Seen) -> tuple[list[str
     return wrong, square
 
 
-def compared(seen: list[Seen], seed: int) -> int:
-    """Print how the fractions differ from what the engine saw; 1 where they are wrong."""
-    began, n = time.monotonic(), MORE * sum(seen[0].counts)
-    told = jb.basin_fractions(
+@functools.cache
+def told_by_package(seed: int, starts: int) -> jb.BasinFractions:
+    """The fractions at all values, from so many random starts."""
+    return jb.basin_fractions(
         lambda nu0: jb.presets.class_b(nu0, NU1),
         span=SPAN,
         rows=VALUES,
         box=BOX,
-        n=n,
+        n=starts,
         key=jax.random.key(seed),
     )
-    print(f"{told}, {time.monotonic() - began:.0f} s")
-    bad, squares = False, []
-    for row, (value, one) in enumerate(zip(told.values, seen, strict=True)):
-        wrong, square = differences(told, row, one)
-        bad |= bool(wrong)
-        squares += [square] if len(one.places) > 1 else []
-        fractions = ", ".join(
-            f"{name} {told.fractions[row, k]:.5f} +- {told.standard_errors[row, k]:.5f}"
-            for k, name in enumerate(told.attractors)
-            if told.fractions[row, k]
-        )
-        shares = ", ".join(
-            f"{place[0]} {count / sum(one.counts):.5f}"
-            for place, count in zip(one.places, one.counts, strict=True)
-        )
-        print(f"nu0 = {value:.4f}: {fractions}; engine {shares}; {square**0.5:.2f} errors off")
-        for line in wrong:
-            print(f"  {line}")
-    chance = float(chi2.sf(sum(squares), len(squares)))
-    print(f"sum of {len(squares)} squares {sum(squares):.2f}, by chance with {chance:.3f}")
-    return int(bad or chance < CHANCE)
 
 
-def run(seed: int, starts: int, threads: int) -> int:
-    """Compare at all values, with about so many starts of the engine at each."""
-    began = time.monotonic()
-    seen = [by_engine(float(nu0), starts, threads) for nu0 in np.linspace(*SPAN, VALUES)]
-    print(f"{sum(seen[0].counts):,} starts of the engine each, {time.monotonic() - began:.0f} s")
-    return compared(seen, seed)
+def settings(options) -> dict:
+    return {"runs": options.runs}
+
+
+def numbers(options) -> range:
+    return range(VALUES)
+
+
+def outcome(options, number: int) -> Outcome:
+    """Compare at one value, with about so many starts of the engine."""
+    nu0 = float(np.linspace(*SPAN, VALUES)[number])
+    seen = by_engine(nu0, options.runs, options.threads)
+    total = sum(seen.counts)
+    told = told_by_package(options.seed, MORE * total)
+    wrong, square = differences(told, number, seen)
+    fractions = ", ".join(
+        f"{name} {told.fractions[number, k]:.5f} +- {told.standard_errors[number, k]:.5f}"
+        for k, name in enumerate(told.attractors)
+        if told.fractions[number, k]
+    )
+    shares = ", ".join(
+        f"{place[0]} {count / total:.5f}"
+        for place, count in zip(seen.places, seen.counts, strict=True)
+    )
+    line = f"nu0 = {nu0:.4f}: {fractions}; engine {shares}; {square**0.5:.2f} errors off"
+    one = Outcome(line, wrong)
+    one.counts.update({"squares": square, "two attractors": len(seen.places) > 1, "starts": total})
+    one.largest["errors off"] = square**0.5
+    return one
+
+
+def said(counts, largest) -> list[str]:
+    return [
+        f"{int(counts['starts']):,} starts of the engine",
+        f"at most {largest.get('errors off', 0.0):.2f} standard errors off",
+        f"sum of {int(counts['two attractors'])} squares {float(counts['squares']):.2f}, by chance "
+        f"with {_chance(counts):.3f}",
+    ]
+
+
+def holds(counts) -> bool:
+    """Whether the values together are as chance gives them."""
+    return _chance(counts) > CHANCE
+
+
+def _chance(counts) -> float:
+    values = int(counts["two attractors"])
+    return float(chi2.sf(float(counts["squares"]), values)) if values else 1.0

@@ -20,6 +20,8 @@ from jaxbelt.bifurcations.cells import look_at
 from jaxbelt.bifurcations.regions import varied_by_names
 from jaxbelt.numerics.continuation import Stop
 
+from .outcome import Outcome
+
 #: Cells along the axes: other numbers, lest cells lie where both parameters are the same.
 CELLS = 64, 65
 #: Rows of a curve that are asked; so far from a row both its sides are, in units of the map's side.
@@ -141,24 +143,31 @@ def _for_mirror(kind: type, condition):
     return kind(belts[0] if names == ["belt"] else belts) if names else kind()
 
 
-def run(show: int = 20) -> int:
-    """Draw the maps twice, the second time warm, and print what they leave out."""
-    failed = 0
-    for plane in PLANES:
-        axes = {name: np.linspace(*ends, n) for (name, ends), n in zip(plane.axes.items(), CELLS)}
-        spent = []
-        for _ in range(2):
-            began = time.monotonic(), time.process_time()
-            told = jb.region_map(plane.make, axes)
-            spent.append((time.monotonic() - began[0], time.process_time() - began[1]))
-        (cold, _), (warm, processor) = spent
-        counts, wrong = differences(plane, told)
-        print(
-            f"{plane.name}: {dict(counts)}, {len(wrong)} wrong; {cold:.0f} s, then {warm:.0f} s "
-            f"({processor:.0f} s of processors)",
-            *wrong[:show],
-            sep="\n  ",
-            flush=True,
-        )
-        failed += bool(wrong)
-    return int(bool(failed))
+def settings(options) -> dict:
+    return {}
+
+
+def numbers(options) -> range:
+    return range(len(PLANES))
+
+
+def outcome(options, number: int) -> Outcome:
+    """Draw a map twice, the second time warm, and compare it."""
+    plane = PLANES[number]
+    axes = {name: np.linspace(*ends, n) for (name, ends), n in zip(plane.axes.items(), CELLS)}
+    spent = []
+    for _ in range(2):
+        began = time.monotonic(), time.process_time()
+        told = jb.region_map(plane.make, axes)
+        spent.append((time.monotonic() - began[0], time.process_time() - began[1]))
+    (cold, _), (warm, processor) = spent
+    counts, wrong = differences(plane, told)
+    line = (
+        f"{plane.name}: {dict(counts)}; {cold:.0f} s, then {warm:.0f} s ({processor:.0f} s of "
+        "processors)"
+    )
+    return Outcome(line, wrong, counts=counts, largest={"seconds, warm": warm})
+
+
+def said(counts, largest) -> list[str]:
+    return [f"{dict(counts)}, the longest {largest.get('seconds, warm', 0.0):.0f} s, warm"]

@@ -26,6 +26,7 @@ from jaxbelt.cycles.attractors import place_of
 
 from . import engine, package
 from .cases import random_case, rational_case, structures
+from .outcome import Outcome
 
 #: Programs, one for each combination of laws, that a campaign compiles.
 PROGRAMS = 6
@@ -496,26 +497,38 @@ def _changes(case: Case) -> bool:
     return len(names) > 1
 
 
-def run(seed: int, paths: int, *, first: int = 0, out=print) -> int:
-    """Compare along so many paths, and say what does not agree; returns how many paths do not."""
-    bad = 0
-    for number in range(first, first + paths):
-        case = case_of(seed, number)
-        report = check(case, seed + number)
-        bad += bool(report.wrong)
-        kinds_found = [point.kind for point in report.points]
-        out(
-            f"path {number} {case.kind} {case.parameter} {case.span}: {len(kinds_found)} points "
-            f"({sum(kind == 'Unexplained' for kind in kinds_found)} unexplained), {report.changes} "
-            f"changes, {report.labels} labels, {report.undecided} undecided, "
-            f"{report.seconds[0]:.1f} + {report.seconds[1]:.1f} s"
-        )
-        for line in report.wrong:
-            out(f"    {line}")
-        unexplained = [float(p.value) for p in report.points if p.kind == "Unexplained"]
-        if unexplained:
-            out(f"    unexplained at {unexplained}")
-        if report.wrong or unexplained:
-            out(f"    {case.oscillator!r}")
-    out(f"{paths} paths, {bad} with something that does not agree")
-    return bad
+def settings(options) -> dict:
+    return {}
+
+
+def numbers(options) -> range:
+    return range(options.runs)
+
+
+def outcome(options, number: int) -> Outcome:
+    """Compare along one path."""
+    case = case_of(options.seed, number)
+    report = check(case, options.seed + number)
+    unexplained = [float(p.value) for p in report.points if p.kind == "Unexplained"]
+    one = Outcome(
+        f"{case.kind} {case.parameter} {case.span}: {len(report.points)} points, "
+        f"{report.changes} changes, {report.labels} labels, {report.undecided} undecided, "
+        f"{report.seconds[0]:.1f} + {report.seconds[1]:.1f} s",
+        report.wrong,
+    )
+    if unexplained:
+        one.notes.append(f"unexplained at {unexplained}")
+    if report.wrong or unexplained:
+        one.notes.append(f"{case.oscillator!r}")
+    one.counts.update(
+        points=len(report.points),
+        unexplained=len(unexplained),
+        changes=report.changes,
+        labels=report.labels,
+        undecided=report.undecided,
+    )
+    return one
+
+
+def said(counts, largest) -> list[str]:
+    return [f"{dict(counts)}"]

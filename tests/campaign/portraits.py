@@ -22,6 +22,7 @@ import jaxbelt as jb
 
 from . import engine, package
 from .cases import PAPER, random_case, rational_case, special_positions, structures
+from .outcome import Outcome
 
 #: Starts: so many displacements and velocities, in this window.
 SIDE, WINDOW = 11, ((-3.0, 3.0), (-2.0, 2.0))
@@ -240,28 +241,36 @@ def _repels(osc: engine.Oscillator, cycle: jb.Cycle, told: jb.Portrait) -> bool:
     return True
 
 
-def run(seed: int, runs: int, show: int = 20) -> int:
-    """Compare so many random portraits, and print what differs."""
-    rng = np.random.default_rng(seed)
-    began, spent, shown = time.monotonic(), 0.0, 0
-    counts, aside, bad = Counter(), Counter(), Counter()
-    for _ in range(runs):
-        kind, osc = random_oscillator(rng)
-        before = time.monotonic()
-        told = jb.portrait(package.oscillator(osc))
-        spent += time.monotonic() - before
-        wrong, left = differences(osc, told)
-        counts[kind] += 1
-        counts["attracting"] += len(told.cycles)
-        counts["unstable"] += len(told.unstable)
-        counts["separatrices"] += len(told.separatrices)
-        aside += left
-        if wrong:
-            bad[kind] += 1
-            if shown < show:
-                shown += 1
-                print(f"\n{kind}: {package.oscillator(osc)!r}")
-                print("\n".join(wrong[:6]), told, sep="\n", flush=True)
-    print(f"seed {seed}, {time.monotonic() - began:.0f} s, {spent / runs:.3f} s a portrait")
-    print(f"{dict(counts)}, set aside: {dict(aside)}, wrong: {dict(bad)}")
-    return int(bool(bad))
+def settings(options) -> dict:
+    return {}
+
+
+def numbers(options) -> range:
+    return range(options.runs)
+
+
+def outcome(options, number: int) -> Outcome:
+    """Compare one random portrait."""
+    kind, osc = random_oscillator(np.random.default_rng((options.seed, number)))
+    before = time.monotonic()
+    told = jb.portrait(package.oscillator(osc))
+    seconds = time.monotonic() - before
+    wrong, aside = differences(osc, told)
+    one = Outcome(kind, wrong)
+    one.counts.update({f"set aside: {name}": n for name, n in aside.items()})
+    one.counts.update(
+        {
+            kind: 1,
+            "attracting": len(told.cycles),
+            "unstable": len(told.unstable),
+            "separatrices": len(told.separatrices),
+            "seconds of portraits": seconds,
+        }
+    )
+    if wrong:
+        wrong.insert(0, f"{package.oscillator(osc)!r}\n{told}")
+    return one
+
+
+def said(counts, largest) -> list[str]:
+    return [f"{dict(counts)}"]

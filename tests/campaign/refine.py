@@ -8,14 +8,12 @@ say, too, on a short path across it.
 """
 
 import time
-from collections import Counter
-
-import numpy as np
 
 import jaxbelt as jb
 from jaxbelt.results import Status
 
 from . import package, paths
+from .outcome import Outcome
 
 #: How far the guesses are from the points.
 AWAY = (1e-3, 1e-2, 3e-2)
@@ -26,33 +24,43 @@ SAME = 1e-7
 GOOD = ("found", "between", "nearer")
 
 
-def run(seed: int, calls: int, *, first: int = 0, out=print) -> int:
-    """Ask so many times, and say how it went; returns how many answers are wrong."""
-    told, seconds, number = Counter(), [], first
-    while sum(told.values()) < calls:
-        case = paths.case_of(seed, number)
-        middle = package.oscillator(case.at(0.5 * sum(case.span)))
-        known = [p for p in jb.scan(middle, case.where, case.span) if p.status == Status.OK]
-        for point in known:
-            for guess in _guesses(case, float(point.value)):
-                osc = package.oscillator(case.at(guess))
-                begun = time.perf_counter()
-                found = jb.refine(point.condition, osc, where=case.where)
-                seconds.append(time.perf_counter() - begun)
-                verdict = _verdict(case, point, guess, found)
-                told[verdict, abs(round(guess - float(point.value), 9))] += 1
-                if verdict not in GOOD:
-                    out(f"path {number} {case.parameter} from {guess!r}: {verdict} {found!r}")
-                    out(f"    {point!r}\n    {case.oscillator!r}")
-        out(f"path {number}: {len(known)} points, {sum(told.values())} calls")
-        number += 1
-    for (verdict, away), count in sorted(told.items()):
-        out(f"{verdict} from {away:g}: {count}")
-    total, right = sum(told.values()), sum(n for (v, _), n in told.items() if v in GOOD)
-    median, longest = np.median(seconds), max(seconds)
-    out(f"{right} of {total} right ({100 * right / total:.2f}%), paths {first} to {number - 1}")
-    out(f"a call takes {1e3 * median:.0f} ms, compilation included at most {longest:.1f} s")
-    return sum(n for (verdict, _), n in told.items() if verdict == "wrong")
+def settings(options) -> dict:
+    return {}
+
+
+def numbers(options) -> range:
+    return range(options.runs)
+
+
+def outcome(options, number: int) -> Outcome:
+    """Ask beside all points of one path."""
+    case = paths.case_of(options.seed, number)
+    middle = package.oscillator(case.at(0.5 * sum(case.span)))
+    known = [p for p in jb.scan(middle, case.where, case.span) if p.status == Status.OK]
+    one = Outcome(f"{case.parameter}, {len(known)} points")
+    for point in known:
+        for guess in _guesses(case, float(point.value)):
+            osc = package.oscillator(case.at(guess))
+            begun = time.perf_counter()
+            found = jb.refine(point.condition, osc, where=case.where)
+            seconds = time.perf_counter() - begun
+            verdict = _verdict(case, point, guess, found)
+            one.counts[f"{verdict} from {abs(guess - float(point.value)):.3f}"] += 1
+            one.counts["calls"] += 1
+            one.counts["right"] += verdict in GOOD
+            one.largest["seconds"] = max(one.largest.get("seconds", 0.0), seconds)
+            if verdict not in GOOD:
+                told = one.wrong if verdict == "wrong" else one.notes
+                told.append(f"{verdict}: {point.condition} from {guess!r}: {found!r}")
+                told.append(f"    {point!r}\n    {case.oscillator!r}")
+    return one
+
+
+def said(counts, largest) -> list[str]:
+    lines = [f"{name}: {n}" for name, n in sorted(counts.items()) if " from " in name]
+    share = 100 * counts["right"] / max(counts["calls"], 1)
+    lines.append(f"{counts['right']} of {counts['calls']} calls right ({share:.2f}%)")
+    return [*lines, f"the longest, compilation included, {largest.get('seconds', 0.0):.1f} s"]
 
 
 def _guesses(case: paths.Case, value: float) -> list[float]:

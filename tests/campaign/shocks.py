@@ -11,8 +11,6 @@ For an oscillator at random, one of its attractors and a direction, four things 
   bisection: a difference of four oscillators beside, extrapolated.
 """
 
-import time
-from collections import Counter
 from math import inf
 
 import jax
@@ -23,6 +21,7 @@ import jaxbelt as jb
 
 from . import derivatives, engine, package
 from .cases import Case
+from .outcome import Outcome
 from .portraits import PATIENCE, _number_of, random_oscillator
 
 #: Errors of distances, and of derivatives relative to 1 and their size.
@@ -36,6 +35,8 @@ REPEATS = 1e-11
 #: Changes of parameters for the differences: the first with which nothing else becomes the nearest
 #: and the two differences that are extrapolated are as near to one another.
 STEPS, ALIKE = (3e-4, 3e-5, 3e-6), 1e-4
+#: Starts that are farther apart than this beside one another are of two ways.
+ELSEWHERE = 0.1
 #: Number of what goes to infinity; of what is told nowhere.
 INFINITY, UNKNOWN = 1000, -1
 
@@ -124,8 +125,8 @@ def _smaller_ones(osc, told: jb.FatalShock, end: int, direction: str) -> list[st
 
 def slope_error(osc, y0, direction: str, along) -> tuple[float, float] | None:
     """The error of the derivative along a direction of the parameters, and that of bisection; None
-    if beside the oscillator, on one side at least, another boundary is the nearest: at round
-    numbers, where things coincide."""
+    if beside the oscillator, on one side at least, another boundary is the nearest, or the same one
+    elsewhere: at round numbers, where things coincide, or where the motion is point-symmetric."""
 
     def shock(by):
         oscillator = package.oscillator(derivatives.moved(osc, along, by))
@@ -139,7 +140,8 @@ def slope_error(osc, y0, direction: str, along) -> tuple[float, float] | None:
     for step in STEPS:
         told = {by: shock(by) for by in (-step, -0.5 * step, 0.5 * step, step)}
         sorts = {(one.attractor, one.boundary, one.beyond) for one in (*told.values(), shock(0.0))}
-        if len(sorts) == 1:
+        apart = np.ptp([np.asarray(one.start) for one in told.values()], axis=0)
+        if len(sorts) == 1 and np.max(apart) < ELSEWHERE:
             values = {by: by_bisection(by, one) for by, one in told.items()}
             whole = (values[step] - values[-step]) / (2 * step)
             half = (values[0.5 * step] - values[-0.5 * step]) / step
@@ -163,36 +165,40 @@ def random_shock(rng: np.random.Generator):
             return kind, osc, y0, direction, shock
 
 
-def run(seed: int, runs: int, *, verbose: bool = False) -> int:
-    """Compare so many random shocks, and print what differs."""
-    rng = np.random.default_rng(seed)
-    began = time.monotonic()
-    counts, bad, largest, steepest = Counter(), 0, 0.0, 0.0
-    for number in range(runs):
-        kind, osc, y0, direction, told = random_shock(rng)
-        along = derivatives.directions(Case(osc, y0), rng)
-        wrong, error = differences(osc, y0, direction, told)
-        slopes = slope_error(osc, y0, direction, along)
-        if slopes is None:
-            counts["another boundary beside"] += 1
-        else:
-            off, size = slopes
-            if not off < SAME_SLOPE * (1 + size):
-                wrong.append(f"derivative off by {off} of {size}")
-            steepest = max(steepest, off / (1 + size))
-        largest = max(largest, error)
-        what = told.boundary.rpartition(" ")[0]
-        counts[f"{told.attractor.split()[0]} to {what}, {direction}"] += 1
-        if verbose:
-            print(
-                f"{number}, {kind}: {told.attractor} to {told.boundary}, {direction}, "
-                f"{float(told.distance):.9f} off by {error:.1e}, slope {slopes}",
-                flush=True,
-            )
-        if wrong:
-            bad += 1
-            print(f"\n{number}, {kind}, from {y0}, along {along}")
-            print(f"{package.oscillator(osc)!r}\n{told}", *wrong[:6], sep="\n", flush=True)
-    print(f"seed {seed}, {time.monotonic() - began:.0f} s, {dict(counts)}")
-    print(f"largest errors: {largest:.1e} of distances, {steepest:.1e} of derivatives; {bad} wrong")
-    return int(bool(bad))
+def settings(options) -> dict:
+    return {}
+
+
+def numbers(options) -> range:
+    return range(options.runs)
+
+
+def outcome(options, number: int) -> Outcome:
+    """Compare one random shock."""
+    rng = np.random.default_rng((options.seed, number))
+    kind, osc, y0, direction, told = random_shock(rng)
+    along = derivatives.directions(Case(osc, y0), rng)
+    wrong, error = differences(osc, y0, direction, told)
+    slopes = slope_error(osc, y0, direction, along)
+    one = Outcome(
+        f"{kind}: {told.attractor} to {told.boundary}, {direction}, "
+        f"{float(told.distance):.9f} off by {error:.1e}, slope {slopes}",
+        wrong,
+    )
+    one.largest["error of distances"] = error
+    if slopes is None:
+        one.counts["another boundary beside"] += 1
+    else:
+        off, size = slopes
+        one.largest["error of derivatives"] = off / (1 + size)
+        if not off < SAME_SLOPE * (1 + size):
+            wrong.append(f"derivative off by {off} of {size}")
+    what = told.boundary.rpartition(" ")[0]
+    one.counts[f"{told.attractor.split()[0]} to {what}, {direction}"] += 1
+    if wrong:
+        wrong.insert(0, f"from {y0}, along {along}\n{package.oscillator(osc)!r}\n{told}")
+    return one
+
+
+def said(counts, largest) -> list[str]:
+    return [f"{dict(counts)}", *(f"largest {name}: {x:.1e}" for name, x in largest.items())]
