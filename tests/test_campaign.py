@@ -288,7 +288,7 @@ def test_nothing_done_is_summed_up(module):
     "arguments",
     [
         "final --runs 300 --structure 0 --seed 11",
-        "attractors --runs 100 --structure 0 --seed 12",
+        pytest.param("attractors --runs 100 --structure 0 --seed 12", marks=pytest.mark.slow),
     ],
 )
 def test_small_campaign(arguments, capsys):

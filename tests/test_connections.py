@@ -55,6 +55,7 @@ def miss(sigma1, sigma0=-0.4, nu=NU):
     return slips((sigma0, 0.0), ((-nu, -1), (nu, 1)), extrema=1) - sigma1
 
 
+@pytest.mark.slow(first=True)
 def test_from_one_saddle_to_another():
     wanted = brentq(miss, 0.2, 0.4, xtol=1e-15)
     assert wanted == pytest.approx(0.2910103952526, abs=1e-12)  # known before there was this kind

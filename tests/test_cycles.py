@@ -226,7 +226,13 @@ CENTRES = {
 }
 
 
-@pytest.mark.parametrize("name", CENTRES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "one belt",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("opposite belts", "an edge")),
+    ],
+)
 def test_circles_around_a_centre_are_no_cycle(name):
     """Friction is constant below the speed of the belts, and nothing damps: every orbit with
     |x2| < nu closes, and outer ones stick until they are on the largest of these."""

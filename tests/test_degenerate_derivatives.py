@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import jaxbelt as jb
@@ -271,3 +272,28 @@ def test_the_order_of_belts_changes_no_derivative(name, by):
         direction = start, damping, tuple(alone[::order])
         found.append(package.derivatives([case], [direction], 1e-11, by)[0])
     np.testing.assert_allclose(*found, rtol=1e-7)
+
+
+@pytest.mark.parametrize("size", [1e4, 1e7])
+def test_derivatives_of_large_states(size):
+    """From the bend of the law the mass is off at once, so that the way there has thousands of
+    steps. By the variational equation, for there is no event yet."""
+    velocities, t1 = (0.3, 0.35), 1.0
+
+    def field(t, state):
+        x1, x2, d1, d2 = state
+        r = np.array(velocities) - x2
+        force, slope = 0.4 / (1 + 10 * r) + 0.6, 4 / (1 + 10 * r) ** 2
+        return [x2, -x1 - 0.5 * x2 + force.sum(), d2, -d1 + (slope.sum() - 0.5) * d2]
+
+    start = [size, 0.0, 1.0, 0.0]
+    atol = [1e-13 * size, 1e-13 * size, 1e-14, 1e-14]
+    known = solve_ivp(field, (0, t1), start, method="DOP853", rtol=1e-13, atol=atol).y[:, -1]
+
+    def end(x1):
+        osc = jb.presets.class_b(*velocities)
+        return jb.simulate(osc, jnp.stack([x1, 0.0]), t1, ts=jnp.array([t1])).ys[-1]
+
+    np.testing.assert_allclose(end(size), known[:2], rtol=1e-9)
+    for found in (jax.jacfwd(end)(size), jax.jacrev(end)(size)):
+        np.testing.assert_allclose(found, known[2:], rtol=1e-8)

@@ -124,6 +124,7 @@ def test_without_damping_all_starts_are_undecided():
     assert found.plot().get_legend_handles_labels()[1] == ["undecided"]
 
 
+@pytest.mark.slow(first=True)
 def test_a_steep_branch_is_one_and_a_jump_is_two():
     """The cycle grows with the load, by a factor of ten in two steps: from 3 to 10 it moves by more
     than a quarter of all. Where belt 0 changes its direction another cycle appears elsewhere."""

@@ -169,6 +169,7 @@ class Loop:
         return self.radius * np.column_stack([np.cos(angle), np.sin(angle)])
 
 
+@pytest.mark.slow(first=True)
 def test_drawn_cycles_pass_through_their_corners():
     osc = jb.presets.class_b(0.1, 0.35)
     cycle = jb.find_cycle(osc, (3.0, 0.0))

@@ -132,7 +132,9 @@ def test_pseudo_hopf_points_are_pseudo_foci():
     for nu0, sigma in curve.values:
         kinds = np.asarray(jb.equilibria(over_sigma(nu0, sigma)).kind).tolist()
         assert jb.EquilibriumKind.PSEUDO_FOCUS in kinds
-    assert [end.kind for end in curve.special] == ["BeltAtRest", "BoundaryHopf"]
+    assert [end.kind for end in curve.special] == [
+        "BeltAtRest", "DegeneratePseudoHopf", "BoundaryHopf"
+    ]  # fmt: skip
     # Where belt 0 is at rest the traces are those of mu' at 0 and 0.3, the pushes 1 - sigma and
     # sigma - 0.7: (1 - sigma) (0.25 - 0.5) + (sigma - 0.7) (4 - 0.5) = 0.
     sigma = (0.25 + 0.7 * 3.5) / (0.25 + 3.5)
