@@ -314,7 +314,7 @@ def test_signature_begins_after_the_longest_stick_phase(cycle):
     assert cycle.signature == ((stick, 1), (slip, 1), (stick, 0), (slip, 0))
 
 
-@pytest.mark.slow(first=True)
+@pytest.mark.slow
 def test_derivatives_with_two_belts():
     """Against Richardson differences of the oracle; 1e-8 relative is what those are good to."""
 

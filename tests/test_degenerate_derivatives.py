@@ -274,6 +274,7 @@ def test_the_order_of_belts_changes_no_derivative(name, by):
     np.testing.assert_allclose(*found, rtol=1e-7)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("size", [1e4, 1e7])
 def test_derivatives_of_large_states(size):
     """From the bend of the law the mass is off at once, so that the way there has thousands of

@@ -46,7 +46,7 @@ def test_they_can_be_drawn_and_written(dataset, tmp_path):
     assert xr.open_zarr(tmp_path / "a.zarr", consolidated=False).equals(found)
 
 
-@pytest.mark.slow(first=True)
+@pytest.mark.slow
 def test_two_cycles_with_one_sequence_of_events_are_two():
     """Both stick to belt 0 once a loop, to the left of where belt 1 begins and to the right."""
 

@@ -266,7 +266,9 @@ COMPOSITIONS = {
 
 
 #: Those that are in another one, or close to it.
-AT_NIGHT = "vmap grad", "grad vmap", "map grad", "vmap jacfwd"
+AT_NIGHT = (
+    "vmap grad", "grad vmap", "map grad", "vmap jacfwd", "jit jvp vmap", "jit grad vmap", "grad map"
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
