@@ -423,3 +423,15 @@ def test_an_orbit_that_all_but_touches_an_edge(offset):
     belts = (jb.Belt(0.2, law, 1.0392850493425 + offset, lower=0.7, upper=1.45), jb.Belt(0.85, law))
     cycle = jb.find_cycle(jb.Oscillator(0.25, belts), (1.45, 0.2))
     assert cycle.status == (Status.OK if offset > 0 else Status.EQUILIBRIUM)
+
+
+def test_a_cycle_beside_circles_that_hardly_sticks():
+    """The static limit is above kinetic friction by so little that it sticks for 1e-4 of its
+    period, by a distance of twice the excess; the rest is an arc of a circle."""
+    excess, nu = 1e-4, 0.3
+    osc = jb.Oscillator(0.0, (jb.Belt(nu, jb.Coulomb(0.5 + excess, 0.5)),))
+    cycle = jb.find_cycle(osc, (1.5, 0.0))
+    assert cycle.status == Status.OK
+    slips = 2 * np.pi - 2 * np.arctan2(excess, nu)
+    assert cycle.stick_durations[0] == pytest.approx(2 * excess / nu, rel=1e-9)
+    assert cycle.period == pytest.approx(2 * excess / nu + slips, rel=1e-12)

@@ -91,6 +91,9 @@ def is_neutral(
         sign = jnp.sign(r[4])
         reached = jnp.minimum(sign * r[0], sign * r[8]) < -slack
         forces = [belt.load * sign * belt.friction.mu(jnp.abs(one)) for one in r]
+        # Where a static limit beyond mu(0) holds the mass for a while it is a cycle of its own.
+        holds = belt.load * (belt.friction.static - belt.friction.mu(zero)) > 0
+        neutral = neutral & ~(touches & holds & (stuck > 0))
         kept = _range_of(forces) <= force_rounding(zero, belt.load)
         neutral = neutral & ~(touches & (reached | ~within & ~kept))
         always = [a + jnp.where(within, f, 0.0) for a, f in zip(always, forces, strict=True)]
