@@ -32,7 +32,7 @@ from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.rest import is_neutral
 from ..motion.simulate import Arcs
-from ..numerics.compiling import any_lane, each, jit
+from ..numerics.compiling import any_lane, each, in_groups, jit
 from ..numerics.newton import HOLDS
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
@@ -44,6 +44,7 @@ from .shooting import (
     Ends,
     Loop,
     admissible,
+    closed,
     closure,
     flow,
     loop_events,
@@ -265,6 +266,11 @@ def _first_failure(status: Array, fine: Array, code: Status) -> Array:
 @jit
 def _loop_reached(osc: Oscillator, y0: Array, size: int) -> tuple[Loop, Array, Array]:
     """The loop that the start leads to, in `size` arcs; how many it has, and a status."""
+    reached = in_groups(functools.partial(_loop_reached_by_lane, size=size))
+    return reached(*lax.stop_gradient((osc, y0)))
+
+
+def _loop_reached_by_lane(osc: Oscillator, y0: Array, size: int) -> tuple[Loop, Array, Array]:
     orbit = follow(osc, y0, MOST_ARCS)
     # Where there is no cycle the first arc still gives finite numbers to calculate with.
     loop = orbit.repeats, orbit.count
@@ -290,9 +296,9 @@ def _if_it_fits(status: Array, count: Array, size: int) -> Array:
 
 def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
     """The cycle that a loop nearly is, with as many integration steps as it takes."""
+    if not is_concrete((osc, loop, status)):
+        return _exactly_in_lanes(osc, loop, status)
     cycle, error = _polished(osc, loop, status, ARC_STEPS)
-    if not is_concrete((cycle, error, status)):
-        return _finer_where_needed(osc, loop, status, cycle, error)
     for steps in (FINE_STEPS, *FINER_STEPS):
         if int(status) != Status.OK or not _is_inexact(cycle, error):
             break
@@ -307,26 +313,44 @@ def _is_inexact(cycle: Cycle, error: Array) -> Array:
     return (cycle.status == Status.NO_CONVERGENCE) | (error > EXACT)
 
 
-def _finer_where_needed(osc: Oscillator, loop: Loop, status: Array, cycle: Cycle, error: Array):
+@jit
+def _exactly_in_lanes(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
     """`exactly` under a trace: a chain of FINE_STEPS, those that are not needed of length zero."""
+    solved = in_groups(_solved_in_lanes)(*lax.stop_gradient((osc, loop, status)))
+    mesh, z, iterations, status = solved
+    chain = Chain(loop.codes, loop.ends, mesh)
+    return cycle_of(osc, chain, closed(osc, chain, z), iterations, status)[0]
+
+
+def _solved_in_lanes(osc: Oscillator, loop: Loop, status: Array) -> tuple[Array, ...]:
+    """Its mesh, unknowns, number of Newton steps, and status."""
+    coarse, error = _polished(osc, loop, status, ARC_STEPS)
+    padding = [(0, 0)] * (coarse.chain.mesh.ndim - 1) + [(0, FINE_STEPS - ARC_STEPS)]
+    found = jnp.pad(coarse.chain.mesh, padding), *_solution_of(coarse)
+    inexact = _is_inexact(coarse, error) & (status == Status.OK)
 
     def fine():
-        return polish(osc, loop, status, FINE_STEPS)
+        # Nothing is solved for in lanes that need it not.
+        own_status = jnp.where(inexact, status, Status.NO_CONVERGENCE.value)
+        finer = polish(osc, loop, own_status, FINE_STEPS)
+        return select(inexact, (finer.chain.mesh, *_solution_of(finer)), found)
 
-    def same():
-        padding = [(0, 0)] * (cycle.chain.mesh.ndim - 1) + [(0, FINE_STEPS - ARC_STEPS)]
-        return eqx.tree_at(lambda c: c.chain.mesh, cycle, jnp.pad(cycle.chain.mesh, padding))
+    return lax.cond(any_lane(inexact), fine, lambda: found)
 
-    inexact = lax.stop_gradient(_is_inexact(cycle, error)) & (status == Status.OK)
-    return lax.cond(any_lane(inexact), fine, same)
+
+def _solution_of(cycle: Cycle) -> tuple[Array, Array, Array]:
+    return cycle.unknowns, cycle.iterations, cycle.status
 
 
 @jit
 def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[Cycle, Array]:
     """The cycle that a loop nearly is, and the error in its equations with halved steps."""
     chain, guess = meshed(lax.stop_gradient(osc), loop, steps)
+    # Where there is no loop nothing is solved for: a step that is not finite is the last one, and
+    # the other lanes of a batch need not wait.
+    guess = jnp.where(status == Status.OK, guess, jnp.nan)
     z, iterations = solve_closed(osc, chain, guess)
-    error, _ = closure(osc, chain.halved, z)
+    error, _ = closure(*lax.stop_gradient((osc, chain.halved, z)))
     status = _first_failure(status, error < HOLDS, Status.NO_CONVERGENCE)
     return cycle_of(osc, chain, z, iterations, status)[0], error
 

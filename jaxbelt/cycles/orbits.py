@@ -3,7 +3,8 @@
 An orbit is followed arc by arc, see `arcs`, every extremum the end of one.
 """
 
-import functools
+from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,7 +31,7 @@ from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.rest import settles
 from ..motion.arcs import ArcEnd, Ends, Signs, after_slip, signs_after, slip_arc, stick_arc
 from ..motion.integrators import STRIDE, Graded
-from ..numerics.compiling import one_kernel
+from ..numerics.compiling import any_lane, one_kernel
 from ..results import Status
 from .settling import AT_REST, has_repeated
 from .shooting import Loop
@@ -47,8 +48,9 @@ class Orbit(eqx.Module):
     """The arcs of an orbit, in rows up to `count`: entry, duration, codes, and what ended each.
 
     tops: x1 where an arc ended in a maximum of x1, else NaN. repeats: row of the top that the last
-    one repeats, else -1. y, code, signs: where it stands now. low, low_before: the smallest x1
-    since the last top, and between that and the one before.
+    one repeats, else -1. y, code, signs: where it stands now. top: that of the last arc;
+    top_before: the last one, NaN where there was none. low, low_before: the smallest x1 since then,
+    and between that and the one before. sticks: whether it has stuck since.
     """
 
     entries: Array
@@ -60,8 +62,11 @@ class Orbit(eqx.Module):
     y: Array
     code: Array
     signs: Signs
+    top: Array
+    top_before: Array
     low: Array
     low_before: Array
+    sticks: Array
     repeats: Array
     status: Array
     done: Array
@@ -79,7 +84,8 @@ def _arc(osc: Oscillator, orbit: Orbit, stride: float) -> ArcEnd:
     return lax.cond(mode.any_stuck, lambda: stick_arc(osc, mode, y, jnp.asarray(jnp.inf)), slip)
 
 
-def _next_arc(osc: Oscillator, orbit: Orbit, stride: float = STRIDE) -> Orbit:
+def _next_arc(osc: Oscillator, orbit: Orbit, stride: float) -> tuple[dict[str, Array], Orbit]:
+    """The next arc, a row of the columns by name; and the orbit after it, without that row."""
     codes = orbit.code
     stuck = mode_of(codes).any_stuck
     end = _arc(osc, orbit, stride)
@@ -90,17 +96,19 @@ def _next_arc(osc: Oscillator, orbit: Orbit, stride: float = STRIDE) -> Orbit:
     is_top = ~stuck & (orbit.signs[1] > 0) & ~end.mode.any_stuck & (end.signs[1] < 0)
     top = jnp.where(is_top, y_end[0], jnp.nan)
     amplitude = top - orbit.low
-    rows = jnp.arange(orbit.tops.size)
-    same = has_repeated(orbit.tops - top, amplitude)
-    same = same & jnp.all(orbit.codes == codes[None], axis=-1)
-    repeats = jnp.max(jnp.where(same, rows, -1))
-    before = jnp.max(jnp.where(jnp.isnan(orbit.tops), -1, rows))
-    # An orbit that sticks is on a cycle, however small: it repeats exactly.
-    stuck_since = jnp.any((rows > before) & jnp.any(orbit.codes == 0, axis=-1))
-    shrinks = amplitude < orbit.tops[before] - orbit.low_before
+
+    def repeated():
+        same = has_repeated(orbit.tops - top, amplitude)
+        same = same & jnp.all(orbit.codes == codes[None], axis=-1)
+        return jnp.max(jnp.where(same, jnp.arange(orbit.tops.size), -1))
+
+    # Nothing repeats where the arc ends in no top, which is NaN.
+    repeats = lax.cond(any_lane(is_top), repeated, lambda: jnp.asarray(-1))
+    shrinks = amplitude < orbit.top_before - orbit.low_before
     # Two arcs that both end at one top are no loop.
     loops = amplitude > force_rounding(y_end[0])
-    resting = is_top & loops & shrinks & (amplitude < AT_REST) & ~stuck_since
+    # An orbit that sticks is on a cycle, however small: it repeats exactly.
+    resting = is_top & ~orbit.sticks & loops & shrinks & (amplitude < AT_REST)
     resting = (resting | settles(osc, end.mode, *end.y)) & ~end.forever
 
     status = jnp.where(end.forever, Status.STUCK_FOREVER.value, Status.OK.value)
@@ -108,44 +116,64 @@ def _next_arc(osc: Oscillator, orbit: Orbit, stride: float = STRIDE) -> Orbit:
     status = jnp.where(end.failed, Status.NOT_SETTLED.value, status)
     status = jnp.where(resting, Status.EQUILIBRIUM.value, status)
     status = jnp.where(jnp.all(jnp.isfinite(y_end)), status, Status.NOT_FINITE.value)
-    own = rows == orbit.count
-
-    def put(column, value):  # column.at[i].set would be a scatter in batches
-        return jnp.where(own.reshape(-1, *[1] * value.ndim), value, column)
-
-    return Orbit(
-        entries=put(orbit.entries, orbit.y),
-        durations=put(orbit.durations, end.duration),
-        codes=put(orbit.codes, codes),
-        ends=put(orbit.ends, end.ended_by),
-        tops=put(orbit.tops, top),
+    row = dict(entries=orbit.y, durations=end.duration, codes=codes, ends=end.ended_by, tops=top)
+    return row, replace(
+        orbit,
         count=orbit.count + 1,
         y=y_end,
         code=code,
         signs=end.signs,
+        top=top,
+        top_before=jnp.where(is_top, top, orbit.top_before),
         low=jnp.where(is_top, y_end[0], jnp.minimum(orbit.low, y_end[0])),
         low_before=jnp.where(is_top, orbit.low, orbit.low_before),
+        sticks=~is_top & (orbit.sticks | stuck),
         repeats=repeats,
         status=status,
         done=(status != Status.OK) | (repeats >= 0),
     )
 
 
+def _followed_while(
+    going: Callable[[Orbit], Array], osc: Oscillator, start: Orbit, stride: float = STRIDE
+) -> Orbit:
+    """Arc after arc, from no arcs, as long as there is room and `going` says so."""
+
+    def unfinished(orbit):
+        return going(orbit) & (orbit.count < orbit.tops.size)
+
+    def turn(state):
+        number, orbit = state
+        row, after = _next_arc(osc, orbit, stride)
+        # Of the columns, long ones, one row is written, the same of all lanes in a batch.
+        own = unfinished(orbit)
+        columns = {name: getattr(orbit, name) for name in row}
+        written = {
+            name: lax.dynamic_update_index_in_dim(
+                column, jnp.where(own, row[name], column[number]), number, 0
+            )
+            for name, column in columns.items()
+        }
+        after = select(own, replace(after, **columns), orbit)
+        return number + 1, replace(after, **written)
+
+    def unfinished_lanes(state):
+        return any_lane(unfinished(state[1]))
+
+    return lax.while_loop(unfinished_lanes, turn, (jnp.zeros((), jnp.int32), start))[1]
+
+
 @one_kernel
 def _follow_from(osc: Oscillator, start: Orbit) -> Orbit:
-    def going(orbit):
-        return ~orbit.done & (orbit.count < orbit.tops.size)
-
-    return lax.while_loop(going, functools.partial(_next_arc, osc), start)
+    return _followed_while(lambda orbit: ~orbit.done, osc, start)
 
 
 @one_kernel
 def _to_top_from(osc: Oscillator, start: Orbit) -> Orbit:
     def going(orbit):
-        arrived = (orbit.count > 0) & ~jnp.isnan(_last_top(orbit))
-        return ~orbit.done & ~arrived & (orbit.count < orbit.tops.size)
+        return ~orbit.done & jnp.isnan(orbit.top)
 
-    return lax.while_loop(going, functools.partial(_next_arc, osc), start)
+    return _followed_while(going, osc, start)
 
 
 @one_kernel
@@ -155,15 +183,9 @@ def _finely_from(osc: Oscillator, start: Orbit, reach: Array) -> Orbit:
         # Where it comes to rest is known before it is there.
         away = jnp.hypot(orbit.y[0] - place_of_rest(osc, orbit), orbit.y[1])
         on_the_way = (orbit.status == Status.EQUILIBRIUM) & (away > SEEN_AT_REST)
-        return (~orbit.done | on_the_way) & near & (orbit.count < orbit.tops.size)
+        return (~orbit.done | on_the_way) & near
 
-    return lax.while_loop(going, lambda orbit: _next_arc(osc, orbit, FINE_STRIDE), start)
-
-
-def _last_top(orbit: Orbit) -> Array:
-    """x1 at the end of the last arc if that is a top, else NaN."""
-    last = jnp.arange(orbit.tops.size) == orbit.count - 1
-    return jnp.max(jnp.where(last, orbit.tops, -jnp.inf))
+    return _followed_while(going, osc, start, FINE_STRIDE)
 
 
 def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
@@ -183,7 +205,7 @@ def follow_to_top(osc: Oscillator, y0: Array, budget: int) -> tuple[Orbit, Array
     to none."""
     osc, y0 = lax.stop_gradient((osc, y0))
     orbit = _to_top_from(osc, _beginning(osc, y0, budget))
-    return orbit, jnp.where(orbit.count > 0, _last_top(orbit), jnp.nan)
+    return orbit, orbit.top
 
 
 def follow_finely(osc: Oscillator, mode: Mode, y0: Array, budget: int, reach: Array) -> Orbit:
@@ -232,8 +254,11 @@ def _standing(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: int
         y=y0,
         code=jnp.stack([jnp.asarray(c, dtype=y0.dtype) for c in mode.codes]),
         signs=signs_after(osc, mode, (y0[0], y0[1])),
+        top=jnp.full_like(y0[0], jnp.nan),
+        top_before=jnp.full_like(y0[0], jnp.nan),
         low=y0[0],
         low_before=jnp.full_like(y0[0], jnp.inf),
+        sticks=jnp.asarray(False),
         repeats=jnp.asarray(-1),
         status=status,
         done=status != Status.OK,

@@ -24,6 +24,7 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -48,7 +49,7 @@ from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, one_kernel
 from ..numerics.extrapolation import Scheme, increments, scheme
-from ..numerics.newton import HOLDS, Equations, solve
+from ..numerics.newton import HOLDS, Equations, apart, solution, solve
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
@@ -269,8 +270,15 @@ def _arc_equations(osc: Oscillator, codes, end, mesh, backwards, unknown: Array)
     equation more, a condition on the oscillator.
     """
     is_unused = end == Ends(len(osc.belts)).unused
-    follow = functools.partial(_followed, osc, codes, end, mesh, backwards)
-    return lax.cond(is_unused, lambda u: jnp.append(u, 0.0), follow, unknown)
+
+    def nothing(unknown):
+        return jnp.append(unknown, 0.0)
+
+    def followed(unknown):
+        out = _followed(osc, codes, end, mesh, backwards, unknown)
+        return jnp.where(is_unused, nothing(unknown), out)
+
+    return lax.cond(any_lane(~is_unused), followed, nothing, unknown)
 
 
 def _followed(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> Array:
@@ -318,12 +326,47 @@ def _equations_and_blocks(
             if along is None:
                 of_unknown = functools.partial(equations, osc)
                 return jax.jvp(of_unknown, (unknown,), (direction,))
-            moved = jax.tree.map(lambda slopes: jnp.sum(slopes * direction[3:]), along)
+            moved = jax.tree.map(functools.partial(_weighted, direction[3:]), along)
             return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
 
         return jax.vmap(column, out_axes=(None, -1))(jnp.eye(3 + more))
 
     return lax.map(one, (chain.codes, chain.ends, chain.mesh, backwards, z))
+
+
+def _weighted(weights: Array, slopes: Array) -> Array:
+    """The sum of the slopes, [k, ..], each times its weight."""
+    return jnp.sum(weights.reshape(-1, *[1] * (slopes.ndim - 1)) * slopes, axis=0)
+
+
+def _directions(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, Array]:
+    """A direction for each number of the oscillator that has a tangent, as an oscillator of arrays
+    [k, ..], and these tangents, [k]."""
+    moving, fixed = apart(osc, tangents)
+    numbers, unravel = jax.flatten_util.ravel_pytree(moving)
+    steady = jax.tree.map(jnp.zeros_like, fixed)
+    units = [eqx.combine(unravel(unit), steady) for unit in np.eye(numbers.size)]
+    none = jax.tree.map(lambda leaf: jnp.zeros((0, *jnp.shape(leaf))), osc)
+    along = jax.tree.map(lambda *leaves: jnp.stack(leaves), *units) if units else none
+    return along, jax.flatten_util.ravel_pytree(tangents)[0]
+
+
+@eqx.filter_custom_jvp
+def _arcs(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
+    """`_all_arc_equations`, with derivatives by columns, arc by arc: backwards through all steps
+    takes ten times as long."""
+    return _all_arc_equations(osc, chain, backwards, z)
+
+
+@_arcs.def_jvp
+def _(primals, tangents):
+    osc, chain, backwards, z = primals
+    along, weights = _directions(osc, tangents[0])
+    out, blocks = _equations_and_blocks(osc, along, chain, backwards, z)
+    change = jnp.sum(blocks[..., 3:] * weights, axis=-1)
+    if tangents[3] is not None:
+        change = change + jnp.sum(blocks[..., :3] * tangents[3][:, None], axis=-1)
+    return out, change
 
 
 def residual(
@@ -333,7 +376,7 @@ def residual(
     the miss of the tangent arcs, zero where there is none. backwards: arcs that are followed so,
     none unless told, [N]."""
     backwards = _none(z) if backwards is None else backwards
-    out = _all_arc_equations(osc, chain, backwards, z)
+    out = _arcs(osc, chain, backwards, z)
     return _mismatch(out, z, backwards), jnp.sum(out[:, 3])
 
 
@@ -393,6 +436,13 @@ class ClosedChain(Equations):
         value, _, blocks = residual_and_blocks(given, None, self.chain, z, self.backwards)
         return value.reshape(-1), jacobian(blocks[:, :3], self.backwards)
 
+    def moved(self, given: Oscillator, z: Array, tangents: Oscillator) -> tuple[Array, Array]:
+        along, weights = _directions(given, tangents)
+        _, _, blocks = residual_and_blocks(given, along, self.chain, z, self.backwards)
+        out = jnp.sum(blocks[..., 3:] * weights, axis=-1)
+        change = _mismatch(out, jnp.zeros_like(z), self.backwards)
+        return change.reshape(-1), jacobian(blocks[:, :3, :3], self.backwards)
+
 
 def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Array]:
     """The unknowns of a closed chain near a guess of them, [N, 3], differentiable with respect to
@@ -403,19 +453,39 @@ def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Ar
     """
     guess = lax.stop_gradient(guess)
     backwards = _magnifying(osc, chain, guess)
-    state = jnp.asarray([True, True, False])[None]
-    ends = backwards[:, None] & state
-    start = jnp.where(ends, jnp.roll(guess, -1, axis=0), guess)
+    start = _with_ends(backwards, guess)
     solved = solve(ClosedChain(chain, backwards), osc, start)
+    return _with_entries(osc, chain, backwards, solved.z), solved.iterations
+
+
+def closed(osc: Oscillator, chain: Chain, z: Array) -> Array:
+    """The unknowns z, which `solve_closed` has found, differentiable with respect to the
+    oscillator."""
+    z = lax.stop_gradient(z)
+    backwards = _magnifying(osc, chain, z)
+    solved = solution(ClosedChain(chain, backwards), osc, _with_ends(backwards, z))
+    return _with_entries(osc, chain, backwards, solved)
+
+
+def _with_ends(backwards: Array, z: Array) -> Array:
+    """The entries, or of arcs that are followed backwards the states in which they end."""
+    return jnp.where(_is_end(backwards), jnp.roll(z, -1, axis=0), z)
+
+
+def _with_entries(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
+    """The other way round, by following these arcs."""
 
     def entered():
-        out = _all_arc_equations(osc, chain, backwards, solved.z)
-        return jnp.where(ends, out[:, :3], solved.z)
+        return jnp.where(_is_end(backwards), _arcs(osc, chain, backwards, z)[:, :3], z)
 
-    z = lax.cond(any_lane(jnp.any(backwards)), entered, lambda: solved.z)
-    return z, solved.iterations
+    return lax.cond(any_lane(jnp.any(backwards)), entered, lambda: z)
 
 
+def _is_end(backwards: Array) -> Array:
+    return backwards[:, None] & jnp.asarray([True, True, False])[None]
+
+
+@eqx.filter_custom_jvp
 def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
     """The largest error in the shooting equations, and the determinant of the monodromy matrix with
     stick phases left out: exp of the mean divergence, and at each crossing of a boundary the
@@ -429,6 +499,18 @@ def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
     return jnp.max(errors), jnp.prod(factors)
 
 
+@closure.def_jvp
+def _(primals, tangents):
+    # By columns, as in `_arcs`; the error has no derivative.
+    osc, chain, z = primals
+    along, weights = _directions(osc, tangents[0])
+    _, by_z, by_osc = multiplier_and_slopes(osc, along, chain, z)
+    change = jnp.sum(by_osc * weights)
+    if tangents[2] is not None:
+        change = change + jnp.sum(by_z * tangents[2])
+    return closure(osc, chain, z), (None, change)
+
+
 @one_kernel
 def _errors_and_factors(osc: Oscillator, chain: Chain, following: Array, z: Array, entries: Array):
     """What each arc contributes to `closure`."""
@@ -439,6 +521,21 @@ def _errors_and_factors(osc: Oscillator, chain: Chain, following: Array, z: Arra
 
 
 def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, entry):
+    """The largest error in the equations of an arc, and what it contributes to the determinant."""
+
+    def followed(unknown, entry):
+        return _error_and_factor_of(osc, codes, end, mesh, following, unknown, entry)
+
+    def nothing(unknown, entry):
+        missed = jnp.append(unknown[:2] - entry, unknown[2])
+        return jnp.max(jnp.abs(missed)), jnp.ones(())
+
+    some = any_lane(end != Ends(len(osc.belts)).unused)
+    return lax.cond(some, followed, nothing, unknown, entry)
+
+
+def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, entry):
+    """`_error_and_factor` of an arc that is used."""
     back = _magnifies(osc, codes, unknown[:2], entry)
     start, target = select(back, (entry, unknown[:2]), (unknown[:2], entry))
     way = jnp.where(back, -1.0, 1.0)
@@ -467,9 +564,17 @@ def multiplier_and_slopes(
     entries = jnp.roll(z[:, :2], -1, axis=0)
     factors, slopes = _factors_and_slopes(osc, along, chain, following_codes(chain), z, entries)
     product = jnp.prod(factors)
-    slopes = slopes * (product / factors)[:, None]
+    slopes = slopes * _products_of_others(factors)[:, None]
     by_z = slopes[:, :3].at[:, :2].add(jnp.roll(slopes[:, 3:5], 1, axis=0))
     return product, by_z, jnp.sum(slopes[:, 5:], axis=0)
+
+
+def _products_of_others(factors: Array) -> Array:
+    """For each factor the product of all others."""
+    one = jnp.ones(1)
+    before = jnp.cumprod(jnp.concatenate([one, factors[:-1]]))
+    after = jnp.cumprod(jnp.concatenate([one, factors[:0:-1]]))[::-1]
+    return before * after
 
 
 @one_kernel
@@ -485,7 +590,7 @@ def _factors_and_slopes(osc, along: Oscillator, chain: Chain, following, z: Arra
             return _error_and_factor(osc, codes, end, mesh, following, unknown, entry)[1]
 
         def column(direction):
-            moved = jax.tree.map(lambda slopes: jnp.sum(slopes * direction[5:]), along)
+            moved = jax.tree.map(functools.partial(_weighted, direction[5:]), along)
             tangents = moved, direction[:3], direction[3:5]
             return jax.jvp(factor, (osc, unknown, entry), tangents)
 

@@ -109,31 +109,46 @@ class Equations(eqx.Module):
 
         return of_flat(flat), jax.jacfwd(of_flat)(flat)
 
+    def moved(self, given: Any, z: Any, tangents: Any) -> tuple[Array, Array]:
+        """How fast the equations change as `given` moves by the tangents, None where it does not,
+        [n]; and their derivatives with respect to the unknowns, [n, n]."""
+        moving, fixed = apart(given, tangents)
 
-@eqx.filter_custom_jvp
+        def of_moving(moving):
+            return self.residual(eqx.combine(moving, fixed), z)
+
+        _, change = jax.jvp(of_moving, (moving,), (tangents,))
+        _, matrix = self.linearized(given, z)
+        return change, matrix
+
+
+def apart(given: Any, tangents: Any) -> tuple[Any, Any]:
+    """The leaves that have a tangent, and those that have None."""
+    has_one = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
+    return eqx.partition(given, has_one)
+
+
 def solve(equations: Equations, given: Any, start: Any) -> Newton:
     """The solution of the equations near `start`, differentiable with respect to `given`.
 
     By the implicit function theorem, in forward and reverse mode. `start` is a guess: nothing
     depends on it.
     """
-    return newton(lambda z: equations.linearized(given, z), start)
+    still, start = lax.stop_gradient((given, start))
+    solved = lax.stop_gradient(newton(lambda z: equations.linearized(still, z), start))
+    return eqx.tree_at(lambda n: n.z, solved, solution(equations, given, solved.z))
 
 
-@solve.def_jvp
+@eqx.filter_custom_jvp
+def solution(equations: Equations, given: Any, z: Any) -> Any:
+    """z, which solves the equations; differentiable with respect to `given`, as `solve` is."""
+    return z
+
+
+@solution.def_jvp
 def _(primals, tangents):
-    equations, given, start = primals
-    solved = solve(equations, given, start)
-    moved, fixed = eqx.partition(
-        given, jax.tree.map(lambda t: t is not None, tangents[1], is_leaf=lambda t: t is None)
-    )
-    _, shift = jax.jvp(
-        lambda moved: equations.residual(eqx.combine(moved, fixed), solved.z),
-        (moved,),
-        (tangents[1],),
-    )
-    _, matrix = equations.linearized(given, solved.z)
-    _, unravel = jax.flatten_util.ravel_pytree(solved.z)
-    change = unravel(jnp.linalg.solve(matrix, -shift))
-    constant = jax.tree.map(lambda _: None, solved)
-    return solved, eqx.tree_at(lambda n: n.z, constant, change, is_leaf=lambda one: one is None)
+    equations, given, z = primals
+    z = solution(equations, given, z)  # for derivatives of derivatives
+    shift, matrix = equations.moved(given, z, tangents[1])
+    _, unravel = jax.flatten_util.ravel_pytree(z)
+    return z, unravel(jnp.linalg.solve(matrix, -shift))
