@@ -17,7 +17,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     presets         the published systems
     kernel/         lanes step events rounds
     motion/         integrators arcs sensitivities sampling batches runs smoothing simulate
-    cycles/         settling shooting orbits cycle attractors functionals
+    cycles/         chains settling shooting orbits cycle attractors functionals
     cycles/         backwards returns separatrices portrait
     cycles/         outlines nearest sides shocks
     sweeps/         marks observers moments along reducers attractor queue threads audit

@@ -14,8 +14,9 @@ from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
+from jaxbelt.cycles.chains import cut
 from jaxbelt.cycles.cycle import as_loop, polish
-from jaxbelt.cycles.shooting import cut
+from jaxbelt.numerics.compiling import GROUP
 
 START = (3.0, 0.0)
 EXTREMA = ("x1_min", "x1_max", "x2_min", "x2_max")
@@ -407,13 +408,26 @@ def test_square_root_law_near_the_hopf_point():
 
 @pytest.mark.slow(first=True)
 def test_a_batch_of_cycles_is_each_of_them():
-    nus = jnp.array([0.45, -0.3, 0.6])
-    batch = jax.jit(jax.vmap(lambda nu: jb.find_cycle(jb.presets.class_b(nu, 0.35), START)))(nus)
-    for i, nu in enumerate(nus[:2]):
-        one = jb.find_cycle(jb.presets.class_b(nu, 0.35), START)
-        assert batch.period[i] == pytest.approx(float(one.period), abs=1e-12)
-        assert batch.stick_durations[i] == pytest.approx(one.stick_durations.tolist(), abs=1e-12)
-    assert batch.status.tolist() == [Status.OK, Status.OK, Status.EQUILIBRIUM]
+    """Of more than a group, some of which have no cycle, or need shorter steps; derivatives too."""
+
+    def of(nu):
+        cycle = jb.find_cycle(jb.presets.class_b(nu, 0.35), START)
+        numbers = jnp.stack([cycle.period, cycle.stick_durations[0], cycle.multiplier])
+        return numbers, (numbers, cycle.status)
+
+    nus = jnp.linspace(-0.35, 0.65, GROUP + 37)
+    slopes, (numbers, status) = jax.jit(jax.vmap(jax.jacrev(of, has_aux=True)))(nus)
+    assert set(status.tolist()) > {Status.OK.value, Status.EQUILIBRIUM.value}
+    alone = jax.jit(jax.jacfwd(of, has_aux=True))
+    for i in range(0, len(nus), 7):
+        nu = nus[i]
+        one_slopes, (one_numbers, one_status) = alone(nu)
+        assert status[i] == one_status
+        np.testing.assert_allclose(numbers[i], one_numbers, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(slopes[i], one_slopes, rtol=1e-8, atol=1e-9)
+        found = jb.find_cycle(jb.presets.class_b(float(nu), 0.35), START)
+        assert status[i] == found.status
+        np.testing.assert_allclose(numbers[i, 0], found.period, rtol=1e-11)
 
 
 @pytest.mark.parametrize("offset", [-1e-7, -1e-9, 1e-9, 1e-7])

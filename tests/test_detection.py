@@ -18,7 +18,7 @@ from jaxbelt import EventKind, Status
 from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import distinct
-from jaxbelt.cycles.shooting import loop_events
+from jaxbelt.cycles.chains import loop_events
 from jaxbelt.model.parameters import leaf_index, vary
 
 

@@ -16,7 +16,7 @@ from matplotlib.colors import to_hex
 
 import jaxbelt as jb
 from jaxbelt.commands.map import cells_along, write_cells
-from jaxbelt.cycles.shooting import Loop
+from jaxbelt.cycles.chains import Loop
 from jaxbelt.numerics.continuation import Stop
 from jaxbelt.numerics.spacing import evenly_spaced
 from jaxbelt.plotting.categories import COLOURS, _colour_of_kind

@@ -33,8 +33,9 @@ from jaxtyping import Array
 
 from ..checks import is_concrete, number, require, require_value
 from ..cycles.attractors import place_of
+from ..cycles.chains import SIZES, Chain, Loop, cut
 from ..cycles.cycle import Cycle, cycle_of
-from ..cycles.shooting import SIZES, Chain, Loop, cut, meshed
+from ..cycles.shooting import meshed
 from ..model.oscillator import Oscillator
 from ..model.variations import Family, Variation
 from ..motion.arcs import Ends

@@ -36,11 +36,12 @@ from jaxtyping import Array
 
 from ..checks import is_concrete, require_value
 from ..cycles.attractors import extent
+from ..cycles.chains import SIZES, Chain, Loop, cut
 from ..cycles.cycle import cycle_of
 from ..cycles.orbits import Orbit, follow_from, place_of_rest
 from ..cycles.returns import side_pulls
 from ..cycles.separatrices import mode_onward
-from ..cycles.shooting import SIZES, Chain, Loop, admissible, cut, flow, meshed
+from ..cycles.shooting import admissible, flow, meshed
 from ..model.modes import edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family

@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..cycles.chains import SIZES, Chain, Loop
 from ..cycles.cycle import Cycle
-from ..cycles.shooting import SIZES, Chain, Loop, meshed
+from ..cycles.shooting import meshed
 from ..model.modes import any_of, mode_of, stick_limit
 from ..model.oscillator import Belt, Oscillator
 from ..motion.arcs import Ends

@@ -22,8 +22,8 @@ import numpy as np
 
 from ..activity import announced, tell
 from ..checks import as_whole, require
+from ..cycles.chains import Loop, cut
 from ..cycles.cycle import Cycle, polish
-from ..cycles.shooting import Loop, cut
 from ..model.equilibria import candidates
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator

@@ -20,9 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..cycles.chains import SIZES, Chain, Loop, following_codes
 from ..cycles.cycle import separating_loop
 from ..cycles.settling import AT_REST
-from ..cycles.shooting import SIZES, Chain, Loop, end_guard, following_codes, meshed
+from ..cycles.shooting import end_guard, meshed
 from ..model.modes import edges, mode_acceleration, mode_of, onset_position
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends

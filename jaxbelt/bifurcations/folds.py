@@ -14,8 +14,9 @@ from jax import lax
 from jaxtyping import Array
 
 from ..cycles.attractors import sticks
+from ..cycles.chains import Chain
 from ..cycles.orbits import first_loop, loop_of
-from ..cycles.shooting import Chain, closure, meshed, multiplier_and_slopes
+from ..cycles.shooting import closure, meshed, multiplier_and_slopes
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..cycles.chains import Loop, following_codes
 from ..cycles.orbits import Orbit, before_stick_ends, follow, last_loop, loop_of
-from ..cycles.shooting import Loop, following_codes
 from ..model.equilibria import Equilibria, candidates
 from ..model.modes import STUCK, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator

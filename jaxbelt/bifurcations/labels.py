@@ -5,7 +5,7 @@ from collections.abc import Hashable
 from typing import NamedTuple
 
 from ..cycles.attractors import Itinerary, sticks
-from ..cycles.shooting import Loop
+from ..cycles.chains import Loop
 from ..model.equilibria import EquilibriumKind
 from ..model.events import events_of
 from ..results import EventKind

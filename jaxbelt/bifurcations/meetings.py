@@ -24,7 +24,8 @@ import numpy as np
 from jaxtyping import Array
 
 from ..checks import is_concrete, require_value
-from ..cycles.shooting import SIZES, Chain, Loop, meshed
+from ..cycles.chains import SIZES, Chain, Loop
+from ..cycles.shooting import meshed
 from ..model.modes import Mode, any_of, capacity, contact, edges, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..results import Status

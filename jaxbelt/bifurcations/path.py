@@ -32,9 +32,9 @@ from ..cycles.attractors import (
     sticks,
     without_idle,
 )
+from ..cycles.chains import SIZES, Loop, cut
 from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
 from ..cycles.settling import AT_REST
-from ..cycles.shooting import SIZES, Loop, cut
 from ..model.equilibria import candidates
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index

@@ -21,8 +21,9 @@ from jax import lax
 from jaxtyping import Array
 
 from ..cycles.attractors import extent
+from ..cycles.chains import Chain, Loop
 from ..cycles.cycle import Cycle, cycle_of
-from ..cycles.shooting import Chain, Loop, jacobian, meshed, residual, residual_and_blocks
+from ..cycles.shooting import jacobian, meshed, residual, residual_and_blocks
 from ..model.modes import edge_guards, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family

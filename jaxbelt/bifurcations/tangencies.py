@@ -23,8 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..cycles.chains import SIZES, Chain, Loop
 from ..cycles.orbits import Orbit, follow, last_loop, loop_of
-from ..cycles.shooting import SIZES, Chain, Loop, admissible, meshed, trace_of
+from ..cycles.shooting import admissible, meshed, trace_of
 from ..model.modes import STUCK, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family

@@ -21,8 +21,9 @@ from ..model.events import of_one_loop
 from ..model.modes import ABOVE
 from ..model.oscillator import Oscillator
 from ..results import Status
+from .chains import Chain, Loop, modes_of
 from .cycle import Cycle
-from .shooting import Chain, Ends, Loop, modes_of
+from .shooting import Ends
 
 if TYPE_CHECKING:
     import xarray

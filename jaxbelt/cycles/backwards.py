@@ -15,8 +15,8 @@ from jaxtyping import Array
 
 from ..model.oscillator import Oscillator
 from ..results import Status
+from .chains import Chain, Loop, cut
 from .cycle import Cycle, exactly
-from .shooting import Chain, Loop, cut
 
 
 class BackwardCycle(Cycle):

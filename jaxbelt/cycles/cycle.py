@@ -36,22 +36,9 @@ from ..numerics.compiling import any_lane, each, in_groups, jit
 from ..numerics.newton import HOLDS
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
+from .chains import SIZES, Chain, Loop, loop_events, room_of
 from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
-from .shooting import (
-    ARC_STEPS,
-    SIZES,
-    Chain,
-    Ends,
-    Loop,
-    admissible,
-    closed,
-    closure,
-    flow,
-    loop_events,
-    meshed,
-    room_of,
-    solve_closed,
-)
+from .shooting import ARC_STEPS, Ends, admissible, closed, closure, flow, meshed, solve_closed
 
 if TYPE_CHECKING:
     import pandas
@@ -236,10 +223,11 @@ def cycle_of(
     they hold: an arc that was solved for backwards may magnify what is followed forwards a hundred
     thousand times.
     """
-    forwards, slope = closure(osc, chain, z)
+    residual, slope = closure(osc, chain, z)
     if error is None:
-        error = forwards
-        status = _first_failure(status, error < HOLDS, Status.NO_CONVERGENCE)
+        status = _first_failure(status, residual < HOLDS, Status.NO_CONVERGENCE)
+    else:
+        residual = error
     status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
     # An equilibrium solves the equations, too, with arcs of any duration.
@@ -251,8 +239,8 @@ def cycle_of(
         chain=chain,
         # A product, so that derivatives are NaN, too.
         unknowns=z * known(1.0, jnp.nan),
-        multiplier=known(jnp.where(sticks, 0.0, slope), jnp.nan),
-        residual=known(error, jnp.nan),
+        multiplier=jnp.where(sticks, 0.0, slope) * known(1.0, jnp.nan),
+        residual=known(residual, jnp.nan),
         iterations=iterations,
         status=status,
     )

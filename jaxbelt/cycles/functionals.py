@@ -15,8 +15,9 @@ from ..checks import require_one_of, require_value
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
+from .chains import Chain
 from .cycle import Cycle
-from .shooting import Chain, flow
+from .shooting import flow
 
 _COORDINATES = {"x1": 0, "x2": 1}
 

@@ -33,8 +33,8 @@ from ..motion.arcs import ArcEnd, Ends, Signs, after_slip, signs_after, slip_arc
 from ..motion.integrators import STRIDE, Graded
 from ..numerics.compiling import any_lane, one_kernel
 from ..results import Status
+from .chains import Loop
 from .settling import AT_REST, has_repeated
-from .shooting import Loop
 
 #: Arcs that an orbit is followed for before it is given up: some 100 loops.
 MOST_ARCS = 1024

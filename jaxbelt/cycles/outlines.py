@@ -35,9 +35,10 @@ from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from .backwards import BackwardCycle
+from .chains import Chain, Loop
 from .cycle import Cycle
 from .separatrices import Separatrix, tangencies
-from .shooting import Chain, Loop, end_guard, flow, meshed, solve_closed
+from .shooting import end_guard, flow, meshed, solve_closed
 
 #: Integration steps in an arc of a separatrix.
 STEPS = 16

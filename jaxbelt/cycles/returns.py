@@ -34,10 +34,10 @@ from ..numerics.compiling import each, jit
 from ..results import Status
 from .attractors import distinct
 from .backwards import forwards, reversed_in_time, solved
+from .chains import SIZES, Loop
 from .cycle import Cycle
 from .orbits import before_stick_ends, follow_to_top, loop_of, place_of_rest
 from .settling import AT_REST
-from .shooting import SIZES, Loop
 
 #: Tops that are evaluated in one batch.
 TOPS_AT_ONCE = 64

@@ -54,9 +54,10 @@ from ..numerics.compiling import each, jit
 from ..results import Status, draw
 from ..tables import table_of
 from .backwards import reversed_in_time
+from .chains import Loop
 from .orbits import follow_finely, place_of_rest
 from .returns import side_pulls
-from .shooting import Loop, flow, meshed, trace_of
+from .shooting import flow, meshed, trace_of
 
 if TYPE_CHECKING:
     import pandas

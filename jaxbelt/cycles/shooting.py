@@ -19,8 +19,7 @@ forward and reverse mode and under `jax.vmap`.
 """
 
 import functools
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -30,7 +29,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..model.events import Signature, events_of
 from ..model.modes import (
     Mode,
     boundary_guards,
@@ -49,85 +47,13 @@ from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, one_kernel
 from ..numerics.extrapolation import Scheme, increments, scheme
-from ..numerics.newton import HOLDS, Equations, apart, solution, solve
+from ..numerics.newton import HOLDS, Equations, moving_and_fixed, solution, solve
+from .chains import Chain, Loop, following_codes
 
-#: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
-SIZES = (16, 32, 64)
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 ARC_STEPS = 8
 #: An arc magnifies, if its end moves so much faster than its entry.
 MAGNIFIED = 1e4
-
-
-class Chain(eqx.Module):
-    """A closed sequence of arcs: contact codes [arcs, belts], ends [arcs], and step fractions.
-
-    ends: numbers of `arcs.Ends`. An unused arc is of duration zero.
-    """
-
-    codes: Array
-    ends: Array
-    mesh: Array
-
-    @property
-    def used(self) -> Array:
-        return self.ends != Ends(self.codes.shape[-1]).unused
-
-    @property
-    def halved(self) -> "Chain":
-        """The same chain with every integration step halved."""
-        return replace(self, mesh=jnp.repeat(self.mesh / 2, 2, axis=-1))
-
-
-class Loop(eqx.Module):
-    """One loop of an orbit, arc by arc, padded: codes and ends of a `Chain`, and a guess of its
-    unknowns, the entry states and durations."""
-
-    codes: Array
-    ends: Array
-    entries: Array
-    durations: Array
-
-    @property
-    def used(self) -> Array:
-        return self.ends != Ends(self.codes.shape[-1]).unused
-
-    @property
-    def exits(self) -> Array:
-        """The states at the ends of the arcs; after the last used one comes the first."""
-        last = jnp.arange(self.ends.size) == jnp.sum(self.used) - 1
-        return jnp.where(last[:, None], self.entries[0], jnp.roll(self.entries, -1, axis=0))
-
-
-def modes_of(loop: Chain | Loop) -> np.ndarray:
-    """The contact codes of the arcs of one loop, [arcs, belts], without those that are unused."""
-    codes, ends = np.asarray(loop.codes), np.asarray(loop.ends)
-    return codes[ends != Ends(codes.shape[-1]).unused].astype(int)
-
-
-def loop_events(loop: Chain | Loop) -> Signature:
-    """The events of one loop, (kind, belt) each; for EDGE the lowest belt that comes or goes."""
-    return events_of(modes_of(loop))
-
-
-def following_codes(chain: Chain | Loop) -> Array:
-    """Contact codes of the arc after each; after the last used one comes the first."""
-    following = jnp.roll(chain.codes, -1, axis=0)
-    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
-    return jnp.where(last[:, None], chain.codes[0], following)
-
-
-def room_of(arcs: int) -> int:
-    """The size of a chain that so many arcs, SIZES[-1] at most, are given."""
-    return next(size for size in SIZES if size >= arcs)
-
-
-def cut(loops: Sequence[Loop], *, more: int = 0) -> list[Loop]:
-    """The loops, known ones, with no more room than the longest of them needs, and some more."""
-    unused = Ends(loops[0].codes.shape[-1]).unused
-    longest = max(int(np.sum(np.asarray(loop.ends) != unused)) for loop in loops)
-    room = slice(room_of(min(longest + more, SIZES[-1])))
-    return [jax.tree.map(lambda leaf: leaf[room], loop) for loop in loops]
 
 
 # Of order 12 for the arcs, of order 4 for placing the steps.
@@ -339,31 +265,31 @@ def _weighted(weights: Array, slopes: Array) -> Array:
     return jnp.sum(weights.reshape(-1, *[1] * (slopes.ndim - 1)) * slopes, axis=0)
 
 
-def _directions(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, Array]:
+def _directions_of(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, Array]:
     """A direction for each number of the oscillator that has a tangent, as an oscillator of arrays
     [k, ..], and these tangents, [k]."""
-    moving, fixed = apart(osc, tangents)
+    moving, fixed = moving_and_fixed(osc, tangents)
     numbers, unravel = jax.flatten_util.ravel_pytree(moving)
     steady = jax.tree.map(jnp.zeros_like, fixed)
-    units = [eqx.combine(unravel(unit), steady) for unit in np.eye(numbers.size)]
+    units = [eqx.combine(unravel(unit), steady) for unit in jnp.eye(numbers.size)]
     none = jax.tree.map(lambda leaf: jnp.zeros((0, *jnp.shape(leaf))), osc)
     along = jax.tree.map(lambda *leaves: jnp.stack(leaves), *units) if units else none
     return along, jax.flatten_util.ravel_pytree(tangents)[0]
 
 
 @eqx.filter_custom_jvp
-def _arcs(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
+def _by_columns(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
     """`_all_arc_equations`, with derivatives by columns, arc by arc: backwards through all steps
     takes ten times as long."""
     return _all_arc_equations(osc, chain, backwards, z)
 
 
-@_arcs.def_jvp
+@_by_columns.def_jvp
 def _(primals, tangents):
     osc, chain, backwards, z = primals
-    along, weights = _directions(osc, tangents[0])
+    along, weights = _directions_of(osc, tangents[0])
     out, blocks = _equations_and_blocks(osc, along, chain, backwards, z)
-    change = jnp.sum(blocks[..., 3:] * weights, axis=-1)
+    change = blocks[..., 3:] @ weights
     if tangents[3] is not None:
         change = change + jnp.sum(blocks[..., :3] * tangents[3][:, None], axis=-1)
     return out, change
@@ -376,7 +302,7 @@ def residual(
     the miss of the tangent arcs, zero where there is none. backwards: arcs that are followed so,
     none unless told, [N]."""
     backwards = _none(z) if backwards is None else backwards
-    out = _arcs(osc, chain, backwards, z)
+    out = _by_columns(osc, chain, backwards, z)
     return _mismatch(out, z, backwards), jnp.sum(out[:, 3])
 
 
@@ -437,9 +363,9 @@ class ClosedChain(Equations):
         return value.reshape(-1), jacobian(blocks[:, :3], self.backwards)
 
     def moved(self, given: Oscillator, z: Array, tangents: Oscillator) -> tuple[Array, Array]:
-        along, weights = _directions(given, tangents)
+        along, weights = _directions_of(given, tangents)
         _, _, blocks = residual_and_blocks(given, along, self.chain, z, self.backwards)
-        out = jnp.sum(blocks[..., 3:] * weights, axis=-1)
+        out = blocks[..., 3:] @ weights
         change = _mismatch(out, jnp.zeros_like(z), self.backwards)
         return change.reshape(-1), jacobian(blocks[:, :3, :3], self.backwards)
 
@@ -476,7 +402,7 @@ def _with_entries(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> 
     """The other way round, by following these arcs."""
 
     def entered():
-        return jnp.where(_is_end(backwards), _arcs(osc, chain, backwards, z)[:, :3], z)
+        return jnp.where(_is_end(backwards), _by_columns(osc, chain, backwards, z)[:, :3], z)
 
     return lax.cond(any_lane(jnp.any(backwards)), entered, lambda: z)
 
@@ -501,14 +427,14 @@ def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
 
 @closure.def_jvp
 def _(primals, tangents):
-    # By columns, as in `_arcs`; the error has no derivative.
+    # By columns, as in `_by_columns`; the error has no derivative.
     osc, chain, z = primals
-    along, weights = _directions(osc, tangents[0])
+    along, weights = _directions_of(osc, tangents[0])
     _, by_z, by_osc = multiplier_and_slopes(osc, along, chain, z)
     change = jnp.sum(by_osc * weights)
     if tangents[2] is not None:
         change = change + jnp.sum(by_z * tangents[2])
-    return closure(osc, chain, z), (None, change)
+    return closure(osc, chain, z), (jnp.zeros(()), change)
 
 
 @one_kernel

@@ -112,7 +112,7 @@ class Equations(eqx.Module):
     def moved(self, given: Any, z: Any, tangents: Any) -> tuple[Array, Array]:
         """How fast the equations change as `given` moves by the tangents, None where it does not,
         [n]; and their derivatives with respect to the unknowns, [n, n]."""
-        moving, fixed = apart(given, tangents)
+        moving, fixed = moving_and_fixed(given, tangents)
 
         def of_moving(moving):
             return self.residual(eqx.combine(moving, fixed), z)
@@ -122,7 +122,7 @@ class Equations(eqx.Module):
         return change, matrix
 
 
-def apart(given: Any, tangents: Any) -> tuple[Any, Any]:
+def moving_and_fixed(given: Any, tangents: Any) -> tuple[Any, Any]:
     """The leaves that have a tangent, and those that have None."""
     has_one = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
     return eqx.partition(given, has_one)
