@@ -16,6 +16,7 @@ import oracle
 import oracle_cycles
 import pytest
 import xarray as xr
+from compilations import compilations
 from typer.testing import CliRunner
 
 import jaxbelt as jb
@@ -162,7 +163,7 @@ class Sticks:
     """How often a run stuck to belt 1, and when something happened last."""
 
     def init(self, osc, x1, x2):
-        return jnp.zeros(()), jnp.zeros(())
+        return jnp.zeros(()), jnp.asarray(0.0)  # of a strong type, and of a weak one
 
     def update(self, state, event):
         stick = (event.kind == jb.EventKind.STICK) & (event.belt == 1)
@@ -239,7 +240,9 @@ def test_progress_is_shown_where_it_is_wanted(capsys):
 
 
 def test_a_reducer_sees_every_event(dataset):
-    reduced = final(AXES, observe=Sticks())
+    with compilations() as compiled:
+        reduced = final(AXES, observe=Sticks())
+    assert compiled.count("jit(advance)") == 1
     for i, nu0 in enumerate(NU0.tolist()):
         run = oracle.simulate(oracle.class_b(nu0, 0.35), (3.0, 0.0), SPAN)
         sticks = [event for event in run.events if (event.kind, event.belt) == ("STICK", 1)]
