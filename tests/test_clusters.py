@@ -158,6 +158,7 @@ def test_impossible_arguments_are_named(tmp_path, monkeypatch, options, message)
 # --- processes of a job array ---------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_parts_of_a_store_are_done_apart_and_the_last_finishes_it(tmp_path, whole):
     path = tmp_path / "a.zarr"
     part = again(path, blocks=(3, 9))

@@ -409,6 +409,7 @@ def test_curve_of_an_unstable_cycle_that_touches_the_edge(diagram):
     assert Stop.STOPPED in grazing.ends
 
 
+@pytest.mark.slow(first=True)
 def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
     """Of belt 1 alone to the right of the edge, and of both belts to the left of it."""
     where, span = (sigma1, nu1), ((0.05, 2.5), (0.1, 0.3))

@@ -198,6 +198,7 @@ def two_cycles(nu):
     return jb.presets.class_d(nu, 0.5073, -0.49694, 0.61855)
 
 
+@pytest.mark.slow(first=True)
 def test_two_cycles_with_one_sequence_of_events():
     """One of them begins as it just touches the edge of belt 1, where belt 0 would hold it back."""
     path = ParameterPath(two_cycles(-0.06341), nu0, (-0.3, -0.02))

@@ -99,6 +99,7 @@ def test_its_amplitude_goes_to_infinity(changes, amplitude):
     assert jb.portrait(one_belt(0.0025, **changes)).unstable == ()
 
 
+@pytest.mark.slow(first=True)
 def test_nothing_comes_from_infinity():
     """Friction that grows without bounds, as r^2 and to all sides; and none at all."""
     point = jb.refine(CONDITION, lambda damping: one_belt(damping, QUADRATIC), at=-0.1)

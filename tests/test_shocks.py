@@ -55,15 +55,20 @@ def test_traced_oscillators_are_refused():
 # --- slow ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow(first=True)
-def test_derivatives_are_those_of_the_closed_form():
+@pytest.mark.parametrize(
+    "of",
+    [
+        pytest.param(jax.grad, marks=pytest.mark.slow(first=True)),
+        pytest.param(jax.jacfwd, marks=pytest.mark.slow),
+    ],
+)
+def test_derivatives_are_those_of_the_closed_form(of):
     """mu(nu1) - sigma, and mu'(0.3) = -0.4 10 / 4^2."""
 
     def distance(nu0, nu1, sigma):
         return jb.minimal_fatal_shock(jb.presets.class_c(nu0, nu1, sigma), (0.7, 0.0)).distance
 
-    for of in (jax.grad, jax.jacfwd):
-        assert of(distance, (0, 1, 2))(*SADDLE) == pytest.approx((0.0, -0.25, -1.0), abs=1e-14)
+    assert of(distance, (0, 1, 2))(*SADDLE) == pytest.approx((0.0, -0.25, -1.0), abs=1e-14)
 
 
 @pytest.mark.slow

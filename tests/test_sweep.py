@@ -138,6 +138,7 @@ def test_derivatives_of_a_cycle_equal_differences_of_the_oracle():
         np.testing.assert_allclose(swept[f"d_{name}_d_nu0"], there(name), atol=1e-7)
 
 
+@pytest.mark.slow(first=True)
 def test_what_is_undecided_tells_of_no_attractor(tmp_path):
     """A loop that is under way when time is up is none; and what is NaN has no derivative of 0."""
     arguments = jb.presets.class_a, {"nu0": [0.0, 0.1, 0.2, 0.45]}
