@@ -106,6 +106,7 @@ def test_points_of_another_system():
     assert fold.value == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_a_law_with_a_jump():
     """The stick phase at the tangency has a duration; beyond, the cycle is gone."""
 
@@ -175,6 +176,7 @@ def test_grazing_from_where_newtons_method_alone_does_not_find_it(offset):
     assert abs(point.value - expected) <= point.error + 1e-11 < 1e-8
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("nu", [0.483, 0.4867, 0.52])
 def test_fold_of_cycles(nu):
     """Two cycles that do not stick meet; from guesses on either side, up to 0.02 away."""

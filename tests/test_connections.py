@@ -70,6 +70,7 @@ def test_from_one_saddle_to_another():
     assert orbit[-1] == pytest.approx((wanted, 0.0), abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_scan_finds_what_changes_no_attractor():
     (point,) = jb.scan(over, span=(0.2, 0.4), resolution=12)
     assert point.condition == jb.SaddleConnection(1, to=0)

@@ -20,6 +20,7 @@ def told() -> jb.Portrait:
     return jb.portrait(jb.presets.class_c(*SADDLE))
 
 
+@pytest.mark.slow(first=True)
 def test_shock_to_a_saddle_is_in_closed_form(told):
     shock = jb.minimal_fatal_shock(told, (0.7, 0.0))
     assert int(shock.status) == jb.Status.OK
@@ -32,6 +33,7 @@ def test_shock_to_a_saddle_is_in_closed_form(told):
     assert row["distance"] == pytest.approx(0.7, abs=1e-15) and row["t"] == 0
 
 
+@pytest.mark.slow(first=True)
 def test_shocks_of_the_velocity_are_longer_and_point_symmetric(told):
     right, left = (jb.minimal_fatal_shock(told, (x1, 0.0), direction="x2") for x1 in (0.7, -0.7))
     assert float(right.distance) > 0.7 and float(right.shock[0]) == pytest.approx(0, abs=1e-12)
