@@ -247,7 +247,7 @@ def test_a_batch_of_hopf_points_and_the_slope_of_their_curve():
     np.testing.assert_allclose(slopes, -0.1 * zetas**-1.5, rtol=1e-12)
 
 
-@pytest.mark.slow(first=True)
+@pytest.mark.slow
 def test_a_batch_of_folds_and_the_slope_of_their_curve():
     def fold(nu1):
         osc = jb.presets.class_b(0.53 - 2.4 * (nu1 - 0.35), nu1)

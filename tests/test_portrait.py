@@ -195,8 +195,13 @@ def test_orbits_that_touch_a_boundary_with_a_jump_bound_basins():
     assert portraits.differences(osc, told)[0] == []
 
 
-@pytest.mark.slow(first=True)
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    "sign",
+    [
+        pytest.param(1.0, marks=pytest.mark.slow(first=True)),
+        pytest.param(-1.0, marks=pytest.mark.slow),
+    ],
+)
 def test_an_edge_cuts_off_what_only_the_static_limit_holds(sign):
     """Found by a campaign: the orbit that comes to the corner of edge and boundary, above which the
     mass comes to be held and below which it slips away, bounds basins."""
