@@ -366,6 +366,7 @@ def test_a_fold_of_cycles_beyond_which_there_is_nothing():
         assert sticks == (value > crossing.value)
 
 
+@pytest.mark.slow(first=True)
 def test_a_change_that_no_condition_explains_is_reported():
     """Belt 0 at rest holds the mass up to 1, but slipping on it takes 0.7 only: the part of the
     segment of equilibria below -0.7 holds but attracts nothing."""

@@ -380,6 +380,7 @@ def test_formulations_converge_to_the_exact_one(formulation, width):
     assert np.all((orders > lowest) & (orders < 1.05))
 
 
+@pytest.mark.slow(first=True)
 def test_the_smooth_formulation_has_derivatives():
     def end(nu):
         osc = jb.presets.class_b(nu, 0.35)

@@ -195,6 +195,7 @@ def test_an_observable_is_one_class():
     assert np.all(found.extent >= 3.0 - 1e-12) and list(found) == ["extent", "status"]
 
 
+@pytest.mark.slow(first=True)
 def test_every_dataset_can_be_drawn_and_written(tmp_path, dataset):
     attractors = jb.sweep(jb.presets.class_b, AXES, observe="attractor")
     basins = jb.basins(jb.presets.class_b(0.45, 0.35), x1=[1.36, 3.0], x2=[0.0]).dataset
@@ -375,6 +376,7 @@ def test_more_runs_than_are_counted_are_refused_at_once():
         threads.run(program, [], np.zeros, 2**30, print, **settings)
 
 
+@pytest.mark.slow(first=True)
 def test_several_derivatives_are_each_by_itself(monkeypatch):
     """Also where the runs are in many chunks, and a long one ends in a later chunk."""
     monkeypatch.setattr(threads, "CHUNK", 96)
