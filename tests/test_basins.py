@@ -182,6 +182,7 @@ def test_impossible_boxes_are_named(arguments, message):
         jb.basin_stability(belt_drive(1.4), key=jax.random.key(0), **arguments)
 
 
+@pytest.mark.slow(first=True)
 def test_command_writes_a_picture_and_a_table(tmp_path):
     belt = "1.4,law=stribeck,static=1,kinetic=0.5,stribeck_velocity=0.5"
     words = f"basins --belt {belt} --damping 0.1 --x1 -1 2 --x2 0 1 --points 5 --starts 50"
