@@ -31,6 +31,10 @@ in_turn = pytest.mark.parametrize(
         pytest.param("class_b", marks=pytest.mark.slow),
     ],
 )
+#: Moments of one sort each; derivatives are those of the sums over all of them.
+at_night = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+)
 #: No events: the belts are faster than the mass ever is.
 FAST = (jb.presets.class_b, {"nu0": [4.0, 5.0], "nu1": [6.0]})
 #: A sweep at 1e-11 is compared with an oracle at 1e-13: errors add up over a run.
@@ -106,7 +110,7 @@ Largest, Energy, Points, Samples = (PAGE[n] for n in ("Largest", "Energy", "Poin
 height = PAGE["height"]
 
 
-@in_turn
+@at_night
 def test_extrema_are_those_of_the_oracle(name):
     found = swept(CASES[name], Largest(10.0))
     for i, run in enumerate(runs(name)):
@@ -116,7 +120,7 @@ def test_extrema_are_those_of_the_oracle(name):
         np.testing.assert_allclose(found.largest[i, 0], late, **CLOSE)
 
 
-@in_turn
+@at_night
 def test_integrals_are_those_of_the_oracle(name):
     found = swept(CASES[name], Energy())
     for i, run in enumerate(runs(name)):
@@ -129,7 +133,7 @@ def test_integrals_are_those_of_the_oracle(name):
     np.testing.assert_allclose(found.fed - found.lost, found.gained, **CLOSE)
 
 
-@in_turn
+@at_night
 def test_points_of_a_section_are_those_of_the_oracle(name):
     found = swept(CASES[name], Points())
     for i, motion in enumerate(map(along, runs(name))):
@@ -144,7 +148,7 @@ def test_points_of_a_section_are_those_of_the_oracle(name):
         np.testing.assert_allclose(found.above[i, 0], above, rtol=0, atol=1e-7)
 
 
-@in_turn
+@at_night
 def test_states_at_fixed_times_are_those_of_the_oracle(name):
     found = swept(CASES[name], Samples())
     assert np.all(found["count"] == 33)
@@ -179,7 +183,7 @@ class Everything:
         return asked | {"low": low, "high": high, "rise": rise, "way": way}
 
 
-@in_turn
+@at_night
 def test_extrema_of_the_velocity_last_through_stick_phases(name):
     found = swept(CASES[name], Everything())
     assert np.all(found.times == 2)
@@ -255,7 +259,7 @@ class Moments:
 
 
 @in_turn
-def test_derivatives_are_differences_of_the_oracle(name):
+def test_sums_and_their_derivatives_are_those_of_the_oracle(name):
     """Of sections, extrema, fixed times, events and integrals, through stick phases and edges."""
     make, axes = CASES[name]
     options = dict(y0=Y0, observe=Moments(), derivatives="nu0", **TIGHT)
@@ -278,6 +282,9 @@ def test_derivatives_are_differences_of_the_oracle(name):
         return np.array([*np.ravel(sums), square[SPAN]])
 
     for i, nu0 in enumerate((NU0[0], NU0[2])):
+        values = [*found.sums[i, 0].values.ravel(), found.square[i, 0].item()]
+        # Of some dozen moments, each of them CLOSE.
+        np.testing.assert_allclose(values, expected(nu0), rtol=0, atol=1e-7)
         differences, error = oracle.richardson(expected, nu0, 2e-3, levels=3)
         ours = [*found.d_sums_d_nu0[i, 0].values.ravel(), found.d_square_d_nu0[i, 0].item()]
         # As good as the differences are, or to 1e-7 of the largest.
@@ -287,12 +294,19 @@ def test_derivatives_are_differences_of_the_oracle(name):
 
 
 @pytest.mark.slow(first=True)
-def test_a_smooth_motion_gives_results_too():
-    points, found = swept(FAST, Points()), swept(FAST, Energy())
+def test_a_smooth_motion_passes_a_section():
+    points = swept(FAST, Points())
     for i, nu0 in enumerate(FAST[1]["nu0"]):
         motion = smooth_run(nu0)
         ups = roots(lambda t, motion=motion: height(None, *motion(t)))[::2]
         assert points["count"][i, 0] == len(ups)
+
+
+@pytest.mark.slow
+def test_a_smooth_motion_has_integrals():
+    found = swept(FAST, Energy())
+    for i, nu0 in enumerate(FAST[1]["nu0"]):
+        motion = smooth_run(nu0)
         square = integral(lambda t, motion=motion: motion(t)[0] ** 2, [0.0, SPAN])
         np.testing.assert_allclose(found.square[i, 0], square, rtol=1e-8)
     np.testing.assert_allclose(found.fed - found.lost, found.gained, **CLOSE)

@@ -119,6 +119,7 @@ def test_a_belt_at_rest_holds_what_comes_to_it():
     assert found.fractions["stuck"] == 1.0
 
 
+@pytest.mark.slow(first=True)
 def test_labels_tell_attractors_of_one_kind_apart():
     """Cycles by where they are; the most frequent first; undecided is -1."""
     dataset = jb.sweep(lambda: belt_drive(1.4), {"x1": [0.0] * 5, "x2": [2.0]}, observe="attractor")
@@ -130,7 +131,7 @@ def test_labels_tell_attractors_of_one_kind_apart():
     assert names[0] == "cycle that sticks to belt 0" and len(cycles) == 1
 
 
-@pytest.mark.slow(first=True)
+@pytest.mark.slow
 def test_two_cycles_with_one_sequence_of_events_are_two():
     """Both stick to belt 0 once a loop, to the left of where belt 1 begins and to the right."""
     osc = jb.presets.class_d(-0.06341, 0.5073, -0.49694, 0.61855)
@@ -181,6 +182,7 @@ def test_impossible_boxes_are_named(arguments, message):
         jb.basin_stability(belt_drive(1.4), key=jax.random.key(0), **arguments)
 
 
+@pytest.mark.slow(first=True)
 def test_command_writes_a_picture_and_a_table(tmp_path):
     belt = "1.4,law=stribeck,static=1,kinetic=0.5,stribeck_velocity=0.5"
     words = f"basins --belt {belt} --damping 0.1 --x1 -1 2 --x2 0 1 --points 5 --starts 50"

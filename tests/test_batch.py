@@ -232,6 +232,7 @@ def test_attractors_equal_the_cycles_of_the_oracle():
         assert here.signature == signature_word(expected.signature)
 
 
+@pytest.mark.slow(first=True)
 def test_a_cycle_that_attracts_weakly_is_not_the_way_to_it():
     """A loop, of multiplier 0.994, moves by less than the tolerance long before the end."""
     gain = 1e-3

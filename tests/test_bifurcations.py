@@ -106,6 +106,7 @@ def test_points_of_another_system():
     assert fold.value == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_a_law_with_a_jump():
     """The stick phase at the tangency has a duration; beyond, the cycle is gone."""
 
@@ -175,6 +176,7 @@ def test_grazing_from_where_newtons_method_alone_does_not_find_it(offset):
     assert abs(point.value - expected) <= point.error + 1e-11 < 1e-8
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("nu", [0.483, 0.4867, 0.52])
 def test_fold_of_cycles(nu):
     """Two cycles that do not stick meet; from guesses on either side, up to 0.02 away."""
@@ -245,7 +247,7 @@ def test_a_batch_of_hopf_points_and_the_slope_of_their_curve():
     np.testing.assert_allclose(slopes, -0.1 * zetas**-1.5, rtol=1e-12)
 
 
-@pytest.mark.slow(first=True)
+@pytest.mark.slow
 def test_a_batch_of_folds_and_the_slope_of_their_curve():
     def fold(nu1):
         osc = jb.presets.class_b(0.53 - 2.4 * (nu1 - 0.35), nu1)

@@ -287,7 +287,9 @@ def test_nothing_done_is_summed_up(module):
 @pytest.mark.parametrize(
     "arguments",
     [
-        "final --runs 300 --structure 0 --seed 11",
+        pytest.param(
+            "final --runs 300 --structure 0 --seed 11", marks=pytest.mark.slow(first=True)
+        ),
         pytest.param("attractors --runs 100 --structure 0 --seed 12", marks=pytest.mark.slow),
     ],
 )

@@ -147,6 +147,7 @@ def test_axes_by_name():
         make(**{"nu0": 0.2, "belts[1].load": -1.0})
 
 
+@pytest.mark.slow(first=True)
 def test_sweep_of_belts_of_ones_own(tmp_path):
     out = tmp_path / "own.nc"
     arguments = ["nu0=0.1:0.5:3", "belts[1].load=0.5:1:2", "--damping", "0.4", "--omega", "1.1"]

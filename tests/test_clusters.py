@@ -53,6 +53,7 @@ def again(path, **options):
 # --- Dask -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_workers_do_what_the_sweep_does(client, tmp_path, whole, capsys):
     path = tmp_path / "a.zarr"
     found = again(path, executor=client, progress=True)
@@ -110,6 +111,7 @@ def test_killed_workers_cost_their_blocks_and_nothing_else(client, tmp_path, mon
     assert told["killed"] == 3
 
 
+@pytest.mark.slow(first=True)
 def test_an_interrupt_leaves_the_workers_free(client, tmp_path):
     """A block that would take minutes: its worker hears of the interrupt, too."""
     axes = {"nu0": AXES["nu0"][:4], "nu1": [0.35]}

@@ -19,6 +19,15 @@ STEEP, STRONG = ("conti", 1.0, 0.6, 5.0, 0.0), ("conti", 1.0, 0.6, 2.0, 0.0)
 MILD, WEAK = ("conti", 1.0, 0.5, 10.0, 0.0), ("conti", 0.5, 0.25, 10.0, 0.0)
 SOFT, DRY = ("conti", 1.0, 0.4, 1.0, 0.0), ("coulomb", 1.2, 0.6)
 STRUCTURES = [((law, law), edges) for law, edges in (("conti", 0), ("conti", 1), ("coulomb", 1))]
+#: Each takes a compilation. The second has all that the first has, and an edge.
+structures = pytest.mark.parametrize(
+    "structure",
+    [
+        pytest.param(STRUCTURES[0], marks=pytest.mark.slow(first=True)),
+        STRUCTURES[1],
+        pytest.param(STRUCTURES[2], marks=pytest.mark.slow(first=True)),
+    ],
+)
 
 
 def at_onset(shift):
@@ -171,7 +180,7 @@ def test_every_case_is_run():
     assert sum(len(wanted(structure)) for structure in STRUCTURES) == len(CASES)
 
 
-@pytest.mark.parametrize("structure", STRUCTURES)
+@structures
 def test_runs_on_round_numbers(structure):
     cases = wanted(structure)
     for case, answer in zip(cases, package.finals(cases, 1e-8)):
@@ -182,7 +191,7 @@ def test_runs_on_round_numbers(structure):
         assert verdict in compare.GOOD, (verdict, package.as_code(case), mine)
 
 
-@pytest.mark.parametrize("structure", STRUCTURES)
+@structures
 def test_labels_of_round_numbers(structure):
     cases = wanted(structure)
     for case, answer in zip(cases, package.labels(cases, 1e-8)):

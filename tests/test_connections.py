@@ -70,6 +70,7 @@ def test_from_one_saddle_to_another():
     assert orbit[-1] == pytest.approx((wanted, 0.0), abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_scan_finds_what_changes_no_attractor():
     (point,) = jb.scan(over, span=(0.2, 0.4), resolution=12)
     assert point.condition == jb.SaddleConnection(1, to=0)
@@ -85,6 +86,7 @@ def test_two_connections_at_one_value():
     assert [one.value for one in points] == pytest.approx([wanted] * 2, abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_back_to_the_same_saddle():
     """An unstable cycle ends there, and with it the basin within."""
 
@@ -128,18 +130,24 @@ def test_point_symmetry():
     assert mirrored.value == pytest.approx(-float(point.value), abs=1e-13)
 
 
-@pytest.mark.slow(first=True)
-def test_derivatives_and_batches():
-    def value(nu, sigma0=-0.4):
-        return jb.refine(jb.SaddleConnection(1), lambda s: over(s, sigma0, nu), at=0.3).value
+def connected(nu, sigma0=-0.4):
+    """The edge at which there is the connection."""
+    return jb.refine(jb.SaddleConnection(1), lambda s: over(s, sigma0, nu), at=0.3).value
 
+
+@pytest.mark.slow(first=True)
+def test_derivative():
     wanted, _ = oracle.richardson(
         lambda nu: brentq(lambda s: miss(s, nu=nu), 0.2, 0.4, xtol=1e-15), NU, 1e-3
     )
-    assert jax.grad(value)(NU) == pytest.approx(float(wanted), abs=1e-8)
+    assert jax.grad(connected)(NU) == pytest.approx(float(wanted), abs=1e-8)
+
+
+@pytest.mark.slow
+def test_a_batch_is_each_of_them():
     edges = jnp.array([-0.42, -0.4, -0.38])
-    values = jax.vmap(lambda sigma0: value(NU, sigma0))(edges)
-    alone = [float(value(NU, float(sigma0))) for sigma0 in edges]
+    values = jax.vmap(lambda sigma0: connected(NU, sigma0))(edges)
+    alone = [float(connected(NU, float(sigma0))) for sigma0 in edges]
     np.testing.assert_allclose(values, alone, rtol=0, atol=1e-13)
 
 

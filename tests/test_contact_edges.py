@@ -80,6 +80,7 @@ def test_points_of_overlapping_belts(diagram):
         assert point.status == Status.OK and point.error < 1e-11
 
 
+@pytest.mark.slow(first=True)
 def test_branches_go_on_beyond_them(diagram):
     """A branch of equilibria, one of attracting cycles; the unstable cycle shrinks to the edge."""
     rests, attracting, repelling = diagram.branches
@@ -375,6 +376,7 @@ def test_slope_of_a_corner():
     assert slope == pytest.approx(difference, rel=1e-7) and jnp.isfinite(found)
 
 
+@pytest.mark.slow(first=True)
 def test_curves(diagram):
     """Where the rows lie exactly is known: in closed form, or from the oracle."""
     where, span = (sigma1, nu1), ((0.05, 2.5), (0.1, 0.3))
@@ -409,6 +411,7 @@ def test_curve_of_an_unstable_cycle_that_touches_the_edge(diagram):
     assert Stop.STOPPED in grazing.ends
 
 
+@pytest.mark.slow(first=True)
 def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
     """Of belt 1 alone to the right of the edge, and of both belts to the left of it."""
     where, span = (sigma1, nu1), ((0.05, 2.5), (0.1, 0.3))

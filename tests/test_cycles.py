@@ -230,7 +230,7 @@ CENTRES = {
 @pytest.mark.parametrize(
     "name",
     [
-        "one belt",
+        pytest.param("one belt", marks=pytest.mark.slow(first=True)),
         *(pytest.param(name, marks=pytest.mark.slow) for name in ("opposite belts", "an edge")),
     ],
 )

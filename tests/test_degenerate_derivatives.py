@@ -84,9 +84,8 @@ def test_an_edge_without_force_where_x2_is_extreme():
     np.testing.assert_allclose(found, [[cos, sin], [-sin, cos]], atol=1e-10)
 
 
-@pytest.mark.parametrize(
-    "by", [pytest.param("simulate", marks=pytest.mark.slow(first=True)), "sweep"]
-)
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("by", ["simulate", "sweep"])
 def test_a_start_that_sticks_moves_with_its_belt(by):
     """x2 of the start is a number, but the mass has the belt's velocity at once."""
     t1, y0 = 2.0, (1.0, 0.2)  # slip onset is at 3.3

@@ -198,6 +198,7 @@ def two_cycles(nu):
     return jb.presets.class_d(nu, 0.5073, -0.49694, 0.61855)
 
 
+@pytest.mark.slow(first=True)
 def test_two_cycles_with_one_sequence_of_events():
     """One of them begins as it just touches the edge of belt 1, where belt 0 would hold it back."""
     path = ParameterPath(two_cycles(-0.06341), nu0, (-0.3, -0.02))
@@ -365,6 +366,7 @@ def test_a_fold_of_cycles_beyond_which_there_is_nothing():
         assert sticks == (value > crossing.value)
 
 
+@pytest.mark.slow(first=True)
 def test_a_change_that_no_condition_explains_is_reported():
     """Belt 0 at rest holds the mass up to 1, but slipping on it takes 0.7 only: the part of the
     segment of equilibria below -0.7 holds but attracts nothing."""

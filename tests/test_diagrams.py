@@ -256,6 +256,7 @@ def cells():
     return jb.region_map(jb.presets.class_b, {"nu0": NU0S, "nu1": NU1S}, lines=0)
 
 
+@pytest.mark.slow(first=True)
 def test_cells_are_named_as_the_oracle_finds(cells):
     rng = np.random.default_rng(7)
     for i, j in zip(rng.integers(0, 12, 14), rng.integers(0, 11, 14), strict=True):
@@ -265,6 +266,7 @@ def test_cells_are_named_as_the_oracle_finds(cells):
     assert cells.curves == () and "12 x 11 cells" in repr(cells)
 
 
+@pytest.mark.slow(first=True)
 def test_an_example_lies_in_its_region(cells):
     for name in cells.regions:
         assert expected_name(*cells.example(name)) == name
@@ -274,6 +276,7 @@ def test_an_example_lies_in_its_region(cells):
         cells.example("7")
 
 
+@pytest.mark.slow(first=True)
 def test_cycles_in_the_examples_are_those_of_the_names(cells):
     """Each once, though several starts lead to it; with the belts that it sticks to."""
     for name, cycles in cells.cycles.items():

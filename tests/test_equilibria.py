@@ -250,6 +250,7 @@ BRUTE_FORCE = [
 ]
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("p", BRUTE_FORCE)
 def test_long_runs_end_where_the_stable_equilibria_are(p):
     osc = oracle.class_d(*p)
@@ -464,6 +465,7 @@ def test_derivatives_of_a_fixed_point_are_those_of_the_formulas():
         )
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_of_a_pseudo_focus_agree_with_differences():
     def first_row(p):
         point = jb.equilibria(jb.presets.class_c(*p))[0]

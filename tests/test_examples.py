@@ -31,6 +31,8 @@ attractors basin_fractions basin_stability basins bifurcation_curve bifurcation_
 distance_to distance_to_basin_boundary find_cycle fit minimal_fatal_shock orbit_diagram plot_basins
 portrait region_map scan
 """.split()
+#: Long, and the only examples of what they show.
+FIRST = "Arcs", "explore", "simulate"
 
 
 def examples(path: Path) -> str:
@@ -71,8 +73,9 @@ def test_the_page_on_scaling_runs():
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=pytest.mark.slow if page in SLOW else [])
+        pytest.param(page, marks=pytest.mark.slow(first=True) if page in FIRST else slow)
         for page, path in sorted(PAGES.items())
+        for slow in [pytest.mark.slow if page in SLOW else []]
         if examples(path)
     ],
 )

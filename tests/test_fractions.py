@@ -47,6 +47,7 @@ def close_figures():
     plt.close("all")
 
 
+@pytest.mark.slow(first=True)
 def test_attractors_keep_their_names_and_are_where_they_are(found):
     values, met = found.values, found.fractions > 0
     assert found.attractors[:2] == ("equilibrium 0", "cycle 0") and values[14] == 0
@@ -72,6 +73,7 @@ def test_attractors_keep_their_names_and_are_where_they_are(found):
     assert np.all(np.isnan(found.x1_min[~met])) and np.all(found.undecided == 0)
 
 
+@pytest.mark.slow(first=True)
 def test_fractions_add_up_and_have_their_errors(found):
     np.testing.assert_allclose(np.sum(found.fractions, axis=1), 1.0, rtol=0, atol=1e-14)
     variance = found.fractions * (1 - found.fractions) / 200
@@ -86,6 +88,7 @@ def test_fractions_add_up_and_have_their_errors(found):
     )
 
 
+@pytest.mark.slow(first=True)
 def test_each_value_has_starts_of_its_own_and_compiles_nothing(found):
     with compilations() as compiled:
         # One attractor alone.

@@ -59,11 +59,12 @@ def test_without_damping():
             {"lower": -1.0, "upper": 1.5},
             -2 / np.pi * 0.05 * 2.5,
         ),
-        (
+        pytest.param(
             jb.Conti(1.0, 0.6, 10.0, 0.05),
             0.5,
             {"lower": 0.0, "upper": 2.0},
             -2 / np.pi * 0.0125 * 2,
+            marks=pytest.mark.slow(first=True),
         ),
         pytest.param(*(Viscous(1.0, 0.02), 1.0, {"load": 2.0}, -0.04), marks=SLOW),
         pytest.param(*(Viscous(1.0, 0.02), 0.5, {"lower": 0.4}, -0.005), marks=SLOW),
@@ -99,6 +100,7 @@ def test_its_amplitude_goes_to_infinity(changes, amplitude):
     assert jb.portrait(one_belt(0.0025, **changes)).unstable == ()
 
 
+@pytest.mark.slow(first=True)
 def test_nothing_comes_from_infinity():
     """Friction that grows without bounds, as r^2 and to all sides; and none at all."""
     point = jb.refine(CONDITION, lambda damping: one_belt(damping, QUADRATIC), at=-0.1)

@@ -61,6 +61,7 @@ def fitted(motion):
     return result, told, x1, sigma
 
 
+@pytest.mark.slow(first=True)
 def test_fit_recovers_what_made_the_record(fitted):
     result, told, x1, sigma = fitted
     assert result.status == Status.OK, result
@@ -82,6 +83,7 @@ def test_fit_recovers_what_made_the_record(fitted):
     np.testing.assert_allclose(width, 2 * 1.959964 * result.standard_errors, rtol=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_standard_errors_are_those_of_the_oracles_derivatives(fitted):
     """The Gauss-Newton matrix at the estimate, from Richardson differences of SciPy's motion."""
     result, _, _, sigma = fitted

@@ -71,7 +71,7 @@ def test_an_exchange_from_either_side(guess):
         # By the pushes left of both edges, between them (none, then both), right of both.
         ((0.35, 0.6), 0.75, 0, 1),
         ((0.35, 0.2), 0.6, 1, 0),
-        ((0.35, 0.2), 0.72, 0, 0),
+        pytest.param((0.35, 0.2), 0.72, 0, 0, marks=pytest.mark.slow(first=True)),
     ],
 )
 def test_what_rests_there_begins_or_ceases_to_be(nu, edge, before, after):

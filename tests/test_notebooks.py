@@ -8,17 +8,15 @@ import matplotlib.pyplot as plt
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
-#: Quick to compile.
-QUICK = ("02_sweeps",)
+#: What the others show takes minutes, and has tests of its own.
+BY_DAY = ("01_first_steps", "02_sweeps", "06_atlas")
 
 
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive:UserWarning")
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(
-            path, marks=[] if path.stem in QUICK else pytest.mark.slow(first=True), id=path.stem
-        )
+        pytest.param(path, marks=pytest.mark.slow(first=path.stem in BY_DAY), id=path.stem)
         for path in NOTEBOOKS
     ],
 )

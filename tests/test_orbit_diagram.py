@@ -62,6 +62,7 @@ def points(found, row, start=0):
     return distinct(both[~np.isnan(both[:, 0])])
 
 
+@pytest.mark.slow(first=True)
 def test_extrema_are_those_of_an_independent_integration(diagram):
     assert diagram.values.tolist() == pytest.approx([-0.5, -0.025, 0.45], abs=1e-15)
     assert np.all(diagram.status == jb.Status.OK)
@@ -79,6 +80,7 @@ def test_extrema_are_those_of_an_independent_integration(diagram):
     assert diagram.x2[2, 1, 0] == 0 and np.isnan(diagram.period[2, 1])
 
 
+@pytest.mark.slow(first=True)
 def test_another_span_is_the_same_question_and_compiles_nothing(diagram):
     with compilations() as compiled:
         there = diagram.over((-0.2, 0.2))
@@ -96,6 +98,7 @@ def test_another_span_is_the_same_question_and_compiles_nothing(diagram):
     assert len(table) == 6 and set(table.kind) == {"undecided"} and table.x1.isna().all()
 
 
+@pytest.mark.slow(first=True)
 def test_table_has_a_row_for_each_point(diagram):
     table = diagram.table()
     assert table.columns.tolist() == ["value", "start", "kind", "period", "x1", "x2"]

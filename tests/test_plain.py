@@ -14,12 +14,13 @@ PART = (
     "test_simulate.py::test_error_falls_with_the_tolerance",
     "test_cycles.py::test_sticking_cycle_is_that_of_the_oracle",
     "test_coincidences.py::test_audits_find_nothing[final]",
-    "test_variations.py::test_hopf_points_in_closed_form",
+    "test_variations.py::test_hopf_points_in_closed_form[half]",
     "test_processes.py::test_a_forked_child_is_told_to_be_spawned",
 )
 #: More of the same.
 MORE = (
     "test_coincidences.py::test_audits_find_nothing[attractor]",
+    "test_variations.py::test_hopf_points_in_closed_form",
     "test_processes.py::test_a_spawned_child_computes",
     "test_processes.py::test_a_child_that_was_forked_before_jax_was_used_computes",
 )

@@ -34,6 +34,7 @@ def class_d() -> jb.Portrait:
     return jb.portrait(jb.presets.class_d(*TWO_CYCLES))
 
 
+@pytest.mark.slow(first=True)
 def test_attractors_are_told_apart_by_where_they_are(class_d):
     assert int(class_d.status) == jb.Status.OK and not len(class_d.gaps)
     left, right = class_d.cycles
@@ -44,6 +45,7 @@ def test_attractors_are_told_apart_by_where_they_are(class_d):
     assert class_d.unstable == () and not class_d.escapes
 
 
+@pytest.mark.slow(first=True)
 def test_saddles_and_their_separatrices(class_d):
     kinds = [jb.EquilibriumKind(int(kind)).name for kind in class_d.equilibria.kind]
     assert kinds == ["FIXED_POINT", "SADDLE", "FIXED_POINT", "SADDLE", "FIXED_POINT"]
@@ -75,6 +77,7 @@ def test_separatrices_are_orbits_to_1e_9(class_d):
             assert np.abs(np.array(run.y_end) - ys[i]).max() < 1e-9
 
 
+@pytest.mark.slow(first=True)
 def test_table_and_text_tell_everything(class_d):
     rows = class_d.table().to_dict("records")
     assert [row["what"] for row in rows] == ["equilibrium"] * 5 + ["cycle"] * 2 + ["separatrix"] * 8
@@ -84,6 +87,7 @@ def test_table_and_text_tell_everything(class_d):
     assert "2 attracting and 0 unstable cycles, 8 separatrices" in text and "SADDLE" in text
 
 
+@pytest.mark.slow(first=True)
 def test_picture_shows_everything(class_d):
     ax = class_d.plot()
     labels = [line.get_label() for line in ax.get_lines()]
@@ -191,8 +195,13 @@ def test_orbits_that_touch_a_boundary_with_a_jump_bound_basins():
     assert portraits.differences(osc, told)[0] == []
 
 
-@pytest.mark.slow(first=True)
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    "sign",
+    [
+        pytest.param(1.0, marks=pytest.mark.slow(first=True)),
+        pytest.param(-1.0, marks=pytest.mark.slow),
+    ],
+)
 def test_an_edge_cuts_off_what_only_the_static_limit_holds(sign):
     """Found by a campaign: the orbit that comes to the corner of edge and boundary, above which the
     mass comes to be held and below which it slips away, bounds basins."""

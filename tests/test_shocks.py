@@ -20,6 +20,7 @@ def told() -> jb.Portrait:
     return jb.portrait(jb.presets.class_c(*SADDLE))
 
 
+@pytest.mark.slow(first=True)
 def test_shock_to_a_saddle_is_in_closed_form(told):
     shock = jb.minimal_fatal_shock(told, (0.7, 0.0))
     assert int(shock.status) == jb.Status.OK
@@ -32,6 +33,7 @@ def test_shock_to_a_saddle_is_in_closed_form(told):
     assert row["distance"] == pytest.approx(0.7, abs=1e-15) and row["t"] == 0
 
 
+@pytest.mark.slow(first=True)
 def test_shocks_of_the_velocity_are_longer_and_point_symmetric(told):
     right, left = (jb.minimal_fatal_shock(told, (x1, 0.0), direction="x2") for x1 in (0.7, -0.7))
     assert float(right.distance) > 0.7 and float(right.shock[0]) == pytest.approx(0, abs=1e-12)
@@ -55,15 +57,20 @@ def test_traced_oscillators_are_refused():
 # --- slow ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow(first=True)
-def test_derivatives_are_those_of_the_closed_form():
+@pytest.mark.parametrize(
+    "of",
+    [
+        pytest.param(jax.grad, marks=pytest.mark.slow(first=True)),
+        pytest.param(jax.jacfwd, marks=pytest.mark.slow),
+    ],
+)
+def test_derivatives_are_those_of_the_closed_form(of):
     """mu(nu1) - sigma, and mu'(0.3) = -0.4 10 / 4^2."""
 
     def distance(nu0, nu1, sigma):
         return jb.minimal_fatal_shock(jb.presets.class_c(nu0, nu1, sigma), (0.7, 0.0)).distance
 
-    for of in (jax.grad, jax.jacfwd):
-        assert of(distance, (0, 1, 2))(*SADDLE) == pytest.approx((0.0, -0.25, -1.0), abs=1e-14)
+    assert of(distance, (0, 1, 2))(*SADDLE) == pytest.approx((0.0, -0.25, -1.0), abs=1e-14)
 
 
 @pytest.mark.slow

@@ -265,16 +265,13 @@ COMPOSITIONS = {
 }
 
 
-#: Those that are in another one, or close to it.
-AT_NIGHT = "vmap grad", "grad vmap", "map grad", "vmap jacfwd", "jit jvp vmap", "jit grad vmap"
+#: What has most of the others in it.
+BY_DAY = ("vmap grad checkpoint",)
 
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow(first=name not in AT_NIGHT))
-        for name in COMPOSITIONS
-    ],
+    [pytest.param(name, marks=pytest.mark.slow(first=name in BY_DAY)) for name in COMPOSITIONS],
 )
 def test_transformations_compose_in_any_order(name):
     def loss(row):
@@ -329,7 +326,7 @@ def mixed_lanes():
     return nu, y0, edges.at[:8].set(jnp.array([-jnp.inf, jnp.inf]))
 
 
-@pytest.mark.slow(first=True)
+@pytest.mark.slow
 def test_vmap_equals_a_loop():
     """A batch is integrated in another way; both keep the tolerance, 1e-10, and some runs magnify
     what they are off by a hundred times."""
@@ -383,6 +380,7 @@ def test_formulations_converge_to_the_exact_one(formulation, width):
     assert np.all((orders > lowest) & (orders < 1.05))
 
 
+@pytest.mark.slow(first=True)
 def test_the_smooth_formulation_has_derivatives():
     def end(nu):
         osc = jb.presets.class_b(nu, 0.35)
@@ -705,6 +703,7 @@ def test_float32_is_refused_with_the_remedy():
         jax.config.update("jax_enable_x64", True)
 
 
+@pytest.mark.slow(first=True)
 def test_times_that_do_not_increase_under_a_trace():
     """Outside they are refused; inside nobody can know, and the samples are right all the same."""
     ts = np.random.default_rng(0).uniform(0.0, SPAN, SAMPLES.size)

@@ -106,8 +106,8 @@ def test_a_store_is_what_the_sweep_gives(path, whole):
 @pytest.mark.parametrize(
     "observe",
     [
-        pytest.param("final", marks=pytest.mark.slow),
-        pytest.param("attractor", marks=pytest.mark.slow(first=True)),
+        pytest.param("final", marks=pytest.mark.slow(first=True)),
+        pytest.param("attractor", marks=pytest.mark.slow),
     ],
 )
 def test_derivatives_and_vectors_are_kept(tmp_path, observe):
@@ -440,8 +440,11 @@ def test_an_interrupt_keeps_what_is_done(tmp_path, whole, monkeypatch):
     assert again(path).equals(whole)
 
 
-@pytest.mark.slow(first=True)
 @pytest.mark.skipif(sys.platform == "win32", reason="processes of POSIX")
-def test_kills_at_random_moments_do_no_harm(tmp_path):
-    told = kills.campaign(tmp_path, "final", kills=20, seed=1)
+@pytest.mark.parametrize(
+    "number",
+    [pytest.param(6, marks=pytest.mark.slow(first=True)), pytest.param(20, marks=pytest.mark.slow)],
+)
+def test_kills_at_random_moments_do_no_harm(number, tmp_path):
+    told = kills.campaign(tmp_path, "final", kills=number, seed=1)
     assert told["blocks seen done"] > 0

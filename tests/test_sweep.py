@@ -16,6 +16,7 @@ import oracle
 import oracle_cycles
 import pytest
 import xarray as xr
+from compilations import compilations
 from typer.testing import CliRunner
 
 import jaxbelt as jb
@@ -137,6 +138,7 @@ def test_derivatives_of_a_cycle_equal_differences_of_the_oracle():
         np.testing.assert_allclose(swept[f"d_{name}_d_nu0"], there(name), atol=1e-7)
 
 
+@pytest.mark.slow(first=True)
 def test_what_is_undecided_tells_of_no_attractor(tmp_path):
     """A loop that is under way when time is up is none; and what is NaN has no derivative of 0."""
     arguments = jb.presets.class_a, {"nu0": [0.0, 0.1, 0.2, 0.45]}
@@ -162,7 +164,7 @@ class Sticks:
     """How often a run stuck to belt 1, and when something happened last."""
 
     def init(self, osc, x1, x2):
-        return jnp.zeros(()), jnp.zeros(())
+        return jnp.zeros(()), jnp.asarray(0.0)  # of a strong type, and of a weak one
 
     def update(self, state, event):
         stick = (event.kind == jb.EventKind.STICK) & (event.belt == 1)
@@ -193,6 +195,7 @@ def test_an_observable_is_one_class():
     assert np.all(found.extent >= 3.0 - 1e-12) and list(found) == ["extent", "status"]
 
 
+@pytest.mark.slow(first=True)
 def test_every_dataset_can_be_drawn_and_written(tmp_path, dataset):
     attractors = jb.sweep(jb.presets.class_b, AXES, observe="attractor")
     basins = jb.basins(jb.presets.class_b(0.45, 0.35), x1=[1.36, 3.0], x2=[0.0]).dataset
@@ -239,7 +242,9 @@ def test_progress_is_shown_where_it_is_wanted(capsys):
 
 
 def test_a_reducer_sees_every_event(dataset):
-    reduced = final(AXES, observe=Sticks())
+    with compilations() as compiled:
+        reduced = final(AXES, observe=Sticks())
+    assert compiled.count("jit(advance)") == 1
     for i, nu0 in enumerate(NU0.tolist()):
         run = oracle.simulate(oracle.class_b(nu0, 0.35), (3.0, 0.0), SPAN)
         sticks = [event for event in run.events if (event.kind, event.belt) == ("STICK", 1)]
@@ -371,6 +376,7 @@ def test_more_runs_than_are_counted_are_refused_at_once():
         threads.run(program, [], np.zeros, 2**30, print, **settings)
 
 
+@pytest.mark.slow(first=True)
 def test_several_derivatives_are_each_by_itself(monkeypatch):
     """Also where the runs are in many chunks, and a long one ends in a later chunk."""
     monkeypatch.setattr(threads, "CHUNK", 96)

@@ -70,6 +70,7 @@ def test_fold_is_that_of_the_return_map(point):
     assert fold.residual < 1e-12
 
 
+@pytest.mark.slow(first=True)
 def test_band_and_fold_are_inverse(point):
     band = switch_band(point, 0.26704, where=nu0)
     assert switch_fold(point, band.v_star, where=nu0).value == pytest.approx(0.26704, abs=1e-12)

@@ -150,21 +150,32 @@ def test_derivatives_of_the_coefficient():
     assert jax.jacfwd(coefficient)(0.2) == pytest.approx(float(expected), rel=1e-6)
 
 
+SPAN = (-0.3, 0.8), (0.2, 0.56)
+
+
+@pytest.fixture(scope="module")
+def degenerate():
+    """Where the coefficient changes its sign on a curve."""
+    point = jb.refine(jb.PseudoHopf(0), belled, at=0.0)
+    return jb.bifurcation_curve(point, belled, SPAN).special
+
+
 @pytest.mark.slow(first=True)
-def test_degenerate_pseudo_hopf_points():
-    """The coefficient changes its sign on the curve; there a fold of cycles ends."""
-    point, span = jb.refine(jb.PseudoHopf(0), belled, at=0.0), ((-0.3, 0.8), (0.2, 0.56))
-    curve = jb.bifurcation_curve(point, belled, span)
-    assert [one.kind for one in curve.special] == ["DegeneratePseudoHopf"] * 2
-    sigma, nu = curve.special[0].values
+def test_degenerate_pseudo_hopf_points(degenerate):
+    assert [one.kind for one in degenerate] == ["DegeneratePseudoHopf"] * 2
+    sigma, nu = degenerate[0].values
     at = jb.refine(jb.PseudoHopf(0), lambda s: belled(s, nu), at=sigma + 1e-3)
     assert at.type == "degenerate" and at.value == pytest.approx(sigma, abs=1e-12)
     assert at.coefficient == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.slow
+def test_a_fold_of_cycles_ends_at_a_degenerate_pseudo_hopf_point(degenerate):
     fold, hopf = jb.scan(lambda s: belled(s, 0.47), span=(0.32, 0.36), resolution=8)
     assert (fold.kind, hopf.type) == ("FoldOfCycles", "subcritical")
-    (end,) = jb.bifurcation_curve(fold, belled, span).special
+    (end,) = jb.bifurcation_curve(fold, belled, SPAN).special
     assert end.kind == "DegeneratePseudoHopf"
-    assert end.values == pytest.approx((sigma, nu), abs=1e-10)
+    assert end.values == pytest.approx(degenerate[0].values, abs=1e-10)
 
 
 # --- other kinds ----------------------------------------------------------------------------------

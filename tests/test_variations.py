@@ -124,6 +124,7 @@ def shared_load(load, nu=0.54):
         (shared_load, 0.6, 0.5 / (4 / 6.4**2 + 4 / 4.5**2)),
         (lambda r: jb.presets.class_b(0.3, 0.3 * r), 0.5, (np.sqrt(4 / 0.25) - 1) / 3),
     ],
+    ids=["half", "root", "other root", "inverse", "logarithm", "shared load", "ratio"],
 )
 def test_hopf_points_in_closed_form(make, at, expected):
     point = jb.refine(jb.Hopf(), make, at=at)

@@ -76,7 +76,9 @@ def idle(program: Program, shared, width: int, columns: int) -> Stream:
     run = jnp.full(width, -1, dtype=jnp.int32)
     lanes = _begin(program, osc, run, rows[0], rows[1], jnp.zeros((), jnp.int32), jnp.ones(()))
     lanes = eqx.tree_at(lambda n: n.done, lanes, jnp.ones(width, dtype=bool))
-    return Stream(lanes, rows, jnp.zeros((), jnp.int32), jnp.ones(width))
+    stream = Stream(lanes, rows, jnp.zeros((), jnp.int32), jnp.ones(width))
+    # Of types such as the kernel gives back: weak ones of a reducer would have it compiled twice.
+    return jax.tree.map(lambda leaf: lax.convert_element_type(leaf, leaf.dtype), stream)
 
 
 def differentiable(stream: Stream) -> Stream:
