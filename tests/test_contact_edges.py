@@ -436,3 +436,21 @@ def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
     (point,) = jb.bifurcation_curve(hopf, where, span, step=0.03).special
     assert point.kind == "BoundaryHopf"
     np.testing.assert_allclose(point.values, expected[1], rtol=0, atol=1e-12)
+
+
+def test_a_segment_of_no_length_at_an_edge_does_not_hold():
+    """A belt at rest touches on the left of x1 = -1, where it holds just what it can: loops shrink
+    to the circle through that point, faster than geometrically, and go on along it."""
+    law = jb.Conti(static=1.0, residual=0.6, steepness=1.0)
+
+    def make(upper):
+        belts = jb.Belt(0.0, law, upper=upper), jb.Belt(0.0, law, load=0.0)
+        return jb.Oscillator(0.0, belts)
+
+    for t1 in (48.0, 60.0):
+        run = jb.simulate(make(-1.0), (3.0, 0.0), t1)
+        assert run.status == jb.Status.OK
+        # The event times add up to some 1e-13 of t1, the radius to the tolerance 1e-10.
+        assert np.hypot(*np.asarray(run.ys[-1])) == pytest.approx(1.0, abs=1e-9)
+    # A little less and there is a segment to come to.
+    assert jb.simulate(make(-0.9), (3.0, 0.0), 60.0).status == jb.Status.STUCK_FOREVER
