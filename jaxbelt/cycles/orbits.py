@@ -40,7 +40,7 @@ MOST_ARCS = 1024
 #: The stride of `Graded` with which every arc is good to 1e-12.
 FINE_STRIDE = 0.05
 #: The speed down to which a fine orbit is followed that creeps.
-CREEPS = 1e-6
+CREEPING_SPEED = 1e-6
 #: So near to an equilibrium such an orbit ends, or nearer.
 SEEN_AT_REST = 1e-2
 
@@ -158,7 +158,7 @@ def _finely_from(osc: Oscillator, start: Orbit, reach: Array) -> Orbit:
         away = jnp.hypot(orbit.y[0] - place_of_rest(osc, orbit), orbit.y[1])
         on_the_way = (orbit.status == Status.EQUILIBRIUM) & (away > SEEN_AT_REST)
         # An arc that takes too many steps creeps to a node, on a boundary say, and goes on.
-        creeps = (orbit.status == Status.NOT_SETTLED) & (jnp.abs(orbit.y[1]) > CREEPS)
+        creeps = (orbit.status == Status.NOT_SETTLED) & (jnp.abs(orbit.y[1]) > CREEPING_SPEED)
         return (~orbit.done | on_the_way | creeps) & near & (orbit.count < orbit.tops.size)
 
     return lax.while_loop(going, lambda orbit: _next_arc(osc, orbit, FINE_STRIDE), start)

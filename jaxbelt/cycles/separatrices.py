@@ -66,7 +66,7 @@ SEPARATRIX_ARCS = 256
 #: Samples of each arc at even times, and as many where the friction law bends.
 ARC_SAMPLES = 16
 #: Steps from one of these states to the next.
-MOST_STEPS = 1000
+STEPS_BETWEEN = 1000
 
 
 class Separatrix(eqx.Module):
@@ -300,7 +300,7 @@ def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array):
             # A steep law, as near a node on a boundary, bounds the length of a stable step.
             (trace,) = trace_of(osc, mode_of(codes), *y)
             steps = jnp.clip(
-                jnp.nan_to_num(jnp.ceil(jnp.abs(trace) * duration * fraction)), 1, MOST_STEPS
+                jnp.nan_to_num(jnp.ceil(jnp.abs(trace) * duration * fraction)), 1, STEPS_BETWEEN
             )
 
             def step(_, y):

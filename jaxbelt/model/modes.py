@@ -481,21 +481,6 @@ def at_focus(osc: Oscillator, x1: Array, x2: Array) -> Array:
     return (x2 == 0) & slips & (a_left >= 0) & (a_right <= 0) & (a_left > a_right)
 
 
-def start_at_focus(osc: Oscillator, x1: Array, x2: Array) -> tuple[Array, Array]:
-    """The start (x1, x2); its derivatives at a pseudo-focus are those of the edge that this is on.
-
-    Neighbours of such a start are soon back there, or never.
-    """
-    if not has_edges(osc):
-        return x1, x2
-    edge = foremost(osc, [x1 == edge for edge in edges(osc)], edges(osc), x1)
-    there = at_focus(osc, x1, x2)
-    # The numbers are the same: XLA never ends to simplify a choice between them.
-    fixed1, fixed2 = lax.stop_gradient((x1, x2))
-    slope = edge - lax.stop_gradient(edge)
-    return jnp.where(there, fixed1 + slope, x1), jnp.where(there, fixed2, x2)
-
-
 def begins_at_rest(osc: Oscillator, x1: Array, x2: Array) -> Array:
     """Whether a start (x1, x2) is a fixed point or a pseudo-focus, up to rounding."""
     mode = mode_of_state(osc, x1, x2)

@@ -6,9 +6,20 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
-from .modes import Mode, boundary_guards, edge_guards, force_rounding, mode_acceleration
+from .modes import (
+    Mode,
+    at_focus,
+    boundary_guards,
+    edge_guards,
+    edges,
+    force_rounding,
+    foremost,
+    has_edges,
+    mode_acceleration,
+)
 from .oscillator import Belt, Oscillator
 
 #: Radius of the smallest disc that is checked: in smaller ones the rounding of x1 counts.
@@ -35,6 +46,21 @@ def is_slow(x2: Array, a: Array) -> Array:
     start has derivatives that are exactly 0.
     """
     return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < SLOW_MOTION
+
+
+def start_at_focus(osc: Oscillator, x1: Array, x2: Array) -> tuple[Array, Array]:
+    """The start (x1, x2); its derivatives at a pseudo-focus are those of the edge that this is on.
+
+    Neighbours of such a start are soon back there, or never.
+    """
+    if not has_edges(osc):
+        return x1, x2
+    edge = foremost(osc, [x1 == edge for edge in edges(osc)], edges(osc), x1)
+    there = at_focus(osc, x1, x2)
+    # The numbers are the same: XLA never ends to simplify a choice between them.
+    fixed1, fixed2 = lax.stop_gradient((x1, x2))
+    slope = edge - lax.stop_gradient(edge)
+    return jnp.where(there, fixed1 + slope, x1), jnp.where(there, fixed2, x2)
 
 
 def settling_margin(
