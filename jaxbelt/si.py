@@ -258,9 +258,9 @@ def _along(result: AlongParameter, machine: Any) -> "xarray.Dataset":
             words = name.replace("_", " ")
             found[name] = _variable("row", table[name].to_numpy(float), quantity, units, words)
         else:
-            missing = {"branch": -1, "stable": False}.get(name)
+            missing = {"branch": -1, "stable": False, "neutral": False}.get(name)
             column = table[name] if missing is None else table[name].fillna(missing)
-            plain = column.to_numpy({"branch": int, "stable": bool}.get(name))
+            plain = column.to_numpy({"branch": int, "stable": bool, "neutral": bool}.get(name))
             found[name] = ("row", plain.astype(str) if plain.dtype == object else plain)
     return xarray.Dataset(found)
 

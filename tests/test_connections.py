@@ -124,6 +124,19 @@ def test_a_separatrix_that_sticks_forgets_where_it_began():
         assert point.status == Status.OK and point.value == pytest.approx(wanted, abs=1e-11)
 
 
+@pytest.mark.slow
+def test_the_nearest_of_two_beside_each_other():
+    """Both are where an attracting cycle comes to the saddle, so `scan` tells them as grazing."""
+    right = jb.Belt(0.4, jb.Conti(1.0, 0.4, 2.0), lower=-0.75, upper=0.73333333333333)
+
+    def make(nu0):
+        return jb.Oscillator(0.05, (jb.Belt(nu0, jb.Stribeck(1.0, 0.8, 0.1)), right))
+
+    grazing = [float(one.value) for one in jb.scan(make, span=(-0.486, -0.482))]
+    point = jb.refine(jb.SaddleConnection(1, 1), make, at=-0.484831720301)
+    assert point.value == pytest.approx(min(grazing), abs=1e-12)
+
+
 def test_point_symmetry():
     point = jb.refine(jb.SaddleConnection(1), over, at=0.3)
     mirrored = jb.refine(jb.SaddleConnection(0), lambda s: over(0.4, s), at=-0.3)

@@ -439,3 +439,42 @@ def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
     (point,) = jb.bifurcation_curve(hopf, where, span, step=0.03).special
     assert point.kind == "BoundaryHopf"
     np.testing.assert_allclose(point.values, expected[1], rtol=0, atol=1e-12)
+
+
+def test_a_segment_of_no_length_at_an_edge_does_not_hold():
+    """A belt at rest touches on the left of x1 = -1, where it holds just what it can: loops shrink
+    to the circle through that point, faster than geometrically, and go on along it."""
+    law = jb.Conti(static=1.0, residual=0.6, steepness=1.0)
+
+    def make(upper):
+        belts = jb.Belt(0.0, law, upper=upper), jb.Belt(0.0, law, load=0.0)
+        return jb.Oscillator(0.0, belts)
+
+    for t1 in (48.0, 60.0):
+        run = jb.simulate(make(-1.0), (3.0, 0.0), t1)
+        assert run.status == jb.Status.OK
+        # The event times add up to some 1e-13 of t1, the radius to the tolerance 1e-10.
+        assert np.hypot(*np.asarray(run.ys[-1])) == pytest.approx(1.0, abs=1e-9)
+    # A little less and there is a segment to come to.
+    assert jb.simulate(make(-0.9), (3.0, 0.0), 60.0).status == jb.Status.STUCK_FOREVER
+
+
+def test_where_one_type_of_boundary_equilibrium_turns_into_the_other():
+    """Belt 0 pulls with 0.7 on the left of the edge, belt 1 with 0.9 mu(nu1) on the right, which is
+    0.7 where 1 + 10 nu1 = 2.25."""
+    law = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
+
+    def make(nu1, sigma):
+        right = jb.Belt(nu1, law, load=0.9, lower=sigma)
+        return jb.Oscillator(0.5, (jb.Belt(0.3, law, upper=sigma), right))
+
+    point = jb.refine(jb.BoundaryEquilibrium(1), lambda sigma: make(0.2, sigma), at=0.65)
+    assert point.value == pytest.approx(0.66, abs=1e-12)
+    curve = jb.bifurcation_curve(point, make, ((0.08, 0.25), (0.5, 0.9)))
+    (special,) = (one for one in curve.special if one.kind == "DoubleBoundaryEquilibrium")
+    assert special.values == pytest.approx((0.125, 0.7), abs=1e-12)
+    types = [
+        jb.refine(jb.BoundaryEquilibrium(1), lambda s, nu=nu: make(nu, s), at=at).type
+        for nu, at in ((0.1, 0.72), (0.2, 0.66))
+    ]
+    assert sorted(types) == ["annihilation", "persistence"]

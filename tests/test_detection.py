@@ -424,3 +424,21 @@ def test_simulation_agrees_between_any_two_points():
             allowed = {tuple(sorted(belts))} | ({()} if "rest" in expected else set())
             # From far out everything comes to the sticking cycle where there is one.
             assert tuple(np.flatnonzero(place[0])) == tuple(sorted(belts)) and seen <= allowed
+
+
+def test_two_cycles_at_one_value_are_two_points():
+    """Each is the other turned round, in the same contact interval of a light belt at rest: at its
+    ends they collide with a corner at one value."""
+    law, light = jb.Conti(1.0, 0.6, 10.0), jb.Coulomb(0.5, 0.5)
+    light = jb.Belt(0.0, light, load=0.02, lower=-1.03, upper=1.03)
+
+    def make(nu):
+        return jb.Oscillator(
+            0.5, (jb.Belt(-nu, law, upper=-0.1), jb.Belt(nu, law, lower=0.1), light)
+        )
+
+    left, right = jb.scan(make, span=(0.188, 0.192), resolution=8)
+    assert left.condition == right.condition == jb.CornerCollision(2)
+    assert left.value == pytest.approx(float(right.value), abs=1e-12)
+    assert left.cycle.x1_min == pytest.approx(-1.03, abs=1e-12)
+    assert right.cycle.x1_max == pytest.approx(1.03, abs=1e-12)

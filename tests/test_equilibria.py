@@ -628,6 +628,50 @@ def test_a_law_of_ones_own_and_a_supercritical_point():
     assert np.ptp(x1) / 2 == pytest.approx(radius, rel=2e-2)
 
 
+#: Damping 0 and friction that does not depend on the speed; on both sides of an edge; laws whose
+#: sum is even in the velocity: c - 0.05 x2^2 (damping 0), and a constant (damping 4 * 0.05).
+CENTRES = {
+    "constant": (0.0, jb.Belt(2.0, jb.Coulomb(1.0, 0.6))),
+    "an edge": (
+        0.0,
+        jb.Belt(2.0, jb.Coulomb(0.8, 0.6), upper=0.1),
+        jb.Belt(-2.0, jb.Coulomb(0.8, 0.5), lower=0.1),
+    ),
+    "even": (
+        0.0,
+        jb.Belt(2.0, jb.Conti(0.5, 0.5, 1.0, 0.05)),
+        jb.Belt(-1.0, jb.Conti(0.5, 0.5, 1.0, -0.1)),
+    ),
+    "damped": (
+        0.2,
+        jb.Belt(1.0, jb.Conti(0.5, 0.5, 1.0, -0.05)),
+        jb.Belt(-1.0, jb.Conti(0.5, 0.5, 1.0, -0.05)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CENTRES)
+def test_a_centre_is_neutral_and_closes(name):
+    damping, *belts = CENTRES[name]
+    osc = jb.Oscillator(damping, tuple(belts))
+    (point,) = jb.equilibria(osc)
+    assert point.neutral and not point.stable and abs(float(point.rate)) < 1e-15
+    assert repr(point).startswith("Equilibria(neutral ")
+    assert point.table().neutral.tolist() == [True]
+    # One loop, and more than the first half of another: from a top it comes back to the top.
+    top = float(point.x1) + 0.3
+    events = jb.simulate(osc, (top, 0.0), 15.0, ts=np.linspace(0.0, 15.0, 3001))
+    assert float(jnp.max(events.ys[1500:, 0])) == pytest.approx(top, abs=1e-5)
+    assert jb.find_cycle(osc, (top, 0.0)).status == jb.Status.NEUTRAL
+    (row,) = jb.equilibria(eqx.tree_at(lambda o: o.damping, osc, damping + 1e-9))
+    assert row.stable and not row.neutral
+
+
+def test_a_point_of_hopf_is_no_centre():
+    (point,) = jb.equilibria(jb.presets.class_a(HOPF_A))
+    assert abs(float(point.rate)) < 1e-15 and not point.neutral
+
+
 def test_lyapunov_coefficients_stand_beside_the_equilibria():
     osc = free_class_d(0.0, 0.3, -0.2, 0.5)
     coefficients, kinds = jb.lyapunov_coefficient(osc), jb.equilibria(osc).kind

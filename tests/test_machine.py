@@ -323,7 +323,8 @@ def along(name="belts[0].velocity", is_argument=False, **changes):
         is_argument,
     )
     branch = Branch(
-        *("cycle", values, np.array([True, False]), *(i * values for i in (-1, 1, -2, 2, 6, 0))),
+        *("cycle", values, np.array([True, False]), np.zeros(2, bool)),
+        *(i * values for i in (-1, 1, -2, 2, 6, 0)),
         *(two, two, tuple(jb.find_cycle(machine().oscillator, (1.0, 0.0)) for _ in values)),
     )
     region = ((0.5, 1.0, "1"),)

@@ -117,10 +117,18 @@ def test_nothing_happens_where_they_meet(make, span):
 
 
 def test_where_they_meet():
-    """Of straight and of bent ways; ends of the span, and edges that go together, do not count."""
+    """Of straight and of bent ways, at ends of the span, too, but not where there can be no
+    oscillator beyond; edges that go together do not count."""
     straight = varied(beside, None, (0.3,))
     bent = varied(lambda p: beside(p**2), None, (0.5,))
-    assert straight.meetings(0.3, 0.5) == {0.4: [(0, 1)]} and straight.meetings(0.4, 0.5) == {}
+    assert straight.meetings(0.3, 0.5) == straight.meetings(0.4, 0.5) == {0.4: [(0, 1)]}
+
+    def shrinking(lower):
+        law = jb.Conti(1.0, 0.6, 10.0)
+        left = jb.Belt(0.2, law, lower=lower, upper=0.4)
+        return jb.Oscillator(0.5, (left, jb.Belt(-0.25, law, lower=0.4)))
+
+    assert varied(shrinking, None, (0.3,)).meetings(0.3, 0.4) == {}
     ((value, belts),) = bent.meetings(0.5, 0.7).items()
     assert value == pytest.approx(np.sqrt(0.4), abs=1e-14) and belts == [(0, 1)]
     together = varied(lambda sigma: jb.presets.class_c(0.2, -0.25, sigma), None, (0.3,))
@@ -158,3 +166,17 @@ def test_their_curves():
     at = jb.refine(EXCHANGE, lambda upper: make(upper, -0.15), at=0.401)
     expected = oracle_cycles.sticking_cycle(oracle.class_c(0.2, -0.15, 0.4), (0.41, 0.2))
     assert at.cycle.period == pytest.approx(expected.period, abs=1e-10)
+
+
+@pytest.mark.parametrize("span", [(0.4, 0.42), (0.38, 0.4)])
+def test_edges_that_meet_at_an_end_of_the_span(span):
+    """What is told inside of a span is told at its ends."""
+    law = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
+
+    def make(upper):
+        return jb.Oscillator(0.5, (jb.Belt(0.2, law, upper=upper), jb.Belt(-0.25, law, lower=0.4)))
+
+    told = jb.scan(make, span=span, resolution=8)
+    there = [one.condition for one in told if float(one.value) == pytest.approx(0.4, abs=1e-9)]
+    assert there == [jb.EdgeExchange((0, 1)), MEETING]
+    assert all(one.status == jb.Status.OK for one in told)

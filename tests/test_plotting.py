@@ -194,6 +194,8 @@ def test_stability_shows():
     assert x2 == 0
     unstable = jb.plot_phase_portrait(jb.presets.class_a(0.1))
     assert line(unstable, "unstable fixed point").get_markerfacecolor() == "white"
+    centre = jb.Oscillator(0.0, (jb.Belt(1.0, jb.Coulomb(1.0, 0.6)),))
+    assert line(jb.plot_phase_portrait(centre), "neutral fixed point")
 
 
 def test_segment_and_pseudo_focus():

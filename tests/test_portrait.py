@@ -256,3 +256,24 @@ def test_continuum_of_closed_orbits_is_a_gap():
     ((low, high),) = np.asarray(told.gaps)
     # Circles around (0.6, 0) with radii up to 0.4; the one that sticks is from 1.0 onwards.
     assert low == pytest.approx(0.6, abs=1e-3) and high == pytest.approx(1.0, abs=1e-2)
+
+
+def test_a_separatrix_that_creeps_to_a_node_comes_from_there():
+    """Backwards it comes to the end of the segment that a belt at rest holds, where slip on the
+    steep law's boundary is a node with the slow rate 0.065: along the fast one steps are short."""
+    law = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
+    belts = jb.Belt(0.45, law, 2.0), jb.Belt(0.0, law, 2.0, lower=-2.0225, upper=0.7)
+    told = jb.portrait(jb.Oscillator(0.1, belts, 2.0))
+    (one,) = (s for s in told.separatrices if s.stable and s.side == "left")
+    assert (one.end, one.to) == ("equilibrium", 0)
+    assert float(one.ys[0, 0]) == pytest.approx(float(told.equilibria.x1_lower[0]), abs=2e-5)
+
+    def backwards(t, y):
+        drag, brake = (2 * (0.4 / (1 + 10 * r) + 0.6) for r in (0.45 - 2 * y[1], 2 * y[1]))
+        return [-y[1], y[0] + 0.1 * y[1] - drag + brake]
+
+    ts = -np.asarray(one.ts)[::-1]
+    span, tight = (0.0, ts[-1]), {"rtol": 1e-12, "atol": 1e-14}
+    run = solve_ivp(backwards, span, [0.7, 0.0], "LSODA", dense_output=True, **tight)
+    # What is drawn is as exact as one step between two samples.
+    assert np.max(np.abs(np.asarray(one.ys)[::-1] - run.sol(ts).T)) < 1e-6

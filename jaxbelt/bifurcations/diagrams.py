@@ -47,8 +47,9 @@ class Branch(eqx.Module):
     """Equilibria or cycles along a path in one parameter: a struct of arrays, a row a value.
 
     kind: "equilibrium" or "cycle". values: of the parameter, [rows]; they turn back at a fold.
-    stable: [rows]. x1_min, x1_max, x2_min, x2_max: the range of the motion, [rows]; of a segment of
-    pseudo-equilibria its ends. period, multiplier (the nontrivial one): of a cycle, else NaN.
+    stable, neutral (a centre, see `Equilibria`; no cycle is), [rows]. x1_min, x1_max, x2_min,
+    x2_max: the range of the motion, [rows]; of a segment of pseudo-equilibria its ends. period,
+    multiplier (the nontrivial one): of a cycle, else NaN.
     stick_durations, stick_velocities: per loop, and of the belt over omega, [rows, belts]; NaN
     where a cycle does not stick to that belt. cycles: a `Cycle` a row, of equilibria none.
     """
@@ -56,6 +57,7 @@ class Branch(eqx.Module):
     kind: str = eqx.field(static=True)
     values: np.ndarray
     stable: np.ndarray
+    neutral: np.ndarray
     x1_min: np.ndarray
     x1_max: np.ndarray
     x2_min: np.ndarray
@@ -86,7 +88,7 @@ class Branch(eqx.Module):
 
     def columns(self) -> dict[str, Any]:
         """What the table of a diagram tells of its rows."""
-        names = ("stable", "x1_min", "x1_max", "x2_min", "x2_max", "period", "amplitude")
+        names = ("stable", "neutral", "x1_min", "x1_max", "x2_min", "x2_max", "period", "amplitude")
         events = [signature_name(cycle.signature) for cycle in self.cycles]
         return {
             "kind": [self.kind] * len(self),
@@ -104,7 +106,7 @@ class Branch(eqx.Module):
     def __repr__(self) -> str:
         ends = f"{self.values[0]:.6g} to {self.values[-1]:.6g}"
         flips = int(np.sum(self.stable[1:] != self.stable[:-1]))
-        first = "stable" if self.stable[0] else "unstable"
+        first = "stable" if self.stable[0] else "neutral" if self.neutral[0] else "unstable"
         return f"Branch({self.kind}, {len(self)} rows, {ends}, {first} first, {flips} changes)"
 
 
@@ -132,10 +134,11 @@ class BifurcationDiagram(eqx.Module):
         """A row for each row of each branch, in order, and then for each special point.
 
         Columns: branch (its number; missing for a point), kind ("equilibrium", "cycle", or the
-        condition of a point), belts and type (of a point), value (of the parameter), stable
-        (missing for a point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests), amplitude
-        (half the range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each belt (NaN
-        where it does not stick to that), signature (the events of a cycle, as in `Cycle.table`).
+        condition of a point), belts and type (of a point), value (of the parameter), stable and
+        neutral (missing for a point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests),
+        amplitude (half the range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each
+        belt (NaN where it does not stick to that), signature (the events of a cycle, as in
+        `Cycle.table`).
         """
         rows = [
             {"branch": number, **row}
@@ -144,7 +147,11 @@ class BifurcationDiagram(eqx.Module):
         ]
         table = table_of([*rows, *map(_row_of_point, self.points)])
         # A point is of no branch, and neither stable nor unstable.
-        return table.astype({"branch": "Int64", "stable": "boolean"}) if len(table) else table
+        return (
+            table.astype({"branch": "Int64", "stable": "boolean", "neutral": "boolean"})
+            if len(table)
+            else table
+        )
 
     def plot(self, ax: Any = None, *, quantity: str | Callable[[Cycle], Any] | None = None) -> Any:
         """Draw it into the axes `ax` (None: new ones), which are returned.
@@ -229,6 +236,7 @@ def _row_of_point(point: BifurcationPoint) -> dict[str, Any]:
         "branch": None,
         **{name: row[name] for name in ("kind", "belts", "type", "value")},
         "stable": None,
+        "neutral": None,
         **{name: row[name] for name in names},
         "amplitude": 0.5 * (row["x1_max"] - row["x1_min"]),
         **per_belt("stick_duration", point.cycle.stick_durations if known else none),
@@ -279,6 +287,7 @@ def _equilibrium_pieces(path: ParameterPath, nodes: Sequence[np.ndarray]) -> lis
                 kind="equilibrium",
                 values=values,
                 stable=here.stable[:, row],
+                neutral=here.neutral[:, row],
                 x1_min=here.x1_lower[:, row],
                 x1_max=here.x1_upper[:, row],
                 x2_min=np.zeros(len(values)),
@@ -333,6 +342,7 @@ class _Rows(NamedTuple):
 
     status: Any
     stable: Any
+    neutral: Any
     x1_min: Any
     x1_max: Any
     x2_min: Any
@@ -351,6 +361,7 @@ def _row_of_branch(cycle: Cycle) -> _Rows:
     return _Rows(
         status=cycle.status,
         stable=cycle.stable,
+        neutral=jnp.zeros_like(cycle.stable),
         x1_min=cycle.x1_min,
         x1_max=cycle.x1_max,
         x2_min=cycle.x2_min,

@@ -29,6 +29,8 @@ SAME_POINT = 1e-9
 #: beyond the next point, to others 0.018 and 0.029 away, after first steps of 0.4 and 0.5, and to a
 #: corner 0.004 away beside another one. Of edges there may be several, and any is looked for.
 NEAR_GUESS, QUITE_NEAR, SHORT_STEP = 0.015, 0.05, 0.25
+#: The same for conditions of which there may be several beside each other.
+BESIDE_OTHERS = 1e-4
 #: How far to both sides of the guess points are looked for where it fails, one after the other, and
 #: in how many intervals first.
 REACHES, INTERVALS = (2e-3, 1.2e-2, 5e-2, 0.2), 15
@@ -78,7 +80,7 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
     condition, guess = point.condition, float(value[0])
     away = _away(point, guess)
     near = QUITE_NEAR if point.steps[0] <= SHORT_STEP else NEAR_GUESS
-    if away <= (REACHES[0] if condition.has_several else near):
+    if away <= (BESIDE_OTHERS if condition.has_several else near):
         return point
     for reach in REACHES:
         ends = (guess + side * min(reach, away) for side in (-1, 1))
@@ -89,6 +91,10 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         # From farther off, too, than in `scan`: these paths are short.
         found = search(path, INTERVALS, near=1.0)
         found = [one for one in found if int(one.status) == Status.OK]
+        if condition.has_several:
+            # What attracts may tell a point as one of another kind, too.
+            also = (condition.found_from(variation, float(one.value)) for one in found)
+            found += [one for one in also if one is not None]
         of_kind = [one for one in found if condition.covers(one.condition)]
         if of_kind:
             nearest = min(of_kind, key=lambda one: _away(one, guess))

@@ -11,7 +11,7 @@ Labels know what attracts. Where contact edges are touched by the unstable cycle
 shows is found in the same way from its signature, see `edges_touched`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -19,10 +19,7 @@ import numpy as np
 
 from ..activity import announced, tell
 from ..checks import as_whole
-from ..cycles.attractors import (
-    is_same,
-    itinerary,
-)
+from ..cycles.attractors import SOLVED, apart, is_same, itinerary, place_of
 from ..cycles.cycle import as_loop
 from ..model.oscillator import Oscillator
 from ..results import Status
@@ -210,29 +207,46 @@ def _possible_kinds(path: ParameterPath, a: float, b: float) -> list[AbstractCon
 def _beside_it(
     path: ParameterPath, a: float, b: float, point: BifurcationPoint
 ) -> list[BifurcationPoint]:
-    """What happens to other belts at the value of a point, as it does where there is a symmetry."""
+    """What happens to other belts, or to other cycles, at the value of a point, as it does where
+    there is a symmetry."""
     sought = point.condition.sought
-    found = [
-        _first_found(path, a, b, [condition])
-        for condition in _possible_kinds(path, a, b)
-        if type(condition.sought) is type(sought) and condition.sought != sought
-    ]
-    return [one for one in found if one is not None and is_at_one_value(one, point)]
+    found = [point]
+    for condition in _possible_kinds(path, a, b):
+        if type(condition.sought) is type(sought):
+            for one in _all_found(path, a, b, condition):
+                if is_at_one_value(one, point) and all(_is_apart(one, other) for other in found):
+                    found.append(one)
+    return found[1:]
+
+
+def _is_apart(point: BifurcationPoint, other: BifurcationPoint) -> bool:
+    """Whether two points at one value are of two families or belts, or of two cycles."""
+    if point.condition.sought != other.condition.sought:
+        return True
+    known = all(int(one.cycle.status) == Status.OK for one in (point, other))
+    return known and apart(place_of(point.cycle), place_of(other.cycle)) >= SOLVED
 
 
 def _first_found(
     path: ParameterPath, a: float, b: float, conditions: Sequence[AbstractCondition]
 ) -> BifurcationPoint | None:
     """The first of the conditions that holds within an interval."""
-    for condition in conditions:
-        slow = condition.slow
-        low, high = (path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]) if slow else (a, b)
-        for value in condition.values(a, b):
-            for loop in condition.beginnings(path.cycles.get(value, [])):
-                point = condition.found_from(path.variation, value, loop)
-                if point is not None and low <= point.value <= high:
-                    return point
-    return None
+    points = (one for condition in conditions for one in _all_found(path, a, b, condition))
+    return next(points, None)
+
+
+def _all_found(
+    path: ParameterPath, a: float, b: float, condition: AbstractCondition
+) -> Iterator[BifurcationPoint]:
+    """Where a condition holds within an interval, from each of its beginnings; one point may come
+    from several."""
+    slow = condition.slow
+    low, high = (path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]) if slow else (a, b)
+    for value in condition.values(a, b):
+        for loop in condition.beginnings(path.cycles.get(value, [])):
+            point = condition.found_from(path.variation, value, loop)
+            if point is not None and low <= point.value <= high:
+                yield point
 
 
 def _at_break(path: ParameterPath, value: float) -> list[BifurcationPoint]:

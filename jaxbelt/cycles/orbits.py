@@ -40,6 +40,8 @@ from .settling import AT_REST, has_repeated
 MOST_ARCS = 1024
 #: The stride of `Graded` with which every arc is good to 1e-12.
 FINE_STRIDE = 0.05
+#: The speed down to which a fine orbit is followed that creeps.
+CREEPING_SPEED = 1e-6
 #: So near to an equilibrium such an orbit ends, or nearer.
 SEEN_AT_REST = 1e-2
 
@@ -183,7 +185,9 @@ def _finely_from(osc: Oscillator, start: Orbit, reach: Array) -> Orbit:
         # Where it comes to rest is known before it is there.
         away = jnp.hypot(orbit.y[0] - place_of_rest(osc, orbit), orbit.y[1])
         on_the_way = (orbit.status == Status.EQUILIBRIUM) & (away > SEEN_AT_REST)
-        return (~orbit.done | on_the_way) & near
+        # An arc that takes too many steps creeps to a node, on a boundary say, and goes on.
+        creeps = (orbit.status == Status.NOT_SETTLED) & (jnp.abs(orbit.y[1]) > CREEPING_SPEED)
+        return (~orbit.done | on_the_way | creeps) & near
 
     return _followed_while(going, osc, start, FINE_STRIDE)
 

@@ -78,8 +78,9 @@ class Portrait(eqx.Module):
         """A row for each equilibrium, cycle and separatrix: what it is, stable or not, where.
 
         Columns: what, number (among its sort), kind (an `EquilibriumKind`, the events of a cycle,
-        or where a separatrix leads to or comes from), stable, x1_min, x1_max, x2_min, x2_max,
-        period and multiplier of a cycle, rate of an equilibrium; NaN where it has none.
+        or where a separatrix leads to or comes from), stable, neutral (of an equilibrium; else
+        False), x1_min, x1_max, x2_min, x2_max, period and multiplier of a cycle, rate of an
+        equilibrium; NaN where it has none.
         """
         rows = [
             _row(
@@ -89,6 +90,7 @@ class Portrait(eqx.Module):
                 rest.stable,
                 np.array([[rest.x1_lower, 0.0], [rest.x1_upper, 0.0]]),
                 rate=float(rest.rate),
+                neutral=bool(rest.neutral),
             )
             for number, rest in enumerate(self.equilibria)
         ]
@@ -126,13 +128,14 @@ class Portrait(eqx.Module):
         return "\n  ".join(lines) + ")"
 
 
-def _row(what: str, number: int, kind: str, stable: Any, ys: np.ndarray, **more: float):
+def _row(what: str, number: int, kind: str, stable: Any, ys: np.ndarray, **more: Any):
     x1, x2 = np.asarray(ys).T
     return {
         "what": what,
         "number": number,
         "kind": kind,
         "stable": bool(stable),
+        "neutral": False,
         "x1_min": float(x1.min()),
         "x1_max": float(x1.max()),
         "x2_min": float(x2.min()),

@@ -66,6 +66,8 @@ if TYPE_CHECKING:
 SEPARATRIX_ARCS = 256
 #: Samples of each arc at even times, and as many where the friction law bends.
 ARC_SAMPLES = 16
+#: Steps from one of these states to the next.
+STEPS_BETWEEN = 1000
 
 
 class Separatrix(eqx.Module):
@@ -296,7 +298,16 @@ def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array):
         duration = lax.while_loop(beyond, lambda duration: 0.8 * duration, duration)
 
         def advance(y, fraction):
-            y = flow(osc, codes, jnp.ones(1), y, duration * fraction)
+            # A steep law, as near a node on a boundary, bounds the length of a stable step.
+            (trace,) = trace_of(osc, mode_of(codes), *y)
+            steps = jnp.clip(
+                jnp.nan_to_num(jnp.ceil(jnp.abs(trace) * duration * fraction)), 1, STEPS_BETWEEN
+            )
+
+            def step(_, y):
+                return flow(osc, codes, jnp.ones(1), y, duration * fraction / steps)
+
+            y = lax.fori_loop(0, steps.astype(int), step, y)
             return y, y
 
         # As near to each other as the law's bends, and the picture, ask.
@@ -331,6 +342,7 @@ def _branch(
         following = np.concatenate([orbit.entries[1:], orbit.y[None]])
         following[count - 1] = orbit.y
         at_boundary = (np.arange(len(following)) < count) & (orbit.ends < len(osc.belts))
+        at_boundary &= orbit.ends >= 0
         stuck = np.flatnonzero(
             at_boundary & np.asarray(_is_held(osc, jax.device_put(following * way)))
         )
@@ -346,7 +358,11 @@ def _branch(
     # The last arc was left, unless it came to where the mass sticks.
     known = np.arange(count) < count - (not was_cut)
     ends = np.where(known, orbit.ends[:count], Ends(len(osc.belts)).unused)
-    columns = orbit.codes[:count], ends, orbit.entries[:count], since[:count, -1]
+    # An arc that creeps is one, though followed in pieces.
+    whole = int(np.argmax(np.append(ends, -1) < 0)) + 1
+    durations = np.append(since[: whole - 1, -1], np.sum(since[whole - 1 : count, -1]))
+    ends = np.where(ends < 0, Ends(len(osc.belts)).unused, ends)
+    columns = orbit.codes[:whole], ends[:whole], orbit.entries[:whole], durations
     arcs = Loop(*jax.device_put(columns))
     end = tops[~np.isnan(tops)], y, float(rest), Status(int(orbit.status))
     return TracedSeparatrix(point, side, stable, ts, ys, *end, was_cut, arcs)

@@ -43,6 +43,7 @@ from .modes import (
     settle,
 )
 from .oscillator import Oscillator, check_oscillator, has_possible_numbers
+from .rest import is_centre
 
 if TYPE_CHECKING:
     import pandas
@@ -80,6 +81,9 @@ class Equilibria(eqx.Module):
     - stable: rate < 0. A segment is stable if disturbances of some part of it end in it again.
       That is where the needed force is less than the sum of u0_k mu_k(0); the rest of a segment,
       if mu(0) is less than the static limit, holds but does not attract.
+    - neutral: a centre: orbits around it are closed, so it neither attracts nor repels, and is not
+      stable in the sense above. It is where the forces on each side are the same at x2 and -x2, as
+      without damping and with friction that does not depend on the speed.
     """
 
     kind: Array
@@ -91,6 +95,7 @@ class Equilibria(eqx.Module):
     eigenvalues: Array
     rate: Array
     stable: Array
+    neutral: Array
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -102,9 +107,10 @@ class Equilibria(eqx.Module):
         return (self[i] for i in range(len(self)))
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each, from left to right: kind (the name of an `EquilibriumKind`), stable, x1,
-        x1_lower, x1_upper, rate, frequency (the imaginary part of the first eigenvalue: small
-        disturbances turn with it), and contact_0, contact_1, ..., the contact code of each belt."""
+        """A row for each, from left to right: kind (the name of an `EquilibriumKind`), stable,
+        neutral, x1, x1_lower, x1_upper, rate, frequency (the imaginary part of the first
+        eigenvalue: small disturbances turn with it), and contact_0, contact_1, ..., the contact
+        code of each belt."""
         require_single(self, self.kind, 0, 1)
         rows = jax.tree.map(np.asarray, self)
         if self.kind.ndim == 0:
@@ -113,6 +119,7 @@ class Equilibria(eqx.Module):
         names = {
             "kind": [EquilibriumKind(int(kind)).name for kind in np.asarray(rows.kind)[here]],
             "stable": rows.stable,
+            "neutral": rows.neutral,
             "x1": rows.x1,
             "x1_lower": rows.x1_lower,
             "x1_upper": rows.x1_upper,
@@ -142,7 +149,12 @@ def _row_text(row: Equilibria) -> str:
     where = number(row.x1)
     if kind == EquilibriumKind.SEGMENT:
         where = f"{number(row.x1_lower)} to {number(row.x1_upper)}"
-    return f"{'stable' if row.stable else 'unstable'} {kind.name} at x1 = {where}"
+    return f"{stability(row)} {kind.name} at x1 = {where}"
+
+
+def stability(row: Equilibria) -> str:
+    """What one row is called."""
+    return "stable" if row.stable else "neutral" if row.neutral else "unstable"
 
 
 def equilibria(osc: Oscillator) -> Equilibria:
@@ -217,6 +229,7 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
         moving_hold += jnp.where(stuck, belt.load * belt.friction.mu(jnp.zeros(())), 0.0)
     attracts = jnp.maximum(pull - moving_hold, lower) < jnp.minimum(pull + moving_hold, upper)
 
+    neutral = is_fixed & is_centre(osc, mode)
     x1 = jnp.where(is_segment, 0.5 * (first + last), pull)
     kind = jnp.where(is_segment, EquilibriumKind.SEGMENT.value, EquilibriumKind.FIXED_POINT.value)
     return Equilibria(
@@ -228,7 +241,8 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
         jacobian=jnp.where(is_fixed[:, None, None], jacobian, jnp.nan),
         eigenvalues=jnp.where(is_fixed[:, None], eigenvalues, complex(np.nan, np.nan)),
         rate=jnp.where(is_fixed, rate, jnp.nan),
-        stable=jnp.where(is_segment, attracts, is_fixed & (rate < 0)) & exists,
+        stable=jnp.where(is_segment, attracts, is_fixed & (rate < 0) & ~neutral) & exists,
+        neutral=neutral,
     )
 
 
@@ -291,6 +305,7 @@ def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equil
     # the velocity that does not go to 0 with it, so infinitely many loops take a finite time.
     rubs = capacity(osc, on_left) + capacity(osc, on_right) > 0
     rate = jnp.where(is_focus, jnp.where(rubs, -jnp.inf, focus.rate), jnp.nan)
+    neutral = exists & is_focus & ~rubs & is_centre(osc, left) & is_centre(osc, right)
     x1 = jnp.where(exists, x1, jnp.nan)
     none = jnp.full_like(x1, jnp.nan)
     kind = jnp.where(is_saddle, EquilibriumKind.SADDLE.value, EquilibriumKind.PSEUDO_FOCUS.value)
@@ -303,7 +318,8 @@ def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equil
         jacobian=jnp.broadcast_to(none[:, None, None], (*x1.shape, 2, 2)),
         eigenvalues=jnp.broadcast_to(lax.complex(none, none)[:, None], (*x1.shape, 2)),
         rate=jnp.where(is_saddle, jnp.inf, rate),
-        stable=rate < 0,
+        stable=(rate < 0) & ~neutral,
+        neutral=neutral,
     )
 
 

@@ -424,14 +424,33 @@ def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) 
     rightward = any_of([hit & right for hit, right in flags])
     after_edge = pass_edge(osc, mode, edge, x2, rightward)
     left, right = select(rightward, (mode, after_edge), (after_edge, mode))
+    released, end = _released_at_edge(osc, held, x1, x2_boundary)
+    needed = mode_acceleration(osc, held, end, x2_boundary)
+    on_end = at_boundary & released
+    beyond = pass_edge(osc, held, end, x2_boundary, needed > 0)
+    after_boundary = select(on_end, beyond, after_boundary)
     return Departure(
         mode=select(at_boundary, after_boundary, select(at_edge, after_edge, mode)),
-        x1=jnp.where(at_edge, edge, x1),
+        x1=jnp.where(at_edge, edge, jnp.where(on_end, end, x1)),
         x2=jnp.where(at_boundary, x2_boundary, x2),
         at_boundary=at_boundary,
         at_edge=at_edge,
         captured=at_edge & is_captured(osc, left, right, edge, x2),
     )
+
+
+def _released_at_edge(osc: Oscillator, held: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
+    """Whether a mass that comes to rest on belts at rest does so up to rounding at their limit and
+    at the edge towards which it is pulled: beyond the edge they hold nothing, so the segment that
+    they hold has no length, and the mass goes on as from a start there. And that edge.
+    """
+    needed = mode_acceleration(osc, held, x1, x2)
+    limit = capacity(osc, held)
+    rounding = ON_GUARD * (1 + jnp.abs(x1) + limit)
+    at_limit = (x2 == 0) & (jnp.abs(jnp.abs(needed) - limit) <= rounding)
+    ends = zip(edge_guards(osc, held, x1), edges_ahead(held, needed), strict=True)
+    near = [is_ahead & (guard <= rounding) for guard, is_ahead in ends]
+    return at_limit & any_of(near), foremost(osc, near, edges(osc), x1)
 
 
 # --- starts ---------------------------------------------------------------------------------------
@@ -460,21 +479,6 @@ def at_focus(osc: Oscillator, x1: Array, x2: Array) -> Array:
     a_right, a_left = (_pull_at_rest(osc, mode, x1) for mode in (right, left))
     slips = ~right.any_stuck & ~left.any_stuck
     return (x2 == 0) & slips & (a_left >= 0) & (a_right <= 0) & (a_left > a_right)
-
-
-def start_at_focus(osc: Oscillator, x1: Array, x2: Array) -> tuple[Array, Array]:
-    """The start (x1, x2); its derivatives at a pseudo-focus are those of the edge that this is on.
-
-    Neighbours of such a start are soon back there, or never.
-    """
-    if not has_edges(osc):
-        return x1, x2
-    edge = foremost(osc, [x1 == edge for edge in edges(osc)], edges(osc), x1)
-    there = at_focus(osc, x1, x2)
-    # The numbers are the same: XLA never ends to simplify a choice between them.
-    fixed1, fixed2 = lax.stop_gradient((x1, x2))
-    slope = edge - lax.stop_gradient(edge)
-    return jnp.where(there, fixed1 + slope, x1), jnp.where(there, fixed2, x2)
 
 
 def begins_at_rest(osc: Oscillator, x1: Array, x2: Array) -> Array:

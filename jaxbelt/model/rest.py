@@ -1,12 +1,26 @@
 """Orbits that come to rest: which states are at rest, or nearly, and which will be."""
 
 import functools
+from collections.abc import Sequence
 
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array
 
-from .modes import Mode, boundary_guards, edge_guards, force_rounding, mode_acceleration
-from .oscillator import Oscillator
+from .modes import (
+    Mode,
+    at_focus,
+    boundary_guards,
+    edge_guards,
+    edges,
+    force_rounding,
+    foremost,
+    has_edges,
+    mode_acceleration,
+)
+from .oscillator import Belt, Oscillator
 
 #: Radius of the smallest disc that is checked: in smaller ones the rounding of x1 counts.
 SMALLEST_DISC = 1e-6
@@ -32,6 +46,21 @@ def is_slow(x2: Array, a: Array) -> Array:
     start has derivatives that are exactly 0.
     """
     return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < SLOW_MOTION
+
+
+def start_at_focus(osc: Oscillator, x1: Array, x2: Array) -> tuple[Array, Array]:
+    """The start (x1, x2); its derivatives at a pseudo-focus are those of the edge that this is on.
+
+    Neighbours of such a start are soon back there, or never.
+    """
+    if not has_edges(osc):
+        return x1, x2
+    edge = foremost(osc, [x1 == edge for edge in edges(osc)], edges(osc), x1)
+    there = at_focus(osc, x1, x2)
+    # The numbers are the same: XLA never ends to simplify a choice between them.
+    fixed1, fixed2 = lax.stop_gradient((x1, x2))
+    slope = edge - lax.stop_gradient(edge)
+    return jnp.where(there, fixed1 + slope, x1), jnp.where(there, fixed2, x2)
 
 
 def settling_margin(
@@ -74,34 +103,72 @@ def is_neutral(
 ) -> Array:
     """Whether a closed orbit is one of a continuum of such.
 
-    It is where no force depends on the speed, so that energy is kept: without damping, for
-    constant friction of belts that no speed of the loop reaches. x1, x2: the smallest and the
-    largest of the loop; stuck: how much of the time it sticks.
+    It is where the force of each belt that no speed of the loop reaches is even in x2, and so the
+    sum of damping and of the belts that always touch, see `_is_balanced`: then time reversed maps
+    (x1, x2) to (x1, -x2), and every such orbit closes. x1, x2: the smallest and the largest of the
+    loop; stuck: how much of the time it sticks.
     """
     zero = jnp.zeros_like(x2[0])
-    speeds = [x2[0] + j / 8 * (x2[1] - x2[0]) for j in range(9)]
-    always = [-osc.damping * v for v in speeds]
     neutral = stuck < STICK_SHARE
     slack = TOUCH_SHARE * osc.omega * (x2[1] - x2[0])
+    fastest = jnp.maximum(-x2[0], x2[1])
+    always = []
     for belt in osc.belts:
         pulls = belt.load != 0
         touches = pulls & (belt.lower < x1[1]) & (belt.upper > x1[0])
         within = pulls & (belt.lower <= x1[0]) & (belt.upper >= x1[1])
-        r = [belt.velocity - osc.omega * v for v in speeds]
-        sign = jnp.sign(r[4])
-        reached = jnp.minimum(sign * r[0], sign * r[8]) < -slack
-        forces = [belt.load * sign * belt.friction.mu(jnp.abs(one)) for one in r]
+        sign = jnp.sign(belt.velocity - 0.5 * osc.omega * (x2[0] + x2[1]))
+        r = [sign * (belt.velocity - osc.omega * v) for v in x2]
+        reached = jnp.minimum(*r) < -slack
         # Where a static limit beyond mu(0) holds the mass for a while it is a cycle of its own.
         holds = belt.load * (belt.friction.static - belt.friction.mu(zero)) > 0
         neutral = neutral & ~(touches & holds & (stuck > 0))
-        kept = _range_of(forces) <= force_rounding(zero, belt.load)
+        undamped = eqx.tree_at(lambda o: o.damping, osc, zero)
+        kept = _is_balanced(undamped, [(belt, sign)], fastest, force_rounding(zero, belt.load))
         neutral = neutral & ~(touches & (reached | ~within & ~kept))
-        always = [a + jnp.where(within, f, 0.0) for a, f in zip(always, forces, strict=True)]
-    return neutral & (_range_of(always) <= force_rounding(zero))
+        always.append((belt, jnp.where(within, sign, 0.0)))
+    return neutral & _is_balanced(osc, always, fastest, force_rounding(zero))
 
 
-def _range_of(values: list[Array]) -> Array:
-    return functools.reduce(jnp.maximum, values) - functools.reduce(jnp.minimum, values)
+def is_centre(osc: Oscillator, mode: Mode) -> Array:
+    """Whether orbits around rest in a slip mode are closed: all its forces together are even in x2
+    up to the speed of the slowest belt that touches, see `is_neutral`.
+
+    Where they are nearly, up to their own rounding, they are taken to be.
+    """
+    slowest = jnp.inf
+    signs = []
+    for belt, code in zip(osc.belts, mode.codes, strict=True):
+        pulls = (jnp.abs(code) <= 1) & (belt.load != 0)
+        signs.append((belt, jnp.where(pulls, code, 0.0)))
+        speed = jnp.abs(belt.velocity) / osc.omega
+        slowest = jnp.minimum(slowest, jnp.where(pulls, speed, jnp.inf))
+    # At the speed of a belt that does not move nothing is balanced.
+    fastest = jnp.where(jnp.isinf(slowest), 1.0, slowest)
+    return (fastest > 0) & _is_balanced(osc, signs, fastest, None)
+
+
+def _is_balanced(
+    osc: Oscillator, signs: Sequence[tuple[Belt, Array]], fastest: Array, error: Array | None
+) -> Array:
+    """Whether damping and belts, with their signs of r (0: none), pull alike at x2 and -x2.
+
+    Looked at up to the speed `fastest`. error: how much counts as equal; None: the rounding of
+    those forces that are not even by themselves.
+    """
+    balanced = jnp.ones_like(fastest, dtype=bool)
+    for j in range(1, 5):
+        v = j / 4 * fastest
+        uneven, rounding = -2 * osc.damping * v, jnp.zeros_like(fastest)
+        for belt, sign in signs:
+            r = [jnp.abs(belt.velocity - osc.omega * speed) for speed in (v, -v)]
+            forces = [belt.load * sign * belt.friction.mu(one) for one in r]
+            uneven += forces[0] - forces[1]
+            larger = jnp.maximum(*map(jnp.abs, forces))
+            rounding += jnp.where(forces[0] != forces[1], larger, 0.0)
+        rounding = 16 * np.finfo(float).eps * rounding
+        balanced = balanced & (jnp.abs(uneven) <= (rounding if error is None else error))
+    return balanced
 
 
 def _losses(osc: Oscillator, mode: Mode, x1_rest: Array, radius: Array) -> list[Array]:

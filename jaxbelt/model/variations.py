@@ -220,8 +220,8 @@ class Variation:
 
     def meetings(self, first: float, last: float) -> dict[float, list[tuple[int, ...]]]:
         """Where, between two values of the one parameter, contact edges of two belts meet, both
-        with a load, their numbers. Not at these values themselves: an edge may have come there from
-        where it cannot be."""
+        with a load, their numbers. At these values themselves, too, unless there can be no
+        oscillator beyond: an edge may have come there from where it cannot be."""
         belts = self.oscillator(np.array([first])).belts
         ends = [
             [(number, name) for name in ("lower", "upper") if np.isfinite(getattr(belt, name))]
@@ -229,7 +229,20 @@ class Variation:
         ]
         which = [pair for two in combinations(ends, 2) for pair in product(*two)]
         found = self._zeros_of(which, first, last)
-        return {value: belts for value, belts in found.items() if first < value < last}
+        little = MERGED * (1 + last - first)
+        beyond = {first: first - little, last: last + little}
+        return {
+            value: belts
+            for value, belts in found.items()
+            if value not in beyond or self._is_possible(beyond[value])
+        }
+
+    def _is_possible(self, value: float) -> bool:
+        try:
+            self.check(value)
+        except ValueError:
+            return False
+        return True
 
     def _zeros_of(
         self, which: Sequence[Sequence[tuple[int, str]]], first: float, last: float

@@ -59,7 +59,7 @@ def plot_diagram(
     ax = new_axes() if ax is None else ax
     special = np.array([float(point.value) for point in diagram.points])
     for branch, drawn in zip(diagram.branches, curves, strict=True):
-        for rows in _stretches_of(branch.stable):
+        for rows in _stretches_of(branch.stable + 2 * branch.neutral):
             lines = [_between_rows(branch.values[rows], curve[rows], special) for curve in drawn]
             _draw_rows(ax, branch, rows, lines)
     first, last = diagram.regions[0][0], diagram.regions[-1][1]
@@ -159,15 +159,16 @@ def _smooth_piece(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def _draw_rows(
     ax: Axes, branch: Branch, rows: slice, lines: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> None:
-    stable = bool(branch.stable[rows][0])
+    stable, neutral = bool(branch.stable[rows][0]), bool(branch.neutral[rows][0])
     is_cycle = branch.kind == "cycle"
+    stability = "stable" if stable else "neutral" if neutral else "unstable"
     style: dict[str, Any] = {
         "color": "black" if stable else UNSTABLE_COLOUR,
         "linewidth": (2.0 if stable else 1.2) if is_cycle else 1.1,
         "linestyle": (0, (4, 2)) if is_cycle and not stable else "-",
         "solid_capstyle": "butt",
         "zorder": 3 if stable else 2.5,
-        "label": f"{'' if stable else 'un'}stable {'cycle' if is_cycle else 'fixed point'}",
+        "label": f"{stability} {'cycle' if is_cycle else 'fixed point'}",
     }
     for values, curve in lines:
         if not np.all(np.isnan(curve)):

@@ -7,8 +7,8 @@ returns the axes. What is drawn is shown in the manner of the paper:
   belt, in the colour of the belt; the part where the mass sticks (the sliding set) is a wide pale
   band behind it. Finite contact edges sigma are dotted vertical lines.
 - stable cycles as thick solid, unstable ones as dashed lines, other orbits thin and grey;
-- stable fixed points filled, unstable ones open, pseudo-foci as diamonds in the same way, a segment
-  of pseudo-equilibria as a thick bar, saddles as crosses.
+- stable fixed points filled, unstable ones open, neutral ones grey, pseudo-foci as diamonds in the
+  same way, a segment of pseudo-equilibria as a thick bar, saddles as crosses.
 - stable separatrices, which bound basins, purple, unstable ones grey and dash-dotted.
 """
 
@@ -27,7 +27,7 @@ from ..checks import as_interval, require_one_of, require_value
 from ..cycles.cycle import Cycle
 from ..cycles.portrait import Portrait
 from ..cycles.separatrices import Separatrix
-from ..model.equilibria import Equilibria, EquilibriumKind
+from ..model.equilibria import Equilibria, EquilibriumKind, stability
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.modes import mode_acceleration, mode_of_state
 from ..model.oscillator import Oscillator, check_oscillator
@@ -390,8 +390,8 @@ def _with_margin(values: Sequence[float]) -> tuple[float, float]:
 
 
 def draw_equilibrium(ax: Axes, row: Equilibria) -> None:
-    """One row of equilibria, see the module's text; filled where stable."""
-    face = "black" if row.stable else "white"
+    """One row of equilibria, see the module's text; filled where stable, grey where neutral."""
+    face = "black" if row.stable else "0.6" if row.neutral else "white"
     ends = [float(row.x1_lower), float(row.x1_upper)]
     if row.kind == EquilibriumKind.SEGMENT:
         bar = {"solid_capstyle": "butt", "zorder": 5}
@@ -403,11 +403,10 @@ def draw_equilibrium(ax: Axes, row: Equilibria) -> None:
         ax.plot(ends[:1], [0.0], color="black", label="saddle", zorder=6, **cross)
         return
     is_focus = row.kind == EquilibriumKind.PSEUDO_FOCUS
-    stability = "stable" if row.stable else "unstable"
     ax.plot(
         ends[:1],
         [0.0],
-        label=f"{stability} {'pseudo-focus' if is_focus else 'fixed point'}",
+        label=f"{stability(row)} {'pseudo-focus' if is_focus else 'fixed point'}",
         linestyle="none",
         marker="D" if is_focus else "o",
         markersize=5,

@@ -34,7 +34,7 @@ SPARE_COLOURS = ("#DDDDDD", "#F5E9A9", "#BFE3D0", "#F3D0E2", "#D9CBEA", "#C5D9E8
 MOST_ROWS = 4
 #: What the names say of equilibria.
 EQUILIBRIA_TOLD = (
-    "after the colon:\nf fixed point\np pseudo-focus\nh held at rest\n(in brackets: unstable)"
+    "after the colon:\nf fixed point\np pseudo-focus\nh held at rest\n(in brackets: not stable)"
 )
 
 

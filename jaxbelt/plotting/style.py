@@ -26,8 +26,10 @@ KEY_ORDER = (
     "sliding set",
     "stable fixed point",
     "unstable fixed point",
+    "neutral fixed point",
     "stable pseudo-focus",
     "unstable pseudo-focus",
+    "neutral pseudo-focus",
     "pseudo-equilibria",
     "saddle",
 )

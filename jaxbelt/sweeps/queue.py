@@ -25,8 +25,8 @@ from ..kernel.events import pass_events
 from ..kernel.lanes import Lanes, Program, are_finite, choose, without_edges
 from ..kernel.rounds import STEPS_PER_ROUND, lanes_at_start
 from ..kernel.step import take_step, window_of
-from ..model.modes import start_at_focus
 from ..model.oscillator import Oscillator
+from ..model.rest import start_at_focus
 from ..numerics.compiling import one_kernel
 from ..results import Status
 
