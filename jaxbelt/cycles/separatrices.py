@@ -359,7 +359,7 @@ def _branch(
     known = np.arange(count) < count - (not was_cut)
     ends = np.where(known, orbit.ends[:count], Ends(len(osc.belts)).unused)
     # An arc that creeps is one, though followed in pieces.
-    whole = int(np.argmax(np.append(ends, -1) < 0)) + 1
+    whole = min(count, int(np.argmax(np.append(ends, -1) < 0)) + 1)
     durations = np.append(since[: whole - 1, -1], np.sum(since[whole - 1 : count, -1]))
     ends = np.where(ends < 0, Ends(len(osc.belts)).unused, ends)
     columns = orbit.codes[:whole], ends[:whole], orbit.entries[:whole], durations
