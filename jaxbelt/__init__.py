@@ -13,7 +13,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     checks          arguments, checked at the public edge
     tables          results as tables
     numerics/       derivatives extrapolation newton continuation roots
-    model/          friction oscillator machine parameters variations modes rest events equilibria
+    model/          friction oscillator machine parameters variations modes pseudofocus transitions
+    model/          rest events equilibria
     presets         the published systems
     kernel/         lanes step events rounds
     motion/         integrators arcs sensitivities sampling batches runs smoothing simulate

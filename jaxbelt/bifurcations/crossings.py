@@ -19,8 +19,9 @@ from jaxtyping import Array
 from ..cycles.chains import SIZES, Chain, Loop
 from ..cycles.cycle import Cycle
 from ..cycles.shooting import meshed
-from ..model.modes import any_of, mode_of, stick_limit
+from ..model.modes import any_of, mode_of
 from ..model.oscillator import Belt, Oscillator
+from ..model.transitions import stick_limit
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..results import EventKind, Status

@@ -8,7 +8,7 @@ There is no cycle at these points, and no unknown but the parameter.
   pseudo-focus, or holds the mass; if that pushes away, it meets the saddle of the edge and both
   vanish (annihilation).
 - `PseudoHopf`: at a pseudo-focus the leading term by which loops grow or shrink is zero. With the
-  next one, of third order, |x2| at the edge obeys r' = rate r + a r^3, see `modes.edge_focus`, and
+  next one, of third order, |x2| at the edge obeys r' = rate r + a r^3, see `edge_focus`, and
   the cycle that is born has r^2 = -rate/a.
 
 Boundary equilibria and the pseudo-Hopf point are those of M. di Bernardo, C. Budd, A. Champneys, P.
@@ -25,19 +25,10 @@ import numpy as np
 from jaxtyping import Array
 
 from ..checks import is_concrete, require_value
-from ..model.modes import (
-    Mode,
-    capacity,
-    contact,
-    edge_focus,
-    edges,
-    field_at_rest,
-    mode_acceleration,
-    mode_of,
-    select,
-    settle,
-)
+from ..model.modes import Mode, capacity, edges, mode_acceleration, mode_of, select, settle
 from ..model.oscillator import Oscillator
+from ..model.pseudofocus import edge_focus, field_at_rest
+from ..model.transitions import contact
 from ..model.variations import Family
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
@@ -134,7 +125,7 @@ class EdgeBalance(_EdgeSystem):
         return field_at_rest(osc, self.left, at)[:2], field_at_rest(osc, self.right, at)[:2]
 
     def balance(self, osc):
-        # The rate of `modes.edge_focus` but for factors: regular where one of the pushes is 0.
+        # The rate of `edge_focus` but for factors: regular where one of the pushes is 0.
         (a_left, trace_left), (a_right, trace_right) = self._sides(osc)
         return trace_right * a_left - trace_left * a_right
 

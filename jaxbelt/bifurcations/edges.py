@@ -24,8 +24,9 @@ from ..cycles.chains import SIZES, Chain, Loop, following_codes
 from ..cycles.cycle import separating_loop
 from ..cycles.settling import AT_REST
 from ..cycles.shooting import end_guard, meshed
-from ..model.modes import edges, mode_acceleration, mode_of, onset_position
+from ..model.modes import edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
+from ..model.transitions import onset_position
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.continuation import Stop

@@ -26,8 +26,9 @@ from jaxtyping import Array
 from ..checks import is_concrete, require_value
 from ..cycles.chains import SIZES, Chain, Loop
 from ..cycles.shooting import meshed
-from ..model.modes import Mode, any_of, capacity, contact, edges, mode_acceleration
+from ..model.modes import Mode, any_of, capacity, edges, mode_acceleration
 from ..model.oscillator import Oscillator
+from ..model.transitions import contact
 from ..results import Status
 from .conditions import AbstractCondition, AbstractCycleCondition, Line, check_two_belts
 from .crossings import arrival_tests

@@ -26,13 +26,7 @@ from jaxtyping import Array
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
-from ..model.modes import (
-    boundary_guards,
-    capacity,
-    edge_guards,
-    mode_acceleration,
-    mode_of,
-)
+from ..model.modes import boundary_guards, capacity, edge_guards, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import Family, Variation

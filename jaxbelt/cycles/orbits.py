@@ -14,21 +14,17 @@ from jaxtyping import Array
 from ..model.modes import (
     STUCK,
     Mode,
-    at_focus,
-    begins_at_rest,
     capacity,
-    contact,
     edges,
     first_of,
     force_rounding,
     mode_acceleration,
     mode_of,
-    mode_of_state,
-    onset_position,
     select,
 )
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.rest import settles
+from ..model.transitions import at_focus, begins_at_rest, contact, mode_of_state, onset_position
 from ..motion.arcs import ArcEnd, Ends, Signs, after_slip, signs_after, slip_arc, stick_arc
 from ..motion.integrators import STRIDE, Graded
 from ..numerics.compiling import any_lane, one_kernel

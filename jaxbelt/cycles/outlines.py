@@ -25,13 +25,13 @@ from ..model.modes import (
     STUCK,
     Mode,
     capacity,
-    contact,
     edges,
     force_rounding,
     mode_acceleration,
     mode_of,
 )
 from ..model.oscillator import Oscillator
+from ..model.transitions import contact
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from .backwards import BackwardCycle

@@ -28,8 +28,9 @@ from jaxtyping import Array
 
 from ..checks import pick
 from ..model.equilibria import Equilibria
-from ..model.modes import contact, edges, mode_acceleration, settle
+from ..model.modes import edges, mode_acceleration, settle
 from ..model.oscillator import Oscillator
+from ..model.transitions import contact
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .attractors import distinct

@@ -40,15 +40,14 @@ from ..model.modes import (
     STUCK,
     Mode,
     capacity,
-    contact,
     edges,
     force_rounding,
     mode_acceleration,
     mode_of,
-    mode_of_state,
     select,
 )
 from ..model.oscillator import Oscillator
+from ..model.transitions import contact, mode_of_state
 from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit
 from ..results import Status, draw

@@ -1,7 +1,7 @@
 """When an orbit has settled: one rule for the orbits behind cycles and for the runs of sweeps.
 
 It has come to rest where it enters a disc that a fixed point attracts (`rest.settling_margin`),
-where a pseudo-focus captures it (`modes.is_captured`), or where its loops shrink and are smaller
+where a pseudo-focus captures it (`is_captured`), or where its loops shrink and are smaller
 than can be told from rest. It is on a cycle where a loop repeats. One that sticks repeats exactly,
 because slip onset is a function of the parameters alone; so it is on a cycle however small it is.
 One that does not stick comes ever nearer to its cycle, and is measured at its tops, the maxima of

@@ -35,14 +35,13 @@ from ..model.modes import (
     capacity,
     edge_guards,
     edges,
-    held_at_boundary,
     mode_acceleration,
     mode_of,
-    onset_position,
     select,
     stick_velocity,
 )
 from ..model.oscillator import Oscillator
+from ..model.transitions import held_at_boundary, onset_position
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, one_kernel

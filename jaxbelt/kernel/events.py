@@ -12,18 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..model.events import Signature, event_between
-from ..model.modes import (
-    Mode,
-    guard_passed,
-    leave_slip,
-    leave_stick,
-    mode_acceleration,
-    select,
-    stick_phase,
-    without_rounding,
-)
+from ..model.modes import Mode, mode_acceleration, select, without_rounding
 from ..model.oscillator import Oscillator
 from ..model.rest import is_at_rest, is_slow
+from ..model.transitions import guard_passed, leave_slip, leave_stick, stick_phase
 from ..results import EventKind, Status
 from .lanes import Lanes, Passage
 from .step import NO_STEP, STEP_SAFETY, first_step

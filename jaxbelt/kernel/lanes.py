@@ -56,7 +56,7 @@ class Passage(eqx.Module):
     """What one call of `events.pass_events` did to the lanes, arrays [lanes].
 
     landed: the last step ended on a guard or where x2 = 0. fired: it was a guard, the one of that
-    number, see `modes.guard_passed`; `before` and `mode` are the modes on both sides of it, at
+    number, see `guard_passed`; `before` and `mode` are the modes on both sides of it, at
     (t, x1, x2). captured: by a pseudo-focus. rests: at rest up to rounding. stuck: a stick phase
     followed, of that duration; released: it ended before t1, by slip onset or at an edge; forever:
     it never ends.

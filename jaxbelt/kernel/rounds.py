@@ -5,8 +5,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import Mode, at_focus, mode_acceleration, mode_of_state
+from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator, has_possible_numbers
+from ..model.transitions import at_focus, mode_of_state
 from ..results import Status
 from .events import pass_events
 from .lanes import Lanes, code_of, without_edges

@@ -32,14 +32,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import (
-    ULPS,
-    bounds_leftward,
-    bounds_rightward,
-    fastest_rate,
-    foremost,
-    select,
-)
+from ..model.modes import ULPS, bounds_leftward, bounds_rightward, fastest_rate, foremost, select
 from ..model.modes import edges as edge_positions
 from ..model.oscillator import Oscillator
 from ..model.rest import is_at_rest

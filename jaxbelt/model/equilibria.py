@@ -5,7 +5,7 @@ pulls with u0_i mu_i(|nu_i|) sgn(nu_i), and the spring balances their sum, the p
 That is a fixed point, eq. (24) of the paper, if it lies in the zone. Touching belts at rest hold
 whatever is up to their capacity, the sum of u0_k mus_k: then all x1 within the capacity of the
 pull are pseudo-equilibria, a segment. At an edge between two zones whose accelerations both point
-to the edge, a_L > 0 > a_R, there is a pseudo-focus (see `modes.edge_focus`).
+to the edge, a_L > 0 > a_R, there is a pseudo-focus (see `pseudofocus.edge_focus`).
 
 At an edge that pushes away to both sides, a_L < 0 < a_R, there is a saddle: x1' = x2 on both sides,
 so nothing slides along an edge, and (sigma, 0) is a visible-visible two-fold (see M. Guardia, T. M.
@@ -31,18 +31,9 @@ from ..checks import is_concrete, number, pick
 from ..numerics.compiling import jit
 from ..results import draw
 from ..tables import per_belt, require_single, table_of
-from .modes import (
-    ABOVE,
-    BELOW,
-    STUCK,
-    Mode,
-    capacity,
-    edge_focus,
-    edges,
-    mode_acceleration,
-    settle,
-)
+from .modes import ABOVE, BELOW, STUCK, Mode, capacity, edges, mode_acceleration, settle
 from .oscillator import Oscillator, check_oscillator, has_possible_numbers
+from .pseudofocus import edge_focus
 from .rest import is_centre
 
 if TYPE_CHECKING:

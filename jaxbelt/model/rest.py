@@ -11,7 +11,6 @@ from jaxtyping import Array
 
 from .modes import (
     Mode,
-    at_focus,
     boundary_guards,
     edge_guards,
     edges,
@@ -21,6 +20,7 @@ from .modes import (
     mode_acceleration,
 )
 from .oscillator import Belt, Oscillator
+from .transitions import at_focus
 
 #: Radius of the smallest disc that is checked: in smaller ones the rounding of x1 counts.
 SMALLEST_DISC = 1e-6

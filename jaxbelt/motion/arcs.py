@@ -27,16 +27,13 @@ from ..model.modes import (
     boundary_guards,
     bounds_leftward,
     bounds_rightward,
-    directions,
     edge_guards,
     first_of,
-    leave_slip,
-    leave_stick,
     mode_acceleration,
     select,
-    stick_phase,
 )
 from ..model.oscillator import Oscillator
+from ..model.transitions import directions, leave_slip, leave_stick, stick_phase
 from ..numerics.roots import first_root
 from .integrators import AbstractIntegrator, State, slip_field
 

@@ -27,15 +27,10 @@ from jax import lax
 from jaxtyping import Array
 
 from ..model.events import event_between
-from ..model.modes import (
-    Mode,
-    at_focus,
-    mode_acceleration,
-    mode_of_state,
-    select,
-)
+from ..model.modes import Mode, mode_acceleration, select
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.rest import is_at_rest
+from ..model.transitions import at_focus, mode_of_state
 from ..numerics.compiling import any_lane, of_lane, one_kernel, with_batches
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc

@@ -27,13 +27,13 @@ from ..model.modes import (
     edge_guards,
     first_of,
     foremost,
-    leave_slip,
     mode_of,
     select,
     stick_velocity,
 )
 from ..model.oscillator import Oscillator
 from ..model.rest import is_slow
+from ..model.transitions import leave_slip
 from ..numerics.compiling import LARGEST, any_lane, one_kernel, with_batches
 from ..numerics.extrapolation import increments, scheme
 from .arcs import stick_arc

@@ -14,9 +14,10 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import as_numbers, check_finite, check_positive, is_concrete, require
-from ..model.modes import contact, has_edges
+from ..model.modes import has_edges
 from ..model.oscillator import Oscillator, check_oscillator, has_possible_numbers
 from ..model.rest import start_at_focus
+from ..model.transitions import contact
 from ..numerics.compiling import jit
 from ..results import EventKind, Status, describe, draw
 from ..tables import per_belt, require_single, table_of

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import STUCK, Mode, capacity, contact, mode_acceleration, select, stick_velocity
+from ..model.modes import STUCK, Mode, capacity, mode_acceleration, select, stick_velocity
 from ..model.oscillator import Oscillator
+from ..model.transitions import contact
 from ..numerics.derivatives import forward_jacobian
 
 #: Steps between two samples before a run is given up.

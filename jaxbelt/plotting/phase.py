@@ -29,8 +29,9 @@ from ..cycles.portrait import Portrait
 from ..cycles.separatrices import Separatrix
 from ..model.equilibria import Equilibria, EquilibriumKind, stability
 from ..model.equilibria import equilibria as find_equilibria
-from ..model.modes import mode_acceleration, mode_of_state
+from ..model.modes import mode_acceleration
 from ..model.oscillator import Oscillator, check_oscillator
+from ..model.transitions import mode_of_state
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
 from .style import (

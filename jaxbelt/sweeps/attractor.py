@@ -13,9 +13,10 @@ from ..cycles.settling import REPEATED, way_left
 from ..kernel.events import append, event_kinds, word_events
 from ..kernel.lanes import Lanes, Observer, Passage, Variable, materialise
 from ..model.events import signature_name
-from ..model.modes import begins_at_rest, select
+from ..model.modes import select
 from ..model.oscillator import Oscillator
 from ..model.rest import is_neutral, settling_margin
+from ..model.transitions import begins_at_rest
 from ..results import Status
 from .marks import Mark
 
@@ -77,7 +78,7 @@ class Attractor(Observer):
       the parameters alone, so it does so to the last bits. One that does not stick converges: its
       top (a maximum of x1, where x2 = 0) repeats, see `settling`.
     - An equilibrium: the run begins on one, or the orbit has entered a disc that is attracted by a
-      fixed point, see `rest.settling_margin`. A pseudo-focus is recognised by `modes.is_captured`.
+      fixed point, see `rest.settling_margin`. A pseudo-focus is recognised by `is_captured`.
     - Stuck for ever: on a belt at rest.
     - None of these: a closed orbit beside others, as around a centre, see `rest.is_neutral`. It
       attracts nothing, and the run ends undecided with the status NEUTRAL.

@@ -16,7 +16,7 @@ import numpy as np
 from ..kernel.events import word_events
 from ..kernel.lanes import Program
 from ..model.events import of_one_loop
-from ..model.modes import FOCUS_RADIUS
+from ..model.pseudofocus import FOCUS_RADIUS
 from ..results import Status
 from .attractor import CYCLE, UNDECIDED
 from .observers import Final

@@ -1,0 +1,97 @@
+"""The pseudo-focus at a contact edge, and when it captures an orbit."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .modes import (
+    Mode,
+    force_rounding,
+    mode_acceleration,
+)
+from .oscillator import Oscillator
+
+#: Speed at the edge above which no orbit counts as captured by a stable pseudo-focus there.
+FOCUS_RADIUS = 1e-2
+#: Speed at the edge below which loops around it, as wide as its square, are rounding of x1.
+FOCUS_ROUNDING = 1e-7
+
+
+class EdgeFocus(eqx.Module):
+    """Motion around a point (edge, 0) with the field a_L on its left, a_R on its right.
+
+    exists: a_L > 0 > a_R, so that the mass at rest there is pushed back from both sides. The
+    velocity r = |x2| at the crossings obeys r' = rate r + coefficient r^3 + O(r^4); bend is a bound
+    of the coefficient's size.
+    """
+
+    exists: Array
+    rate: Array
+    coefficient: Array
+    bend: Array
+
+
+def field_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array, Array, Array]:
+    """Taylor coefficients of x2' of a slip mode in x2, from (x1, 0): of order 0 to 3."""
+    rest = jnp.zeros_like(x1)
+
+    def derivative(fn):
+        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
+
+    def a(x2):
+        return mode_acceleration(osc, mode, x1, x2)
+
+    first = derivative(a)
+    second = derivative(first)
+    return a(rest), first(rest), second(rest) / 2, derivative(second)(rest) / 6
+
+
+def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFocus:
+    """The pseudo-focus at x1 = edge between the slip modes to its left and right.
+
+    Of the half-loop on one side, from (edge, v) to (edge, -w), with x2' = -a - (x1 - edge) +
+    b x2 + c x2^2 + d x2^3 there: 1/w = 1/v - k - e v^2 + O(v^3), where k = 2 b / (3 a) and
+    e = 2 d/(5 a) + 2 b c/(15 a^2) + 4 b^3/(135 a^3) - 2 b/(15 a^3), with -c for c on the left, by
+    inserting the series into the orbit x1(x2). Both sides add up, and a loop takes
+    (2/a_L + 2/|a_R|) |x2|: rate and coefficient are the sums of k and of e over that factor.
+    """
+    sides = [field_at_rest(osc, mode, edge) for mode in (left, right)]
+    exists = (sides[0][0] > 0) & (sides[1][0] < 0)
+    k, e, bend, slowness = (jnp.zeros(()),) * 4
+    for (a, b, c, d), turn in zip(sides, (-1.0, 1.0), strict=True):
+        a = jnp.where(exists, jnp.abs(a), 1.0)
+        k, slowness = k + 2 * b / (3 * a), slowness + 2 / a
+        even = turn * b * c / (7.5 * a**2)
+        terms = (2 * d / (5 * a), even, 4 * (b / a) ** 3 / 135, -b / (7.5 * a**3))
+        e, bend = e + sum(terms), bend + sum(map(jnp.abs, terms))
+    return EdgeFocus(exists, k / slowness, e / slowness, bend / slowness)
+
+
+def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array) -> Array:
+    """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
+
+    The leading term of a loop must outweigh the next one by ten (see `EdgeFocus`), and no boundary
+    may be near. With a belt at rest, or with a fixed point on the edge, the loops shrink to
+    rounding.
+    """
+    focus = edge_focus(osc, left, right, edge)
+    size = jnp.abs(x2)
+    nearest = jnp.inf
+    for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
+        rubs = (is_left | is_right) & (belt.load != 0)
+        nearest = jnp.minimum(nearest, jnp.where(rubs, jnp.abs(belt.velocity), jnp.inf))
+    captured = (
+        focus.exists
+        & (focus.rate < 0)
+        & (10 * size**2 * focus.bend < -focus.rate)
+        & (size < FOCUS_RADIUS)
+        & (2 * osc.omega * size < nearest)
+    )
+    a_left, trace_left, *_ = field_at_rest(osc, left, edge)
+    a_right, trace_right, *_ = field_at_rest(osc, right, edge)
+    rounding = force_rounding(edge)
+    pushed = (a_left > -rounding) & (a_right < rounding) & (a_left - a_right > rounding)
+    shrinks = trace_right * jnp.maximum(a_left, 0) - trace_left * jnp.minimum(a_right, 0) < 0
+    captured = captured | pushed & (shrinks | (nearest == 0)) & (size < FOCUS_ROUNDING)
+    return captured & ~left.any_stuck & ~right.any_stuck

@@ -1,0 +1,330 @@
+"""Transitions: how an orbit goes on where a guard of its mode vanishes, and from a start.
+
+An orbit leaves a mode where one of its guards, positive inside, vanishes. What follows is decided
+by `leave_slip` and `leave_stick`, and both leave the question "stuck or not" to `modes.settle`:
+whether the contacts that are to be stuck can hold the force needed.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from .modes import (
+    ABOVE,
+    BELOW,
+    STUCK,
+    ULPS,
+    Mode,
+    any_of,
+    boundary_guards,
+    bounds_rightward,
+    capacity,
+    edge_guards,
+    edges,
+    edges_ahead,
+    first_of,
+    force_rounding,
+    foremost,
+    has_edges,
+    mode_acceleration,
+    select,
+    settle,
+    stick_velocity,
+    without_rounding,
+)
+from .oscillator import Oscillator
+from .pseudofocus import (
+    is_captured,
+)
+
+#: A guard this small, over 1 + |nu| or 1 + |x1|, is 0: orbits are put on a guard exactly, so this
+#: is the rounding of a difference.
+ON_GUARD = 1e-14
+
+
+def directions(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
+    """Signs of x2' and of x2 just after (x1, x2) in a slip mode.
+
+    Where x2' = 0, as at slip onset, x2'' = -x2 decides; where x2 = 0, x2' does. Both are 0 at an
+    equilibrium only.
+    """
+    a = mode_acceleration(osc, mode, x1, x2)
+    tangent = (jnp.abs(a) < force_rounding(x1)) & (x2 != 0)
+    a_sign = jnp.sign(jnp.where(tangent, -x2, a))
+    return a_sign, jnp.where(x2 == 0, a_sign, jnp.sign(x2))
+
+
+def guard_passed(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+    """The number of the guard through which an orbit leaves a slip mode at (x1, x2), or -1.
+
+    The guard has to vanish there, and to fall: one that vanishes and rises bounds what the orbit
+    has just entered. Numbered as in `leave_slip`; of several the first.
+    """
+    a_sign, v_sign = directions(osc, mode, x1, x2)
+    guards = boundary_guards(osc, mode, x2)
+    passed = [
+        (guard <= ON_GUARD * (1 + jnp.abs(belt.velocity))) & (code * a_sign > 0)
+        for belt, code, guard in zip(osc.belts, mode.codes, guards, strict=True)
+    ]
+    if has_edges(osc):
+        guards, ahead = edge_guards(osc, mode, x1), edges_ahead(mode, v_sign)
+        passed += [
+            (guard <= ON_GUARD * (1 + jnp.abs(x1))) & is_ahead
+            for guard, is_ahead in zip(guards, ahead, strict=True)
+        ]
+    numbers = [jnp.asarray(i) for i in range(len(passed))]
+    return first_of(passed, numbers, jnp.asarray(-1))
+
+
+def held_at_boundary(osc: Oscillator, mode: Mode, hit: Sequence[Array]) -> tuple[Mode, Array]:
+    """The mode in which a mass at r_k = 0 of the belt with hit[k] set is held by all belts that
+    touch it and have that velocity, and x2 = nu_k/omega."""
+    velocities = [belt.velocity for belt in osc.belts]
+    velocity = first_of(hit, velocities, velocities[0])
+    held = _held_by(osc, mode, velocity)
+    return held, foremost(osc, held.stuck, velocities, velocity) / osc.omega
+
+
+def _held_by(osc: Oscillator, mode: Mode, velocity: Array) -> Mode:
+    """The mode in which all touching belts of a velocity hold the mass."""
+    rows = zip(osc.belts, mode.codes, mode.touching, strict=True)
+    return Mode(
+        tuple(jnp.where(on & (belt.velocity == velocity), STUCK, code) for belt, code, on in rows)
+    )
+
+
+def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Array) -> Mode:
+    """The mode after the mass passed a contact edge at x1 = edge, rightward or leftward.
+
+    Belts whose interval ends there leave, those whose interval begins there arrive with the sign
+    of their relative velocity. If the mass was stuck it may stay so, be torn off, or, where the
+    belt that it was stuck to is left, slip on.
+    """
+    speed = stick_velocity(osc, mode, osc.omega * x2)
+    codes = []
+    for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
+        at_lower, at_upper = belt.lower == edge, belt.upper == edge
+        arrives = jnp.where(rightward, at_lower & (code == BELOW), at_upper & (code == ABOVE))
+        leaves = touches & jnp.where(rightward, at_upper, at_lower)
+        code = jnp.where(arrives, _slip_sign(belt.velocity, speed), code)
+        codes.append(jnp.where(leaves, jnp.where(rightward, ABOVE, BELOW), code))
+    # Slip may have set in just before; a belt of that very velocity that arrives asks anew.
+    after = Mode(tuple(codes))
+    velocity = stick_velocity(osc, after, jnp.full_like(edge, jnp.nan))
+    return settle(osc, _held_by(osc, after, velocity), edge, x2)
+
+
+def _slip_sign(velocity: Array, speed: Array) -> Array:
+    """Sign of velocity - speed; 0 where they are equal but for the rounding of nu/omega."""
+    same = jnp.abs(velocity - speed) <= ULPS * jnp.abs(velocity)
+    return jnp.where(same, STUCK, jnp.sign(velocity - speed))
+
+
+class StickPhase(eqx.Module):
+    """A stick phase in closed form, from its entry to its end (arrays of the batch shape).
+
+    duration: inf where it never ends (a belt at rest); x1: where it ends; x2: of the mass in all of
+    it, which moves with the belt (a start that sticks has the same number, but not its
+    derivatives); slips: it ends by slip onset; edge: which of `edges` ends it otherwise, one flag
+    each.
+    """
+
+    duration: Array
+    x1: Array
+    x2: Array
+    slips: Array
+    edge: list[Array]
+
+
+def onset_position(osc: Oscillator, mode: Mode) -> Array:
+    """x1 where a stick phase of the mode comes to slip onset, eqs. (10), (19), (20).
+
+    The needed force is linear in x1, needed = rest - x1; it reaches the capacity there.
+    """
+    return stick_limit(osc, mode, jnp.sign(stick_velocity(osc, mode, jnp.zeros(()))))
+
+
+def stick_limit(osc: Oscillator, mode: Mode, side: Array) -> Array:
+    """x1 where the needed force is as large as the stuck belts of the mode can hold.
+
+    side: 1 the end on the right of where the mass sticks, -1 that on the left.
+    """
+    v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
+    return mode_acceleration(osc, mode, jnp.zeros(()), v) + side * capacity(osc, mode)
+
+
+def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
+    """How the stick phase of `mode` that is at x1 goes on: x1 moves with x2 = nu_k/omega.
+
+    It ends at slip onset or at the first contact edge ahead. Where both are at one place but for
+    rounding it ends at the edge, and `pass_edge` tells whether the mass sticks beyond.
+    """
+    v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
+    moves = v != 0
+    v_or_one = jnp.where(moves, v, 1.0)
+    x1_onset = onset_position(osc, mode)
+    onset_distance = jnp.where(moves, jnp.sign(v) * (x1_onset - x1), jnp.inf)
+
+    edge_distances = [
+        jnp.where(is_ahead, guard, jnp.inf)
+        for is_ahead, guard in zip(edges_ahead(mode, v), edge_guards(osc, mode, x1), strict=True)
+    ]
+    to_edge = functools.reduce(jnp.minimum, edge_distances)
+    rounding = ON_GUARD * (1 + jnp.abs(x1_onset) + capacity(osc, mode))
+    slips = (onset_distance + rounding < to_edge) | jnp.isinf(to_edge)
+    at_edge = [~slips & (distance <= to_edge) for distance in edge_distances]
+    x1_end = jnp.where(slips, x1_onset, foremost(osc, at_edge, edges(osc), x1))
+    # Not distance/|v|: x1_end does not depend on x1, and so neither do its derivatives.
+    duration = (x1_end - x1) / v_or_one
+    # Negative by rounding only; its derivatives are those of the quotient there, too.
+    duration = duration + lax.stop_gradient(jnp.maximum(duration, 0.0) - duration)
+    duration = jnp.where(moves, duration, jnp.inf)
+    return StickPhase(duration, x1_end, v, slips, at_edge)
+
+
+def leave_stick(osc: Oscillator, mode: Mode, phase: StickPhase) -> Mode:
+    """The mode after a stick phase at its end: slip onset, or an edge passed while sticking.
+
+    Slip onset is tangent to the boundary; the new sign is -sgn(needed) = sgn(nu_k).
+    """
+    slipping = Mode(
+        tuple(
+            jnp.where(stuck, jnp.sign(phase.x2), code)
+            for code, stuck in zip(mode.codes, mode.stuck, strict=True)
+        )
+    )
+    if not has_edges(osc):
+        return slipping
+    return select(phase.slips, slipping, pass_edge(osc, mode, phase.x1, phase.x2, phase.x2 > 0))
+
+
+class Departure(eqx.Module):
+    """How an orbit goes on after a guard of its slip mode vanished (arrays of the batch shape).
+
+    mode, x1, x2: from there on, x2 = nu/omega (x1 = edge) put exactly on a boundary (an edge);
+    captured: by a pseudo-focus at the edge, see `is_captured`.
+    """
+
+    mode: Mode
+    x1: Array
+    x2: Array
+    at_boundary: Array
+    at_edge: Array
+    captured: Array
+
+
+def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) -> Departure:
+    """What follows where the guard of that number of a slip mode vanishes at (x1, x2).
+
+    The n `boundary_guards` come first, then the 2n `edge_guards`; any other number is no
+    transition.
+    """
+    n = len(osc.belts)
+    at_boundary, at_edge = (guard >= 0) & (guard < n), (guard >= n) & (guard < 3 * n)
+    hit = [guard == i for i in range(n)]
+    held, x2_boundary = held_at_boundary(osc, mode, hit)
+    after_boundary = settle(osc, held, x1, x2_boundary)
+    if not has_edges(osc):
+        x2 = jnp.where(at_boundary, x2_boundary, x2)
+        after_boundary = select(at_boundary, after_boundary, mode)
+        return Departure(after_boundary, x1, x2, at_boundary, at_edge, at_edge)
+    edge_hit = [guard == n + i for i in range(2 * n)]
+    edge = first_of(edge_hit, edges(osc), x1)
+    edge = foremost(osc, [other == edge for other in edges(osc)], edges(osc), edge)
+    flags = zip(edge_hit, bounds_rightward(mode), strict=True)
+    rightward = any_of([hit & right for hit, right in flags])
+    after_edge = pass_edge(osc, mode, edge, x2, rightward)
+    left, right = select(rightward, (mode, after_edge), (after_edge, mode))
+    released, end = _released_at_edge(osc, held, x1, x2_boundary)
+    needed = mode_acceleration(osc, held, end, x2_boundary)
+    on_end = at_boundary & released
+    beyond = pass_edge(osc, held, end, x2_boundary, needed > 0)
+    after_boundary = select(on_end, beyond, after_boundary)
+    return Departure(
+        mode=select(at_boundary, after_boundary, select(at_edge, after_edge, mode)),
+        x1=jnp.where(at_edge, edge, jnp.where(on_end, end, x1)),
+        x2=jnp.where(at_boundary, x2_boundary, x2),
+        at_boundary=at_boundary,
+        at_edge=at_edge,
+        captured=at_edge & is_captured(osc, left, right, edge, x2),
+    )
+
+
+def _released_at_edge(osc: Oscillator, held: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
+    """Whether a mass that comes to rest on belts at rest does so up to rounding at their limit and
+    at the edge towards which it is pulled: beyond the edge they hold nothing, so the segment that
+    they hold has no length, and the mass goes on as from a start there. And that edge.
+    """
+    needed = mode_acceleration(osc, held, x1, x2)
+    limit = capacity(osc, held)
+    rounding = ON_GUARD * (1 + jnp.abs(x1) + limit)
+    at_limit = (x2 == 0) & (jnp.abs(jnp.abs(needed) - limit) <= rounding)
+    ends = zip(edge_guards(osc, held, x1), edges_ahead(held, needed), strict=True)
+    near = [is_ahead & (guard <= rounding) for guard, is_ahead in ends]
+    return at_limit & any_of(near), foremost(osc, near, edges(osc), x1)
+
+
+# --- starts ---------------------------------------------------------------------------------------
+
+
+def mode_of_state(osc: Oscillator, x1: Array, x2: Array) -> Mode:
+    """The mode in which an orbit goes on from the state (x1, x2), on a boundary or an edge too.
+
+    On an edge the velocity decides which side; at rest there, the acceleration on the right-hand
+    side does: the mass goes right if that is positive, else left. Where the left-hand side pushes
+    it back it stays: on the right if it can rest there, else at a pseudo-focus, see `at_focus`.
+    """
+    right, left = _sides(osc, x1, x2)
+    a_right, a_left = (_pull_at_rest(osc, mode, x1) for mode in (right, left))
+    goes_right = (a_right > 0) | (a_right == 0) & (a_left > 0)
+    return select((x2 > 0) | (x2 == 0) & goes_right, right, left)
+
+
+def at_focus(osc: Oscillator, x1: Array, x2: Array) -> Array:
+    """Whether the state (x1, x2) is a pseudo-focus: at rest on an edge, pushed back by both sides,
+    or by one of them where the other lets it rest.
+
+    Stable or not, it is an equilibrium: an orbit that starts there stays there.
+    """
+    right, left = _sides(osc, x1, x2)
+    a_right, a_left = (_pull_at_rest(osc, mode, x1) for mode in (right, left))
+    slips = ~right.any_stuck & ~left.any_stuck
+    return (x2 == 0) & slips & (a_left >= 0) & (a_right <= 0) & (a_left > a_right)
+
+
+def begins_at_rest(osc: Oscillator, x1: Array, x2: Array) -> Array:
+    """Whether a start (x1, x2) is a fixed point or a pseudo-focus, up to rounding."""
+    mode = mode_of_state(osc, x1, x2)
+    fixed = (x2 == 0) & ~mode.any_stuck & (_pull_at_rest(osc, mode, x1) == 0)
+    return fixed | at_focus(osc, x1, x2)
+
+
+def _sides(osc: Oscillator, x1: Array, x2: Array) -> tuple[Mode, Mode]:
+    """The modes just right and just left of a state; where it is on no edge they are the same."""
+    sides = (contact(osc, x1, x2, rightward=side) for side in (True, False))
+    right, left = (settle(osc, mode, x1, x2) for mode in sides)
+    return right, left
+
+
+def _pull_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> Array:
+    """x2' at rest, (x1, 0): 0 where a belt holds the mass, and where it is but rounding."""
+    a = mode_acceleration(osc, mode, x1, jnp.zeros_like(x1))
+    return jnp.where(mode.any_stuck, 0.0, without_rounding(a, x1))
+
+
+def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
+    """Which belts touch at a state, and the sign of each r_i; 0 on the boundary r_i = 0 itself.
+
+    An edge that x1 lies on counts as passed to the right (rightward) or to the left.
+    """
+    codes = []
+    for belt in osc.belts:
+        is_below = x1 < belt.lower if rightward else x1 <= belt.lower
+        is_above = x1 >= belt.upper if rightward else x1 > belt.upper
+        sign = _slip_sign(belt.velocity, osc.omega * x2)
+        codes.append(jnp.where(is_below, BELOW, jnp.where(is_above, ABOVE, sign)))
+    return Mode(tuple(codes))
