@@ -34,17 +34,16 @@ class EdgeFocus(eqx.Module):
 
 def field_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array, Array, Array]:
     """Taylor coefficients of x2' of a slip mode in x2, from (x1, 0): of order 0 to 3."""
-    rest = jnp.zeros_like(x1)
-
-    def derivative(fn):
-        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
 
     def a(x2):
         return mode_acceleration(osc, mode, x1, x2)
 
-    first = derivative(a)
-    second = derivative(first)
-    return a(rest), first(rest), second(rest) / 2, derivative(second)(rest) / 6
+    def with_slope(fn):
+        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))
+
+    all_orders = with_slope(with_slope(with_slope(a)))
+    ((of_order_0, of_order_1), (_, second)), (_, (_, third)) = all_orders(jnp.zeros_like(x1))
+    return of_order_0, of_order_1, second / 2, third / 6
 
 
 def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFocus:
@@ -56,7 +55,10 @@ def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFoc
     inserting the series into the orbit x1(x2). Both sides add up, and a loop takes
     (2/a_L + 2/|a_R|) |x2|: rate and coefficient are the sums of k and of e over that factor.
     """
-    sides = [field_at_rest(osc, mode, edge) for mode in (left, right)]
+    return _edge_focus(*(field_at_rest(osc, mode, edge) for mode in (left, right)))
+
+
+def _edge_focus(*sides: tuple[Array, ...]) -> EdgeFocus:
     exists = (sides[0][0] > 0) & (sides[1][0] < 0)
     k, e, bend, slowness = (jnp.zeros(()),) * 4
     for (a, b, c, d), turn in zip(sides, (-1.0, 1.0), strict=True):
@@ -75,7 +77,8 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     may be near. With a belt at rest, or with a fixed point on the edge, the loops shrink to
     rounding.
     """
-    focus = edge_focus(osc, left, right, edge)
+    on_left, on_right = (field_at_rest(osc, mode, edge) for mode in (left, right))
+    focus = _edge_focus(on_left, on_right)
     size = jnp.abs(x2)
     nearest = jnp.inf
     for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
@@ -88,8 +91,7 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
         & (size < FOCUS_RADIUS)
         & (2 * osc.omega * size < nearest)
     )
-    a_left, trace_left, *_ = field_at_rest(osc, left, edge)
-    a_right, trace_right, *_ = field_at_rest(osc, right, edge)
+    (a_left, trace_left, *_), (a_right, trace_right, *_) = on_left, on_right
     rounding = force_rounding(edge)
     pushed = (a_left > -rounding) & (a_right < rounding) & (a_left - a_right > rounding)
     shrinks = trace_right * jnp.maximum(a_left, 0) - trace_left * jnp.minimum(a_right, 0) < 0

@@ -7,6 +7,7 @@ whether the contacts that are to be stuck can hold the force needed.
 
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -217,40 +218,74 @@ class Departure(eqx.Module):
     captured: Array
 
 
+class _Guard(NamedTuple):
+    """Where a guard of a slip mode vanishes: on a boundary, or at an edge, there (x1, x2) is put.
+
+    held: the mode in which belts hold the mass on the boundary; on_end: whether at their limit they
+    do not, at an edge, see `_released_at_edge`; rightward: whether the edge is passed to the right.
+    """
+
+    at_boundary: Array
+    at_edge: Array
+    x1: Array
+    x2: Array
+    held: Mode
+    x2_boundary: Array
+    edge: Array
+    rightward: Array
+    on_end: Array
+    end: Array
+
+
+def _guard_of(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) -> _Guard:
+    n = len(osc.belts)
+    at_boundary, at_edge = (guard >= 0) & (guard < n), (guard >= n) & (guard < 3 * n)
+    held, x2_boundary = held_at_boundary(osc, mode, [guard == i for i in range(n)])
+    x2_after = jnp.where(at_boundary, x2_boundary, x2)
+    if not has_edges(osc):
+        edgeless = x1, at_edge, at_edge, x1
+        return _Guard(at_boundary, at_edge, x1, x2_after, held, x2_boundary, *edgeless)
+    edge_hit = [guard == n + i for i in range(2 * n)]
+    edge = first_of(edge_hit, edges(osc), x1)
+    edge = foremost(osc, [other == edge for other in edges(osc)], edges(osc), edge)
+    flags = zip(edge_hit, bounds_rightward(mode), strict=True)
+    rightward = any_of([hit & right for hit, right in flags])
+    released, end = _released_at_edge(osc, held, x1, x2_boundary)
+    on_end = at_boundary & released
+    x1_after = jnp.where(at_edge, edge, jnp.where(on_end, end, x1))
+    there = edge, rightward, on_end, end
+    return _Guard(at_boundary, at_edge, x1_after, x2_after, held, x2_boundary, *there)
+
+
+def on_guard(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array):
+    """(x1, x2) put exactly on the boundary or the edge, see `leave_slip`."""
+    found = _guard_of(osc, mode, guard, x1, x2)
+    return found.x1, found.x2
+
+
 def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) -> Departure:
     """What follows where the guard of that number of a slip mode vanishes at (x1, x2).
 
     The n `boundary_guards` come first, then the 2n `edge_guards`; any other number is no
     transition.
     """
-    n = len(osc.belts)
-    at_boundary, at_edge = (guard >= 0) & (guard < n), (guard >= n) & (guard < 3 * n)
-    hit = [guard == i for i in range(n)]
-    held, x2_boundary = held_at_boundary(osc, mode, hit)
-    after_boundary = settle(osc, held, x1, x2_boundary)
+    at = _guard_of(osc, mode, guard, x1, x2)
+    after_boundary = settle(osc, at.held, x1, at.x2_boundary)
     if not has_edges(osc):
-        x2 = jnp.where(at_boundary, x2_boundary, x2)
-        after_boundary = select(at_boundary, after_boundary, mode)
-        return Departure(after_boundary, x1, x2, at_boundary, at_edge, at_edge)
-    edge_hit = [guard == n + i for i in range(2 * n)]
-    edge = first_of(edge_hit, edges(osc), x1)
-    edge = foremost(osc, [other == edge for other in edges(osc)], edges(osc), edge)
-    flags = zip(edge_hit, bounds_rightward(mode), strict=True)
-    rightward = any_of([hit & right for hit, right in flags])
-    after_edge = pass_edge(osc, mode, edge, x2, rightward)
-    left, right = select(rightward, (mode, after_edge), (after_edge, mode))
-    released, end = _released_at_edge(osc, held, x1, x2_boundary)
-    needed = mode_acceleration(osc, held, end, x2_boundary)
-    on_end = at_boundary & released
-    beyond = pass_edge(osc, held, end, x2_boundary, needed > 0)
-    after_boundary = select(on_end, beyond, after_boundary)
+        after = select(at.at_boundary, after_boundary, mode)
+        return Departure(after, at.x1, at.x2, at.at_boundary, at.at_edge, at.at_edge)
+    after_edge = pass_edge(osc, mode, at.edge, x2, at.rightward)
+    left, right = select(at.rightward, (mode, after_edge), (after_edge, mode))
+    needed = mode_acceleration(osc, at.held, at.end, at.x2_boundary)
+    beyond = pass_edge(osc, at.held, at.end, at.x2_boundary, needed > 0)
+    after_boundary = select(at.on_end, beyond, after_boundary)
     return Departure(
-        mode=select(at_boundary, after_boundary, select(at_edge, after_edge, mode)),
-        x1=jnp.where(at_edge, edge, jnp.where(on_end, end, x1)),
-        x2=jnp.where(at_boundary, x2_boundary, x2),
-        at_boundary=at_boundary,
-        at_edge=at_edge,
-        captured=at_edge & is_captured(osc, left, right, edge, x2),
+        mode=select(at.at_boundary, after_boundary, select(at.at_edge, after_edge, mode)),
+        x1=at.x1,
+        x2=at.x2,
+        at_boundary=at.at_boundary,
+        at_edge=at.at_edge,
+        captured=at.at_edge & is_captured(osc, left, right, at.edge, x2),
     )
 
 

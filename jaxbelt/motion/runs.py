@@ -17,6 +17,7 @@ half a loop around a focus within it, which `MAX_ARC` and `MAX_FRACTION` exclude
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -31,7 +32,7 @@ from ..model.modes import Mode, mode_acceleration, select
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.rest import is_at_rest
 from ..model.transitions import at_focus, mode_of_state
-from ..numerics.compiling import any_lane, of_lane, one_kernel, with_batches
+from ..numerics.compiling import any_lane, more_rows, of_lane, one_kernel, with_batches
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
 from .batches import BOOK, LANES_AT_ONCE, PAGE, Batch, Group, blank_book, followed_together
@@ -210,9 +211,32 @@ def _alone(osc: Oscillator, y0, t0, t1, ts, rtol, atol, *, rules: Rules):
     return final, records, sampled(osc, records, ts, rtol, atol)
 
 
-def _together(lane, axis_size, batched, osc, y0, t0, t1, ts, rtol, atol, *, rules: Rules):
+def _together(lane, axis_size, batched, *args, rules: Rules):
     """`arcs_of_run` of a batch."""
-    args = osc, y0, t0, t1, ts, rtol, atol
+    leaves, structure = jax.tree.flatten(args)
+    flags = tuple(jax.tree.leaves(batched))
+    return _rows_together(lane, structure, flags, axis_size, rules)(*leaves)
+
+
+def _rows_together(lane, structure, flags, count: int, rules: Rules) -> Callable:
+    """`arcs_of_run` of so many rows, by the leaves of its arguments: rows where flagged, else the
+    same for all. A batch of it is so many more rows."""
+
+    def call(*leaves):
+        batched = jax.tree.unflatten(structure, flags)
+        return _followed_rows(lane, count, batched, jax.tree.unflatten(structure, leaves), rules)
+
+    def batch(_, size, outer, *leaves):
+        differ = tuple(a or b for a, b in zip(flags, outer, strict=True))
+        rows = map(functools.partial(more_rows, size, count), leaves, flags, outer)
+        out = _rows_together(lane, structure, differ, size * count, rules)(*rows)
+        return jax.tree.map(lambda leaf: leaf.reshape(size, count, *leaf.shape[1:]), out)
+
+    return with_batches(call, batch)
+
+
+def _followed_rows(lane, axis_size: int, batched, args, rules: Rules):
+    osc, y0, t0, t1, ts, rtol, atol = args
     one, rows = of_lane(lane, batched, args)
     shapes = jax.eval_shape(one, [leaf[0] for leaf in rows])
     room = shapes[1].t.shape[0]
@@ -258,8 +282,7 @@ def _together(lane, axis_size, batched, osc, y0, t0, t1, ts, rtol, atol, *, rule
 
         return lax.map(turn, (alone, found, rows))
 
-    # A true branch in a batch of batches, too.
-    return lax.cond(any_lane(jnp.any(alone)), again, lambda: found)
+    return lax.cond(jnp.any(alone), again, lambda: found)
 
 
 def _as_runs(group: Group, t0: Array, t1: Array, shapes) -> tuple[Any, Array]:
@@ -304,8 +327,12 @@ def arcs_of_run(osc: Oscillator, y0, t0, t1, ts, rtol, atol, rules: Rules):
     """The chain of arcs from y0: the final state, the stacked records, NaN where unused, and the
     states at the times ts, [samples, 2], without derivatives (those past the end are not told)."""
     numbers = map(jnp.asarray, (y0, t0, t1, ts, rtol, atol))
-    parts = (functools.partial(part, rules=rules) for part in (_alone, _together))
-    return with_batches(*parts)(osc, *numbers)
+    return _followed_by(rules)(osc, *numbers)
+
+
+@functools.cache
+def _followed_by(rules: Rules) -> Callable:
+    return with_batches(*(functools.partial(part, rules=rules) for part in (_alone, _together)))
 
 
 @arcs_of_run.def_jvp

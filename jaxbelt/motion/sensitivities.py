@@ -10,6 +10,7 @@ The tangent of a run is its sensitivities times those of its inputs, a product t
 transposes; so both modes, and any number of derivatives by one run, cost about the same.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,8 +34,8 @@ from ..model.modes import (
 )
 from ..model.oscillator import Oscillator
 from ..model.rest import is_slow
-from ..model.transitions import leave_slip
-from ..numerics.compiling import LARGEST, any_lane, one_kernel, with_batches
+from ..model.transitions import on_guard
+from ..numerics.compiling import LARGEST, any_lane, more_rows, one_kernel, with_batches
 from ..numerics.extrapolation import increments, scheme
 from .arcs import stick_arc
 from .integrators import State, density, slip_field
@@ -209,10 +210,8 @@ def _passed(osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array) -
     guard, slope = jax.jvp(fired_guard, end, slopes)
     late = (lax.stop_gradient(guard) - guard) / jnp.where(slope == 0, 1.0, slope)
     late = jnp.where(arc.in_time, remaining - arc.duration, late)
-    after = leave_slip(
-        osc, mode, arc.ended_by, end[0] + late * slopes[0], end[1] + late * slopes[1]
-    )
-    slipped = after.x1, jnp.where(arc.captured, 0.0, after.x2), arc.duration + late
+    x1, x2 = on_guard(osc, mode, arc.ended_by, end[0] + late * slopes[0], end[1] + late * slopes[1])
+    slipped = x1, jnp.where(arc.captured, 0.0, x2), arc.duration + late
     phase = stick_arc(osc, mode, y, remaining)
     return select(stuck, (*phase.y, phase.duration), slipped)
 
@@ -266,14 +265,8 @@ def _side_by_side(function: Callable, by_run) -> Callable:
         leaf, is_batched = jax.tree.leaves(args[2:])[0], jax.tree.leaves(batched[2:])[0]
         runs = leaf.shape[1 if is_batched else 0]
 
-        def merged(leaf, by_run, is_batched):
-            if is_batched and not by_run:
-                return jnp.repeat(leaf, runs, axis=0)
-            if by_run and not is_batched:
-                leaf = jnp.broadcast_to(leaf, (size, *leaf.shape))
-            return leaf.reshape(-1, *leaf.shape[2:]) if by_run else leaf
-
         differ = jax.tree.map(lambda a, b: a or b, by_run, tuple(batched[:2]))
+        merged = functools.partial(more_rows, size, runs)
         out = _side_by_side(function, differ)(*jax.tree.map(merged, args, flags, tuple(batched)))
         return jax.tree.map(lambda leaf: leaf.reshape(size, runs, *leaf.shape[1:]), out)
 

@@ -141,6 +141,24 @@ def traced_once(function: Callable) -> Any:
     return filter_jit(function) if PLAIN else filter_jit(function, inline=True)
 
 
+def _traced_once_anywhere(function: Callable) -> Callable:
+    """The same function of arrays; its trace is kept.
+
+    JAX keeps traces by the mesh, and it is none outside of rules and an empty one inside.
+    """
+    kept = jax.jit(function)
+
+    @functools.wraps(function)
+    def call(*args):
+        mesh = jax.sharding.get_abstract_mesh()
+        if not mesh.empty:
+            return kept(*args)
+        with jax.sharding.use_abstract_mesh(mesh):
+            return kept(*args)
+
+    return call
+
+
 def each(function: Callable) -> Callable:
     """`jax.vmap` of a function of trees with a row in each array; on the CPU one row after another.
 
@@ -181,6 +199,8 @@ def with_batches(function: Callable, batch: Callable) -> Callable:
 
     batched: a tree of flags like args. Derivatives of batches are as they were.
     """
+    # It stands in the batch, too, and in its derivatives.
+    function = _traced_once_anywhere(function)
     lanes = _as_lanes(function, batch)
 
     @functools.wraps(function)
@@ -211,6 +231,16 @@ def in_groups(function: Callable) -> Callable:
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:axis_size], done)
 
     return with_batches(function, batch)
+
+
+def more_rows(size: int, rows: int, leaf: jax.Array, is_row: bool, is_batched: bool) -> jax.Array:
+    """A leaf of a batch of `size`, each with so many rows, as rows of one; as it is where it is the
+    same for all."""
+    if is_batched and not is_row:
+        return jnp.repeat(leaf, rows, axis=0)
+    if is_row and not is_batched:
+        leaf = jnp.broadcast_to(leaf, (size, *leaf.shape))
+    return leaf.reshape(-1, *leaf.shape[2:]) if is_row else leaf
 
 
 def _as_lanes(function: Callable, batch: Callable) -> Callable:
@@ -275,6 +305,7 @@ def one_kernel(function: Callable) -> Callable:
     for a few numbers that takes longer than the operations do. In a batch, in derivatives, and
     where something in it is not possible in one piece, the function is as it was.
     """
+    function = _traced_once_anywhere(function)
     piece = _as_piece(function)
 
     @functools.wraps(function)
