@@ -44,6 +44,8 @@ class Status(enum.IntEnum):
     INCOMPLETE = 20
     # A cycle, and a run of a sweep.
     NEUTRAL = 21
+    # A bifurcation point.
+    DEGENERATE = 22
 
 
 ADVICE = {
@@ -118,6 +120,11 @@ ADVICE = {
     Status.NEUTRAL: (
         "The orbit closes, and so do those beside it, as around a centre: no cycle that attracts, "
         "but one of a continuum, and which one depends on the start. simulate follows it."
+    ),
+    Status.DEGENERATE: (
+        "The condition holds here and beside it, all along the parameter as far as numbers tell: "
+        "there is no one value at which it does. Vary another parameter, or shift one that makes "
+        "it hold, such as the edge that lies on an equilibrium. What else happens jb.scan tells."
     ),
     Status.UNEXPLAINED: (
         "What the oscillator does changes here, and no condition known to the search explains how. "

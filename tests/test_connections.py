@@ -225,3 +225,20 @@ def test_no_saddle_no_connection():
     # A pseudo-focus on the edge.
     point = jb.refine(jb.SaddleConnection(0), lambda n: jb.presets.class_c(n, -0.3, 0.0), at=0.3)
     assert point.status == Status.NOT_TOUCHED and jnp.isnan(point.value)
+
+
+def test_an_orbit_that_slowly_circles_a_pseudo_focus_stays_between_saddles():
+    """Found by a campaign: how many loops it takes until it counts as at rest is no difference."""
+    stribeck = jb.Stribeck(1.2156234004882518, 1.0138132582447077, 0.8970527898384911)
+    conti = jb.Conti(
+        1.0806532617460558, 0.8834968101467371, 2.0580829655030133, 0.08027645786017466
+    )
+
+    def at(v):
+        belts = (
+            jb.Belt(v, stribeck, 1.0736123969087175, upper=0.5890596277834703),
+            jb.Belt(-0.6232106467377576, conti, 1.3247909701486493, upper=0.16499225790624839),
+        )
+        return jb.Oscillator(0.14666389569371077, belts, 1.2720166147779866)
+
+    assert jb.scan(at, span=(0.0032336, 0.0032348), resolution=4) == ()

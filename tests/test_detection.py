@@ -442,3 +442,47 @@ def test_two_cycles_at_one_value_are_two_points():
     assert left.value == pytest.approx(float(right.value), abs=1e-12)
     assert left.cycle.x1_min == pytest.approx(-1.03, abs=1e-12)
     assert right.cycle.x1_max == pytest.approx(1.03, abs=1e-12)
+
+
+def _edge_beside_the_equilibrium(distance):
+    """v: an oscillator with an edge so far to the right of where the mass is at rest on a belt."""
+    conti = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
+
+    def at(v):
+        lower = 0.4 / (1 + 10 * v) + 0.6 + distance(v)
+        return jb.Oscillator(0.5, (jb.Belt(v, conti), jb.Belt(0.5, conti, lower=lower)))
+
+    return at
+
+
+def test_what_holds_all_along_is_no_point():
+    # Rounding decides on which side the edge is; what is added makes it do so on any machine.
+    at = _edge_beside_the_equilibrium(lambda v: 4e-16 * jnp.sin(1e3 * v))
+    assert jb.refine(jb.BoundaryEquilibrium(1), at, at=0.23).status == Status.DEGENERATE
+    hopf, along = jb.scan(at, span=(0.22, 0.24), resolution=4)
+    assert hopf.kind == "Hopf" and along.status == Status.DEGENERATE
+    assert along.condition == jb.BoundaryEquilibrium(1)
+    assert along.value == pytest.approx(0.23) and along.error == pytest.approx(0.01)
+    diagram = jb.bifurcation_diagram(at, span=(0.22, 0.24), resolution=4, rows=16)
+    assert [b for _, b, _ in diagram.regions] == [pytest.approx(float(hopf.value)), 0.24]
+
+
+def test_edges_that_are_one_all_along_do_not_meet():
+    conti = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
+
+    def at(v):
+        belts = jb.Belt(v, conti, upper=0.5), jb.Belt(0.35, conti, lower=0.5)
+        return jb.Oscillator(0.5, belts)
+
+    assert jb.refine(jb.MeetingEdges((0, 1)), at, at=0.3).status == Status.DEGENERATE
+
+
+@pytest.mark.parametrize("start", [0.26, 0.2999, 0.33])
+def test_the_error_of_a_double_root_is_told(start):
+    # The edge is at the least friction, which is at v = 0.3: 2 q v = 4 / (1 + 10 v)^2.
+    quadratic = 0.25 / 0.6
+    conti = jb.Conti(static=1.0, residual=0.6, steepness=10.0, quadratic=quadratic)
+    edge = 0.7 + quadratic * 0.09
+    osc = jb.Oscillator(0.5, (jb.Belt(start, conti), jb.Belt(0.5, conti, lower=edge)))
+    point = jb.refine(jb.BoundaryEquilibrium(1), osc, where=lambda osc: osc.belts[0].velocity)
+    assert point.status != Status.OK or abs(point.value - 0.3) <= point.error

@@ -40,7 +40,6 @@ from ..model.oscillator import Oscillator
 from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
-from ..numerics.newton import NEWTON_STEPS
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
 from .guesses import nearest
@@ -52,6 +51,7 @@ from .systems import (
     CycleSystem,
     Solution,
     Tests,
+    judged_by,
     solve_system,
 )
 
@@ -218,13 +218,19 @@ class AbstractCondition(eqx.Module):
         One of a family is named as what it is. loop: of the cycle that it is about, where that is
         known.
         """
-        data, start = self.sought.as_data(), np.array([value])
-        osc = variation.oscillator(start)
-        guess = data.guess(osc, data.room) if loop is None else data.guess_near(loop)
-        point = data.solve(variation, osc, start, guess)
+        point = self.solved_from(variation, value, loop)
         if int(point.status) != Status.OK:
             return None
         return replace(point, condition=self.sought.named(point))
+
+    def solved_from(
+        self, variation: Variation, value: float, loop: Loop | None = None
+    ) -> "BifurcationPoint":
+        """As `found_from`, without a name, whatever its status."""
+        data, start = self.sought.as_data(), np.array([value])
+        osc = variation.oscillator(start)
+        guess = data.guess(osc, data.room) if loop is None else data.guess_near(loop)
+        return data.solve(variation, osc, start, guess)
 
     def guess_near(self, loop: Loop) -> Any:
         """The guess, where a loop of the cycle is known."""
@@ -489,6 +495,7 @@ def point_of(
     family: Family, solution: Solution, cycle: Cycle, multiplier: Array, status: Array
 ) -> BifurcationPoint:
     """The point of a solution, NaN where the status is not OK."""
+    status = judged_by(solution.error, status)
     known = functools.partial(jnp.where, status == Status.OK)
     return BifurcationPoint(
         condition=UNNAMED,
@@ -586,12 +593,3 @@ def point_without_cycle(family: Family, p, steps, size, error, status, why) -> B
         cycle=cycle,
         status=status,
     )
-
-
-def unexplained_point(variation: Variation, value: float, width: float) -> BifurcationPoint:
-    """A point where something changes, within an interval of that width, that nothing explains."""
-    p, error, none = np.array([value]), jnp.asarray(width), jnp.asarray(jnp.nan)
-    ok, steps = jnp.asarray(Status.OK.value), jnp.full(NEWTON_STEPS, jnp.nan)
-    why = jnp.asarray(Status.UNEXPLAINED.value)
-    point = point_without_cycle(variation.family(p), jnp.asarray(p), steps, none, error, ok, why)
-    return replace(point, status=why)

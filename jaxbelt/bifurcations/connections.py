@@ -372,8 +372,8 @@ SaddleCourse = tuple[int, ...]
 
 class _Courses(eqx.Module):
     """Of each edge and each side, [edges, sides]: whether an orbit leaves a saddle there, x1 at the
-    ends of its arcs that are extrema of it, else NaN, [edges, sides, arcs], and the row after which
-    it repeats, or -1."""
+    ends of its arcs that are extrema of it, else NaN, [edges, sides, arcs], the row after which it
+    repeats, or -1, and x1 where it was left, at rest, else NaN."""
 
     positions: Array
     leaves: Array
@@ -399,7 +399,10 @@ def _courses_of(oscs: Oscillator) -> _Courses:
             edge, rightward = start
             orbit = _departing(osc, edge, rightward, parts[edge], ARCS)
             extrema = jnp.where(_turns_back(osc, orbit), _exits(orbit)[:, 0], jnp.nan)
-            return extrema, orbit.repeats, place_of_rest(osc, orbit)
+            # Between which saddles it rests is where it is at last; around a slow pseudo-focus it may
+            # be taken to rest in a mode whose own equilibrium is elsewhere.
+            rest = jnp.where(jnp.isnan(place_of_rest(osc, orbit)), jnp.nan, orbit.y[0])
+            return extrema, orbit.repeats, rest
 
         starts = jnp.repeat(jnp.arange(2 * n), 2), jnp.tile(jnp.array([False, True]), 2 * n)
         found = jax.tree.map(

@@ -195,8 +195,9 @@ def bifurcation_diagram(
     rows, resolution = as_whole(rows, "rows"), as_whole(resolution, "resolution")
     path = ParameterPath(osc, where, span)
     points = search(path, resolution)
-    # A point on an end of the span has one side only.
-    inner = [point for point in points if path.first < float(point.value) < path.last]
+    # A point on an end of the span has one side only, and what holds all along none.
+    bounds = [point for point in points if int(point.status) != Status.DEGENERATE]
+    inner = [point for point in bounds if path.first < float(point.value) < path.last]
     special: dict[float, list[BifurcationPoint]] = {}
     for point in inner:
         known = next(reversed(special), np.nan)

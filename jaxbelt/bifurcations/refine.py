@@ -78,6 +78,8 @@ def refine(
 def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> BifurcationPoint:
     """The point, or one of its kind that is nearer to the guess, from what `scan` does there."""
     condition, guess = point.condition, float(value[0])
+    if int(point.status) == Status.DEGENERATE:
+        return point
     away = _away(point, guess)
     near = QUITE_NEAR if point.steps[0] <= SHORT_STEP else NEAR_GUESS
     if away <= (BESIDE_OTHERS if condition.has_several else near):

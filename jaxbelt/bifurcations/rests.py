@@ -40,7 +40,7 @@ from .conditions import (
 )
 from .guesses import HINT_BUDGET, orbit_after_stick
 from .special import SpecialPoint, Trail
-from .systems import RestSystem, small_newton, velocity_of
+from .systems import RestSystem, judged_by, small_newton, velocity_of
 
 #: The unknowns of a state of rest of which all is known.
 NOTHING = np.zeros(0)
@@ -90,7 +90,7 @@ def _solved_rest(family: Family, system: RestSystem, x0, p0, status, why):
     exists = system.exists(family.at(p), x)
     judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
     judged = jnp.where(size < HOLDS, judged, Status.NO_CONVERGENCE.value)
-    status = jnp.where(status == Status.OK, judged, status)
+    status = judged_by(error, jnp.where(status == Status.OK, judged, status))
     return point_without_cycle(family, p, steps, size, error, status, why), (x, p)
 
 

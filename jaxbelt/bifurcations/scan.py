@@ -12,9 +12,11 @@ shows is found in the same way from its signature, see `edges_touched`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
+from dataclasses import replace
+from itertools import pairwise, takewhile
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..activity import announced, tell
@@ -22,8 +24,9 @@ from ..checks import as_whole
 from ..cycles.attractors import SOLVED, apart, is_same, itinerary, place_of
 from ..cycles.cycle import as_loop
 from ..model.oscillator import Oscillator
+from ..numerics.newton import NEWTON_STEPS
 from ..results import Status
-from .conditions import AbstractCondition, BifurcationPoint, unexplained_point
+from .conditions import UNNAMED, AbstractCondition, BifurcationPoint, point_without_cycle
 from .connections import SaddleConnection
 from .crossings import CrossingSliding, SlidingExchange
 from .edge_rests import BoundaryEquilibrium, PseudoHopf
@@ -79,7 +82,10 @@ def scan(
     edges is looked for where there are any; where an unstable cycle touches them only
     `bifurcation_diagram` says, as what attracts stays the same. Where something changes and no
     condition explains it, there is a point of kind `Unexplained`, with the status UNEXPLAINED and
-    the value where it happens, good to about 1e-9 of the span. `ValueError` names an impossible
+    the value where it happens, good to about 1e-9 of the span. A condition that holds all along, as
+    where an edge moves with an equilibrium, is told once, with the status DEGENERATE; its value and
+    error are the middle and half the length of where it was seen to hold, and what happens there
+    that Newton's method does not find at once is not told. `ValueError` names an impossible
     argument.
     """
     resolution = as_whole(resolution, "resolution")
@@ -116,8 +122,10 @@ def search(
                 before, after = path.beside(float(point.value), slow=point.condition.slow)
                 settled.append((before, after))
                 values += [max(a, before), min(b, after)]
+            elif b - a <= near * path.length and _is_degenerate(path, a, b, points):
+                settled.append((a, b))
             elif b - a <= 1e-9 * path.length:
-                points.append(unexplained_point(path.variation, 0.5 * (a + b), b - a))
+                points.append(_told_point(path, 0.5 * (a + b), b - a))
                 settled.append((a, b))
             else:
                 values += np.linspace(a, b, 3 if is_narrow else 9).tolist()
@@ -184,7 +192,7 @@ def edges_touched(
         elif unstable(middle).status == Status.OK and b - a > 1e-9 * path.length:
             intervals += changes([a, middle, b])
         else:
-            points.append(unexplained_point(path.variation, middle, b - a))
+            points.append(_told_point(path, middle, b - a))
     return by_value(points)
 
 
@@ -270,5 +278,62 @@ def _at_break(path: ParameterPath, value: float) -> list[BifurcationPoint]:
     if not points and not labels[0].is_as(labels[1]):
         # Something else may happen just there.
         point = _explained(path, *interval)
-        points = [point or unexplained_point(path.variation, value, 0.0)]
+        points = [point or _told_point(path, value, 0.0)]
     return points
+
+
+# --- what Newton's method does not find -----------------------------------------------------------
+
+
+def _is_degenerate(path: ParameterPath, a: float, b: float, points: list[BifurcationPoint]) -> bool:
+    """Whether one of the conditions that could make the difference holds all along.
+
+    Where it does, on which side of it the oscillator is seen to be is rounding. It is told once, by
+    a point in the middle of the values looked at where it holds, which is added to the points.
+    """
+    for condition in _possible_kinds(path, a, b):
+        if all(_holds_along(path, value, condition) for value in (a, b)):
+            break
+    else:
+        return False
+    for point in points:
+        if int(point.status) == Status.DEGENERATE and point.condition == condition:
+            if abs(float(point.value) - 0.5 * (a + b)) <= float(point.error):
+                return True
+    looked_at = sorted(path.labels)
+    sides = [v for v in looked_at if v <= a][::-1], [v for v in looked_at if v >= b]
+    low, high = (_last_along(path, values, condition) for values in sides)
+    middle, width = 0.5 * (low + high), 0.5 * (high - low)
+    points.append(_told_point(path, middle, width, condition, Status.DEGENERATE))
+    return True
+
+
+def _last_along(
+    path: ParameterPath, values: Sequence[float], condition: AbstractCondition
+) -> float:
+    """The last of the values, from the first one on, at which a condition holds all along."""
+    along = takewhile(lambda value: _holds_along(path, value, condition), values)
+    return list(along)[-1]
+
+
+def _holds_along(path: ParameterPath, value: float, condition: AbstractCondition) -> bool:
+    """Whether a condition holds at a value and beside it, all along the path."""
+    loops = condition.beginnings(path.cycles[value])
+    points = (condition.solved_from(path.variation, value, loop) for loop in loops)
+    return any(int(point.status) == Status.DEGENERATE for point in points)
+
+
+def _told_point(
+    path: ParameterPath,
+    value: float,
+    width: float,
+    condition: AbstractCondition = UNNAMED,
+    why: Status = Status.UNEXPLAINED,
+) -> BifurcationPoint:
+    """A point where something changes that is not known better than to a width, and why not."""
+    p, none = np.array([value]), jnp.asarray(jnp.nan)
+    ok, steps = jnp.asarray(Status.OK.value), jnp.full(NEWTON_STEPS, jnp.nan)
+    status, family = jnp.asarray(why.value), path.variation.family(p)
+    error = jnp.asarray(width)
+    point = point_without_cycle(family, jnp.asarray(p), steps, none, error, ok, status)
+    return replace(point, condition=condition, status=status)

@@ -36,6 +36,9 @@ from ..results import Status
 #: rest. Of seven curves of class (b) one ends too early with a tenth of it; with three times as
 #: much they take half as many points again.
 WEIGHT = 0.1
+#: A point is determined where its error is smaller: at a double root it is some 1e-7, and where the
+#: equations hold all along the parameter 1 and more.
+DETERMINED = 1e-3
 #: The place of nothing.
 NOWHERE = np.full(5, np.nan)
 #: Functions by what it means that one vanishes: the name of a special point, the belts concerned.
@@ -346,6 +349,13 @@ def _accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
     return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
 
 
+def judged_by(error: Array, status: Array) -> Array:
+    """The status of a point with that error of its parameter: DEGENERATE in place of OK where the
+    equations hold, and do not tell the parameter."""
+    fails = (status == Status.OK) & ~(error < DETERMINED)
+    return jnp.where(fails, Status.DEGENERATE.value, status)
+
+
 def small_newton(equations, osc, unknowns):
     """Newton's method for a few equations(osc, unknowns).
 
@@ -354,14 +364,32 @@ def small_newton(equations, osc, unknowns):
 
     def linearized(u):
         still = functools.partial(equations, lax.stop_gradient(osc))
-        return still(u), jax.jacfwd(still)(u)
+        return _held(u, still(u), jax.jacfwd(still)(u))
 
     solved = newton(linearized, lax.stop_gradient(unknowns))
     u = lax.stop_gradient(solved.z)
     # One more step carries the derivatives with respect to the other parameters.
     matrix = jax.jacfwd(lambda u: equations(osc, u))(u)
     value = equations(osc, u)
-    u = u - jnp.linalg.solve(matrix, value)
-    weights = jnp.linalg.solve(matrix.T, jnp.zeros(u.size).at[-1].set(1.0))
-    error = 1e-15 * (1 + jnp.max(jnp.abs(u))) * jnp.sum(jnp.abs(weights))
+    change = jnp.linalg.solve(matrix, value)
+    # Towards a multiple root steps shrink by a half or a third only.
+    error = _rounding(u, matrix) + 2 * jnp.abs(lax.stop_gradient(change[-1]))
+    determined = error < DETERMINED
+    u = u - jnp.where(determined, change, 0.0)
     return u, solved.lengths, jnp.max(jnp.abs(value)), error
+
+
+def _rounding(u: Array, matrix: Array) -> Array:
+    """What rounding does to the last of the unknowns."""
+    weights = jnp.linalg.solve(matrix.T, jnp.zeros(u.size).at[-1].set(1.0))
+    return 1e-15 * (1 + jnp.max(jnp.abs(u))) * jnp.sum(jnp.abs(weights))
+
+
+def _held(u: Array, value: Array, matrix: Array) -> tuple[Array, Array]:
+    """Equations of which the next Newton step leaves the parameter as it is where they hold and do
+    not tell it."""
+    fails = ~(_rounding(u, matrix) < DETERMINED) & jnp.all(jnp.abs(value) < HOLDS)
+    own = matrix.at[:, -1].set(0.0)
+    normal = own.T @ own + 1e-14 * jnp.maximum(jnp.sum(own**2), 1.0) * jnp.eye(u.size)
+    change = jnp.linalg.solve(normal, own.T @ value)
+    return jnp.where(fails, change, value), jnp.where(fails, jnp.eye(u.size), matrix)
