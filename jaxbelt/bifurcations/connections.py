@@ -399,8 +399,8 @@ def _courses_of(oscs: Oscillator) -> _Courses:
             edge, rightward = start
             orbit = _departing(osc, edge, rightward, parts[edge], ARCS)
             extrema = jnp.where(_turns_back(osc, orbit), _exits(orbit)[:, 0], jnp.nan)
-            # Between which saddles it rests is where it is at last; around a slow pseudo-focus it may
-            # be taken to rest in a mode whose own equilibrium is elsewhere.
+            # It rests between the saddles between which it is at last. Around a slow pseudo-focus
+            # it may be taken to rest in a mode whose own equilibrium is elsewhere.
             rest = jnp.where(jnp.isnan(place_of_rest(osc, orbit)), jnp.nan, orbit.y[0])
             return extrema, orbit.repeats, rest
 
