@@ -346,6 +346,23 @@ def test_vmap_equals_a_loop():
 
 
 @pytest.mark.slow(first=True)
+def test_a_batch_of_batches_is_one_batch():
+    """A grid of belt speeds and starts, by two vmaps, where either is the same for all of one."""
+
+    def final(nu, x1):
+        osc = jb.presets.class_b(nu, 0.35)
+        return jb.simulate(osc, (x1, 0.0), 20.0, ts=jnp.array([20.0])).ys[-1, 0]
+
+    both = jax.value_and_grad(final, argnums=(0, 1))
+    nus, starts = jnp.linspace(-0.5, 0.6, 4), jnp.linspace(-2.5, 2.5, 5)
+    grid = jax.jit(jax.vmap(jax.vmap(both, (None, 0)), (0, None)))(nus, starts)
+    rows = jax.jit(jax.vmap(both))(jnp.repeat(nus, 5), jnp.tile(starts, 4))
+    for one, other in zip(jax.tree.leaves(grid), jax.tree.leaves(rows), strict=True):
+        assert one.shape == (4, 5) and len(np.unique(one)) > 10
+        np.testing.assert_allclose(one.reshape(-1), other, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.slow(first=True)
 def test_a_lane_that_is_not_finite_harms_no_other():
     nu, y0, edges = mixed_lanes()
     sound = all_of_class_d(nu, y0, edges)
