@@ -364,7 +364,7 @@ def small_newton(equations, osc, unknowns):
 
     def linearized(u):
         still = functools.partial(equations, lax.stop_gradient(osc))
-        return _held(u, still(u), jax.jacfwd(still)(u))
+        return _determined(u, still(u), jax.jacfwd(still)(u))
 
     solved = newton(linearized, lax.stop_gradient(unknowns))
     u = lax.stop_gradient(solved.z)
@@ -385,7 +385,7 @@ def _rounding(u: Array, matrix: Array) -> Array:
     return 1e-15 * (1 + jnp.max(jnp.abs(u))) * jnp.sum(jnp.abs(weights))
 
 
-def _held(u: Array, value: Array, matrix: Array) -> tuple[Array, Array]:
+def _determined(u: Array, value: Array, matrix: Array) -> tuple[Array, Array]:
     """Equations of which the next Newton step leaves the parameter as it is where they hold and do
     not tell it."""
     fails = ~(_rounding(u, matrix) < DETERMINED) & jnp.all(jnp.abs(value) < HOLDS)
