@@ -258,6 +258,7 @@ def test_continuum_of_closed_orbits_is_a_gap():
     assert low == pytest.approx(0.6, abs=1e-3) and high == pytest.approx(1.0, abs=1e-2)
 
 
+@pytest.mark.slow(first=True)
 def test_a_separatrix_that_creeps_to_a_node_comes_from_there():
     """Backwards it comes to the end of the segment that a belt at rest holds, where slip on the
     steep law's boundary is a node with the slow rate 0.065: along the fast one steps are short."""
