@@ -399,10 +399,7 @@ def _courses_of(oscs: Oscillator) -> _Courses:
             edge, rightward = start
             orbit = _departing(osc, edge, rightward, parts[edge], ARCS)
             extrema = jnp.where(_turns_back(osc, orbit), _exits(orbit)[:, 0], jnp.nan)
-            # It rests between the saddles between which it is at last. Around a slow pseudo-focus
-            # it may be taken to rest in a mode whose own equilibrium is elsewhere.
-            rest = jnp.where(jnp.isnan(place_of_rest(osc, orbit)), jnp.nan, orbit.y[0])
-            return extrema, orbit.repeats, rest
+            return extrema, orbit.repeats, place_of_rest(osc, orbit)
 
         starts = jnp.repeat(jnp.arange(2 * n), 2), jnp.tile(jnp.array([False, True]), 2 * n)
         found = jax.tree.map(
