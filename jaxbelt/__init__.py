@@ -16,12 +16,12 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     model/          friction oscillator machine parameters variations modes pseudofocus transitions
     model/          rest events equilibria
     presets         the published systems
-    kernel/         lanes step events rounds
-    motion/         integrators arcs sensitivities sampling batches runs smoothing simulate
+    kernel/         lanes marks step events rounds
+    motion/         integrators arcs sensitivities sampling loops batches runs smoothing simulate
     cycles/         chains settling shooting orbits cycle attractors functionals
     cycles/         backwards returns separatrices portrait
     cycles/         outlines nearest sides shocks
-    sweeps/         marks observers moments along reducers attractor queue threads audit
+    sweeps/         observers moments along reducers attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     sweeps/         fractions orbit_diagram
     bifurcations/   special labels systems guesses conditions tangencies crossings rests edge_rests

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jaxbelt as jb
+from jaxbelt.kernel.marks import Mark, code_of
 from jaxbelt.results import Status
 from jaxbelt.sweeps import threads
-from jaxbelt.sweeps.marks import Mark, code_of
 from tests.campaign import compare, package
 from tests.campaign.cases import PAPER, Case
 from tests.campaign.engine import Belt, Oscillator

@@ -1,5 +1,7 @@
 """Lanes at the start of their runs, and rounds of them that are written down."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
@@ -71,11 +73,18 @@ class Round(eqx.Module):
 
 
 def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol, *, edges: bool):
-    """The lanes past the events and STEPS_PER_ROUND steps further, and the `Round`."""
+    """The lanes past the events and STEPS_PER_ROUND steps further, and the `Round`.
+
+    Their memory is a `marks.LoopSearch`, whose numbers are those of rounds: loops that a lane would
+    repeat it passes at once, behind the stick phase.
+    """
     osc = osc if edges else without_edges(osc)
     lanes, passage = pass_events(
         osc, lanes, t1, rtol, edges=edges, captures=True, derivatives=False
     )
+    released = passage.released & ~lanes.mode.any_stuck
+    repeat, t = lanes.memory.looked_for(lanes, released, t1, ones)
+    lanes = replace(lanes, t=t, memory=replace(repeat, number=repeat.number + 1))
     window = window_of(osc, lanes, edges=edges, extrema=None)
 
     def step(lanes, _):

@@ -2,13 +2,15 @@
 
 Runs are done in groups, side by side. A round of a group is some steps of all its lanes, and what
 happens to them on the way is written down, round after round. The arcs of a run, their events and
-its samples are then looked up in these books.
+its samples are then looked up in these books. A loop that a run repeats is followed once, see
+`kernel.marks`.
 
 Few runs end in a way that the lanes do not tell to the last, at rest on a guard, say. These are
 followed again, each by itself.
 """
 
 import functools
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -17,12 +19,14 @@ from jax import lax
 from jaxtyping import Array
 
 from ..kernel.lanes import Lanes, are_finite, codes_in
+from ..kernel.marks import LoopSearch, time_back
 from ..kernel.rounds import Round, flown_on, lanes_at_start, one_round
 from ..model.events import event_between
 from ..model.modes import Mode
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import any_lane, one_kernel
 from ..results import Status
+from .loops import RepeatedLoop
 
 #: Lanes of a group, at most, and rounds that one piece of machine code makes.
 LANES_AT_ONCE, PAGE = 128, 8
@@ -45,13 +49,15 @@ LEAST_TOLERANCE = 1e-13
 class Batch(NamedTuple):
     """What all groups of a batch have in common.
 
-    width: lanes of a group; rounds: room for so many; rows: room for the arcs of a run; belts: how
-    many; edges: whether a contact edge may be met.
+    width: lanes of a group; rounds: room for so many; rows: room for the arcs of a run that are
+    followed; most: arcs of a run, at most; belts: how many; edges: whether a contact edge may be
+    met.
     """
 
     width: int
     rounds: int
     rows: int
+    most: int
     belts: int
     edges: bool
 
@@ -60,12 +66,14 @@ class Group(NamedTuple):
     """The runs of a group, arrays [.., lanes].
 
     lanes: at the end; arcs: columns of `runs.ArcRecord` by name, [rows, lanes]; used: which of the
-    rows are; samples: [samples, 2, lanes]; alone: runs that have to be followed by themselves.
+    rows are; loop: that they repeat; samples: [samples, 2, lanes]; alone: runs that have to be
+    followed by themselves.
     """
 
     lanes: Lanes
     arcs: dict[str, Any]
     used: Array
+    loop: RepeatedLoop
     samples: Array
     alone: Array
 
@@ -84,7 +92,9 @@ def blank_book(osc, batch: Batch) -> Round:
 
 def _first_lanes(osc, y0, rtol, batch: Batch) -> Lanes:
     run, (x1, x2) = jnp.zeros(batch.width, jnp.int32), y0
-    return lanes_at_start(osc, run, x1, x2, jnp.zeros((), jnp.int32), rtol, edges=batch.edges)
+    passes = jnp.zeros((), jnp.int32)
+    lanes = lanes_at_start(osc, run, x1, x2, passes, rtol, edges=batch.edges)
+    return replace(lanes, memory=LoopSearch.none(lanes.t))
 
 
 def followed_together(
@@ -100,11 +110,13 @@ def followed_together(
     lanes = _first_lanes(osc, y0, tolerances[0], batch)
     lanes, book, rounds = _written(osc, lanes, ones, span, tolerances, batch, book)
     inside = (jnp.arange(batch.rounds) < rounds)[:, None]
-    arcs, used, fits = _arcs(book, inside, batch)
+    repeat: LoopSearch = lanes.memory
+    arcs, used, loop, fits = _arcs(book, inside, repeat, batch)
+    ts = ts - time_back(ts, repeat.loops, repeat.t, repeat.period)
     samples = _samples(osc, book, inside, ones, ts, batch)
     begins_nowhere = lanes.status == Status.NOT_FINITE.value
     known = lanes.done & fits & ~jnp.any(book.rests & inside, axis=0) & are_finite(lanes)
-    return Group(lanes, arcs, used, samples, ~known & ~begins_nowhere), book
+    return Group(lanes, arcs, used, loop, samples, ~known & ~begins_nowhere), book
 
 
 def _written(osc, lanes, ones, span, tolerances, batch: Batch, book) -> tuple[Lanes, Round, Array]:
@@ -177,13 +189,14 @@ def _running_total(rows: Array) -> Array:
     return (within + before[:, None]).reshape(rows.shape)
 
 
-def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Array, Array]:
-    """The arcs of the lanes, which rows are used, and whether there was room for all."""
+def _arcs(book: Round, inside: Array, repeat: LoopSearch, batch: Batch):
+    """The arcs of the lanes, which rows are used, the loops that they repeat, and whether there was
+    room for all."""
     chains = _chains(book, inside)
     total, size = chains.begun[-1], min(ARCS_AT_ONCE, batch.rows)
 
     def some(first):
-        return _arcs_from(first, size, book, chains, batch)
+        return _arcs_from(first, size, book, chains, repeat, batch)
 
     def nothing(first):
         shapes = jax.eval_shape(some, first)
@@ -194,10 +207,18 @@ def _arcs(book: Round, inside: Array, batch: Batch) -> tuple[dict[str, Any], Arr
 
     parts = lax.map(looked_up, jnp.arange(0, batch.rows, size, dtype=jnp.int32))
     arcs, used = jax.tree.map(lambda leaf: leaf.reshape(-1, batch.width)[: batch.rows], parts)
-    return arcs, used, (total > 0) & (total <= batch.rows)
+
+    def behind(number):
+        """How many arcs had ended behind the stick phase of a round."""
+        return jnp.take_along_axis(chains.ended, 2 * number[None], axis=0)[0]
+
+    loop = RepeatedLoop(behind(repeat.first), behind(repeat.last), repeat.loops)
+    fits = (total > 0) & (total <= batch.rows)
+    fits = fits & (total + loop.loops * (loop.last - loop.first) <= batch.most)
+    return arcs, used, loop, fits
 
 
-def _arcs_from(first, size: int, book: Round, chains: _Chains, batch: Batch):
+def _arcs_from(first, size: int, book: Round, chains: _Chains, repeat: LoopSearch, batch: Batch):
     """So many arcs of the lanes from that number on, and which of them there are."""
     wanted, total = first + jnp.arange(1, size + 1, dtype=jnp.int32), chains.begun[-1]
     there = wanted[:, None] <= total[None]
@@ -221,7 +242,9 @@ def _arcs_from(first, size: int, book: Round, chains: _Chains, batch: Batch):
     next_codes = codes_in(either(at(book.mode, after), at(book.mode_after, row)), batch.belts)
     kind, belt = event_between(tuple(codes), tuple(next_codes))
     begins = at(book.ts[0], row)
-    t, t_end = either(begins, at(book.t, row)), either(at(book.ts[-1], last_row), begins)
+    # Behind the stick phase at whose end a loop repeats, the run goes on behind the last loop.
+    released = jnp.where((row == repeat.last) & (repeat.loops > 0), repeat.t, begins)
+    t, t_end = either(begins, at(book.t, row)), either(at(book.ts[-1], last_row), released)
     x1_start, x2_start = at(book.x1s[0], row), at(book.x2s[0], row)
     x2_end = either(at(book.x2s[-1], last_row), x2_start)
     arcs = dict(

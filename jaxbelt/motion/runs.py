@@ -10,6 +10,8 @@ stick arc is known in closed form. Who follows it depends on what is asked:
 - derivatives (the rule of `arcs_of_run`): the arcs that are known, flown once more, see
   `sensitivities`.
 
+A loop that a run repeats is followed once, see `kernel.marks` and `loops`.
+
 The arcs of a run by itself end at extrema where a boundary or an
 edge is within reach, and else after the time MAX_ARC. So no root hides within a step: between two
 zeros of x2' lies a zero of x2, since x2'' = -x2 there, and two extrema of x2 in one step would take
@@ -27,6 +29,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..kernel.marks import LoopSearch
 from ..model.events import event_between
 from ..model.modes import Mode, mode_acceleration, select
 from ..model.oscillator import Oscillator, has_possible_numbers
@@ -37,6 +40,7 @@ from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
 from .batches import BOOK, LANES_AT_ONCE, PAGE, Batch, Group, blank_book, followed_together
 from .integrators import Adaptive, State
+from .loops import RepeatedLoop
 from .sampling import arcs_at, sampled
 from .sensitivities import Arc, Sensitivity, in_one_row, sensitivities, split, with_derivatives
 
@@ -63,6 +67,16 @@ class RunState(eqx.Module):
     signs: Signs
     status: Array
     done: Array
+
+    @property
+    def x1(self) -> Array:
+        """Displacement."""
+        return self.y[0]
+
+    @property
+    def x2(self) -> Array:
+        """Velocity."""
+        return self.y[1]
 
 
 def _slip_segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[ArcEnd, Array]:
@@ -146,9 +160,21 @@ def _segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[RunState
     return RunState(t, end.y, mode, end.signs, status, done), record
 
 
+class Rules(NamedTuple):
+    """What is fixed when runs are compiled.
+
+    max_segments: arcs of a run, at most; followed: those that are followed, without the loops that
+    are only repeated; edges: whether edges may be met.
+    """
+
+    max_segments: int
+    followed: int
+    edges: bool
+
+
 def _followed_arcs(
-    osc: Oscillator, y0, t0, t1, rtol, atol, max_segments: int
-) -> tuple[RunState, ArcRecord]:
+    osc: Oscillator, y0, t0, t1, rtol, atol, rules: Rules
+) -> tuple[RunState, ArcRecord, RepeatedLoop]:
     y = (y0[0], y0[1])
     mode = mode_of_state(osc, *y)
     finite = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
@@ -156,36 +182,41 @@ def _followed_arcs(
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
     start = RunState(t0, y, mode, signs_after(osc, mode, y), status, status != Status.OK)
 
-    def segment(given, state):
-        osc, t1, rtol, atol = given
+    def segment(given, carry):
+        (osc, t1, rtol, atol), (state, repeat) = given, carry
         blank = _unused(len(osc.belts))
 
         def advance():
             new, record = _segment(osc, state, t1, rtol, atol)
+            ended = replace(repeat, number=repeat.number + 1)
+            released = state.mode.any_stuck & ~new.mode.any_stuck & ~new.done
+            found, t = ended.looked_for(new, released, t1, jnp.ones(()), rules.max_segments)
             keep = functools.partial(jnp.where, state.done)
-            return jax.tree.map(keep, state, new), jax.tree.map(keep, blank, record)
+            after = jax.tree.map(keep, carry, (replace(new, t=t), found))
+            return after, jax.tree.map(keep, blank, record)
 
         # A true branch under vmap too: once every lane is done nothing more is computed.
-        return lax.cond(any_lane(~state.done), advance, lambda: (state, blank))
+        return lax.cond(any_lane(~state.done), advance, lambda: (carry, blank))
 
     # In blocks, because stepping over what is left of the budget is not free.
-    length = min(BLOCK, max_segments)
+    length = min(BLOCK, rules.followed)
     blank = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (length, *leaf.shape)), _unused(len(osc.belts))
     )
 
     @one_kernel
-    def segments(given, state):
-        return lax.scan(lambda state, _: segment(given, state), state, length=length)
+    def segments(given, carry):
+        return lax.scan(lambda carry, _: segment(given, carry), carry, length=length)
 
-    def block(state, _):
+    def block(carry, _):
         return lax.cond(
-            any_lane(~state.done),
-            lambda: segments((osc, t1, rtol, atol), state),
-            lambda: (state, blank),
+            any_lane(~carry[0].done),
+            lambda: segments((osc, t1, rtol, atol), carry),
+            lambda: (carry, blank),
         )
 
-    final, records = lax.scan(block, start, length=-(-max_segments // length))
+    blocks = -(-rules.followed // length)
+    (final, repeat), records = lax.scan(block, (start, LoopSearch.none(t0)), length=blocks)
     records = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), records)
     # A run that begins at a pseudo-focus has one arc, of duration zero.
     blank, zero = _unused(len(osc.belts)), jnp.zeros(())
@@ -195,20 +226,15 @@ def _followed_arcs(
         lambda leaf, first: leaf.at[0].set(jnp.where(at_rest, first, leaf[0])), records, rest
     )
     unfinished = jnp.where(final.done, final.status, Status.TOO_MANY_SEGMENTS.value)
-    return eqx.tree_at(lambda s: s.status, final, unfinished), records
-
-
-class Rules(NamedTuple):
-    """What is fixed when runs are compiled: room for their arcs; whether edges may be met."""
-
-    max_segments: int
-    edges: bool
+    loop = RepeatedLoop(*(n.astype(int) for n in (repeat.first, repeat.last, repeat.loops)))
+    return eqx.tree_at(lambda s: s.status, final, unfinished), records, loop
 
 
 def _alone(osc: Oscillator, y0, t0, t1, ts, rtol, atol, *, rules: Rules):
     """`arcs_of_run` of one run."""
-    final, records = _followed_arcs(osc, y0, t0, t1, rtol, atol, rules.max_segments)
-    return final, records, sampled(osc, records, ts, rtol, atol)
+    final, records, loop = _followed_arcs(osc, y0, t0, t1, rtol, atol, rules)
+    ts = loop.followed(ts, records.event_t)
+    return final, records, loop, sampled(osc, records, ts, rtol, atol)
 
 
 def _together(lane, axis_size, batched, *args, rules: Rules):
@@ -242,7 +268,7 @@ def _followed_rows(lane, axis_size: int, batched, args, rules: Rules):
     room = shapes[1].t.shape[0]
     rounds = -(-room // PAGE) * PAGE
     width = min(LANES_AT_ONCE, -(-axis_size // 8) * 8, max(8, BOOK // rounds))
-    batch = Batch(width, rounds, room, len(osc.belts), rules.edges)
+    batch = Batch(width, rounds, room, rules.max_segments, len(osc.belts), rules.edges)
     groups = -(-axis_size // width)
 
     def by_group(leaf):
@@ -317,15 +343,16 @@ def _as_runs(group: Group, t0: Array, t1: Array, shapes) -> tuple[Any, Array]:
     )
     samples = jnp.moveaxis(jnp.where(nowhere[None, None], jnp.nan, group.samples), -1, 0)
     out = jax.tree.map(
-        lambda leaf, like: leaf.astype(like.dtype), (final, records, samples), shapes
+        lambda leaf, like: leaf.astype(like.dtype), (final, records, group.loop, samples), shapes
     )
     return out, group.alone
 
 
 @eqx.filter_custom_jvp
 def arcs_of_run(osc: Oscillator, y0, t0, t1, ts, rtol, atol, rules: Rules):
-    """The chain of arcs from y0: the final state, the stacked records, NaN where unused, and the
-    states at the times ts, [samples, 2], without derivatives (those past the end are not told)."""
+    """The chain of arcs from y0: the final state, the stacked records of the arcs that were
+    followed, NaN where unused, the `RepeatedLoop`, and the states at the times ts, [samples, 2],
+    without derivatives (those past the end are not told)."""
     numbers = map(jnp.asarray, (y0, t0, t1, ts, rtol, atol))
     return _followed_by(rules)(osc, *numbers)
 
@@ -338,9 +365,11 @@ def _followed_by(rules: Rules) -> Callable:
 @arcs_of_run.def_jvp
 def _(primals, tangents):
     osc, y0, t0, t1, *_ = primals
-    final, records, samples = arcs_of_run(*primals)
+    final, records, loop, samples = arcs_of_run(*primals)
     varied, rest = split(osc, tangents[0])
     used = ~jnp.isnan(records.event_t)
+    behind = jnp.arange(1, used.size + 1)
+    again = jnp.where(behind == loop.last, loop.loops, 0)
     arcs = Arc(
         entry=(records.y[:, 0], records.y[:, 1]),
         end=(records.event_y[:, 0], records.event_y[:, 1]),
@@ -350,6 +379,8 @@ def _(primals, tangents):
         in_time=records.in_time,
         captured=records.captured,
         used=used,
+        begins_loop=behind == loop.first,
+        again=again,
     )
     start = [
         jnp.zeros_like(value) if slope is None else slope
@@ -357,13 +388,15 @@ def _(primals, tangents):
     ]
     inputs = in_one_row(*start, tangents[0])
     ends = sensitivities(varied, rest, arcs, t1 - records.t).along(inputs)
-    # The first entry moves as the start does, the others as the ends before them.
+    # The first entry moves as the start does, the others as the ends before them, behind the loop
+    # later by the periods that were not followed.
+    late = again.astype(float) * (ends.t - ends.t[jnp.maximum(loop.first - 1, 0)])
     entries = jax.tree.map(
         lambda first, rows: jnp.append(first, rows[:-1]),
         Sensitivity(start[0][0], start[0][1], start[1]),
-        ends,
+        replace(ends, t=ends.t + late),
     )
-    nothing = jax.tree.map(lambda _: None, (final, records, samples))
+    nothing = jax.tree.map(lambda _: None, (final, records, loop, samples))
     last = jax.tree.map(lambda leaf: leaf[-1], ends)
 
     def rows(leaf):
@@ -374,14 +407,14 @@ def _(primals, tangents):
         return jnp.stack([one.x1, one.x2], axis=1)
 
     def places(run):
-        final, records, _ = run
+        final, records, *_ = run
         events = records.event_t, records.event_y
         return final.t, final.y, records.t, records.y, records.duration, *events
 
     moved = [entries.t, states(entries), ends.t - entries.t, ends.t, states(ends)]
     moved = last.t, (last.x1, last.x2), *map(rows, moved)
     moved = eqx.tree_at(places, nothing, moved, is_leaf=lambda leaf: leaf is None)
-    return (final, records, samples), moved
+    return (final, records, loop, samples), moved
 
 
 def _unused(belts: int) -> ArcRecord:
@@ -403,11 +436,18 @@ def _unused(belts: int) -> ArcRecord:
     )
 
 
-def states_at(osc: Oscillator, final: RunState, records: ArcRecord, samples: Array, ts: Array):
+def states_at(
+    osc: Oscillator,
+    final: RunState,
+    records: ArcRecord,
+    loop: RepeatedLoop,
+    samples: Array,
+    ts: Array,
+):
     """States and modes at the times ts, with derivatives; samples: the states, without."""
     # Past the end of the last arc the run either rests, with a reason, or is unknown.
     rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
-    arcs, _, since = arcs_at(records, ts)
+    arcs, _, since = arcs_at(records, loop.followed(ts, records.event_t))
     beyond = ts > final.t
     since = jnp.where(beyond, 0.0, since)
     ys = with_derivatives(osc, arcs.y, since, arcs.mode, lax.stop_gradient(samples))

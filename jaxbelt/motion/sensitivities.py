@@ -68,7 +68,8 @@ class Arc(eqx.Module):
 
     The end helps to place the steps. ended_by: a number of `arcs.Ends`, -1 for none; in_time:
     whether the run ended with it, in time; captured: whether the mass came to rest in a
-    pseudo-focus at its end; used: whether there was such an arc at all.
+    pseudo-focus at its end; used: whether there was such an arc at all. begins_loop, again: where
+    the loop that the run repeats begins behind it, and how many more times it is passed behind it.
     """
 
     entry: State
@@ -79,6 +80,8 @@ class Arc(eqx.Module):
     in_time: Array
     captured: Array
     used: Array
+    begins_loop: Array
+    again: Array
 
     @property
     def mode(self) -> Mode:
@@ -412,35 +415,36 @@ def _sensitivities(by_run, varied, rest, arcs: Arc, remaining: Array) -> Sensiti
     own = jax.tree.map(
         lambda leaf: jnp.pad(leaf, (padding[0], *[(0, 0)] * (leaf.ndim - 1)), "edge"), own
     )
-    first = jnp.broadcast_to(jnp.eye(inputs)[:3, None], (3, width, inputs))
+    first = Sensitivity(*jnp.broadcast_to(jnp.eye(inputs)[:3, None], (3, width, inputs)))
 
     def block(ends, number):
         of_block = jax.tree.map(lambda leaf: _part(leaf, (number * width, width)), own)
         varied, rest = eqx.combine(shared, of_block)
 
         def chunk(state, k):
-            entry, ends = state
+            carry, ends = state
             place = number * width, k * depth
             some, left = jax.tree.map(
                 lambda leaf: _part(leaf, (place[0], width), (place[1], depth)), (arcs, remaining)
             )
 
             def work():
-                return _past_chunk(by_run, varied, rest, some, left, entry)
+                return _past_chunk(by_run, varied, rest, some, left, carry)
 
             def nothing():
                 told = jnp.zeros((width, depth, inputs))
-                return entry, Sensitivity(told, told, told)
+                return carry, Sensitivity(told, told, told)
 
-            entry, told = lax.cond(any_lane(jnp.any(some.used)), work, nothing)
+            carry, told = lax.cond(any_lane(jnp.any(some.used)), work, nothing)
             ends = jax.tree.map(
                 lambda a, b: lax.dynamic_update_slice(a, b, (*place, 0)), ends, told
             )
-            return (entry, ends), None
+            return (carry, ends), None
 
-        (entry, ends), _ = lax.scan(chunk, (Sensitivity(*first), ends), jnp.arange(chunks))
+        (carry, ends), _ = lax.scan(chunk, ((first, first.t), ends), jnp.arange(chunks))
         last = number * width, rows - 1, 0
-        ends = jax.tree.map(lambda a, b: lax.dynamic_update_slice(a, b[:, None], last), ends, entry)
+        put = functools.partial(lax.dynamic_update_slice, start_indices=last)
+        ends = jax.tree.map(lambda a, b: put(a, b[:, None]), ends, carry[0])
         return ends, None
 
     blank = jnp.zeros((blocks * width, chunks * depth, inputs))
@@ -455,9 +459,14 @@ def _part(leaf: Array, *spans) -> Array:
     return leaf
 
 
-def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, entry: Sensitivity):
-    """Sensitivities of runs side by side after some arcs, [runs, inputs], and at their ends, [runs,
-    arcs, inputs]; entry: before the first one."""
+#: Sensitivities of runs where they stand, and those of the time when the loop began, arrays [runs,
+#: inputs].
+Carry = tuple[Sensitivity, Array]
+
+
+def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, carry: Carry):
+    """Sensitivities of runs side by side after some arcs, and at their ends, [runs, arcs, inputs];
+    carry: before the first one."""
     width, depth = remaining.shape
     flat = jax.tree.map(
         lambda leaf: jnp.swapaxes(leaf, 0, 1).reshape(-1, *leaf.shape[2:]), (arcs, remaining)
@@ -475,23 +484,24 @@ def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, entry: Sensitivity):
     steps = steps._replace(number=jnp.where(arcs.used, steps.number, -1.0))
     slopes = _slopes(_passed, by_run, varied, rest, run, arcs, remaining, steps)
     # As many rows at once as fit into one piece of machine code.
-    size = min(depth, _largest_power(max(1, LARGEST // entry.x1.size)))
+    size = min(depth, _largest_power(max(1, LARGEST // carry[1].size)))
     rows = jax.tree.map(
         lambda leaf: leaf.reshape(depth // size, size, width, *leaf.shape[1:]),
-        (slopes, arcs.used, creeps),
+        (slopes, arcs.used, creeps, arcs.begins_loop, arcs.again.astype(float)),
     )
-    entry, ends = lax.scan(lambda entry, rows: _past_rows(entry, rows), entry, rows)
+    carry, ends = lax.scan(lambda carry, rows: _past_rows(carry, rows), carry, rows)
     ends = jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(depth, width, -1), 0, 1), ends)
-    return entry, ends
+    return carry, ends
 
 
 @one_kernel
-def _past_rows(entry: Sensitivity, rows):
-    """The sensitivities past some arcs, [runs, inputs], and at the end of each, [arcs, runs,
-    inputs]; rows: of each the derivatives, whether it was used, and `_creep`."""
+def _past_rows(carry: Carry, rows):
+    """The sensitivities past some arcs, and at the end of each, [arcs, runs, inputs]; rows: of each
+    the derivatives, whether it was used, `_creep`, and what loop begins and ends behind it."""
 
-    def advance(before, row):
-        slopes, used, (creeps, x2, a) = row
+    def advance(carry, row):
+        before, began = carry
+        slopes, used, (creeps, x2, a), begins_loop, again = row
         x2, a = x2[:, None], a[:, None]
         moved = before.x1 - x2 * before.t, before.x2 - a * before.t
         fixed = Sensitivity(*moved, jnp.zeros_like(before.t))
@@ -506,9 +516,11 @@ def _past_rows(entry: Sensitivity, rows):
 
         x1, x2, duration = (through(part) for part in slopes)
         after = select(used[:, None], Sensitivity(x1, x2, before.t + duration), before)
-        return after, after
+        began = jnp.where(begins_loop[:, None], after.t, began)
+        late = again[:, None] * (after.t - began)
+        return (replace(after, t=after.t + late), began), after
 
-    return lax.scan(advance, entry, rows)
+    return lax.scan(advance, carry, rows)
 
 
 def _made_safe(arcs: Arc) -> Arc:
@@ -585,6 +597,8 @@ def _slopes_of_samples(by_run, varied, rest, entries: Array, since: Array, codes
             in_time=never,
             captured=never,
             used=known,
+            begins_loop=never,
+            again=jnp.zeros(since.shape, int),
         )
 
         def looked(parts, arc):

@@ -162,29 +162,33 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
 def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution) -> Trajectory:
     grid = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution) if ts is None else ts
     y0 = jnp.stack(start_at_focus(osc, *y0))
-    final, records, samples = arcs_of_run(osc, y0, t0, t1, grid, rtol, atol, rules)
+    final, records, loop, samples = arcs_of_run(osc, y0, t0, t1, grid, rtol, atol, rules)
+    _, period = loop.end(records.event_t)
     count = jnp.cumsum(records.kind > 0)
     wanted = jnp.arange(1, max_events + 1)
-    happened = wanted <= count[-1]
-    rows = jnp.minimum(jnp.searchsorted(count, wanted), count.size - 1)
+    happened = wanted <= loop.total(count)
+    rows, earlier = loop.place(wanted, count)
     events = Events(
-        t=jnp.where(happened, records.event_t[rows], jnp.nan),
+        t=jnp.where(happened, records.event_t[rows] + earlier * period, jnp.nan),
         y=jnp.where(happened[:, None], records.event_y[rows], jnp.nan),
         kind=jnp.where(happened, records.kind[rows], 0),
         belt=jnp.where(happened, records.belt[rows], -1),
     )
-    too_many = count[-1] > max_events
+    too_many = loop.total(count) > max_events
     status = jnp.where(too_many, Status.TOO_MANY_SEGMENTS.value, final.status)
-    ys, modes = states_at(osc, final, records, samples, grid)
+    ys, modes = states_at(osc, final, records, loop, samples, grid)
+    numbers = jnp.arange(1, max(rules.max_segments, count.size) + 1)
+    rows, earlier = loop.place(numbers, numbers[: count.size])
+    t = records.t[rows] + earlier * period
+    arcs = Arcs(t, records.y[rows], records.mode[rows], records.duration[rows])
     if ts is None:
         # An even grid, and between its points the entries of the arcs, which are known already.
-        unused = jnp.isnan(records.t)
-        ts = jnp.concatenate([grid, jnp.where(unused, t1, records.t)])
-        ys = jnp.concatenate([ys, jnp.where(unused[:, None], ys[-1], records.y)])
-        modes = jnp.concatenate([modes, jnp.where(unused[:, None], modes[-1], records.mode)])
+        unused = jnp.isnan(arcs.t)
+        ts = jnp.concatenate([grid, jnp.where(unused, t1, arcs.t)])
+        ys = jnp.concatenate([ys, jnp.where(unused[:, None], ys[-1], arcs.y)])
+        modes = jnp.concatenate([modes, jnp.where(unused[:, None], modes[-1], arcs.mode)])
         order = jnp.argsort(ts)
         ts, ys, modes = ts[order], ys[order], modes[order]
-    arcs = Arcs(records.t, records.y, records.mode, records.duration)
     return Trajectory(ts, ys, modes, events, arcs, status)
 
 
@@ -263,17 +267,23 @@ def simulate(
             resolution=resolution,
         )
     edges, expected = has_edges(osc), "a positive integer"
+    padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
+    followed = max_segments
     if max_segments is None:
         # Around a pseudo-focus at a contact edge a run has many short arcs.
         max_segments = _power_of_two((64 if edges else 8) * span, 512)
+        # Without edges a loop is cut into eight arcs at most by extrema and lengths of time, and
+        # into two more by each belt; there the padding costs more than the arcs.
+        rate = 0.5 * (2 + len(osc.belts))
+        few = padded and not edges
+        followed = min(max_segments, _power_of_two(rate * span, 128)) if few else max_segments
     is_count = isinstance(max_segments, int) and max_segments > 0
     require(is_count, "max_segments", expected, max_segments)
     if max_events is None:
-        padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
         room = _power_of_two((16 if edges else 4) * span, 64) if padded else max_segments
         max_events = min(max_segments, room)
     require(isinstance(max_events, int) and max_events > 0, "max_events", expected, max_events)
-    rules = Rules(max_segments, edges)
+    rules = Rules(max_segments, followed, edges)
     trajectory = _filippov(
         osc, y0, t0, t1, ts, rtol, atol, rules=rules, max_events=max_events, resolution=resolution
     )

@@ -12,13 +12,13 @@ from jaxtyping import Array
 from ..cycles.settling import REPEATED, way_left
 from ..kernel.events import append, event_kinds, word_events
 from ..kernel.lanes import Lanes, Observer, Passage, Variable, materialise
+from ..kernel.marks import Mark
 from ..model.events import signature_name
 from ..model.modes import select
 from ..model.oscillator import Oscillator
 from ..model.rest import is_neutral, settling_margin
 from ..model.transitions import begins_at_rest
 from ..results import Status
-from .marks import Mark
 
 #: What a run leads to, in the order of their codes.
 KINDS = ("undecided", "equilibrium", "cycle", "stuck")
@@ -122,7 +122,7 @@ class Attractor(Observer):
         nothing = zero + jnp.nan
         rests = begins_at_rest(osc, lanes.x1, lanes.x2)
         return _LoopSoFar(
-            mark=Mark.none(lanes),
+            mark=Mark.none(lanes.t),
             x1_min=lanes.x1,
             x1_max=lanes.x1,
             sticks=tuple(zero for _ in osc.belts),
@@ -153,7 +153,7 @@ class Attractor(Observer):
         cycle = found & ~resting
         mark = loop.mark
         # Where it comes back and has not settled, the next loop is compared with this one.
-        renewed, new = mark.renewed(lanes, section & ~found, ones, met)
+        renewed, new = mark.renewed(lanes, section & ~found, lanes.events, ones, met)
         # An attractor at rest is a point; a new mark begins a new loop.
         fresh = new | resting
         memory = _LoopSoFar(
@@ -171,7 +171,7 @@ class Attractor(Observer):
             kind=jnp.where(found, kind, loop.kind),
             period=jnp.where(cycle, lanes.t - mark.t, loop.period),
             transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), loop.transient),
-            loop_events=jnp.where(cycle, lanes.events - mark.events, loop.loop_events),
+            loop_events=jnp.where(cycle, lanes.events - mark.count, loop.loop_events),
         )
         # Lanes that are decided keep what they found until it is handed in.
         memory = select(loop.kind == UNDECIDED, memory, loop)

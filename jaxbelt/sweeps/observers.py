@@ -7,12 +7,11 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from ..kernel.events import event_kinds
 from ..kernel.lanes import Observer, Variable, choose
-from .marks import Mark
+from ..kernel.marks import Mark
 
 #: What contact codes stand for.
 CONTACTS = {
@@ -43,22 +42,18 @@ class Final(Observer):
     skip: bool = eqx.field(static=True, default=True)
 
     def start(self, osc, lanes):
-        return Mark.none(lanes)
+        return Mark.none(lanes.t)
 
     def watch(self, osc, lanes, passage, ones, t1, tol):
         if not self.skip:
             return lanes
         mark: Mark = lanes.memory
         released = passage.released & ~lanes.mode.any_stuck
-        period = lanes.t - mark.t
-        repeats = released & mark.met_by(lanes, 0.0) & (period > 0)
-        loops = jnp.floor((t1 - lanes.t) / jnp.where(repeats, period, jnp.inf))
-        loops = lax.stop_gradient(jnp.maximum(loops, 0.0))
-        per_loop = lanes.events - mark.events
-        t = jnp.where(repeats, lanes.t + loops * period, lanes.t)
-        events = lanes.events + jnp.where(repeats, loops.astype(per_loop.dtype) * per_loop, 0)
-        lanes = replace(lanes, t=t, events=events)
-        return replace(lanes, memory=mark.renewed(lanes, released, ones)[0])
+        loops = mark.loops_left(lanes, released, t1)
+        t = jnp.where(loops > 0, lanes.t + loops * (lanes.t - mark.t), lanes.t)
+        events = lanes.events + loops.astype(mark.count.dtype) * (lanes.events - mark.count)
+        renewed, _ = mark.renewed(lanes, released, lanes.events, ones)
+        return replace(lanes, t=t, events=events, memory=renewed)
 
     def finish(self, osc, lanes):
         return {

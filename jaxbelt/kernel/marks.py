@@ -1,0 +1,136 @@
+"""Marks: a state of each run that later ones are compared with, to find what repeats.
+
+At the end of a stick phase the state is a function of the parameters alone. Where it repeats,
+everything repeats, to the last bit; so a run need not follow the same loop again.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..model.modes import select
+from .lanes import code_of, materialise
+
+#: Part of a loop, at least, that a run follows behind those that it need not, so that it ends on
+#: the way, and not at the end of a loop but for rounding.
+LEAST_REST = 1e-6
+
+
+class Mark(eqx.Module):
+    """A state of a run that later ones are compared with, arrays [lanes].
+
+    When it is 1, 2, 4, ... states old, the next one takes its place (Brent's method), so a cycle of
+    any number of such states is found at their first repetition or soon after. count: what is
+    counted along a run, its events, say, when it was there.
+    """
+
+    x1: Array
+    x2: Array
+    code: Array
+    t: Array
+    count: Array
+    age: Array
+    limit: Array
+
+    @classmethod
+    def none(cls, t: Array) -> "Mark":
+        """Marks to which no run returns; t: times of the runs."""
+        zero, count = jnp.zeros_like(t), jnp.zeros_like(t, jnp.int32)
+        return cls(zero + jnp.nan, zero, zero, zero, count, count, count)
+
+    def met_by(self, run: Any, close: Array | float) -> Array:
+        """Whether the runs are in the marked state again: mode, x2, and x1 to `close`.
+
+        run: has the state of the runs, x1, x2, and mode. x2 is that of a belt, or 0, on both
+        occasions, and so it is the same to the last bit.
+        """
+        same = (run.x2 == self.x2) & (code_of(run.mode) == self.code)
+        return same & (jnp.abs(run.x1 - self.x1) <= close)
+
+    def loops_left(self, run: Any, released: Array, t1: Array) -> Array:
+        """How many more times the runs pass the loop since their marks before t1, and some of it
+        once more; 0 where they are not `released` from a stick phase in the marked state."""
+        period = run.t - self.t
+        repeats = released & self.met_by(run, 0.0) & (period > 0)
+        left = (t1 - run.t) / jnp.where(repeats, period, jnp.inf)
+        loops = jnp.maximum(jnp.floor(left - LEAST_REST), 0.0)
+        return lax.stop_gradient(jnp.where(repeats, loops, 0.0))
+
+    def renewed(
+        self, run: Any, at: Array, count: Array, ones: Array, met: Array | bool = False
+    ) -> tuple["Mark", Array]:
+        """The marks when the runs `at` are in a state to compare, and which of them are new.
+
+        met: runs that have come back to their mark, and are to go on from there.
+        """
+        age = self.age + jnp.where(at, 1, 0)
+        old = age >= self.limit
+        new = materialise(at & (old | met), ones)
+        here = Mark(
+            run.x1,
+            run.x2,
+            code_of(run.mode),
+            run.t,
+            count,
+            jnp.zeros_like(age),
+            jnp.where(old, jnp.maximum(2 * self.limit, 1), self.limit),
+        )
+        return select(new, here, eqx.tree_at(lambda m: m.age, self, age)), new
+
+
+class LoopSearch(eqx.Module):
+    """The loop that a run repeats, and by which it was found, arrays [lanes].
+
+    number: counts along the run, arcs or rounds; first, last: the numbers behind which the loop
+    began and ended; loops: how many more times it is passed then, 0 where none was found; t: when
+    it ended first; period: of the loop.
+    """
+
+    mark: Mark
+    number: Array
+    first: Array
+    last: Array
+    loops: Array
+    t: Array
+    period: Array
+
+    @classmethod
+    def none(cls, t: Array) -> "LoopSearch":
+        """Nothing was found yet; t: times of the runs."""
+        zero, count = jnp.zeros_like(t), jnp.zeros_like(t, jnp.int32)
+        return cls(Mark.none(t), count, count, count, count, zero, zero)
+
+    def looked_for(
+        self, run: Any, released: Array, t1: Array, ones: Array, room: int | None = None
+    ) -> tuple["LoopSearch", Array]:
+        """The repeats where runs stand behind that number, and their times: behind the loops, where
+        they repeat one. Not where the numbers would be more than there is room for."""
+        mark = self.mark
+        loops = mark.loops_left(run, released, t1)
+        if room is not None:
+            number, length = (n.astype(float) for n in (self.number, self.number - mark.count))
+            loops = jnp.where(number + (loops + 1) * length <= room, loops, 0.0)
+        found, period = loops > 0, run.t - mark.t
+        return LoopSearch(
+            mark=mark.renewed(run, released, self.number, ones)[0],
+            number=self.number,
+            first=jnp.where(found, mark.count, self.first),
+            last=jnp.where(found, self.number, self.last),
+            loops=jnp.where(found, loops.astype(self.loops.dtype), self.loops),
+            t=jnp.where(found, run.t, self.t),
+            period=jnp.where(found, period, self.period),
+        ), jnp.where(found, run.t + loops * period, run.t)
+
+
+def time_back(ts: Array, loops: Array, t: Array, period: Array) -> Array:
+    """How much earlier a run was where it is at the times ts, in the loop that it repeats.
+
+    loops, t, period: see `LoopSearch`; 0 before it repeats the loop, and behind that.
+    """
+    since, loops = ts - t, loops.astype(float)
+    period = jnp.where(loops > 0, period, 1.0)
+    again = jnp.clip(jnp.ceil(since / period), 0.0, loops)
+    return lax.stop_gradient(jnp.where(since > loops * period, 0.0, again)) * period
