@@ -74,7 +74,7 @@ def test_a_run_is_that_of_its_pieces(name):
 @pytest.mark.slow(first=True)
 def test_times_of_later_loops_move_by_the_period():
     """d t(n + k m)/dp = d t(n)/dp + k d period/dp, the period by shooting."""
-    loops, size = 8, 2  # events of a loop: STICK and SLIP
+    loops, size = 7, 2  # events of a loop: STICK and SLIP
 
     def times(p):
         run = jb.simulate(
