@@ -15,7 +15,7 @@ from ..model.events import Signature, event_between
 from ..model.modes import Mode, mode_acceleration, select, without_rounding
 from ..model.oscillator import Oscillator
 from ..model.rest import is_at_rest, is_slow
-from ..model.transitions import guard_passed, leave_slip, leave_stick, stick_phase
+from ..model.transitions import guard_passed, leave_slip, leave_stick, stick_phase, where_any
 from ..results import EventKind, Status
 from .lanes import Lanes, Passage
 from .step import NO_STEP, STEP_SAFETY, first_step
@@ -49,7 +49,11 @@ def pass_events(
     x1, x2 = after.x1, jnp.where(captured, 0.0, after.x2)
 
     stuck = after.mode.any_stuck & ~captured & ~lanes.done
-    hold = _held(osc, after.mode, stuck, x1, x2, t1 - lanes.t)
+    hold = where_any(
+        stuck,
+        lambda: _held(osc, after.mode, stuck, x1, x2, t1 - lanes.t),
+        _Hold(after.mode, x1, x2, jnp.zeros_like(x1), stuck, stuck),
+    )
     x2, released = hold.x2, hold.released
     mode = select(captured, lanes.mode, hold.mode)
     new_x1 = hold.x1

@@ -6,7 +6,7 @@ whether the contacts that are to be stuck can hold the force needed.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,6 +20,7 @@ from .modes import (
     STUCK,
     ULPS,
     Mode,
+    Tree,
     any_of,
     boundary_guards,
     bounds_rightward,
@@ -37,10 +38,9 @@ from .modes import (
     stick_velocity,
     without_rounding,
 )
+from ..numerics.compiling import any_lane
 from .oscillator import Oscillator
-from .pseudofocus import (
-    is_captured,
-)
+from .pseudofocus import FOCUS_RADIUS, is_captured
 
 #: A guard this small, over 1 + |nu| or 1 + |x1|, is 0: orbits are put on a guard exactly, so this
 #: is the rounding of a difference.
@@ -270,14 +270,32 @@ def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) 
     transition.
     """
     at = _guard_of(osc, mode, guard, x1, x2)
-    after_boundary = settle(osc, at.held, x1, at.x2_boundary)
+    # Modes are piecewise constant: they have no derivatives.
+    still, place, mode, v = lax.stop_gradient((osc, at, mode, x2))
+
+    def from_boundary():
+        return settle(still, place.held, lax.stop_gradient(x1), place.x2_boundary)
+
+    after_boundary = where_any(at.at_boundary, from_boundary, mode)
     if not has_edges(osc):
         after = select(at.at_boundary, after_boundary, mode)
         return Departure(after, at.x1, at.x2, at.at_boundary, at.at_edge, at.at_edge)
-    after_edge = pass_edge(osc, mode, at.edge, x2, at.rightward)
+
+    def past_edge():
+        return pass_edge(still, mode, place.edge, v, place.rightward)
+
+    def past_end():
+        needed = mode_acceleration(still, place.held, place.end, place.x2_boundary)
+        return pass_edge(still, place.held, place.end, place.x2_boundary, needed > 0)
+
+    after_edge = where_any(at.at_edge, past_edge, mode)
     left, right = select(at.rightward, (mode, after_edge), (after_edge, mode))
-    needed = mode_acceleration(osc, at.held, at.end, at.x2_boundary)
-    beyond = pass_edge(osc, at.held, at.end, at.x2_boundary, needed > 0)
+
+    def capture():
+        return is_captured(still, left, right, place.edge, v)
+
+    slow = at.at_edge & (jnp.abs(x2) < FOCUS_RADIUS)
+    beyond = where_any(at.on_end, past_end, after_boundary)
     after_boundary = select(at.on_end, beyond, after_boundary)
     return Departure(
         mode=select(at.at_boundary, after_boundary, select(at.at_edge, after_edge, mode)),
@@ -285,8 +303,14 @@ def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) 
         x2=at.x2,
         at_boundary=at.at_boundary,
         at_edge=at.at_edge,
-        captured=at.at_edge & is_captured(osc, left, right, at.edge, x2),
+        captured=slow & where_any(slow, capture, jnp.zeros_like(slow)),
     )
+
+
+def where_any(flags: Array, function: Callable[[], Tree], otherwise: Tree) -> Tree:
+    """What the function gives, if the flag of any lane is set: few lanes are at an event at a time,
+    and fewer at one of a kind."""
+    return lax.cond(any_lane(jnp.any(flags)), function, lambda: otherwise)
 
 
 def _released_at_edge(osc: Oscillator, held: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
