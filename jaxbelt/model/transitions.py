@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..numerics.compiling import any_lane
 from .modes import (
     ABOVE,
     BELOW,
@@ -38,7 +39,6 @@ from .modes import (
     stick_velocity,
     without_rounding,
 )
-from ..numerics.compiling import any_lane
 from .oscillator import Oscillator
 from .pseudofocus import FOCUS_RADIUS, is_captured
 

@@ -220,9 +220,11 @@ def simulate(
     tanh(r/eps) in place of sgn(r). The last two have no events.
 
     max_segments: budget of arcs; None chooses one from the time span. A run that uses it up
-    returns what it has, with the status TOO_MANY_SEGMENTS. max_events: how many events are given,
-    with the same status where there were more; None: all of them, and under a transformation, where
-    there has to be room for them, about 4 (where edges are passed 16) a unit of time.
+    returns what it has, with the status TOO_MANY_SEGMENTS. A loop behind a stick phase that repeats
+    to the last digit is followed once, and its arcs count every time. max_events: how many events
+    are given, with the same status where there were more; None: all of them, and under a
+    transformation, where there has to be room for them, about 4 (where edges are passed 16) a unit
+    of time.
 
     Works under `jax.jit`, `jax.vmap` (batches), `jax.jacfwd` and `jax.jacrev`. There the lengths
     are padded (see `Events`); outside they are cut to what happened.
