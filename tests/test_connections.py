@@ -77,6 +77,7 @@ def test_scan_finds_what_changes_no_attractor():
     assert point.value == pytest.approx(brentq(miss, 0.2, 0.4, xtol=1e-15), abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_two_connections_at_one_value():
     """With both edges in a symmetric place: from the left one to the right one, and back."""
     wanted = brentq(lambda s: miss(s, sigma0=-s), 0.5, 0.506, xtol=1e-15)
@@ -227,6 +228,7 @@ def test_no_saddle_no_connection():
     assert point.status == Status.NOT_TOUCHED and jnp.isnan(point.value)
 
 
+@pytest.mark.slow(first=True)
 def test_an_orbit_that_slowly_circles_a_pseudo_focus_stays_between_saddles():
     """Found by a campaign: how many loops it takes until it counts as at rest is no difference."""
     stribeck = jb.Stribeck(1.2156234004882518, 1.0138132582447077, 0.8970527898384911)
