@@ -38,9 +38,7 @@ from .modes import (
     without_rounding,
 )
 from .oscillator import Oscillator
-from .pseudofocus import (
-    is_captured,
-)
+from .pseudofocus import is_captured
 
 #: A guard this small, over 1 + |nu| or 1 + |x1|, is 0: orbits are put on a guard exactly, so this
 #: is the rounding of a difference.
