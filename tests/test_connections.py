@@ -115,6 +115,7 @@ def test_back_to_the_same_saddle():
     assert points[-1].value == pytest.approx(-0.252465, abs=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_a_separatrix_that_sticks_forgets_where_it_began():
     """From slip onset on belt 1 to the saddle, wherever the orbit begins to stick."""
     # Belt 1 holds its limit, against the damping and belt 0, which slips at a speed of 1.
