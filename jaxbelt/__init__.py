@@ -24,9 +24,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         observers moments along reducers attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     sweeps/         fractions orbit_diagram
-    bifurcations/   special labels systems guesses conditions tangencies crossings rests edge_rests
-    bifurcations/   edges folds meetings connections infinity path scan refine curves cells faces
-    bifurcations/   bounds regions diagrams switch_folds
+    bifurcations/   special labels systems guesses base conditions tangencies crossings rests
+    bifurcations/   edge_rests edges folds meetings connections infinity path scan refine tracks
+    bifurcations/   curves cells faces bounds regions diagrams switch_folds
     inverse/        selection record fit margins design
     si              results in SI units
     plotting/       style phase histories points diagrams regions categories sweeps orbits

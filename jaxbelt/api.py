@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from . import presets
 from .activity import show_progress
-from .bifurcations.conditions import BifurcationPoint
+from .bifurcations.base import BifurcationPoint
 from .bifurcations.connections import SaddleConnection
 from .bifurcations.crossings import CrossingSliding, SlidingExchange
 from .bifurcations.curves import BifurcationCurve, bifurcation_curve

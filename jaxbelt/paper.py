@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from .bifurcations.conditions import AbstractCondition
+from .bifurcations.base import AbstractCondition
 from .bifurcations.crossings import SlidingExchange
 from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
 from .bifurcations.regions import RegionMap, region_map

@@ -56,7 +56,11 @@ def simulated(kind: str, table: np.ndarray):
         jb.simulate(make(*one), (3.0, 0.0), SPAN, rtol=TIGHT, atol=TIGHT, max_segments=ARCS)
         for one in table.T.tolist()
     ]
-    found = [(run.ys[-1], run.modes[-1], len(run.events.t), run.status) for run in runs]
+    # Each length of a run would be a program that picks its last row.
+    found = [
+        (np.asarray(run.ys)[-1], np.asarray(run.modes)[-1], len(run.events.t), run.status)
+        for run in runs
+    ]
     return [np.stack([np.asarray(one) for one in column]) for column in zip(*found, strict=True)]
 
 

@@ -8,6 +8,7 @@ import threading
 import time
 from types import SimpleNamespace
 
+import jax
 import kills
 import numpy as np
 import pytest
@@ -36,7 +37,8 @@ def small_blocks(monkeypatch):
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory):
-    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR") or tmp_path_factory.mktemp("cache")
+    # Where the sweeps of this process have left their programs.
+    cache = jax.config.jax_compilation_cache_dir or tmp_path_factory.mktemp("cache")
     with kills.cluster(2, cache) as client:
         yield client
 

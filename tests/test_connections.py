@@ -77,6 +77,7 @@ def test_scan_finds_what_changes_no_attractor():
     assert point.value == pytest.approx(brentq(miss, 0.2, 0.4, xtol=1e-15), abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_two_connections_at_one_value():
     """With both edges in a symmetric place: from the left one to the right one, and back."""
     wanted = brentq(lambda s: miss(s, sigma0=-s), 0.5, 0.506, xtol=1e-15)
@@ -114,6 +115,7 @@ def test_back_to_the_same_saddle():
     assert points[-1].value == pytest.approx(-0.252465, abs=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_a_separatrix_that_sticks_forgets_where_it_began():
     """From slip onset on belt 1 to the saddle, wherever the orbit begins to stick."""
     # Belt 1 holds its limit, against the damping and belt 0, which slips at a speed of 1.
@@ -227,6 +229,7 @@ def test_no_saddle_no_connection():
     assert point.status == Status.NOT_TOUCHED and jnp.isnan(point.value)
 
 
+@pytest.mark.slow(first=True)
 def test_an_orbit_that_slowly_circles_a_pseudo_focus_stays_between_saddles():
     """Found by a campaign: how many loops it takes until it counts as at rest is no difference."""
     stribeck = jb.Stribeck(1.2156234004882518, 1.0138132582447077, 0.8970527898384911)

@@ -1,46 +1,46 @@
 """Pseudo-arclength on curves whose equations are known, and every way in which one can end."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbelt.numerics.continuation import Stop, continue_curve
+from jaxbelt.numerics.continuation import Stop, continue_curve, corrected
 
 # Points solve their equation to rounding; Newton's method ends below this.
 ROUNDING = 1e-12
 
 
-def linearized(function):
-    """The function and its matrix."""
+def solved(function):
+    """What gives the points of the curve function(u, number) = 0, for a number."""
 
-    def both(u, args):
-        return function(u, args), jax.jacfwd(function)(u, args)
+    def linearized(u, number):
+        return function(u, number), jax.jacfwd(function)(u, number)
 
-    return both
+    return lambda number=0.0: functools.partial(corrected, linearized, jnp.asarray(number))
 
 
-@linearized
+@solved
 def circle(u, radius):
     return jnp.array([u[0] ** 2 + u[1] ** 2 - radius**2])
 
 
-@linearized
+@solved
 def cubic(u, _):
     # Two folds: u[1] = x^3 - x turns round at x = -1/sqrt(3) and 1/sqrt(3).
     return jnp.array([u[0] ** 3 - u[0] - u[1]])
 
 
-@linearized
+@solved
 def imperfect_pitchfork(u, offset):
     return jnp.array([offset + u[1] * u[0] - u[0] ** 3])
 
 
 def test_a_circle_is_followed_round():
     step, n = 0.3, 50
-    points = list(
-        continue_curve(circle, (1.9, 0.1), (0.0, 1.0), args=2.0, max_step=step, max_points=n)
-    )
+    points = list(continue_curve(circle(2.0), (1.9, 0.1), (0.0, 1.0), max_step=step, max_points=n))
     u = np.array([point.u for point in points])
     assert np.allclose(np.hypot(*u.T), 2.0, rtol=0, atol=ROUNDING)
     assert [point.end for point in points] == [None] * (n - 1) + [Stop.POINT_COUNT]
@@ -53,7 +53,7 @@ def test_a_circle_is_followed_round():
 
 
 def test_folds_are_passed_and_the_span_is_met_exactly():
-    points = list(continue_curve(cubic, (-1.5, -1.9), (1.0, 0.0), span=((-2, -3), (2, 2.5))))
+    points = list(continue_curve(cubic(), (-1.5, -1.9), (1.0, 0.0), span=((-2, -3), (2, 2.5))))
     u = np.array([point.u for point in points])
     assert np.allclose(u[:, 0] ** 3 - u[:, 0], u[:, 1], rtol=0, atol=ROUNDING)
     assert np.sum(np.diff(np.sign(np.diff(u[:, 1]))) != 0) == 2
@@ -68,7 +68,7 @@ def test_folds_are_passed_and_the_span_is_met_exactly():
 @pytest.mark.parametrize("side", [0.5, 0.5 + 1e-14])
 def test_a_point_on_a_side_of_the_span_is_told_once(side):
     """Steps of a quarter come to it by themselves, up to rounding."""
-    line, ahead = linearized(lambda u, _: u[:1]), np.array([0.0, 1.0])
+    line, ahead = solved(lambda u, _: u[:1])(), np.array([0.0, 1.0])
     span, steps = (-1.0, side), {"step": 0.25, "max_step": 0.25}
     points = list(continue_curve(line, np.zeros(2), ahead, span=span, **steps))
     assert [float(point.u[1]) for point in points] == pytest.approx([0.0, 0.25, 0.5], abs=1e-13)
@@ -78,34 +78,30 @@ def test_a_point_on_a_side_of_the_span_is_told_once(side):
 
 
 def test_a_pitchfork_off_its_axis_is_followed_round_the_bend():
-    branch = continue_curve(
-        imperfect_pitchfork, (-0.7, 0.49), (0.0, -1.0), args=-1e-4, span=(-1, 1)
-    )
+    branch = continue_curve(imperfect_pitchfork(-1e-4), (-0.7, 0.49), (0.0, -1.0), span=(-1, 1))
     u = np.array([point.u for point in branch])
     # With the offset the branch comes down one side and leaves along the axis, x = offset / -p.
     assert u[-1] == pytest.approx([-1e-4, -1.0], abs=1e-7)
     # It never passes to the other side.
     assert np.all(u[:, 0] < 0)
     # Against the sense: up to the edge, the outer branch sqrt(p).
-    *_, last = continue_curve(
-        imperfect_pitchfork, (-0.7, 0.49), (0.0, 1.0), args=-1e-4, span=(-1, 1)
-    )
+    *_, last = continue_curve(imperfect_pitchfork(-1e-4), (-0.7, 0.49), (0.0, 1.0), span=(-1, 1))
     assert last.u[1] == pytest.approx(1.0, abs=ROUNDING) and last.end is Stop.LEFT_SPAN
 
 
 def test_ends():
-    *_, last = continue_curve(circle, (2.0, 0.0), (0.0, 1.0), args=2.0, max_points=7)
+    *_, last = continue_curve(circle(2.0), (2.0, 0.0), (0.0, 1.0), max_points=7)
     assert last.end is Stop.POINT_COUNT
 
-    @linearized
+    @solved
     def until_it_stops(u, _):
         return jnp.array([u[1] - jnp.sqrt(1 - u[0])])
 
-    *_, last = continue_curve(until_it_stops, (0.0, 1.0), (1.0, 0.0))
+    *_, last = continue_curve(until_it_stops(), (0.0, 1.0), (1.0, 0.0))
     # The square root's branch point ends the real curve.
     assert last.end is Stop.STEP_TOO_SMALL and last.u == pytest.approx([1, 0], abs=1e-3)
 
-    assert list(continue_curve(until_it_stops, (3.0, 1.0), (1.0, 0.0))) == []
+    assert list(continue_curve(until_it_stops(), (3.0, 1.0), (1.0, 0.0))) == []
 
 
 @pytest.mark.parametrize(
@@ -120,4 +116,4 @@ def test_ends():
 def test_impossible_arguments_are_named(arguments, message):
     given = {"start": (2.0, 0.0), "direction": (0.0, 1.0), **arguments}
     with pytest.raises(ValueError, match=message):
-        list(continue_curve(circle, given.pop("start"), given.pop("direction"), args=2.0, **given))
+        list(continue_curve(circle(2.0), given.pop("start"), given.pop("direction"), **given))

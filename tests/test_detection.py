@@ -426,6 +426,7 @@ def test_simulation_agrees_between_any_two_points():
             assert tuple(np.flatnonzero(place[0])) == tuple(sorted(belts)) and seen <= allowed
 
 
+@pytest.mark.slow(first=True)
 def test_two_cycles_at_one_value_are_two_points():
     """Each is the other turned round, in the same contact interval of a light belt at rest: at its
     ends they collide with a corner at one value."""

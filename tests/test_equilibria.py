@@ -630,12 +630,17 @@ def test_a_law_of_ones_own_and_a_supercritical_point():
 
 #: Damping 0 and friction that does not depend on the speed; on both sides of an edge; laws whose
 #: sum is even in the velocity: c - 0.05 x2^2 (damping 0), and a constant (damping 4 * 0.05).
+def constant(friction):
+    """Two belts with one sort of law are one program, whatever its numbers."""
+    return jb.Conti(friction, friction, 1.0)
+
+
 CENTRES = {
-    "constant": (0.0, jb.Belt(2.0, jb.Coulomb(1.0, 0.6))),
+    "constant": (0.0, jb.Belt(2.0, constant(0.6)), jb.Belt(-2.0, constant(0.4))),
     "an edge": (
         0.0,
-        jb.Belt(2.0, jb.Coulomb(0.8, 0.6), upper=0.1),
-        jb.Belt(-2.0, jb.Coulomb(0.8, 0.5), lower=0.1),
+        jb.Belt(2.0, constant(0.6), upper=0.1),
+        jb.Belt(-2.0, constant(0.5), lower=0.1),
     ),
     "even": (
         0.0,
@@ -658,10 +663,13 @@ def test_a_centre_is_neutral_and_closes(name):
     assert point.neutral and not point.stable and abs(float(point.rate)) < 1e-15
     assert repr(point).startswith("Equilibria(neutral ")
     assert point.table().neutral.tolist() == [True]
-    # One loop, and more than the first half of another: from a top it comes back to the top.
+    # Around the end of the second loop: from a top it comes back to the top. In the shapes of
+    # tests/test_simulate.py, for one program; between samples it is 3e-6 higher at most.
     top = float(point.x1) + 0.3
-    events = jb.simulate(osc, (top, 0.0), 15.0, ts=np.linspace(0.0, 15.0, 3001))
-    assert float(jnp.max(events.ys[1500:, 0])) == pytest.approx(top, abs=1e-5)
+    loop = 3.54 if name == "an edge" else 2 * np.pi
+    ts = 2 * loop + np.linspace(-0.5, 0.7, 241)
+    run = jb.simulate(osc, (top, 0.0), 15.0, ts=ts, max_segments=4096)
+    assert float(jnp.max(run.ys[:, 0])) == pytest.approx(top, abs=1e-5)
     assert jb.find_cycle(osc, (top, 0.0)).status == jb.Status.NEUTRAL
     (row,) = jb.equilibria(eqx.tree_at(lambda o: o.damping, osc, damping + 1e-9))
     assert row.stable and not row.neutral
@@ -687,7 +695,8 @@ def test_rows_and_their_texts():
     assert len(points) == 3 and [float(p.x1) for p in points] == points.x1.tolist()
     assert repr(points[2]) == "Equilibria(stable FIXED_POINT at x1 = 0.7)"
     assert "stable SEGMENT at x1 = -1 to -0.2; stable SEGMENT" in repr(points)
-    assert "kind" in repr(batched(free_class_d)(np.zeros((2, 4))))
+    # As many as above, for one program.
+    assert "kind" in repr(batched(free_class_d)(np.zeros((240, 4))))
 
 
 def test_bad_input_is_named():

@@ -106,6 +106,7 @@ def test_each_value_has_starts_of_its_own_and_compiles_nothing(found):
     np.testing.assert_array_equal(again.fractions, equal.fractions)
 
 
+@pytest.mark.slow(first=True)
 def test_at_a_hopf_point_the_equilibrium_attracts_nothing():
     found = along(jb.presets.class_b(0.3, NU1), (HOPF, 0.45), 2, n=300)
     assert found.attractors == ("cycle 0", "equilibrium 0")

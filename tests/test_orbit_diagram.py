@@ -111,6 +111,7 @@ def test_table_has_a_row_for_each_point(diagram):
     )
 
 
+@pytest.mark.slow(first=True)
 def test_a_cycle_that_does_not_come_back_is_undecided(diagram, monkeypatch):
     """Within no distance at all: what is not the same to the last bit is refused."""
     monkeypatch.setattr(module, "RUN", 0.0)

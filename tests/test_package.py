@@ -96,8 +96,10 @@ def defined_names(module: str) -> set[str]:
 def test_no_two_modules_define_different_things_under_one_name():
     """But for commands, each named as the function that it calls. Nor does what comes from another
     package have a name that is defined here."""
-    modules = [module for module in LADDER if not module.startswith("commands.")]
-    defined = {module: defined_names(module) for module in modules}
+    defined = {module: defined_names(module) for module in LADDER}
+    for module in LADDER:
+        if module.startswith("commands."):
+            defined[module] -= {*jaxbelt.__all__, "reproduce"}
     times = Counter(
         name for names in defined.values() for name in {name.lstrip("_") for name in names} - {""}
     )

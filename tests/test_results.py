@@ -47,7 +47,8 @@ def nu0(osc):
 def results() -> dict[type, Any]:
     """One of each; numbers that no test is about are made up, which compiles nothing."""
     osc, span = jb.presets.class_b(0.45, 0.35), np.linspace(0.0, 1.0, 5)
-    run = jb.simulate(osc, (3.0, 0.0), 20.0)
+    # Room for as many arcs as in tests/test_simulate.py, for one program.
+    run = jb.simulate(osc, (3.0, 0.0), 20.0, max_segments=4096)
     cycle, inner = jb.find_cycle(osc, (3.0, 0.0)), jb.unstable_cycle(osc)
     point, rests = jb.refine(jb.NonsmoothFold(belt=1), osc, where=nu0), jb.equilibria(osc)
     ts, ys = jnp.asarray(span), jnp.asarray(np.column_stack([np.cos(span), np.sin(span)]))

@@ -48,6 +48,7 @@ def return_map(nu, v_star, x1):
     return run.y_events[0][0][0] if run.t_events[0].size else None
 
 
+@pytest.mark.slow(first=True)
 def test_fold_is_that_of_the_return_map(point):
     """Two cycles meet where the smallest of R(x1) - x1 over the entries x1 is zero."""
     v_star = 1e-3

@@ -17,7 +17,7 @@ from ..activity import tell
 from ..model.variations import Variation
 from ..numerics.continuation import Stop
 from ..results import Status
-from .conditions import BifurcationPoint
+from .base import BifurcationPoint
 from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
 from .faces import densely
 from .path import ParameterPath

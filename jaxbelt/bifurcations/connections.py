@@ -50,7 +50,7 @@ from ..numerics.compiling import each, jit
 from ..numerics.continuation import Stop
 from ..numerics.newton import HOLDS, newton
 from ..results import Status
-from .conditions import AbstractCondition, Line, point_of
+from .base import AbstractCondition, Line, point_of
 from .crossings import has_jump
 from .edge_rests import check_edge
 from .rests import hopf_limit

@@ -25,7 +25,8 @@ from ..model.transitions import stick_limit
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..results import EventKind, Status
-from .conditions import AbstractCycleCondition, Line, check_two_belts
+from .base import Line, check_two_belts
+from .conditions import AbstractCycleCondition
 from .guesses import nearest, orbit_after_stick, repeated_loop, without_arcs
 from .special import SpecialPoint
 from .systems import (

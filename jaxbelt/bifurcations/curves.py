@@ -13,31 +13,26 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, tell
 from ..checks import as_array, as_interval, as_positive, as_whole, require, require_value
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
-from ..model.variations import Family, Variation
-from ..numerics.compiling import jit
-from ..numerics.continuation import Corrected, CurvePoint, Stop, continue_curve, corrected
+from ..model.variations import Variation
+from ..numerics.continuation import CurvePoint, Stop, continue_curve
 from ..results import Status, draw
 from ..tables import table_of
-from .conditions import AbstractCondition, BifurcationPoint, Trail
-from .special import CREEPS, SpecialPoint, where_belts_stop, where_edge_is_touched
-from .systems import AbstractSystem, Seen
+from .base import AbstractCondition, BifurcationPoint
+from .special import CREEPS, SpecialPoint, Trail, where_belts_stop, where_edge_is_touched
+from .systems import Seen
+from .tracks import Track, special_between
 
 if TYPE_CHECKING:
     import pandas
 
 #: After so many points the steps of integration are spread anew.
 REMESH = 10
-#: How often, at most, the points on both sides of a singular one are brought nearer to it by half.
-#: Newton's method fails before: after four times in the cases known, where twice leave 5e-9.
-SHRINKS = 8
 #: A cycle changes by less in a step, relative to its size; a fixed point by less. Along curves of
 #: classes (b), (c) and (d) it was 0.15 at most.
 FAR = 0.2
@@ -261,7 +256,7 @@ class _Side(NamedTuple):
 
 def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: float) -> _Side:
     """The curve to one side of a point: leg by leg, each with one signature and one mesh."""
-    track, u = _Track.begun(problem, point, start)
+    track, u = Track.begun(problem.variation, point, start)
     origin, direction = u[-2:], sign * track.tangent(u)
     rows: list[_Row] = []
     special: list[SpecialPoint] = []
@@ -292,7 +287,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         further = None if is_end else _beyond(problem, last[-2:], centre, place)
         if further is None:
             return _ended(problem, rows, special)
-        track, u = _Track.begun(problem, *further)
+        track, u = Track.begun(problem.variation, *further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
         rows.append(_row_at(problem, track, u, track.look(u)))
@@ -328,14 +323,14 @@ class _Leg(NamedTuple):
     end: Stop
 
 
-def _leg(problem: _Problem, track: "_Track", u, direction, origin) -> _Leg:
+def _leg(problem: _Problem, track: Track, u, direction, origin) -> _Leg:
     points, special = [], []
     for at in _points_along(problem, track, u, direction):
         if points:
             at = _closing(track, points[-1][0], at, origin) or at
         points.append((at, track.look(at.u)))
         if len(points) > 1:
-            special += _between(problem, track, points[-2], points[-1])
+            special += special_between(track, problem.limits, points[-2], points[-1])
         if not points[-1][1].exists:
             beyond, _ = points.pop()
             return _Leg(points, special, beyond, Stop.STOPPED)
@@ -344,7 +339,7 @@ def _leg(problem: _Problem, track: "_Track", u, direction, origin) -> _Leg:
     return _Leg(points, special, None, Stop.STEP_TOO_SMALL)
 
 
-def _closing(track: "_Track", before: CurvePoint, after: CurvePoint, origin) -> CurvePoint | None:
+def _closing(track: Track, before: CurvePoint, after: CurvePoint, origin) -> CurvePoint | None:
     """The point where the curve began, if the step from one point to the next passes it."""
     chord = (after.u - before.u)[-2:]
     part = (origin - before.u[-2:]) @ chord / (chord @ chord)
@@ -358,11 +353,11 @@ def _closing(track: "_Track", before: CurvePoint, after: CurvePoint, origin) -> 
     return after._replace(u=at.u, tangent=at.tangent, end=Stop.CLOSED)
 
 
-def _points_along(problem: _Problem, track: "_Track", u: np.ndarray, direction: np.ndarray):
+def _points_along(problem: _Problem, track: Track, u: np.ndarray, direction: np.ndarray):
     span = np.full((2, u.size), np.inf) * np.array([[-1.0], [1.0]])
     span[:, -2:] = problem.limits.T
     return continue_curve(
-        _curve_linearized,
+        track.corrected,
         u,
         direction,
         span=(span[0], span[1]),
@@ -370,92 +365,13 @@ def _points_along(problem: _Problem, track: "_Track", u: np.ndarray, direction: 
         min_step=1e-2 * problem.step,
         max_step=problem.step,
         max_points=REMESH,
-        solve=track.corrected,
     )
 
 
-def _row_at(problem: _Problem, track: "_Track", u: np.ndarray, seen: Seen) -> _Row:
+def _row_at(problem: _Problem, track: Track, u: np.ndarray, seen: Seen) -> _Row:
     osc = problem.variation.oscillator(u[-2:])
     kind = problem.condition.kind_along(osc, seen.multiplier)
     return _Row(u[-2:], kind, seen.multiplier, seen.residual, track.place(u))
-
-
-def _between(problem: _Problem, track: "_Track", before, after) -> list[SpecialPoint]:
-    """The points of codimension two between two neighbours: where a watched function vanishes."""
-    from scipy.optimize import brentq  # half a second that only curves need
-
-    (a, seen_a), (b, seen_b) = before, after
-    length = float((b.u - a.u) @ a.tangent)
-    found = []
-    for name, start in seen_a.tests.items():
-        end = seen_b.tests.get(name, np.nan)
-        if start * end >= 0 or np.isnan(start * end):
-            continue
-
-        def probe(part, name=name):
-            at = track.corrected(a.u, a.tangent, part * length)
-            seen = track.look(at.u)
-            value = seen.tests[name]
-            if not at.found or np.isnan(value):
-                raise _SingularError
-            return _Probe(part, value, at.u[-2:], max(seen.residual, abs(value)))
-
-        try:
-            # Beside a singular point what is solved for anew at an end may be on the other side.
-            if probe(0.0).test * probe(1.0).test > 0:
-                raise _SingularError
-            root: Any = brentq(lambda part, probe=probe: probe(part).test, 0.0, 1.0, xtol=1e-14)
-            special = probe(root)
-        except _SingularError:
-            ends = _Probe(0.0, start, a.u[-2:], 0.0), _Probe(1.0, end, b.u[-2:], 0.0)
-            special = _from_both_sides(probe, *ends)
-        values = special.values
-        if np.all((problem.limits[:, 0] <= values) & (values <= problem.limits[:, 1])):
-            pair = float(values[0]), float(values[1])
-            found.append((special.part, SpecialPoint(name[0], name[1], pair, special.residual)))
-    return [point for _, point in sorted(found, key=lambda item: item[0])]
-
-
-class _Probe(NamedTuple):
-    """A part of a step, the watched function and the parameters there, the largest error."""
-
-    part: float
-    test: float
-    values: np.ndarray
-    residual: float
-
-
-class _SingularError(Exception):
-    """Newton's method does not converge there, or the watched function is not defined."""
-
-
-def _from_both_sides(probe: Callable[[float], _Probe], low: _Probe, high: _Probe) -> _Probe:
-    """Where a function vanishes that has no value there: extrapolated from what has on both sides.
-
-    So it is where the cycle of a curve shrinks to a point: with all arcs of duration zero its
-    equations are singular.
-    """
-    from scipy.interpolate import KroghInterpolator
-
-    known = [low, high]
-    for _ in range(SHRINKS):
-        middle = low.part - low.test * (high.part - low.part) / (high.test - low.test)
-        try:
-            nearer = [probe(0.5 * (side.part + middle)) for side in (low, high)]
-        except _SingularError:
-            break
-        if any(new.test * old.test <= 0 for new, old in zip(nearer, (low, high), strict=True)):
-            break
-        known += nearer
-        low, high = nearer
-
-    def at_zero(probes):
-        numbers = [np.array([probe.part, *probe.values]) for probe in probes]
-        return KroghInterpolator([probe.test for probe in probes], numbers)(0.0)
-
-    best, other = at_zero(known[-6:]), at_zero(known[-4:])
-    residual = float(np.max(np.abs(best - other))) if len(known) > 4 else np.nan
-    return _Probe(float(best[0]), 0.0, best[1:], residual)
 
 
 def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np.ndarray):
@@ -492,7 +408,7 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np
     return None if best is None else best[1:]
 
 
-def _limit(problem: _Problem, track: "_Track", rows: list[_Row], u, end: Stop):
+def _limit(problem: _Problem, track: Track, rows: list[_Row], u, end: Stop):
     """What the curve ends in where there is no such motion, if that is near its point u."""
     values = np.array([row.values for row in rows[-3:]])
     trail = Trail(problem.variation, problem.step, values, track.system, track.unknowns(u), end)
@@ -517,84 +433,3 @@ def _towards(problem: _Problem, last: np.ndarray, limit: SpecialPoint) -> list[_
         numbers = float(point.multiplier), float(point.residual)
         rows.append(_Row(guess, type(point.condition), *numbers, point.place))
     return rows
-
-
-# --- the equations in two parameters --------------------------------------------------------------
-
-
-class _Track(NamedTuple):
-    """The system of a curve in the unknowns u: its own, weighted, and both parameters."""
-
-    variation: Variation
-    system: AbstractSystem
-    weights: Array
-
-    @classmethod
-    def begun(
-        cls, problem: _Problem, point: BifurcationPoint, pair: np.ndarray
-    ) -> tuple["_Track", np.ndarray]:
-        """The system that is followed from a point, and u there; pair: both parameters."""
-        system, x = point.condition.followed(point)
-        weights = system.weights(jnp.asarray(x))
-        u = np.append(np.asarray(weights) * np.asarray(x).reshape(-1), pair)
-        return cls(problem.variation, system, weights), u
-
-    def corrected(self, u: ArrayLike, tangent: ArrayLike, length: float) -> Corrected:
-        """As `continuation.corrected`."""
-        start, normal = np.asarray(u), np.asarray(tangent)
-
-        def attempt(family, unknowns):
-            args = family, self.system, self.weights
-            # In the same plane: the first guess of u is `length` ahead, the others lie in it.
-            ahead = length if unknowns[0] is start else 0.0
-            solved = corrected(_curve_linearized, args, unknowns[0], normal, ahead)
-            return solved, (solved.u, solved.u[-2:])
-
-        solved, settled = self.variation.settle(attempt, (start, (start + length * normal)[-2:]))
-        return solved._replace(found=solved.found & settled)
-
-    def unknowns(self, u: np.ndarray) -> np.ndarray:
-        """Those of the system."""
-        return np.asarray(self.system.shaped(jnp.asarray(u[:-2] / np.asarray(self.weights))))
-
-    def place(self, u: np.ndarray) -> np.ndarray:
-        """Where the motion is, see `place_of`."""
-        return self.system.place(self.unknowns(u))
-
-    def look(self, u: np.ndarray) -> Seen:
-        """What is seen at a solution, in numbers."""
-        osc, x = self.variation.oscillator(u[-2:]), jnp.asarray(self.unknowns(u))
-        seen = _seen_at(osc, self.system, x)
-        tests = {name: float(value) for name, value in seen.tests.items()}
-        return Seen(tests, bool(seen.exists), float(seen.multiplier), float(seen.residual))
-
-    def remeshed(self, u: np.ndarray, tangent: np.ndarray) -> tuple["_Track", Any, Any]:
-        """The same with the steps of integration spread anew, and u and the tangent in it."""
-        osc, x = self.variation.oscillator(u[-2:]), jnp.asarray(self.unknowns(u))
-        system, weights = _remeshed(osc, self.system, x)
-        scale = np.append(np.asarray(weights) / np.asarray(self.weights), [1.0, 1.0])
-        return _Track(self.variation, system, weights), scale * u, scale * tangent
-
-    def tangent(self, u: np.ndarray) -> np.ndarray:
-        """The direction of the curve at u, in the sense in which a parameter grows."""
-        for axis in (-2, -1):
-            solved = self.corrected(u, np.eye(u.size)[axis], 0.0)
-            if solved.found:  # it is not where the curve turns back in this parameter
-                break
-        return solved.tangent
-
-
-def _curve_linearized(u: Array, args: tuple[Family, AbstractSystem, Array]) -> tuple[Array, Array]:
-    family, system, weights = args
-    value, matrix = system.linearized(family.at, system.shaped(u[:-2] / weights), u[-2:])
-    return value, matrix.at[:, :-2].divide(weights[None])
-
-
-@jit
-def _seen_at(osc: Oscillator, system: AbstractSystem, x: Array) -> Seen:
-    return system.look(osc, x)
-
-
-@jit
-def _remeshed(osc: Oscillator, system: AbstractSystem, x: Array):
-    return system.remeshed(osc, x), system.weights(x)

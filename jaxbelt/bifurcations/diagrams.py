@@ -30,8 +30,8 @@ from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
 from ..results import Status, draw
 from ..tables import per_belt, table_of
+from .base import BifurcationPoint
 from .cells import in_plane_of_paper, region_name
-from .conditions import BifurcationPoint
 from .labels import Label
 from .path import ParameterPath
 from .scan import by_value, edges_touched, is_at_one_value, search

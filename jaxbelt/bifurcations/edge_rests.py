@@ -33,7 +33,7 @@ from ..model.variations import Family
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status
-from .conditions import Line
+from .base import Line
 from .rests import NOTHING, AbstractRestCondition, criticality
 from .special import SpecialPoint, Trail
 from .systems import RestSystem, Tests, small_newton

@@ -32,7 +32,8 @@ from ..numerics.compiling import jit
 from ..numerics.continuation import Stop
 from ..numerics.newton import HOLDS
 from ..results import Status
-from .conditions import AbstractCycleCondition, Line
+from .base import Line
+from .conditions import AbstractCycleCondition
 from .crossings import arrival_tests
 from .edge_rests import check_edge
 from .guesses import nearest, without_arcs

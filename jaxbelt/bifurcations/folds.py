@@ -22,7 +22,8 @@ from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
 from ..numerics.continuation import Stop
 from ..results import Status
-from .conditions import AbstractCycleCondition, Line
+from .base import Line
+from .conditions import AbstractCycleCondition
 from .edge_rests import pseudo_hopf_limit
 from .rests import hopf_limit, third_derivative
 from .systems import CycleSystem, contact_tests, nearest_contacts

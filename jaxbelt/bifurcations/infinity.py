@@ -27,7 +27,7 @@ from ..model.modes import any_of
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
 from ..results import Status
-from .conditions import Line
+from .base import Line
 from .rests import NOTHING, AbstractRestCondition
 from .systems import RestSystem
 

@@ -30,7 +30,8 @@ from ..model.modes import Mode, any_of, capacity, edges, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..model.transitions import contact
 from ..results import Status
-from .conditions import AbstractCondition, AbstractCycleCondition, Line, check_two_belts
+from .base import AbstractCondition, Line, check_two_belts
+from .conditions import AbstractCycleCondition
 from .crossings import arrival_tests
 from .guesses import nearest
 from .rests import NOTHING, AbstractRestCondition

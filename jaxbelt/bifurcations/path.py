@@ -41,7 +41,7 @@ from ..model.parameters import leaf_index
 from ..model.variations import as_span, varied
 from ..numerics.compiling import each, jit
 from ..results import Status
-from .conditions import AbstractCondition, check_conditions
+from .base import AbstractCondition, check_conditions
 from .connections import SaddleCourse, courses_of
 from .guesses import settled_loops
 from .infinity import is_bounded

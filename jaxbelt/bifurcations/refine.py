@@ -18,7 +18,7 @@ from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
 from ..numerics.compiling import is_outermost
 from ..results import Status
-from .conditions import AbstractCondition, BifurcationPoint
+from .base import AbstractCondition, BifurcationPoint
 from .path import ParameterPath
 from .scan import search
 

@@ -33,11 +33,7 @@ from ..model.variations import Family, Variation
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status
-from .conditions import (
-    AbstractCondition,
-    Line,
-    point_without_cycle,
-)
+from .base import AbstractCondition, Line, point_without_cycle
 from .guesses import HINT_BUDGET, orbit_after_stick
 from .special import SpecialPoint, Trail
 from .systems import RestSystem, judged_by, small_newton, velocity_of

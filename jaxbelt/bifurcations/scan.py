@@ -26,7 +26,7 @@ from ..cycles.cycle import as_loop
 from ..model.oscillator import Oscillator
 from ..numerics.newton import NEWTON_STEPS
 from ..results import Status
-from .conditions import UNNAMED, AbstractCondition, BifurcationPoint, point_without_cycle
+from .base import UNNAMED, AbstractCondition, BifurcationPoint, point_without_cycle
 from .connections import SaddleConnection
 from .crossings import CrossingSliding, SlidingExchange
 from .edge_rests import BoundaryEquilibrium, PseudoHopf

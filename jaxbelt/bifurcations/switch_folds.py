@@ -32,7 +32,7 @@ from ..model.modes import Mode, capacity, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index, vary
 from ..numerics.compiling import jit
-from .conditions import BifurcationPoint
+from .base import BifurcationPoint
 from .systems import small_newton
 from .tangencies import NonsmoothFold
 

@@ -33,7 +33,8 @@ from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS, newton
 from ..results import EventKind, Status
-from .conditions import AbstractCycleCondition, Line
+from .base import Line
+from .conditions import AbstractCycleCondition
 from .guesses import HINT_BUDGET, least_push, orbit_after_stick
 from .special import SpecialPoint
 from .systems import (

@@ -97,7 +97,7 @@ def basins(
 
         grid = [evenly_spaced(*span, points) for span in (x1, x2)]
         found = jb.basins(osc, x1=grid[0], x2=grid[1])
-        lines, data = [repr(found)], _as_data(found)
+        lines, data = [repr(found)], _shares_as_data(found)
         if starts:
             key = jax.random.key(seed)
             stability = jb.basin_stability(osc, box=(x1, x2), n=starts, key=key)
@@ -123,7 +123,7 @@ def basins(
     say(console, lines, written, as_json=as_json, data=data)
 
 
-def _as_data(found: "jb.Basins") -> dict[str, Any]:
+def _shares_as_data(found: "jb.Basins") -> dict[str, Any]:
     """The fractions of the grid by the words for their attractors."""
     labels = found.label.values
     shares = {name: float((labels == i).mean()) for i, name in enumerate(found.attractors)}

@@ -21,13 +21,13 @@ from .options import (
     Sigma,
     Sigma0,
     Sigma1,
+    as_json_value,
     check_description,
     check_range,
     make_console,
     oscillator,
     outputs,
     parameters,
-    plain,
     plain_errors,
     say,
     turn_on_float64,
@@ -36,7 +36,7 @@ from .options import (
 #: Arguments of classes that may be varied, other than velocities: an edge of two belts, or of one.
 EDGES = ("sigma", "sigma0", "sigma1")
 #: What a diagram shows.
-QUANTITIES = ("amplitude", "x1", "x2", "period")
+DRAWABLE = ("amplitude", "x1", "x2", "period")
 POINT_COLUMNS = ("value", "kind", "belts", "type", "error", "status")
 
 
@@ -99,8 +99,8 @@ def diagram(
     with plain_errors():
         if rows < 1:
             raise ValueError(f"rows must be at least 1, got {rows}")
-        if quantity is not None and quantity not in QUANTITIES:
-            raise ValueError(f"quantity must be one of {', '.join(QUANTITIES)}, got {quantity}")
+        if quantity is not None and quantity not in DRAWABLE:
+            raise ValueError(f"quantity must be one of {', '.join(DRAWABLE)}, got {quantity}")
         check_range("span", span)
         written = outputs(out, ".png", ".csv", "_points.csv")
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
@@ -133,7 +133,7 @@ def diagram(
         write_branches(found, written[1])
         write_points(found.points, written[2])
     regions = [{"from": a, "to": b, "name": name} for a, b, name in found.regions]
-    data = {"parameter": found.name, "points": _as_data(found.points), "regions": regions}
+    data = {"parameter": found.name, "points": _points_as_data(found.points), "regions": regions}
     lines = [repr(found), *map(repr, found.points)]
     say(console, lines, written, as_json=as_json, data=data)
 
@@ -153,19 +153,19 @@ def write_points(points, path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(POINT_COLUMNS)
-        writer.writerows(map(_row_of_point, points))
+        writer.writerows(map(_in_columns, points))
 
 
-def _row_of_point(point: "jb.BifurcationPoint") -> list[Any]:
+def _in_columns(point: "jb.BifurcationPoint") -> list[Any]:
     belts = " ".join(map(str, point.condition.belts_concerned))
     status = jb.Status(int(point.status)).name
     return [float(point.value), point.kind, belts, point.type, float(point.error), status]
 
 
-def _as_data(points) -> list[dict[str, Any]]:
+def _points_as_data(points) -> list[dict[str, Any]]:
     """The rows of `write_points`, for JSON."""
-    rows = [dict(zip(POINT_COLUMNS, _row_of_point(point), strict=True)) for point in points]
-    return [row | {name: plain(row[name]) for name in ("value", "error")} for row in rows]
+    rows = [dict(zip(POINT_COLUMNS, _in_columns(point), strict=True)) for point in points]
+    return [row | {name: as_json_value(row[name]) for name in ("value", "error")} for row in rows]
 
 
 def write_branches(found: "jb.BifurcationDiagram", path: Path) -> None:

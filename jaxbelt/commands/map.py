@@ -19,7 +19,7 @@ from .options import (
     Sigma,
     Sigma0,
     Sigma1,
-    check_axes,
+    check_axis_names,
     check_description,
     check_range,
     family,
@@ -85,7 +85,7 @@ def region_map(
     with plain_errors():
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
         check_description(system, arguments, belt)
-        check_axes(system, axes, belt=belt)
+        check_axis_names(system, axes, belt=belt)
         if cells < 2:
             raise ValueError(f"cells must be at least 2, got {cells}")
         check_range("p", p)

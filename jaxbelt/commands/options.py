@@ -83,7 +83,7 @@ def check_out(out: Path) -> None:
         raise OSError(f"out must be a place that can be written to, got {out}") from None
 
 
-def check_positive(name: str, value: float) -> None:
+def check_number(name: str, value: float) -> None:
     """Raise unless a number is finite and > 0, as what computes does, but before it is imported."""
     if not 0 < value < math.inf:
         raise ValueError(f"{name} must be finite and > 0, got {value}")
@@ -119,7 +119,7 @@ def say(
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def plain(value: Any) -> Any:
+def as_json_value(value: Any) -> Any:
     """A number, or an array of them, as JSON has it: what is not finite is null."""
     import numpy as np
 
@@ -243,7 +243,7 @@ def check_class(system: str) -> None:
         raise ValueError(f"class must be a, b, c or d, got {system}")
 
 
-def check_axes(
+def check_axis_names(
     system: str,
     axes: Iterable[str],
     others: tuple[str, ...] = (),

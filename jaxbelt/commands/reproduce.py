@@ -56,7 +56,7 @@ def reproduce(
         data = {"critical_values": paper.table_as_json(values)}
         say(console, [], [out / name for name in names], as_json=True, data=data)
         return
-    console.print(_table_of(values))
+    console.print(_rich_table(values))
     for line in (
         *paper.REMARKS,
         f"Written to {out}: critical_values.json, {', '.join(paper.FIGURES)}",
@@ -64,7 +64,7 @@ def reproduce(
         console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
 
 
-def _table_of(values) -> rich.table.Table:
+def _rich_table(values) -> rich.table.Table:
     table = rich.table.Table(title="Critical velocities nu0 of the paper, recomputed")
     for name in ("class", "point", "kind"):
         table.add_column(name)

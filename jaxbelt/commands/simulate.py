@@ -21,12 +21,12 @@ from .options import (
     Sigma,
     Sigma0,
     Sigma1,
+    as_json_value,
     check_description,
-    check_positive,
+    check_number,
     make_console,
     oscillator,
     outputs,
-    plain,
     plain_errors,
     say,
     turn_on_float64,
@@ -107,8 +107,8 @@ def simulate(
             meant = did_you_mean(formulation, FORMULATIONS)
             names = ", ".join(FORMULATIONS)
             raise ValueError(f"formulation must be one of {names}, got {formulation}{meant}")
-        check_positive("t1", t1)
-        check_positive("tolerance", tolerance)
+        check_number("t1", t1)
+        check_number("tolerance", tolerance)
         if not all(map(math.isfinite, start)):
             raise ValueError(f"start must be finite, got {start[0]} {start[1]}")
         written = outputs(out, ".png", ".csv", "_events.csv")
@@ -142,9 +142,9 @@ def simulate(
         write_events(trajectory, written[2])
     data = {
         "status": jb.Status(int(trajectory.status)).name,
-        "t": plain(trajectory.ts[-1]),
-        "x1": plain(trajectory.ys[-1, 0]),
-        "x2": plain(trajectory.ys[-1, 1]),
+        "t": as_json_value(trajectory.ts[-1]),
+        "x1": as_json_value(trajectory.ys[-1, 0]),
+        "x2": as_json_value(trajectory.ys[-1, 1]),
         "events": len(trajectory.events.t),
     }
     say(console, [repr(trajectory)], written, as_json=as_json, data=data)

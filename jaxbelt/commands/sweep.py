@@ -15,9 +15,9 @@ from .options import (
     Damping,
     Json,
     Omega,
-    check_axes,
+    check_axis_names,
+    check_number,
     check_out,
-    check_positive,
     family,
     make_console,
     plain_errors,
@@ -124,7 +124,7 @@ def sweep(
         if part and out.suffix != ".zarr":
             raise ValueError(f"out must end in .zarr where blocks are given, got {out}")
         parsed = list(map(parse_axis, axes))
-        check_axes(system, [name for name, _ in parsed], ("x1", "x2"), belt)
+        check_axis_names(system, [name for name, _ in parsed], ("x1", "x2"), belt)
         values = dict(parsed)
         if observe not in VARIABLES:
             meant = did_you_mean(observe, VARIABLES)
@@ -132,9 +132,9 @@ def sweep(
         shown = variable or VARIABLES[observe][0]
         drawn = part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2)
         _check_variable(shown, observe)
-        check_positive("tolerance", tolerance)
+        check_number("tolerance", tolerance)
         if t1 is not None:
-            check_positive("t1", t1)
+            check_number("t1", t1)
         if out.suffix == ".nc":
             check_out(out)
         check_out(out.with_suffix(".png"))
@@ -160,8 +160,8 @@ def sweep(
         written = [out]
         if drawn:
             written.append(out.with_suffix(".png"))
-            _draw(dataset, shown, written[1])
-    say(console, [repr(dataset)], written, as_json=as_json, data=_as_data(dataset))
+            _draw_variable(dataset, shown, written[1])
+    say(console, [repr(dataset)], written, as_json=as_json, data=_counts_as_data(dataset))
 
 
 def _check_variable(name: str, observe: str) -> None:
@@ -172,7 +172,7 @@ def _check_variable(name: str, observe: str) -> None:
         raise ValueError(f"variable must be one of {', '.join(known)}, got {name}{meant}")
 
 
-def _as_data(dataset: Any) -> dict[str, Any]:
+def _counts_as_data(dataset: Any) -> dict[str, Any]:
     """How much there is, and how the runs ended."""
     statuses = jb.decoded(dataset[["status"]]).status.values.ravel().tolist()
     counts = {name or "not run": statuses.count(name) for name in sorted(set(statuses))}
@@ -180,7 +180,7 @@ def _as_data(dataset: Any) -> dict[str, Any]:
     return {"sizes": sizes, "variables": [str(name) for name in dataset], "status": counts}
 
 
-def _draw(dataset: Any, variable: str, out: Path) -> None:
+def _draw_variable(dataset: Any, variable: str, out: Path) -> None:
     from ..plotting.style import journal_figure, journal_style, save
     from ..plotting.sweeps import plot_sweep
 

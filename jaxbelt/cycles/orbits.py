@@ -21,6 +21,7 @@ from ..model.modes import (
     mode_acceleration,
     mode_of,
     select,
+    zone,
 )
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.rest import settles
@@ -223,22 +224,11 @@ def place_of_rest(osc: Oscillator, orbit: Orbit) -> Array:
     mode = mode_of(orbit.code)
     fixed = mode_acceleration(osc, mode, jnp.zeros(()), jnp.zeros(()))
     # That of the mode's field lies beyond an edge where the orbit circles a pseudo-focus there.
-    lower, upper = _zone(osc, mode)
+    lower, upper = zone(osc, mode)
     fixed = jnp.where(fixed < lower, lower, jnp.where(fixed > upper, upper, fixed))
     ways = (Status.STUCK_FOREVER, Status.PSEUDO_FOCUS, Status.EQUILIBRIUM)
     places = (held, orbit.y[0], fixed)
     return first_of([orbit.status == way for way in ways], places, jnp.asarray(jnp.nan))
-
-
-def _zone(osc: Oscillator, mode: Mode) -> tuple[Array, Array]:
-    """The edges between which a mode's contacts do not change."""
-    lower, upper = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
-    for belt, code in zip(osc.belts, mode.codes, strict=True):
-        is_left, is_right = code < -1.5, code > 1.5
-        begin = jnp.where(is_left, -jnp.inf, jnp.where(is_right, belt.upper, belt.lower))
-        end = jnp.where(is_right, jnp.inf, jnp.where(is_left, belt.lower, belt.upper))
-        lower, upper = jnp.maximum(lower, begin), jnp.minimum(upper, end)
-    return lower, upper
 
 
 def _settled_or_not(orbit: Orbit) -> Orbit:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..bifurcations.conditions import AbstractCondition, check_conditions
+from ..bifurcations.base import AbstractCondition, check_conditions
 from ..bifurcations.refine import refine
 from ..checks import as_array, as_numbers, check_finite, require, require_callable, require_value
 from ..cycles.cycle import Cycle, find_cycle

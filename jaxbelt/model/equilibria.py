@@ -31,10 +31,11 @@ from ..checks import is_concrete, number, pick
 from ..numerics.compiling import jit
 from ..results import draw
 from ..tables import per_belt, require_single, table_of
-from .modes import ABOVE, BELOW, STUCK, Mode, capacity, edges, mode_acceleration, settle
+from .modes import STUCK, Mode, capacity, edges, mode_acceleration, settle
 from .oscillator import Oscillator, check_oscillator, has_possible_numbers
 from .pseudofocus import edge_focus
 from .rest import is_centre
+from .transitions import contact
 
 if TYPE_CHECKING:
     import pandas
@@ -198,11 +199,11 @@ def _rows_of(osc: Oscillator, *, with_saddles: bool) -> Equilibria:
 def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     end = jnp.full(1, jnp.inf)
     lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
-    mode = _contacts(osc, lower, rightward=True)
+    rest = jnp.zeros_like(lower)
+    mode = contact(osc, lower, rest, rightward=True)
     held = capacity(osc, mode)
     # A belt at rest that can hold nothing, for lack of load or friction, slips (either sign does).
     mode = Mode(tuple(jnp.where((c == STUCK) & (held == 0), 1.0, c) for c in mode.codes))
-    rest = jnp.zeros_like(lower)
     pull = mode_acceleration(osc, mode, rest, rest)
 
     possible = has_possible_numbers(osc)
@@ -235,17 +236,6 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
         stable=jnp.where(is_segment, attracts, is_fixed & (rate < 0) & ~neutral) & exists,
         neutral=neutral,
     )
-
-
-def _contacts(osc: Oscillator, x1: Array, *, rightward: bool) -> Mode:
-    """The contacts of a mass at rest just right or left of x1: sgn(nu_i) where belt i touches."""
-    codes = []
-    for belt in osc.belts:
-        is_below = x1 < belt.lower if rightward else x1 <= belt.lower
-        is_above = x1 >= belt.upper if rightward else x1 > belt.upper
-        code = jnp.where(is_above, ABOVE, jnp.sign(belt.velocity))
-        codes.append(jnp.where(is_below, BELOW, code))
-    return Mode(tuple(codes))
 
 
 def _codes(mode: Mode, exists: Array) -> Array:
@@ -282,7 +272,7 @@ def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equil
     is_edge = jnp.isfinite(positions) & (positions > before)
     x1 = jnp.where(is_edge, positions, 0.0)
     rest = jnp.zeros_like(x1)
-    on_left, on_right = (_contacts(osc, x1, rightward=side) for side in (False, True))
+    on_left, on_right = (contact(osc, x1, rest, rightward=side) for side in (False, True))
     left, right = (settle(osc, contacts, x1, rest) for contacts in (on_left, on_right))
     focus = edge_focus(osc, left, right, x1)
     # Where a belt at rest holds the mass, the segment on that side ends here.

@@ -210,6 +210,16 @@ def edges(osc: Oscillator) -> list[Array]:
     return [belt.lower for belt in osc.belts] + [belt.upper for belt in osc.belts]
 
 
+def zone(osc: Oscillator, mode: Mode) -> tuple[Array, Array]:
+    """The edges between which the contacts of a mode do not change."""
+    lower, upper = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
+    sides = zip(edges(osc), bounds_leftward(mode), bounds_rightward(mode), strict=True)
+    for edge, on_left, on_right in sides:
+        lower = jnp.maximum(lower, jnp.where(on_left, edge, -jnp.inf))
+        upper = jnp.minimum(upper, jnp.where(on_right, edge, jnp.inf))
+    return lower, upper
+
+
 def has_edges(osc: Oscillator) -> bool:
     """Whether there may be a contact edge: one is finite, or not known to be infinite.
 

@@ -15,7 +15,6 @@ the step has gone over to another branch, and is halved, too.
 """
 
 import enum
-import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -62,27 +61,23 @@ class CurvePoint(NamedTuple):
 
 
 def continue_curve(
-    linearized: Callable[..., tuple[Array, Array]],
+    solve: Callable[..., "Corrected"],
     start: ArrayLike | tuple,
     direction: ArrayLike | tuple,
     *,
-    args: Any = None,
     span: tuple[Any, Any] | None = None,
     step: float = 0.01,
     min_step: float = 1e-8,
     max_step: float = 0.1,
     max_points: int = 1000,
-    solve: Callable[..., "Corrected"] | None = None,
 ) -> Iterator[CurvePoint]:
-    """The points of the curve F(u, args) = 0 from near `start`, as they are found.
+    """The points of the curve F(u) = 0 from near `start`, as they are found.
 
-    linearized: gives F, [n], and its matrix, [n, n + 1], at u, [n + 1], and is traced once; keep
-    the function and pass what varies as `args`, any pytree of arrays. start: a guess of the first
-    point. direction: [n + 1], the way to go from there, as its angle with the tangent tells. span:
-    smallest and largest u, numbers or [n + 1]; the curve ends with a point on the first side that
-    it meets. step, min_step, max_step: lengths of the first, the shortest and the longest chord.
-    solve: (u, tangent, length) as in `corrected`, which it stands for where F itself is to be known
-    better at every point.
+    solve: gives the point of the curve of (u, tangent, length), such as
+    `functools.partial(corrected, linearized, args)`. start: a guess of the first point. direction:
+    [n + 1], the way to go from there, as its angle with the tangent tells. span: smallest and
+    largest u, numbers or [n + 1]; the curve ends with a point on the first side that it meets.
+    step, min_step, max_step: lengths of the first, the shortest and the longest chord.
 
     The last point says why it is the last. Where Newton's method fails at the start there is no
     point. `ValueError` names an impossible argument.
@@ -97,11 +92,6 @@ def continue_curve(
     require(ordered, "step", "such that 0 < min_step <= step <= max_step", steps)
     lower, upper = (-np.inf, np.inf) if span is None else span
     limits = np.broadcast_to(lower, u0.shape), np.broadcast_to(upper, u0.shape)
-
-    # A number that is no array would be a constant of the program, compiled anew for every value.
-    args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, args)
-
-    solve = solve or functools.partial(corrected, linearized, args)
 
     first = solve(u0, way / np.linalg.norm(way), 0.0)
     if not first.found:
@@ -171,7 +161,11 @@ class Corrected(NamedTuple):
 
 
 def corrected(linearized, args, u, tangent, length) -> Corrected:
-    """The point of the curve in the plane normal to the tangent, `length` ahead of u; in NumPy."""
+    """The point of the curve in the plane normal to the tangent, `length` ahead of u; in NumPy.
+
+    linearized: gives F, [n], and its matrix, [n, n + 1], at u, [n + 1], and args, and is traced
+    once; keep the function and pass what varies as `args`, any pytree of arrays.
+    """
     given = (jnp.asarray(u), jnp.asarray(tangent), jnp.asarray(length))
     return jax.tree.map(np.asarray, _correct(linearized, args, *given))
 

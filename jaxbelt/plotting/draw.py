@@ -5,7 +5,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from ..bifurcations.conditions import BifurcationPoint
+from ..bifurcations.base import BifurcationPoint
 from ..bifurcations.curves import BifurcationCurve
 from ..bifurcations.diagrams import BifurcationDiagram
 from ..bifurcations.regions import RegionMap

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..bifurcations.conditions import BifurcationPoint
+from ..bifurcations.base import BifurcationPoint
 from ..checks import require
 from ..cycles.cycle import Cycle
 from ..cycles.shocks import FatalShock

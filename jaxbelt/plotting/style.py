@@ -172,9 +172,9 @@ def in_fractions(unit: str) -> str:
     return " ".join(above or ["1"]) + "".join(f"/{part}" for part in below)
 
 
-def save(figure: Figure, path: Path, dpi: int = 220) -> None:
+def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG (or what else the ending of the path says)."""
-    figure.savefig(path, dpi=dpi)
+    figure.savefig(path, dpi=220)
 
 
 def belt_colour(belt: int) -> str:

@@ -1,0 +1,473 @@
+"""What every bifurcation condition is: `AbstractCondition`, and the `BifurcationPoint` it leads to.
+
+A condition is one more equation, in one more unknown: the parameter. It is written so that the
+whole system is regular at the point, which "stick duration of the cycle = 0" is not: solved for
+the cycle at every parameter, the duration goes like a square root and Newton's method fails. In the
+unknowns of fixed-signature shooting (see `cycles`) the same equation is harmless.
+
+Each kind is one class that carries all that is known of it: its theory; a guess and the system of
+equations that Newton's method solves from there, which also judges the solution; what hints at it
+between two values on a path; what to watch along its curve, and where that ends; its names and its
+line in pictures. `refine`, `scan`, `bifurcation_curve`, the diagrams and the pictures ask it and
+know no kind. What conditions on a cycle have in common is in `conditions`, what those on a state of
+rest have in `rests`.
+
+The numbers in a condition, such as its belt, are data of the compiled programs, so one program
+serves all of them: in `guess` and `system` they are arrays. A field that decides which program runs
+is static.
+"""
+
+import abc
+import functools
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..checks import is_concrete, number, require, require_value
+from ..cycles.attractors import place_of
+from ..cycles.chains import SIZES, Chain, Loop
+from ..cycles.cycle import Cycle
+from ..model.oscillator import Oscillator
+from ..model.variations import Family, Variation
+from ..motion.arcs import Ends
+from ..results import Status, describe, draw
+from ..tables import require_single, table_of
+from .labels import AttractingCycle, Label
+from .special import SpecialPoint, Trail
+from .systems import (
+    NOWHERE,
+    AbstractSystem,
+    Solution,
+    judged_by,
+)
+
+if TYPE_CHECKING:
+    import pandas
+
+
+class Line(NamedTuple):
+    """How the curves of a kind are drawn: its name in legends, a colour, a line style (plain data,
+    as Matplotlib takes it)."""
+
+    name: str
+    colour: str
+    style: str | tuple[float, tuple[float, ...]] = "-"
+
+
+def check_conditions(conditions: Any, field: str = "conditions") -> tuple["AbstractCondition", ...]:
+    """`conditions` as a tuple, or a `ValueError`."""
+    expected = "a tuple of conditions, such as (jb.Hopf(),)"
+    is_many = isinstance(conditions, Iterable) and not isinstance(conditions, str | dict)
+    require_value(is_many, field, expected, conditions)
+    conditions = tuple(conditions)
+    for one in conditions:
+        require_value(isinstance(one, AbstractCondition), field, expected, one)
+    return conditions
+
+
+def check_two_belts(belts: Any) -> None:
+    """`ValueError` unless they are the numbers of two belts."""
+    two = isinstance(belts, tuple | list) and len(set(belts)) == len(belts) == 2
+    require_value(two, "belts", "two different numbers, such as (0, 1)", belts)
+
+
+class AbstractCondition(eqx.Module):
+    """What is to happen at a bifurcation point."""
+
+    #: What is said of a point in a diagram, with {belt} for the number of the belt. A kind that
+    #: points are named by has this and a line; what is `sought` for a family needs neither.
+    caption: ClassVar[str]
+    #: How its curves are drawn.
+    line: ClassVar[Line]
+    #: The name of what stays the same along a curve on which the kind changes; "": its own.
+    family: ClassVar[str] = ""
+    #: Whether orbits beside a point are slow to settle, so that it is seen from farther off only.
+    slow: ClassVar[bool] = False
+    #: Whether one loop may be near to several such points, in different arcs.
+    has_several: ClassVar[bool] = False
+    #: Whether branches of a diagram go on through a point.
+    joins: ClassVar[bool] = True
+    #: Whether its curve ends where the signature changes.
+    ends_at_contact: ClassVar[bool] = False
+    #: Whether its curve bends sharply before its limit, so that rows are wanted close to that.
+    bends: ClassVar[bool] = False
+
+    @property
+    def belts_concerned(self) -> tuple[int, ...]:
+        """The numbers of the belts that it is about: those in its field `belt`, or `belts`."""
+        belt = getattr(self, "belt", None)
+        return getattr(self, "belts", ()) if belt is None else (belt,)
+
+    @property
+    def lineage(self) -> tuple[str, tuple[int, ...]]:
+        """What stays the same along a curve: the name of the family, and the belts."""
+        return self.family or type(self).__name__, self.belts_concerned
+
+    @property
+    def words(self) -> str:
+        """What is said of a point in a diagram."""
+        return self.caption.format(belt=" ".join(map(str, self.belts_concerned)))
+
+    @property
+    def sought(self) -> "AbstractCondition":
+        """The condition of whichever kind of its family; what is found is named afterwards."""
+        return self
+
+    def named(self, point: "BifurcationPoint") -> "AbstractCondition":
+        """What a point that was sought is."""
+        return self
+
+    def covers(self, other: "AbstractCondition") -> bool:
+        """Whether a point of the other condition is one of this one."""
+        return self == other
+
+    def check(self, osc: Oscillator) -> None:
+        """`ValueError` where the oscillator cannot meet it."""
+        n = len(osc.belts)
+        # Of a field `belt` that is None, too.
+        belts = [vars(self)["belt"]] if "belt" in vars(self) else self.belts_concerned
+        for belt in belts:
+            there = isinstance(belt, int) and 0 <= belt < n
+            require_value(there, "belt", f"0 to {n - 1}", belt)
+        plain = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(self))
+        require(plain, "condition", "made of plain numbers", self)
+
+    def as_data(self) -> Any:
+        """The same with arrays for its numbers, as compiled programs take it."""
+        return jax.tree.map(lambda leaf: jnp.asarray(np.array(leaf)), self)
+
+    # --- a point ---
+
+    @property
+    def room(self) -> int:
+        """Room for the arcs of one loop."""
+        return SIZES[0]
+
+    @abc.abstractmethod
+    def guess(self, osc: Oscillator, size: int) -> Any:
+        """What its system of equations begins from, any tree; size: room for the arcs of a loop.
+
+        It is asked of the condition as data, see `as_data`, and may be a loop of a cycle, a state
+        of rest, or what else `prepared` takes. Where there is nothing to begin from, the status of
+        `prepared` says so.
+        """
+
+    @abc.abstractmethod
+    def prepared(self, osc: Oscillator, guess: Any) -> tuple[AbstractSystem, Any, Array]:
+        """The system near a guess, its unknowns there, and a status.
+
+        guess: what `guess` returned; osc: the oscillator there. The unknowns are what the system
+        takes as x; the status is OK, or says why there is no guess.
+        """
+
+    @abc.abstractmethod
+    def solved(
+        self, family: Family, system: Any, x: Any, p: Any, status: Array
+    ) -> tuple["BifurcationPoint", tuple[Any, Array]]:
+        """The point near a guess (x, p) in a family of oscillators, and (x, p) there.
+
+        system, x, status: of `prepared`; p: the parameter, [1]. The condition of the point is
+        `UNNAMED`; its status is that of `prepared` where that was not OK.
+        """
+
+    def solve(
+        self, variation: Variation, osc: Oscillator, value: Any, guess: Any
+    ) -> "BifurcationPoint":
+        """The point near a guess, without a name; osc: the oscillator at that value, [1]."""
+        system, x, status = self.prepared(osc, guess)
+
+        def attempt(family, unknowns):
+            x, p = unknowns
+            return self.solved(family, system, x, p, status)
+
+        point, settled = variation.settle(attempt, (x, value))
+        if settled is True:
+            return point
+        fails = (point.status == Status.OK) & ~jnp.asarray(settled)
+        numbers = ("value", "residual", "error", "multiplier")
+        known = {name: jnp.where(fails, jnp.nan, getattr(point, name)) for name in numbers}
+        status = jnp.where(fails, Status.NO_CONVERGENCE.value, point.status)
+        return replace(point, **known, status=status)
+
+    def point(
+        self, variation: Variation, osc: Oscillator, value: Any, size: int
+    ) -> "BifurcationPoint":
+        """The point near an oscillator, that at a value, [1], of what is varied."""
+        data = self.as_data()
+        return replace(data.solve(variation, osc, value, data.guess(osc, size)), condition=self)
+
+    def found_from(
+        self, variation: Variation, value: float, loop: Loop | None = None
+    ) -> "BifurcationPoint | None":
+        """The point that is found from that value of what is varied, or None.
+
+        One of a family is named as what it is. loop: of the cycle that it is about, where that is
+        known.
+        """
+        point = self.solved_from(variation, value, loop)
+        if int(point.status) != Status.OK:
+            return None
+        return replace(point, condition=self.sought.named(point))
+
+    def solved_from(
+        self, variation: Variation, value: float, loop: Loop | None = None
+    ) -> "BifurcationPoint":
+        """As `found_from`, without a name, whatever its status."""
+        data, start = self.sought.as_data(), np.array([value])
+        osc = variation.oscillator(start)
+        guess = data.guess(osc, data.room) if loop is None else data.guess_near(loop)
+        return data.solve(variation, osc, start, guess)
+
+    def guess_near(self, loop: Loop) -> Any:
+        """The guess, where a loop of the cycle is known."""
+        raise NotImplementedError
+
+    # --- on a path ---
+
+    @classmethod
+    def between(
+        cls, before: Label, after: Label, edged: Sequence[int]
+    ) -> Sequence["AbstractCondition"]:
+        """Those of its kind that could make the difference between two labels.
+
+        edged: belts with a finite contact edge, one for each place.
+        """
+        return ()
+
+    @classmethod
+    def at_coincidence(cls, belts: tuple[int, ...]) -> Sequence["AbstractCondition"]:
+        """Those that could hold where a belt is at rest, or two run at one velocity."""
+        return ()
+
+    @classmethod
+    def at_meeting(
+        cls, belts: tuple[int, ...], before: Label, after: Label
+    ) -> Sequence["AbstractCondition"]:
+        """Those that could make the difference where contact edges of two belts meet."""
+        return ()
+
+    @classmethod
+    def of_unstable_cycles(cls, edged: Sequence[int]) -> Sequence["AbstractCondition"]:
+        """Those that could make the difference between the modes of two unstable cycles."""
+        return ()
+
+    def mark(self, osc: Oscillator, cycles: Sequence[Loop]) -> Hashable:
+        """What changes where it holds, beside a label; cycles: the attracting ones, in order."""
+        return None
+
+    def beginnings(self, cycles: Sequence[AttractingCycle]) -> Sequence[Loop | None]:
+        """Of the attracting cycles those to begin from; None: its own guess."""
+        return (None,)
+
+    def values(self, a: float, b: float) -> Sequence[float]:
+        """Where to begin, if it may hold between two values."""
+        return a, b
+
+    # --- along a curve ---
+
+    @abc.abstractmethod
+    def followed(self, point: "BifurcationPoint") -> tuple[AbstractSystem, Any]:
+        """The system to be followed from a point, and its unknowns there."""
+
+    def kind_along(self, osc: Oscillator, multiplier: float) -> type["AbstractCondition"]:
+        """The kind that holds at a point of its curve."""
+        return type(self)
+
+    def limit(self, trail: Trail) -> SpecialPoint | None:
+        """What its curve ends in where there is no such motion, if that is near."""
+        return None
+
+    def place(self, point: "BifurcationPoint") -> np.ndarray:
+        """Where the motion at a point is, see `place_of`; NaN where there is none."""
+        return place_of(point.cycle) if int(point.cycle.status) == Status.OK else NOWHERE
+
+    def type_of(self, point: "BifurcationPoint") -> str:
+        """Of a kind that has several types that of a point, "" where there is but one."""
+        return ""
+
+    def coefficient(self, osc: Oscillator) -> Array:
+        """Of a kind where a cycle is born the coefficient that tells which way, at the point."""
+        return jnp.asarray(jnp.nan)
+
+    def orbit(self, point: "BifurcationPoint") -> np.ndarray | None:
+        """States of the motion at a point that is no cycle, [samples, 2]; None: there is none."""
+        return None
+
+
+class BifurcationPoint(eqx.Module):
+    """What `refine` returns.
+
+    condition: the condition that holds there; value: of the parameter; residual: largest error in
+    the defining equations; iterations: Newton steps; steps: how far each went, NaN padded; error: a
+    bound on |value - exact value|, from the same equations with every integration step halved, and
+    rounding; oscillator: at the point;
+    cycle: at the point, with a status that says why where there is none (at a Hopf point it has
+    shrunk to the equilibrium, at `SuddenSliding` its period is infinite); multiplier: of the cycle
+    on the side where it does not stick to the belt, for `NonsmoothFold` and `GrazingSliding`, else
+    NaN; status: a `Status` code. Where it is not OK the value is NaN.
+    """
+
+    condition: AbstractCondition = eqx.field(static=True)
+    value: Array
+    residual: Array
+    iterations: Array
+    steps: Array
+    error: Array
+    multiplier: Array
+    oscillator: Oscillator
+    cycle: Cycle
+    status: Array
+
+    @property
+    def kind(self) -> str:
+        """Name of the condition."""
+        return type(self.condition).__name__
+
+    @property
+    def type(self) -> str:
+        """Which sort of its kind it is, "" where the kind has but one or no point was found.
+
+        "supercritical" or "subcritical" of `Hopf` and `PseudoHopf`: the cycle that is born attracts
+        or repels ("degenerate": the coefficient is zero). "persistence" or "annihilation" of
+        `BoundaryEquilibrium`: there is an equilibrium on both sides of the point, or two meet and
+        vanish ("degenerate": another one lies there, too). "crossing" or "buckling" of
+        `CrossingSliding`: a stick phase ceases to be there, or the boundary is crossed once more
+        before it ("jump": for long at once). "homoclinic" or "heteroclinic" of
+        `SaddleConnection`: it leads back to the same saddle or to another one.
+        """
+        require_single(self, self.value, 0)
+        return self.condition.type_of(self) if int(self.status) == Status.OK else ""
+
+    @property
+    def coefficient(self) -> Array:
+        """The coefficient a of `Hopf` and `PseudoHopf`, else NaN; with derivatives by parameters.
+
+        The amplitude r of small oscillations, of x1 around a fixed point, of x2 at the edge around
+        a pseudo-focus, obeys r' = rate r + a r^3, with the `rate` of `Equilibria`. So near the
+        point there is a cycle with r^2 = -rate/a, which attracts where a < 0.
+        """
+        found = self.condition.coefficient(self.oscillator)
+        return jnp.where(self.status == Status.OK, found, jnp.nan)
+
+    @property
+    def place(self) -> np.ndarray:
+        """Where the motion is, see `place_of`; NaN where there is none."""
+        return self.condition.place(self)
+
+    def row(self) -> dict[str, Any]:
+        """What `table` tells of it."""
+        require_single(self, self.value, 0)
+        place = self.place if int(self.status) == Status.OK else NOWHERE
+        *extent, period = np.where(place == 0, [0, 0, 0, 0, np.nan], place)  # none at equilibria
+        return {
+            "kind": self.kind,
+            "belts": " ".join(map(str, self.condition.belts_concerned)),
+            "type": self.type,
+            **{name: float(getattr(self, name)) for name in ("value", "error", "residual")},
+            "iterations": int(self.iterations),
+            **dict(zip(("x1_min", "x1_max", "x2_min", "x2_max"), extent, strict=True)),
+            "period": period,
+            "multiplier": float(self.multiplier),
+            "coefficient": float(self.coefficient),
+            "status": Status(int(self.status)).name,
+        }
+
+    def table(self) -> "pandas.DataFrame":
+        """One row: kind, belts, type, value, error, residual, iterations, x1_min, x1_max, x2_min,
+        x2_max and period of the motion there, multiplier, coefficient, status. Points of a scan:
+        `pandas.concat`."""
+        return table_of([self.row()])
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the phase plane at the point, with the cycle where there is one, into the axes `ax`
+        (None: new ones), which are returned. `ValueError` where no point was found."""
+        return draw(self, ax)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.value) or self.value.ndim:
+            return f"BifurcationPoint({self.condition!r}, value={self.value.shape})"
+        if int(self.status) != Status.OK:
+            name, advice = Status(int(self.status)).name, describe(self.status)
+            if "jb.scan" not in advice:
+                advice += " Every bifurcation point in an interval is found by jb.scan."
+            return f"BifurcationPoint({self.condition!r}, {name}: {advice})"
+        sort = f"{self.type}, " if self.type else ""
+        return (
+            f"BifurcationPoint({self.condition!r}, {sort}value {number(self.value)}, "
+            f"residual {float(self.residual):.1e}, {int(self.iterations)} iterations, "
+            f"error < {float(self.error):.1e})"
+        )
+
+
+class Unexplained(AbstractCondition):
+    """What the oscillator does changes, and no other condition explains it; from `scan` only."""
+
+    caption: ClassVar[str] = "unexplained"
+
+    def guess(self, osc, size):
+        raise ValueError("condition must be one that can be refined, got Unexplained()")
+
+    def prepared(self, osc, guess):
+        raise NotImplementedError
+
+    def solved(self, family, system, x, p, status):
+        raise NotImplementedError
+
+    def followed(self, point):
+        raise ValueError(f"point must be of a kind that has curves, got {self!r}")
+
+
+#: A point is named by who asks for it: a name would be a constant of the compiled programs.
+UNNAMED = Unexplained()
+
+
+def point_of(
+    family: Family, solution: Solution, cycle: Cycle, multiplier: Array, status: Array
+) -> BifurcationPoint:
+    """The point of a solution, NaN where the status is not OK."""
+    status = judged_by(solution.error, status)
+    known = functools.partial(jnp.where, status == Status.OK)
+    return BifurcationPoint(
+        condition=UNNAMED,
+        value=known(solution.p[0], jnp.nan),
+        residual=known(solution.residual, jnp.nan),
+        iterations=solution.iterations,
+        steps=solution.steps,
+        error=known(solution.error, jnp.nan),
+        multiplier=known(multiplier, jnp.nan),
+        oscillator=family.at(known(solution.p, jnp.nan)),
+        cycle=cycle,
+        status=status,
+    )
+
+
+def point_without_cycle(family: Family, p, steps, size, error, status, why) -> BifurcationPoint:
+    """A point at p where there is no cycle: why not."""
+    iterations = jnp.sum(~jnp.isnan(steps))
+    known = functools.partial(jnp.where, status == Status.OK)
+    at_point = family.at(known(p, jnp.nan))
+    nan = jnp.full((SIZES[0], 3), jnp.nan)
+    n = len(at_point.belts)
+    chain = Chain(
+        jnp.ones((SIZES[0], n)), jnp.full(SIZES[0], Ends(n).unused), jnp.zeros((SIZES[0], 1))
+    )
+    none = jnp.asarray(jnp.nan)
+    cycle = Cycle(at_point, chain, nan, none, none, iterations, why)
+    return BifurcationPoint(
+        condition=UNNAMED,
+        value=known(p[0], jnp.nan),
+        residual=known(size, jnp.nan),
+        iterations=iterations,
+        steps=steps,
+        error=known(error, jnp.nan),
+        multiplier=none,
+        oscillator=at_point,
+        cycle=cycle,
+        status=status,
+    )

@@ -1,0 +1,189 @@
+"""The system of equations along a curve of bifurcation points, and the special points on its way.
+
+A `Track` is the system of a condition with both parameters among its unknowns. Between two points
+of it the functions that are watched may change their signs: where one does, `special_between`
+solves for its zero, a point of codimension two.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from ..model.oscillator import Oscillator
+from ..model.variations import Family, Variation
+from ..numerics.compiling import jit
+from ..numerics.continuation import Corrected, CurvePoint, corrected
+from .base import BifurcationPoint
+from .special import SpecialPoint
+from .systems import AbstractSystem, Seen
+
+#: How often, at most, the points on both sides of a singular one are brought nearer to it by half.
+#: Newton's method fails before: after four times in the cases known, where twice leave 5e-9.
+SHRINKS = 8
+
+
+class Track(NamedTuple):
+    """The system of a curve in the unknowns u: its own, weighted, and both parameters."""
+
+    variation: Variation
+    system: AbstractSystem
+    weights: Array
+
+    @classmethod
+    def begun(
+        cls, variation: Variation, point: BifurcationPoint, pair: np.ndarray
+    ) -> tuple["Track", np.ndarray]:
+        """The system that is followed from a point, and u there; pair: both parameters."""
+        system, x = point.condition.followed(point)
+        weights = system.weights(jnp.asarray(x))
+        u = np.append(np.asarray(weights) * np.asarray(x).reshape(-1), pair)
+        return cls(variation, system, weights), u
+
+    def corrected(self, u: ArrayLike, tangent: ArrayLike, length: float) -> Corrected:
+        """As `continuation.corrected`."""
+        start, normal = np.asarray(u), np.asarray(tangent)
+
+        def attempt(family, unknowns):
+            args = family, self.system, self.weights
+            # In the same plane: the first guess of u is `length` ahead, the others lie in it.
+            ahead = length if unknowns[0] is start else 0.0
+            solved = corrected(_curve_linearized, args, unknowns[0], normal, ahead)
+            return solved, (solved.u, solved.u[-2:])
+
+        solved, settled = self.variation.settle(attempt, (start, (start + length * normal)[-2:]))
+        return solved._replace(found=solved.found & settled)
+
+    def unknowns(self, u: np.ndarray) -> np.ndarray:
+        """Those of the system."""
+        return np.asarray(self.system.shaped(jnp.asarray(u[:-2] / np.asarray(self.weights))))
+
+    def place(self, u: np.ndarray) -> np.ndarray:
+        """Where the motion is, see `place_of`."""
+        return self.system.place(self.unknowns(u))
+
+    def look(self, u: np.ndarray) -> Seen:
+        """What is seen at a solution, in numbers."""
+        osc, x = self.variation.oscillator(u[-2:]), jnp.asarray(self.unknowns(u))
+        seen = _seen_at(osc, self.system, x)
+        tests = {name: float(value) for name, value in seen.tests.items()}
+        return Seen(tests, bool(seen.exists), float(seen.multiplier), float(seen.residual))
+
+    def remeshed(self, u: np.ndarray, tangent: np.ndarray) -> tuple["Track", Any, Any]:
+        """The same with the steps of integration spread anew, and u and the tangent in it."""
+        osc, x = self.variation.oscillator(u[-2:]), jnp.asarray(self.unknowns(u))
+        system, weights = _remeshed(osc, self.system, x)
+        scale = np.append(np.asarray(weights) / np.asarray(self.weights), [1.0, 1.0])
+        return Track(self.variation, system, weights), scale * u, scale * tangent
+
+    def tangent(self, u: np.ndarray) -> np.ndarray:
+        """The direction of the curve at u, in the sense in which a parameter grows."""
+        for axis in (-2, -1):
+            solved = self.corrected(u, np.eye(u.size)[axis], 0.0)
+            if solved.found:  # it is not where the curve turns back in this parameter
+                break
+        return solved.tangent
+
+
+def _curve_linearized(u: Array, args: tuple[Family, AbstractSystem, Array]) -> tuple[Array, Array]:
+    family, system, weights = args
+    value, matrix = system.linearized(family.at, system.shaped(u[:-2] / weights), u[-2:])
+    return value, matrix.at[:, :-2].divide(weights[None])
+
+
+@jit
+def _seen_at(osc: Oscillator, system: AbstractSystem, x: Array) -> Seen:
+    return system.look(osc, x)
+
+
+@jit
+def _remeshed(osc: Oscillator, system: AbstractSystem, x: Array):
+    return system.remeshed(osc, x), system.weights(x)
+
+
+# --- special points -------------------------------------------------------------------------------
+
+
+def special_between(
+    track: Track,
+    limits: np.ndarray,
+    before: tuple[CurvePoint, Seen],
+    after: tuple[CurvePoint, Seen],
+) -> list[SpecialPoint]:
+    """The points of codimension two between two neighbours: where a watched function vanishes."""
+    from scipy.optimize import brentq  # half a second that only curves need
+
+    (a, seen_a), (b, seen_b) = before, after
+    length = float((b.u - a.u) @ a.tangent)
+    found = []
+    for name, start in seen_a.tests.items():
+        end = seen_b.tests.get(name, np.nan)
+        if start * end >= 0 or np.isnan(start * end):
+            continue
+
+        def probe(part, name=name):
+            at = track.corrected(a.u, a.tangent, part * length)
+            seen = track.look(at.u)
+            value = seen.tests[name]
+            if not at.found or np.isnan(value):
+                raise _SingularError
+            return _Probe(part, value, at.u[-2:], max(seen.residual, abs(value)))
+
+        try:
+            # Beside a singular point what is solved for anew at an end may be on the other side.
+            if probe(0.0).test * probe(1.0).test > 0:
+                raise _SingularError
+            root: Any = brentq(lambda part, probe=probe: probe(part).test, 0.0, 1.0, xtol=1e-14)
+            special = probe(root)
+        except _SingularError:
+            ends = _Probe(0.0, start, a.u[-2:], 0.0), _Probe(1.0, end, b.u[-2:], 0.0)
+            special = _from_both_sides(probe, *ends)
+        values = special.values
+        if np.all((limits[:, 0] <= values) & (values <= limits[:, 1])):
+            pair = float(values[0]), float(values[1])
+            found.append((special.part, SpecialPoint(name[0], name[1], pair, special.residual)))
+    return [point for _, point in sorted(found, key=lambda item: item[0])]
+
+
+class _Probe(NamedTuple):
+    """A part of a step, the watched function and the parameters there, the largest error."""
+
+    part: float
+    test: float
+    values: np.ndarray
+    residual: float
+
+
+class _SingularError(Exception):
+    """Newton's method does not converge there, or the watched function is not defined."""
+
+
+def _from_both_sides(probe: Callable[[float], _Probe], low: _Probe, high: _Probe) -> _Probe:
+    """Where a function vanishes that has no value there: extrapolated from what has on both sides.
+
+    So it is where the cycle of a curve shrinks to a point: with all arcs of duration zero its
+    equations are singular.
+    """
+    from scipy.interpolate import KroghInterpolator
+
+    known = [low, high]
+    for _ in range(SHRINKS):
+        middle = low.part - low.test * (high.part - low.part) / (high.test - low.test)
+        try:
+            nearer = [probe(0.5 * (side.part + middle)) for side in (low, high)]
+        except _SingularError:
+            break
+        if any(new.test * old.test <= 0 for new, old in zip(nearer, (low, high), strict=True)):
+            break
+        known += nearer
+        low, high = nearer
+
+    def at_zero(probes):
+        numbers = [np.array([probe.part, *probe.values]) for probe in probes]
+        return KroghInterpolator([probe.test for probe in probes], numbers)(0.0)
+
+    best, other = at_zero(known[-6:]), at_zero(known[-4:])
+    residual = float(np.max(np.abs(best - other))) if len(known) > 4 else np.nan
+    return _Probe(float(best[0]), 0.0, best[1:], residual)
