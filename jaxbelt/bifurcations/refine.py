@@ -32,7 +32,7 @@ NEAR_GUESS, QUITE_NEAR, SHORT_STEP = 0.015, 0.05, 0.25
 #: The same for conditions of which there may be several beside each other.
 BESIDE_OTHERS = 1e-4
 #: How far to both sides of the guess points are looked for where it fails, one after the other, and
-#: in how many intervals first.
+#: in how many intervals first. All of these in units of the parameter, see `Family.unit`.
 REACHES, INTERVALS = (2e-3, 1.2e-2, 5e-2, 0.2), 15
 
 
@@ -80,11 +80,12 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
     condition, guess = point.condition, float(value[0])
     if int(point.status) == Status.DEGENERATE:
         return point
+    unit = float(variation.family(np.asarray(value)).unit)
     away = _away(point, guess)
     near = QUITE_NEAR if point.steps[0] <= SHORT_STEP else NEAR_GUESS
-    if away <= (BESIDE_OTHERS if condition.has_several else near):
+    if away <= unit * (BESIDE_OTHERS if condition.has_several else near):
         return point
-    for reach in REACHES:
+    for reach in (unit * each for each in REACHES):
         ends = (guess + side * min(reach, away) for side in (-1, 1))
         first, last = (_possible(variation, guess, end) for end in ends)
         if not first < last:
@@ -100,7 +101,7 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         of_kind = [one for one in found if condition.covers(one.condition)]
         if of_kind:
             nearest = min(of_kind, key=lambda one: _away(one, guess))
-            return nearest if _away(nearest, guess) < away - SAME_POINT else point
+            return nearest if _away(nearest, guess) < away - unit * SAME_POINT else point
         if away <= reach:
             break
     return point
