@@ -288,9 +288,14 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
     if not is_concrete((osc, loop, status)):
         return _exactly_in_lanes(osc, loop, status)
     cycle, error = _polished(osc, loop, status, ARC_STEPS)
+    coarser = ARC_STEPS
     for steps in (FINE_STEPS, *FINER_STEPS):
         if int(status) != Status.OK or not _is_inexact(cycle, error):
             break
+        fails = int(cycle.status) == Status.NO_CONVERGENCE
+        if fails and _mesh_error(osc, loop, coarser) < EXACT:
+            break  # not for its steps
+        coarser = steps
         finer, remaining = _polished(osc, loop, status, steps)
         if int(cycle.status) == Status.OK and remaining > 0.1 * error:
             break  # the rest is rounding
@@ -300,6 +305,13 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
 
 def _is_inexact(cycle: Cycle, error: Array) -> Array:
     return (cycle.status == Status.NO_CONVERGENCE) | (error > EXACT)
+
+
+@jit
+def _mesh_error(osc: Oscillator, loop: Loop, steps: int) -> Array:
+    """How much halved steps change the error in the equations of a loop as it is."""
+    chain, z = meshed(osc, loop, steps)
+    return jnp.abs(closure(osc, chain, z)[0] - closure(osc, chain.halved, z)[0])
 
 
 @jit
