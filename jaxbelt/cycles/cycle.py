@@ -38,7 +38,17 @@ from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Chain, Loop, loop_events, room_of
 from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
-from .shooting import ARC_STEPS, Ends, admissible, closed, closure, flow, meshed, solve_closed
+from .shooting import (
+    ARC_STEPS,
+    Ends,
+    admissible,
+    closed,
+    closure,
+    flow,
+    meshed,
+    residual,
+    solve_closed,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -309,9 +319,10 @@ def _is_inexact(cycle: Cycle, error: Array) -> Array:
 
 @jit
 def _mesh_error(osc: Oscillator, loop: Loop, steps: int) -> Array:
-    """How much halved steps change the error in the equations of a loop as it is."""
+    """How much halved steps change the equations of a loop as it is, at most."""
     chain, z = meshed(osc, loop, steps)
-    return jnp.abs(closure(osc, chain, z)[0] - closure(osc, chain.halved, z)[0])
+    values = (residual(osc, one, z)[0] for one in (chain, chain.halved))
+    return jnp.max(jnp.abs(jnp.subtract(*values)))
 
 
 @jit
