@@ -276,3 +276,20 @@ def test_a_batch_of_folds_and_the_slope_of_their_curve():
     )
     assert nu1s[2] == 0.35
     assert slopes[2] == pytest.approx(difference, rel=1e-7)
+
+
+@pytest.mark.slow(first=True)
+def test_the_nearer_of_two_to_which_a_cycle_grazes():
+    """Newton's method makes a long first step from there, and ends in the farther one."""
+
+    def make(nu):
+        belts = (
+            jb.Belt(-0.9, jb.Stribeck(0.5, 0.4, 0.15), load=2.0, upper=0.8),
+            jb.Belt(nu, jb.Conti(1.0, 0.6, 10.0), load=1.5),
+        )
+        return jb.Oscillator(0.05, belts, omega=0.5)
+
+    near, far = jb.scan(make, span=(0.99, 1.01), resolution=8)
+    assert near.kind == far.kind == "GrazingSliding" and far.value - near.value > 8e-3
+    for guess in (0.9969278, 0.9985):
+        assert jb.refine(near.condition, make, at=guess).value == pytest.approx(float(near.value))

@@ -478,12 +478,38 @@ def test_edges_that_are_one_all_along_do_not_meet():
     assert jb.refine(jb.MeetingEdges((0, 1)), at, at=0.3).status == Status.DEGENERATE
 
 
-@pytest.mark.parametrize("start", [0.26, 0.2999, 0.33])
-def test_the_error_of_a_double_root_is_told(start):
-    # The edge is at the least friction, which is at v = 0.3: 2 q v = 4 / (1 + 10 v)^2.
+def _edge_at_the_least_friction(v):
+    # At v = 0.3: 2 q v = 4 / (1 + 10 v)^2.
     quadratic = 0.25 / 0.6
     conti = jb.Conti(static=1.0, residual=0.6, steepness=10.0, quadratic=quadratic)
     edge = 0.7 + quadratic * 0.09
-    osc = jb.Oscillator(0.5, (jb.Belt(start, conti), jb.Belt(0.5, conti, lower=edge)))
+    return jb.Oscillator(0.5, (jb.Belt(v, conti), jb.Belt(0.5, conti, lower=edge)))
+
+
+@pytest.mark.parametrize("start", [0.26, 0.2999, 0.33])
+def test_the_error_of_a_double_root_is_told(start):
+    osc = _edge_at_the_least_friction(start)
     point = jb.refine(jb.BoundaryEquilibrium(1), osc, where=lambda osc: osc.belts[0].velocity)
     assert point.status != Status.OK or abs(point.value - 0.3) <= point.error
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e-3])
+def test_the_unit_of_the_parameter_makes_no_difference(unit):
+    along = _edge_beside_the_equilibrium(lambda v: 4e-16 * jnp.sin(1e3 * v))
+    found = jb.scan(lambda s: along(s / unit), span=(0.22 * unit, 0.24 * unit), resolution=4)
+    assert [point.status for point in found] == [Status.OK, Status.DEGENERATE]
+    assert float(found[1].error) == pytest.approx(0.01 * unit)
+    # A double root, known to 5e-8 units, and a simple one, from farther off than 0.5.
+    double = jb.refine(
+        jb.BoundaryEquilibrium(1), lambda s: _edge_at_the_least_friction(s / unit), at=0.2999 * unit
+    )
+    assert double.status == Status.OK and double.error < 1e-6 * unit
+    assert abs(double.value - 0.3 * unit) <= double.error
+    hopf = jb.refine(jb.Hopf(), lambda s: jb.presets.class_b(s / unit, 0.35), at=0.25 * unit)
+    assert hopf.value == pytest.approx(0.263654916039 * unit, rel=1e-11)
+    assert hopf.error < 1e-13 * unit
+
+
+def test_a_span_that_is_hardly_longer_than_a_point():
+    (rest,) = jb.scan(lambda nu: jb.presets.class_b(nu, 0.35), span=(-5e-7, 5e-7))
+    assert rest.kind == "SuddenSliding" and abs(rest.value) < 1e-14

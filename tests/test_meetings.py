@@ -10,6 +10,8 @@ import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.model.variations import varied
 from jaxbelt.numerics.continuation import Stop
+from tests.campaign import engine
+from tests.campaign.cases import PAPER
 
 LAW = jb.Conti(1.0, 0.6, 10.0)
 EXCHANGE, MEETING = jb.EdgeExchange((0, 1)), jb.MeetingEdges((0, 1))
@@ -180,3 +182,27 @@ def test_edges_that_meet_at_an_end_of_the_span(span):
     there = [one.condition for one in told if float(one.value) == pytest.approx(0.4, abs=1e-9)]
     assert there == [jb.EdgeExchange((0, 1)), MEETING]
     assert all(one.status == jb.Status.OK for one in told)
+
+
+def attractor(upper, y0):
+    """What the campaigns' engine comes to."""
+    belts = engine.Belt(0.2, PAPER, upper=upper), engine.Belt(-0.25, PAPER, lower=0.4)
+    return engine.attractor(engine.Oscillator(0.5, belts), y0)
+
+
+def test_an_orbit_that_settles_slowly():
+    """Loops around both edges, of which each is by a hundredth nearer to the cycle."""
+    cycle, seen = jb.find_cycle(beside(0.4004), (0.4, 0.1)), attractor(0.4004, (0.4, 0.1))
+    assert cycle.status == Status.OK and cycle.multiplier == pytest.approx(0.98769, abs=1e-5)
+    assert cycle.period == pytest.approx(seen.period, abs=1e-8)
+    assert (cycle.x1_min, cycle.x1_max) == pytest.approx(seen.x1, abs=1e-8)
+
+
+def test_a_small_cycle_within_an_unstable_one_within_another():
+    (fold,) = jb.scan(beside, span=(0.4002, 0.405), resolution=8)
+    assert fold.kind == "FoldOfCycles" and fold.error < 1e-11
+    # Shortly before it the engine comes to it, beyond to the cycle that sticks.
+    start = float(fold.cycle.x1_max), 0.0
+    for way, reached in ((-1e-5, 0.406), (1e-5, 0.419)):
+        seen = attractor(float(fold.value) + way, start)
+        assert seen.kind == "cycle" and seen.x1[1] == pytest.approx(reached, abs=1e-3)

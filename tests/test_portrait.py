@@ -278,3 +278,19 @@ def test_a_separatrix_that_creeps_to_a_node_comes_from_there():
     run = solve_ivp(backwards, span, [0.7, 0.0], "LSODA", dense_output=True, **tight)
     # What is drawn is as exact as one step between two samples.
     assert np.max(np.abs(np.asarray(one.ys)[::-1] - run.sol(ts).T)) < 1e-6
+
+
+@pytest.mark.slow(first=True)
+def test_an_unstable_cycle_that_takes_fine_steps():
+    """Far out, where damping is negative: the largest error in the equations of its first loop is
+    not one of the steps of integration, others are."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+    belts = (
+        jb.Belt(0.0832138215457, law, upper=0.866285905625),
+        jb.Belt(-0.257265751997, law, lower=-0.970587365831),
+    )
+    told = jb.portrait(jb.Oscillator(-0.137007563083, belts))
+    (outer,) = told.unstable
+    assert told.status == jb.Status.OK and told.escapes
+    # By bisection with the campaigns' engine: from there tops neither rise nor fall.
+    assert outer.x1_max == pytest.approx(6.4667377846218, abs=1e-10)

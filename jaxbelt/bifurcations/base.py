@@ -431,7 +431,7 @@ def point_of(
     family: Family, solution: Solution, cycle: Cycle, multiplier: Array, status: Array
 ) -> BifurcationPoint:
     """The point of a solution, NaN where the status is not OK."""
-    status = judged_by(solution.error, status)
+    status = judged_by(solution.error, family, status)
     known = functools.partial(jnp.where, status == Status.OK)
     return BifurcationPoint(
         condition=UNNAMED,

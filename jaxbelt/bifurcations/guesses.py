@@ -31,8 +31,9 @@ HINT_BUDGET = 32
 #: 87% had settled within 96 arcs, 95% within 384 and 97% within 768; the others creep.
 FOLLOWED = 96
 ATTEMPTS = 6
-#: Where some of them start to the right of an equilibrium, so far from it.
-DISTANCES = (0.02, 0.3, 3.0)
+#: Where some of them start to the right of an equilibrium, so far from it; and where one more does
+#: if it repels: within an unstable cycle around it there may be one that attracts.
+DISTANCES, INNERMOST = (0.02, 0.3, 3.0), 4e-3
 
 
 def starts(osc: Oscillator, rests: Equilibria) -> Array:
@@ -45,7 +46,9 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
     row = jnp.where(jnp.any(repels), jnp.argmax(repels), jnp.maximum(jnp.sum(exists) - 1, 0))
     centre = jnp.where(jnp.any(exists), rests.x1[row], 0.0)
     ends = [before_stick_ends(osc, belt) for belt in range(len(osc.belts))]
-    others = [jnp.stack([centre + distance, jnp.zeros(())])[None] for distance in DISTANCES]
+    innermost = jnp.where(jnp.any(repels), INNERMOST, jnp.nan)
+    distances = (innermost, *DISTANCES)
+    others = [jnp.stack([centre + distance, jnp.zeros(())])[None] for distance in distances]
     return jnp.concatenate([*ends, *others])
 
 

@@ -82,6 +82,8 @@ class ParameterPath:
             condition.check(self.osc)
         self.conditions = conditions
         self.length = self.last - self.first
+        #: In which the parameter is measured.
+        self.unit = float(self.variation.family(np.array([0.5 * (self.first + self.last)])).unit)
         (self.name,) = self.variation.names
         self.labels: dict[float, Label] = {}
         self.cycles: dict[float, list[AttractingCycle]] = {}
@@ -106,7 +108,7 @@ class ParameterPath:
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
         """The values just below and just above; farther off where motions are slow to settle."""
         # Not nearer in a short span: a loop counts as repeated when it does so to 1e-7.
-        distance = CLOSE * (1.0 + self.length)
+        distance = CLOSE * (self.unit + self.length)
         # Loops around a pseudo-focus with a velocity below 1e-5 are lost in rounding.
         if slow or (value in self.breaks and self.edged):
             distance *= 30.0

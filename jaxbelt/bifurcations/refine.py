@@ -24,15 +24,15 @@ from .scan import search
 
 #: Points found in two ways are one if they are no further apart.
 SAME_POINT = 1e-9
-#: Where Newton's method ends so near to the guess, there is no look for a nearer point; nor where
-#: it ends so near, if its first step was no longer than that. Of two thousand guesses three led
-#: beyond the next point, to others 0.018 and 0.029 away, after first steps of 0.4 and 0.5, and to a
-#: corner 0.004 away beside another one. Of edges there may be several, and any is looked for.
-NEAR_GUESS, QUITE_NEAR, SHORT_STEP = 0.015, 0.05, 0.25
-#: The same for conditions of which there may be several beside each other.
+#: Where Newton's method ends so near to the guess, there is no look for a nearer point, if its
+#: first step was no longer than that. Of three thousand guesses four led beyond the next point,
+#: to others 0.008, 0.018 and 0.029 away, after first steps of 0.4 and 0.5, and to a corner 0.004
+#: away beside another one. Of edges there may be several, and any is looked for.
+QUITE_NEAR, SHORT_STEP = 0.05, 0.25
+#: The same after a longer step, and for conditions of which there may be several beside each other.
 BESIDE_OTHERS = 1e-4
 #: How far to both sides of the guess points are looked for where it fails, one after the other, and
-#: in how many intervals first.
+#: in how many intervals first. All of these in units of the parameter, see `Family.unit`.
 REACHES, INTERVALS = (2e-3, 1.2e-2, 5e-2, 0.2), 15
 
 
@@ -80,11 +80,12 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
     condition, guess = point.condition, float(value[0])
     if int(point.status) == Status.DEGENERATE:
         return point
+    unit = float(variation.family(np.asarray(value)).unit)
     away = _away(point, guess)
-    near = QUITE_NEAR if point.steps[0] <= SHORT_STEP else NEAR_GUESS
-    if away <= (BESIDE_OTHERS if condition.has_several else near):
+    is_direct = bool(point.steps[0] <= SHORT_STEP) and not condition.has_several
+    if away <= unit * (QUITE_NEAR if is_direct else BESIDE_OTHERS):
         return point
-    for reach in REACHES:
+    for reach in (unit * each for each in REACHES):
         ends = (guess + side * min(reach, away) for side in (-1, 1))
         first, last = (_possible(variation, guess, end) for end in ends)
         if not first < last:
@@ -100,7 +101,7 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         of_kind = [one for one in found if condition.covers(one.condition)]
         if of_kind:
             nearest = min(of_kind, key=lambda one: _away(one, guess))
-            return nearest if _away(nearest, guess) < away - SAME_POINT else point
+            return nearest if _away(nearest, guess) < away - unit * SAME_POINT else point
         if away <= reach:
             break
     return point

@@ -81,12 +81,12 @@ def _solved_rest(family: Family, system: RestSystem, x0, p0, status, why):
     def equations(family, u):
         return system.residual(family.at(u[-1:]), u[:-1])
 
-    u, steps, size, error = small_newton(equations, family, jnp.append(x0, p0))
+    u, steps, size, error = small_newton(equations, family, jnp.append(x0, p0), family.unit)
     x, p = u[:-1], u[-1:]
     exists = system.exists(family.at(p), x)
     judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
     judged = jnp.where(size < HOLDS, judged, Status.NO_CONVERGENCE.value)
-    status = judged_by(error, jnp.where(status == Status.OK, judged, status))
+    status = judged_by(error, family, jnp.where(status == Status.OK, judged, status))
     return point_without_cycle(family, p, steps, size, error, status, why), (x, p)
 
 

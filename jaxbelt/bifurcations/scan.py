@@ -102,7 +102,7 @@ def search(
     points = [point for at in path.breaks for point in _at_break(path, at)]
     ends = [path.first, *(v for at in path.breaks for v in path.beside(at)), path.last]
     width = (path.last - path.first) / resolution
-    stretches = []
+    stretches = [np.empty(0)]  # a short span may have none beside a break
     for a, b in zip(ends[::2], ends[1::2], strict=True):
         if b > a:
             stretches.append(np.linspace(a, b, 1 + max(1, round((b - a) / width))))

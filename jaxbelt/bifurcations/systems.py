@@ -8,7 +8,6 @@ be watched along a curve.
 """
 
 import abc
-import functools
 from collections.abc import Callable
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -36,8 +35,8 @@ from ..results import Status
 #: rest. Of seven curves of class (b) one ends too early with a tenth of it; with three times as
 #: much they take half as many points again.
 WEIGHT = 0.1
-#: A point is determined where its error is smaller: at a double root it is some 1e-7, and where the
-#: equations hold all along the parameter 1 and more.
+#: A point is determined where its error, in units of the parameter, is smaller: at a double root it
+#: is some 1e-7, and where the equations hold all along the parameter 1 and more.
 DETERMINED = 1e-3
 #: The place of nothing.
 NOWHERE = np.full(5, np.nan)
@@ -287,16 +286,16 @@ def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: int | Array =
 
 
 class _InParameter(Equations):
-    """The equations of a system in its own unknowns and one parameter."""
+    """The equations of a system in its own unknowns and one parameter, in units of that."""
 
     system: CycleSystem
 
     def residual(self, given, z):
         own, p = z
-        return self.system.residual(given.at(p), own)
+        return self.system.residual(given.at(given.unit * p), own)
 
     def linearized(self, given, z):
-        return self.system.linearized(given.at, *z)
+        return self.system.linearized(lambda p: given.at(given.unit * p), *z)
 
 
 class Solution(NamedTuple):
@@ -320,20 +319,22 @@ def solve_system(family: Family, system: CycleSystem, z0, p0, status: Array) -> 
     """The solution of a system near (z0, p0); status: of that guess."""
     # Without a guess Newton's method ends at once.
     z0 = jnp.where(status == Status.OK, z0, jnp.nan)
-    solved = solve(_InParameter(system), family, (z0, lax.stop_gradient(p0)))
-    (z, p), steps = solved.z, solved.lengths
+    unit = family.unit
+    solved = solve(_InParameter(system), family, (z0, lax.stop_gradient(p0) / unit))
+    z, p, steps = solved.z[0], unit * solved.z[1], solved.lengths
     iterations = jnp.sum(~jnp.isnan(steps))
     # By the last steps: the residual costs an integration more, and who asks for it gets it.
     last, before = steps[jnp.maximum(iterations - 1, 0)], steps[jnp.maximum(iterations - 2, 0)]
     converged = is_settled(last, before, HOLDS) | (last < STEP_ROUNDING) | (status != Status.OK)
     status = jnp.where(converged, status, Status.NO_CONVERGENCE.value)
     at_point, system, at, matrix = lax.stop_gradient((family.at(p), system, z, solved.matrix))
-    return Solution(z, p, steps, iterations, *_accuracy(at_point, system, at, matrix), status)
+    residual, error = _accuracy(at_point, system, at, matrix)
+    return Solution(z, p, steps, iterations, residual, unit * error, status)
 
 
 def _accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
-    """The residual, and a bound on the error of p: what the residual with halved steps and rounding
-    do to it."""
+    """The residual, and a bound on the error of p, in its units: what the residual with halved
+    steps and rounding do to it."""
     mesh = system.chain.mesh
     # The steps as they are, and halved; padded by steps of length zero to one shape.
     meshes = jnp.stack(
@@ -349,34 +350,39 @@ def _accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
     return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
 
 
-def judged_by(error: Array, status: Array) -> Array:
+def judged_by(error: Array, family: Family, status: Array) -> Array:
     """The status of a point with that error of its parameter: DEGENERATE in place of OK where the
     equations hold, and do not tell the parameter."""
-    fails = (status == Status.OK) & ~(error < DETERMINED)
+    fails = (status == Status.OK) & ~(error < DETERMINED * family.unit)
     return jnp.where(fails, Status.DEGENERATE.value, status)
 
 
-def small_newton(equations, osc, unknowns):
+def small_newton(equations, osc, unknowns, unit: Any = 1.0):
     """Newton's method for a few equations(osc, unknowns).
 
-    Returns the solution, its steps, its residual and the error of the last unknown.
+    unit: of the last unknown. Returns the solution, its steps, its residual and the error of the
+    last unknown.
     """
+    units = jnp.ones(unknowns.size).at[-1].set(unit)
 
-    def linearized(u):
-        still = functools.partial(equations, lax.stop_gradient(osc))
-        return _determined(u, still(u), jax.jacfwd(still)(u))
+    def linearized(u, osc):
+        def still(u):
+            return equations(osc, units * u)
 
-    solved = newton(linearized, lax.stop_gradient(unknowns))
+        return still(u), jax.jacfwd(still)(u)
+
+    def determined(u):
+        return _determined(u, *linearized(u, lax.stop_gradient(osc)))
+
+    solved = newton(determined, lax.stop_gradient(unknowns) / units)
     u = lax.stop_gradient(solved.z)
     # One more step carries the derivatives with respect to the other parameters.
-    matrix = jax.jacfwd(lambda u: equations(osc, u))(u)
-    value = equations(osc, u)
+    value, matrix = linearized(u, osc)
     change = jnp.linalg.solve(matrix, value)
     # Towards a multiple root steps shrink by a half or a third only.
     error = _rounding(u, matrix) + 2 * jnp.abs(lax.stop_gradient(change[-1]))
-    determined = error < DETERMINED
-    u = u - jnp.where(determined, change, 0.0)
-    return u, solved.lengths, jnp.max(jnp.abs(value)), error
+    u = u - jnp.where(error < DETERMINED, change, 0.0)
+    return units * u, solved.lengths, jnp.max(jnp.abs(value)), unit * error
 
 
 def _rounding(u: Array, matrix: Array) -> Array:

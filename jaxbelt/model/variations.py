@@ -69,6 +69,15 @@ class Family(eqx.Module):
             leaves[place] = jnp.asarray(sum(moves, start=one.asarray(leaf)))
         return jax.tree.unflatten(structure, leaves)
 
+    @property
+    def unit(self) -> Any:
+        """By how much the last parameter changes where that number of the oscillator which changes
+        most does so by one: what the parameter is measured in makes no difference to who asks."""
+        slopes = [slope[-1] for slope in lax.stop_gradient(self.slopes) if slope is not None]
+        one: Any = np if is_concrete(slopes) else jnp
+        rate = one.max(one.stack([one.max(one.abs(slope)) for slope in slopes]))
+        return one.where(rate > 0, 1 / one.where(rate > 0, rate, 1.0), 1.0)
+
     def belt_slopes(self, belt: int, name: str) -> Any:
         """Those of a number of a belt, [k]."""
         slopes = jax.tree.unflatten(jax.tree.structure(self.oscillator), self.slopes)

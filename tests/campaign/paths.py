@@ -42,6 +42,8 @@ NARROW = 1e-4
 SAME = 1e-6
 #: Smaller cycles than this one around a pseudo-focus are not told from it.
 TINY = 1e-3
+#: Events at the end of a run that passes too many, some loops.
+LAST_EVENTS = 100
 #: Time after which orbits that part at a saddle are looked at.
 PARTED = 1.0
 #: Time until the engine gives a run up.
@@ -181,8 +183,11 @@ def label_of(osc: engine.Oscillator, starts) -> Label:
         label.decided &= found.kind != "undecided"
         if found.kind == "cycle":
             cycle = _cycle(osc, found)
-            # Loops around a pseudo-focus seem to repeat long before they have shrunk to it.
-            if any(kind == 3 for kind, _, _ in label.rests) and found.x1[1] - found.x1[0] < TINY:
+            # Loops around a pseudo-focus seem to repeat long before they have shrunk to it; but not
+            # those that stick, which are the same after one.
+            slips = not any(0 in modes for modes in cycle.modes)
+            around = any(kind == 3 for kind, _, _ in label.rests)
+            if slips and around and found.x1[1] - found.x1[0] < TINY:
                 label.decided = False
                 continue
             if not any(cycle.is_same(other) for other in label.cycles):
@@ -197,7 +202,9 @@ def _circles_an_edge(osc: engine.Oscillator, start, rests) -> bool:
     run = engine.simulate(osc, start, 400.0, max_events=8000)
     ends = [x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)]
     near = min(abs(run.y_end[0] - x) for x in ends) + abs(run.y_end[1]) < 0.05
-    return near and run.status in (engine.BUDGET, engine.PSEUDO_FOCUS)
+    # A loop that sticks after thousands of others is a cycle, however small.
+    still_sticks = run.status == engine.BUDGET and np.any(run.codes[-LAST_EVENTS:] == 0)
+    return near and not still_sticks and run.status in (engine.BUDGET, engine.PSEUDO_FOCUS)
 
 
 def _cycle(osc: engine.Oscillator, found: engine.Attractor) -> Cycle:
