@@ -17,7 +17,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     model/          rest events equilibria
     presets         the published systems
     kernel/         lanes marks step events rounds
-    motion/         integrators arcs sensitivities sampling loops batches runs smoothing simulate
+    motion/         integrators arcs flights sensitivities sampling loops batches runs smoothing
+    motion/         simulate
     cycles/         chains settling shooting orbits cycle attractors functionals
     cycles/         backwards returns separatrices portrait
     cycles/         outlines nearest sides shocks

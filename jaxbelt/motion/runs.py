@@ -103,7 +103,7 @@ def _stick_segment(osc: Oscillator, state: RunState, t1) -> tuple[ArcEnd, Array]
 class ArcRecord(eqx.Module):
     """What a segment leaves behind: its arc, the event at its end, and what ended it.
 
-    ended_by, in_time, captured: as in `sensitivities.Arc`.
+    ended_by, in_time, captured: as in `flights.Arc`.
     """
 
     t: Array

@@ -270,17 +270,18 @@ def simulate(
         )
     edges, expected = has_edges(osc), "a positive integer"
     padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
-    followed = max_segments
+    is_default = max_segments is None
     if max_segments is None:
         # Around a pseudo-focus at a contact edge a run has many short arcs.
         max_segments = _power_of_two((64 if edges else 8) * span, 512)
-        # Without edges a loop is cut into eight arcs at most by extrema and lengths of time, and
-        # into two more by each belt; there the padding costs more than the arcs.
-        rate = 0.5 * (2 + len(osc.belts))
-        few = padded and not edges
-        followed = min(max_segments, _power_of_two(rate * span, 128)) if few else max_segments
     is_count = isinstance(max_segments, int) and max_segments > 0
     require(is_count, "max_segments", expected, max_segments)
+    followed = max_segments
+    if is_default and padded and not edges:
+        # Padding costs more than the arcs here. A unit of time has one arc for its length; a loop,
+        # of 2 pi or more, two for its extrema and three for a boundary that is met from both sides.
+        rate = 1.5 + 0.5 * len(osc.belts)
+        followed = min(max_segments, max(128, 64 * math.ceil(rate * span / 64)))
     if max_events is None:
         room = _power_of_two((16 if edges else 4) * span, 64) if padded else max_segments
         max_events = min(max_segments, room)

@@ -1,0 +1,282 @@
+"""Flights: arcs that are known, flown again for their derivatives, many side by side.
+
+Each is flown by a number of steps that is fixed beforehand, so there is nothing to search and to
+control; flights that take about as many steps are made together, in one piece of machine code.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..model.modes import Mode, mode_of
+from ..model.oscillator import Oscillator
+from ..numerics.compiling import LARGEST, any_lane, more_rows, one_kernel, with_batches
+from ..numerics.extrapolation import increments, scheme
+from .integrators import State, density, slip_field
+
+#: A step of order twelve times the density of steps that is wanted there. Of 5,000 arcs of random
+#: oscillators nine in ten were then right to 1e-12, all to 1e-8.
+LENGTH = 0.3
+#: Most steps of an arc, in groups of groups: most arcs need a few, stiff ones, and those that begin
+#: in the bend of the law with a large acceleration, thousands.
+GROUPS = (8, 32, 16, 4)
+MOST_STEPS = math.prod(GROUPS)
+#: Arcs that are flown side by side, at most.
+SIDE_BY_SIDE = 64
+#: Runs, at most, and arcs of each, that are sorted by their numbers of steps together; and how many
+#: arcs these are, at most.
+RUNS, ROWS, MOST_FLIGHTS = 128, 128, 2048
+#: Groups into which these are divided, at least.
+LEAST_GROUPS = 16
+#: Largest density of steps, so that all numbers stay finite.
+DENSEST = 1e4
+#: Along an arc the steps vary by the ratio of the densities at its ends to this power: between the
+#: ends the law bends less than in the middle between them.
+POWER = 1.5
+
+_ORDER_12 = scheme((2, 4, 6, 8, 10, 12))
+
+
+class Arc(eqx.Module):
+    """An arc that is known: its entry and end, contact codes [belts], and duration.
+
+    The end helps to place the steps. ended_by: a number of `arcs.Ends`, -1 for none; in_time:
+    whether the run ended with it, in time; captured: whether the mass came to rest in a
+    pseudo-focus at its end; used: whether there was such an arc at all. begins_loop, again: where
+    the loop that the run repeats begins behind it, and how many more times it is passed behind it.
+    """
+
+    entry: State
+    end: State
+    codes: Array
+    duration: Array
+    ended_by: Array
+    in_time: Array
+    captured: Array
+    used: Array
+    begins_loop: Array
+    again: Array
+
+    @property
+    def mode(self) -> Mode:
+        """The mode of the arc."""
+        return mode_of(self.codes.astype(float))
+
+
+class Steps(NamedTuple):
+    """Steps that are fixed beforehand: how many, and how they are graded, see `steps_of`."""
+
+    number: Array
+    is_even: Array
+    ratio: Array
+
+
+def steps_of(osc: Oscillator, arc: Arc) -> Steps:
+    """The steps from the entry of an arc to its end; they have no derivatives.
+
+    Their number and their grading follow from the density of steps that is wanted at both.
+    """
+    osc, arc = lax.stop_gradient((osc, arc))
+    mode, duration, y, end = arc.mode, arc.duration, arc.entry, arc.end
+    first, last = (
+        jnp.clip(jnp.nan_to_num(density(osc, mode, *at), nan=1.0), 1.0, DENSEST) for at in (y, end)
+    )
+    is_even = jnp.abs(last - first) < 1e-3 * first
+    ratio = jnp.where(is_even, 2.0, last / first)
+    mean = jnp.where(is_even, first, (last - first) / jnp.log(ratio))
+    number = jnp.ceil(jnp.abs(duration) * mean / LENGTH)
+    return Steps(jnp.where(mode.any_stuck, 0.0, number), is_even, ratio)
+
+
+def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, steps: Steps) -> State:
+    """The state after a time in the field of a slip mode, by steps that are fixed beforehand.
+
+    NaN where MOST_STEPS are too few.
+    """
+    number, is_even, ratio = steps
+
+    def place(passed):
+        # As if the logarithm of the density were linear: of that density the integral up to s is
+        # proportional to ratio^s - 1.
+        share = jnp.minimum(passed / jnp.maximum(number, 1.0), 1.0)
+        graded = jnp.log1p(share * (ratio**POWER - 1)) / jnp.log(ratio**POWER)
+        return jnp.where(is_even, share, graded)
+
+    def field(y):
+        return slip_field(osc, mode, y)
+
+    def advance(passed, y, groups):
+        """Past the steps behind those that are passed, as many as fit into the groups."""
+        if not groups:
+            h = duration * (place(passed + 1) - place(passed))
+            (change,) = increments(field, y, h, _ORDER_12)
+            return y[0] + change[0], y[1] + change[1]
+        size, *parts = groups
+
+        def some(i, y):
+            begin = passed + i * math.prod(parts)
+            # In groups, for stepping over the steps that an arc does not need is not free.
+            return lax.cond(any_lane(begin < number), advance_some, lambda *_: y, begin, y)
+
+        def advance_some(begin, y):
+            return advance(begin, y, parts)
+
+        # Made again, not kept, where a derivative of a derivative comes back through them.
+        return lax.fori_loop(0, size, jax.checkpoint(some, prevent_cse=False), y)
+
+    x1, x2 = advance(0, y, GROUPS)
+    known = jnp.where(number <= MOST_STEPS, 1.0, jnp.nan)
+    return x1 * known, x2 * known
+
+
+def _flown_again(osc: Oscillator, arc: Arc, steps: Steps, x1: Array, x2: Array) -> State:
+    """The end of an arc that is known, where it slips, by oscillator and entry near those of it."""
+    return flown(osc, arc.mode, (x1, x2), jnp.where(arc.mode.any_stuck, 0.0, arc.duration), steps)
+
+
+# --- many runs side by side -----------------------------------------------------------------------
+
+
+def _side_by_side(function: Callable, by_run) -> Callable:
+    """function(by_run, varied, rest, *rows) of runs side by side, as a function of the others.
+
+    rows are arrays [runs, ..], and so are the leaves of the oscillator for which by_run, a tree of
+    flags like (varied, rest), says it. A batch of it is so many more runs.
+    """
+
+    def call(varied, rest, *rows):
+        return function(by_run, varied, rest, *rows)
+
+    def batch(_, size, batched, *args):
+        flags = *by_run, *jax.tree.map(lambda _: True, args[2:])
+        leaf, is_batched = jax.tree.leaves(args[2:])[0], jax.tree.leaves(batched[2:])[0]
+        runs = leaf.shape[1 if is_batched else 0]
+
+        differ = jax.tree.map(lambda a, b: a or b, by_run, tuple(batched[:2]))
+        merged = functools.partial(more_rows, size, runs)
+        out = _side_by_side(function, differ)(*jax.tree.map(merged, args, flags, tuple(batched)))
+        return jax.tree.map(lambda leaf: leaf.reshape(size, runs, *leaf.shape[1:]), out)
+
+    return with_batches(call, batch)
+
+
+def of_one_run(function: Callable, varied, rest, *rows):
+    """The function of runs side by side, see `_side_by_side`, for one run."""
+    call = _side_by_side(function, jax.tree.map(lambda _: False, (varied, rest)))
+    out = call(varied, rest, *jax.tree.map(lambda leaf: leaf[None], rows))
+    return jax.tree.map(lambda leaf: leaf[0], out)
+
+
+def sizes_of(by_run, varied) -> list[int]:
+    """How many numbers each leaf has for one run."""
+    pairs = zip(jax.tree.leaves(varied), jax.tree.leaves(by_run[0]), strict=True)
+    return [leaf.size // leaf.shape[0] if flag else leaf.size for leaf, flag in pairs]
+
+
+def largest_power(number: int) -> int:
+    """The largest that is not above the number, 1 or more."""
+    return 1 << (number.bit_length() - 1)
+
+
+def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, steps: Steps):
+    """Derivatives of flights, arrays [flights, 3 + varied] for each number of the result: by x1 and
+    x2 of the entry, by a time, and by the parameters.
+
+    result(osc, arc, end, y, time): of one flight, scalars, by its end; arcs: the flights, their
+    leaves arrays [flights, ..]; times: arrays [flights]; run: to which run each belongs; steps: of
+    each, for those of about as many are made side by side; a number of -1: it is not wanted.
+    """
+    flights, columns = times.size, 3 + sum(sizes_of(by_run, varied))
+    most = min(SIDE_BY_SIDE, largest_power(max(1, LARGEST // columns)))
+    # A few groups at least, for all of a group wait for the longest.
+    size = min(most, max(1, flights // LEAST_GROUPS))
+    short = jnp.clip(jnp.nan_to_num(steps.number), -1, MOST_STEPS).astype(jnp.int32) + 1
+    # Sorted with their places as one number: a sort of pairs takes ten times as long.
+    in_order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32))
+    order, wanted = in_order % flights, in_order >= flights
+    places = jnp.zeros_like(order).at[order].set(jnp.arange(flights, dtype=jnp.int32))
+    own, shared = eqx.partition((varied, rest), by_run)
+    own = jax.tree.map(lambda leaf: leaf[run], own)
+    rows = jax.tree.map(lambda leaf: leaf[order], (own, arcs, steps, times))
+    rows = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), (*rows, wanted))
+
+    @one_kernel
+    def made(shared, own, *rows):
+        return _columns(result, by_run, *eqx.combine(shared, own), *rows)
+
+    def group(rows):
+        *rows, wanted = rows
+        shapes = jax.eval_shape(made, shared, *rows)
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
+        # A kernel that is not in a branch of its own has no second derivatives in a loop (JAX
+        # 0.10).
+        return lax.cond(any_lane(jnp.any(wanted)), lambda: made(shared, *rows), lambda: nothing)
+
+    # In one array, so that a flight's numbers stand side by side.
+    slopes = jnp.concatenate(lax.map(group, rows), axis=1)
+    slopes = jnp.moveaxis(slopes, 1, 2).reshape(flights, -1)[places]
+    return tuple(jnp.split(slopes, slopes.shape[1] // columns, axis=1))
+
+
+def _columns(result, by_run, varied, rest, arcs: Arc, steps: Steps, times):
+    """The derivatives of flights that are made together, arrays [3 + varied, flights], see
+    `slopes_of`."""
+    axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
+
+    def each(function, varied, *rows):
+        def of_one(varied, rest, *rows):
+            return function(eqx.combine(varied, rest), *rows)
+
+        return jax.vmap(of_one, (*axes, *[0] * len(rows)))(varied, rest, *rows)
+
+    def ends(varied, x1, x2):
+        return each(_flown_again, varied, arcs, steps, x1, x2)
+
+    def results(varied, end, x1, x2, times):
+        def of_one(osc, arc, end, x1, x2, time):
+            return result(osc, arc, end, (x1, x2), time)
+
+        return each(of_one, varied, arcs, end, x1, x2, times)
+
+    def parts(direction):
+        by_entry = [jnp.full_like(a, 1.0) * b for a, b in zip(arcs.entry, direction[:2])]
+        return _directed(by_run[0], varied, direction[2:]), *by_entry
+
+    def flight(direction):
+        return jax.jvp(ends, (varied, *arcs.entry), parts(direction))
+
+    def column(moved, direction, time):
+        along, *by_entry = parts(direction)
+        slopes = along, moved, *by_entry, jnp.full_like(times, 1.0) * time
+        return jax.jvp(results, (varied, end, *arcs.entry, times), slopes)[1]
+
+    # The time has no part in the flight itself.
+    directions = jnp.eye(2 + sum(sizes_of(by_run, varied)))
+    end, moved = jax.vmap(flight, out_axes=(None, 0))(directions)
+
+    def with_time(leaf, own):
+        row = jnp.broadcast_to(own, (1, *leaf.shape[1:]))
+        return jnp.concatenate([leaf[:2], row, leaf[2:]])
+
+    moved = jax.tree.map(lambda leaf: with_time(leaf, 0.0), moved)
+    is_time = jnp.where(jnp.arange(len(directions) + 1) == 2, 1.0, 0.0)
+    return jax.vmap(column)(moved, with_time(directions, 0.0), is_time)
+
+
+def _directed(by_run, varied, numbers: Array):
+    """A tree like `varied`, of these numbers, the same for all runs."""
+    leaves, structure = jax.tree.flatten(varied)
+    parts, before = [], 0
+    for leaf, flag in zip(leaves, jax.tree.leaves(by_run), strict=True):
+        shape = leaf.shape[1:] if flag else leaf.shape
+        part = numbers[before : before + math.prod(shape)].reshape(shape)
+        parts.append(jnp.broadcast_to(part, leaf.shape))
+        before += math.prod(shape)
+    return jax.tree.unflatten(structure, parts)
