@@ -14,22 +14,26 @@ import numpy as np
 from jaxtyping import Array
 
 from .bifurcations.diagrams import BifurcationDiagram
-from .checks import require
+from .checks import outside_of_traces, require
 from .cycles.cycle import Cycle
 from .cycles.functionals import energy_dissipated
+from .cycles.portrait import Portrait
+from .cycles.shocks import FatalShock
 from .inverse.fit import Fit
 from .model.friction import Conti, Coulomb, Stribeck
 from .model.machine import Machine, Units
-from .model.modes import mode_acceleration, mode_of
+from .model.modes import STUCK, mode_acceleration, mode_of
 from .model.oscillator import Oscillator
+from .model.parameters import names_of
 from .motion.simulate import Trajectory
 from .results import EventKind, Status
-from .sweeps.basins import Basins
+from .sweeps.basins import Basins, BasinStability
 from .sweeps.datasets import flags
 from .sweeps.fractions import BasinFractions
 from .sweeps.orbit_diagram import OrbitDiagram
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
 
 #: What the variables of this package are, by their names.
@@ -38,6 +42,7 @@ DIMENSIONS = {
     **dict.fromkeys(("x1", "x1_event", "x1_end", "x1_min", "x1_max", "amplitude"), "length"),
     **dict.fromkeys(("x2", "x2_event", "x2_end", "x2_min", "x2_max"), "velocity"),
     **{"x1_residual": "length", "x2_residual": "velocity"},
+    **{"shock_x1": "length", "shock_x2": "velocity"},
     "force": "force",
     "energy": "energy",
 }
@@ -51,16 +56,23 @@ UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "steepness": ("s m-1", lambda units: 1 / units.velocity),
     "quadratic": ("s2 m-2", lambda units: 1 / units.velocity**2),
 }
+#: Numbers of a machine's oscillator and of a result's that differ by less, relative to their size,
+#: are the same: those of the one may have been computed in another way.
+SAME_NUMBER = 1e-9
 #: Results along a parameter.
 AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
 SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
 
 
+@outside_of_traces
 def in_si(
     result: Union[
         Trajectory,
         Cycle,
+        Portrait,
+        FatalShock,
         Basins,
+        BasinStability,
         Fit,
         BifurcationDiagram,
         OrbitDiagram,
@@ -71,17 +83,25 @@ def in_si(
 ) -> "xarray.Dataset":
     """A result in SI units, as a dataset whose variables carry their units.
 
-    result: of the machine's oscillator, a `Trajectory`, a `Cycle`, `Basins`, a `Fit`, a
-    `BifurcationDiagram`, an `OrbitDiagram`, `BasinFractions`, or the dataset of a sweep. machine:
-    the `Machine`; where the sweep has axes other than starts, or a function was given in place of
-    an oscillator, a function of these that returns it, for its units may be others in each run.
+    result: of the machine's oscillator, a `Trajectory`, a `Cycle`, a `Portrait`, a `FatalShock`,
+    `Basins`, `BasinStability`, a `Fit`, a `BifurcationDiagram`, an `OrbitDiagram`,
+    `BasinFractions`, or the dataset of a sweep. machine: the `Machine`; where the sweep has axes
+    other than starts, or a function was given in place of an oscillator, a function of these that
+    returns it, for its units may be others in each run. `ValueError` where that of the machine is
+    not the oscillator of the result, but for what was fitted or varied. Trajectories, basin
+    stabilities and fractions, and datasets keep none: of the first only the velocity at which it
+    sticks is compared, of the others nothing.
 
     Of a trajectory: `t` in s, `x1` in m, `x2` in m/s, `force`, the friction on the mass, in N
     (exact formulation only), and `mode` at each sample; `t_event`, `x1_event`, `x2_event`,
     `event_kind` and `event_belt`. Of a cycle: `period`, `stick_duration` of each belt, `x1_min`,
     `x1_max`, `x2_min`, `x2_max`, `amplitude`, and `energy`, what friction and dashpot turn into
-    heat in one period. Of a fit: over `parameter`, the names in its table, `estimate`,
-    `standard_error`, `lower` and `upper` (the confidence interval of 95 per cent), each in the
+    heat in one period. Of a portrait: over `row`, the columns of its `table()`, `rate` in 1/s. Of a
+    shock: `x1` and `x2` of its start, `shock_x1`, `shock_x2`, and `distance`, in m/s where it
+    changes the velocity alone; of both, a distance in the dimensionless plane, it stays as it is.
+    Of a basin stability: its `table()`, which has no units. Of a fit: over `parameter`, the names
+    in its table, `estimate`, `standard_error`, `lower` and `upper` (the confidence interval of 95
+    per cent), each in the
     `unit` beside it (a `load` is the normal force), and a parameter of a law of one's own stays as
     the law has it, with the unit ""; over `t` the fitted motion, `x1` and `x2`, and `x1_residual`
     and `x2_residual`, datum minus motion. Of a diagram, or of fractions: over `row`, the columns of
@@ -99,8 +119,15 @@ def in_si(
             return _trajectory(result, _one(machine))
         case Cycle():
             return _cycle(result, _one(machine))
+        case Portrait():
+            return _portrait(result, _one(machine))
+        case FatalShock():
+            return _shock(result, _one(machine))
         case Basins():
+            check_machine(result, machine)
             return _dataset(result.dataset, machine)
+        case BasinStability():
+            return _columns(result.table(), _one(machine).units)
         case Fit():
             return _fitted(result, _one(machine))
         case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
@@ -111,14 +138,63 @@ def in_si(
             require(not is_done, "result", "dimensionless", "a dataset that is in SI units")
             return _dataset(result, machine)
     raise TypeError(
-        "result must be a Trajectory, a Cycle, Basins, a Fit, a BifurcationDiagram, an "
-        f"OrbitDiagram, BasinFractions, or the dataset of a sweep, got {type(result).__name__}"
+        "result must be a Trajectory, a Cycle, a Portrait, a FatalShock, Basins, BasinStability, "
+        "a Fit, a BifurcationDiagram, an OrbitDiagram, BasinFractions, or the dataset of a sweep, "
+        f"got {type(result).__name__}"
     )
 
 
 def _one(machine: Any) -> Machine:
     require(isinstance(machine, Machine), "machine", "a Machine", repr(machine))
     return machine
+
+
+def check_machine(result: Any, machine: Any) -> None:
+    """Raise a `ValueError` where a result keeps its oscillator, and that of the machine is another.
+
+    What was fitted, or varied along a path, may be; of a function the one at the first value is
+    compared.
+    """
+    free: set[str] = set()
+    if isinstance(result, BifurcationDiagram | OrbitDiagram):
+        free = {result.name}
+        if result.is_argument:
+            machine = machine(**{result.name: _first_value(result)})
+    match result:
+        case BifurcationDiagram():
+            osc = result.oscillator
+        case OrbitDiagram() if result.sampling is not None:
+            osc = result.sampling.variation.oscillator(np.array([_first_value(result)]))
+        case Fit():
+            osc = result.oscillator
+            free = {name for tied in result.names for name in tied.split(" = ")}
+        case Cycle() | Basins() | Portrait():
+            osc = result.oscillator
+        case FatalShock():
+            osc = result.portrait.oscillator
+        case _:
+            return
+    if not isinstance(machine, Machine):
+        return
+    own, belts = machine.oscillator, len(osc.belts)
+    require(len(own.belts) == belts, "machine", f"of {belts} belts", f"{len(own.belts)} belts")
+    one, other = _numbers_of(own), _numbers_of(osc)
+    for name in one.keys() | other.keys():
+        require(name in one and name in other, "machine", "with the laws of the result", machine)
+    for name, value in other.items():
+        fits = name in free or np.allclose(one[name], value, rtol=SAME_NUMBER, atol=0)
+        expected = f"the one of the result, whose oscillator has {name} = {value:.12g}"
+        require(fits, "machine", expected, f"{one[name]:.12g}")
+
+
+def _first_value(result: BifurcationDiagram | OrbitDiagram) -> float:
+    first = result.values if isinstance(result, OrbitDiagram) else np.ravel(result.regions[0][:1])
+    return float(first[0])
+
+
+def _numbers_of(osc: Oscillator) -> dict[str, float]:
+    pairs = zip(names_of(osc), jax.tree.leaves(osc), strict=True)
+    return {name: float(leaf) for name, leaf in pairs if np.ndim(leaf) == 0}
 
 
 def _variable(dims: Any, values: Any, name: str, units: Units, long_name: str) -> tuple:
@@ -150,6 +226,14 @@ def _trajectory(run: Trajectory, machine: Machine) -> "xarray.Dataset":
     require(run.ts.ndim == 1, "result", "one trajectory, not a batch", repr(run))
     belts = len(osc.belts)
     require(run.modes.shape[-1] == belts, "result", f"of a machine of {belts} belts", repr(run))
+    if run.arcs.t.size:
+        # A trajectory keeps no oscillator, but where it sticks it has the velocity of a belt.
+        stuck = np.asarray(run.modes) == STUCK
+        for belt, held in enumerate(stuck.T):
+            own, its = float(osc.belts[belt].velocity), np.asarray(run.ys)[held, 1]
+            fits = np.allclose(its, own, rtol=SAME_NUMBER, atol=SAME_NUMBER)
+            came = f"one that sticks to belt {belt} at {its[0]:.12g}" if not fits else ""
+            require(fits, "result", f"of the machine, its belt {belt} at velocity {own:.12g}", came)
 
     def variable(dims, values, name, long_name):
         return _variable(dims, values, name, units, long_name)
@@ -181,6 +265,7 @@ def _cycle(cycle: Cycle, machine: Machine) -> "xarray.Dataset":
     import xarray
 
     require(cycle.unknowns.ndim == 2, "result", "one cycle, not a batch", repr(cycle))
+    check_machine(cycle, machine)
     told = {
         "period": ((), cycle.period, "period"),
         "stick_duration": ("belt", cycle.stick_durations, "time stuck to the belt in one loop"),
@@ -200,10 +285,31 @@ def _cycle(cycle: Cycle, machine: Machine) -> "xarray.Dataset":
     return xarray.Dataset(found, {"belt": np.arange(len(machine.belts))}, attrs)
 
 
+def _portrait(portrait: Portrait, machine: Machine) -> "xarray.Dataset":
+    check_machine(portrait, machine)
+    units, table = machine.units, portrait.table()
+    rate = table["rate"].to_numpy(float) / float(units.time)
+    told = {"long_name": "rate at which small motions about it grow", "units": "s-1"}
+    found = _columns(table.drop(columns="rate"), units).assign(rate=("row", rate, told))
+    return found.assign_attrs(status=Status(int(portrait.status)).name)
+
+
+def _shock(shock: FatalShock, machine: Machine) -> "xarray.Dataset":
+    check_machine(shock, machine)
+    table, units = shock.table(), machine.units
+    distance, told = float(shock.distance), {"long_name": "size of the shock"}
+    if shock.direction == "x2":
+        distance, told["units"] = distance * float(units.velocity), SYMBOLS["velocity"]
+    words = ("attractor", "direction", "boundary", "beyond", "status")
+    found = _columns(table.drop(columns=["distance", *words]), units).squeeze("row")
+    attrs = {name: table[name][0] for name in words}
+    return found.assign(distance=((), distance, told)).assign_attrs(attrs)
+
+
 def _fitted(fit: Fit, machine: Machine) -> "xarray.Dataset":
     import xarray
 
-    machine.of_oscillator(fit.oscillator)  # a `ValueError` where it is of another machine
+    check_machine(fit, machine)
     units, table = machine.units, fit.table()
     told = [*(_unit_of(name, fit.oscillator, units) for name in fit.names), *_units_of_start(units)]
     symbols, sizes = zip(*told, strict=True)
@@ -245,14 +351,21 @@ def _units_of_start(units: Units) -> list[tuple[str, float]]:
 
 
 def _along(result: AlongParameter, machine: Any) -> "xarray.Dataset":
-    import xarray
-
     table = result.table()
     values = table["value"].to_numpy(float)
     units, (symbol, size) = units_along(result, values, machine)
+    check_machine(result, machine)
     told = {"long_name": result.name, **({"units": symbol} if symbol else {})}
-    found: dict[str, Any] = {"value": ("row", values * size, told)}
-    for name in map(str, table.columns.drop("value")):
+    rest = _columns(table.drop(columns="value"), units)
+    return rest.assign(value=("row", values * size, told))
+
+
+def _columns(table: "pandas.DataFrame", units: Units) -> "xarray.Dataset":
+    """The columns of a table over `row`, what has a unit in that."""
+    import xarray
+
+    found: dict[str, Any] = {}
+    for name in map(str, table.columns):
         quantity = "stick_duration" if name.startswith("stick_duration_") else name
         if quantity in DIMENSIONS:
             words = name.replace("_", " ")

@@ -32,7 +32,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import as_array, as_whole, check_finite, require, require_value
+from ..checks import as_array, as_whole, check_finite, outside_of_traces, require, require_value
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import simulate
 from ..motion.smoothing import smooth_field
@@ -49,6 +49,8 @@ if TYPE_CHECKING:
 JOIN = 3
 #: Steps of the search, and its learning rate in units of a parameter's size.
 SEARCH_STEPS, LEARNING_RATE = 200, 0.05
+#: How often other starts are searched from until a fit is plausible.
+SEARCHES = 3
 #: A start whose windows are further off than this (chi^2 per datum) is not followed further.
 HOPELESS = 6.0
 #: A fit as bad as this happens once in a million records, by noise.
@@ -120,26 +122,33 @@ def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, st
     return unknown, gradient(unknown)[0]
 
 
-def _first_guesses(selection, u, osc, record: Record, starts: int):
-    """The ends of the search, best first, each with its window starts; near ones count once."""
+def _guesses(selection, u, osc, record: Record, starts: int, tell):
+    """The ends of the search, best first, then those of the same from other starts."""
+    rng, met = np.random.default_rng(0), []
+    for number in range(SEARCHES):
+        again = f"search {number + 1}" if number else "search"
+        tell(f"{again}: {starts} starts, {len(record.starts)} windows of {WINDOW} time units")
+        yield from _ends_of_search(selection, u, osc, record, starts, rng, met)
+
+
+def _ends_of_search(selection, u, osc, record: Record, starts: int, rng, met: list):
+    """Each with its window starts and misfit, the best first; not those near to what was `met`."""
     # The velocity over which tanh changes its sign. Steps of the scheme are stable up to 2.8 over
     # the slope of the friction there; two belts of one velocity double it.
     eps = 0.1 * float(record.scale[1])
     slope = max(float(b.load * b.friction.static * osc.omega) for b in osc.belts) / eps
     steps = 16 * int(np.ceil(float(jnp.max(record.times)) * max(20.0, slope / 1.3) / 16))
-    rng = np.random.default_rng(0)
     spread = rng.standard_normal((starts, u.size + 1))
-    spread[0] = 0.0
+    spread[0] *= bool(met)  # the guess itself, the first time
     first = (jnp.asarray(u + 0.3 * spread[:, :-1]), jnp.asarray(spread[:, -1]))
     found: Any = _adam(first, selection, osc, record, jnp.asarray(eps), steps)
     ends, shifts, misfits = map(np.asarray, jax.tree.leaves(found))
-    chosen: list[int] = []
-    for i in np.argsort(misfits):
-        near = any(np.max(np.abs(ends[i] - ends[j])) < 0.1 for j in chosen)
-        if np.isfinite(misfits[i]) and not near:
-            chosen.append(int(i))
     shift = np.array([float(record.lacks), 0.0])
-    return [(ends[i], np.asarray(record.starts) + shifts[i] * shift, misfits[i]) for i in chosen]
+    for i in np.argsort(misfits):
+        near = any(np.max(np.abs(ends[i] - other)) < 0.1 for other in met)
+        if np.isfinite(misfits[i]) and not near:
+            met.append(ends[i])
+            yield ends[i], np.asarray(record.starts) + shifts[i] * shift, misfits[i]
 
 
 # --- 2 and 3: windows of the exact motion ---------------------------------------------------------
@@ -263,7 +272,8 @@ class Fit(eqx.Module):
     candidates: how many starts were followed; evaluations: of the motion and its Jacobian; status:
     OK, NOT_IDENTIFIED (an infinite standard error), MISFIT (plausibility below 1e-6),
     NO_CONVERGENCE or NOT_FINITE. Standard errors are those of the linearised problem: right where
-    the model is and the errors are small.
+    the model is and the errors are small. With a MISFIT they mean nothing, and `table` and the text
+    leave them out.
     """
 
     oscillator: Oscillator
@@ -291,10 +301,12 @@ class Fit(eqx.Module):
 
     def table(self) -> "pandas.DataFrame":
         """A row for each parameter, and for x1 and x2 at the first time: name, estimate,
-        standard_error, lower, upper (the confidence interval of 95 per cent)."""
+        standard_error, lower, upper (the confidence interval of 95 per cent); these three are NaN
+        where the status is MISFIT."""
         names = (*self.names, "x1 at the start", "x2 at the start")
         estimates = np.concatenate([self.estimates, self.y0])
         errors = np.concatenate([self.standard_errors, self.y0_standard_errors])
+        errors = np.where(int(self.status) == Status.MISFIT, np.nan, errors)
         reach = _standard_errors_in(0.95) * errors
         return table_of(
             {
@@ -313,8 +325,10 @@ class Fit(eqx.Module):
 
     def __repr__(self) -> str:
         status = Status(int(self.status))
+        fits = status != Status.MISFIT
         rows = [
-            f"  {name} = {float(value):.6g} +- {float(error):.2g}"
+            f"  {name} = {float(value):.6g} "
+            + (f"+- {float(error):.2g}" if fits else "(a misfit: without a standard error)")
             for name, value, error in zip(self.names, self.estimates, self.standard_errors)
         ]
         head = (
@@ -331,6 +345,7 @@ def _standard_errors_in(level: float) -> float:
 
 
 @announced("fit")
+@outside_of_traces
 def fit(
     oscillator: Oscillator,
     ts: ArrayLike,
@@ -345,10 +360,11 @@ def fit(
 ) -> Fit:
     """Parameters of an oscillator from a measured record of its motion, with standard errors.
 
-    oscillator: the guess; 30 per cent off is near enough for a stick-slip record of many loops.
-    ts: the times, increasing, [samples]; x1, x2: displacement, velocity, or both, [samples], NaN
-    where a datum is missing. All dimensionless, as in `simulate`. The start of the motion, its
-    state at ts[0], is estimated too.
+    oscillator: the guess. How near it has to be depends on the record and on which parameters trade
+    with each other; 20 per cent off is mostly near enough. The status MISFIT may mean that it was
+    not: give a nearer one, or more starts. ts: the times, increasing, [samples]; x1, x2:
+    displacement, velocity, or both, [samples], NaN where a datum is missing. All dimensionless, as
+    in `simulate`. The start of the motion, its state at ts[0], is estimated too.
 
     where: selects the parameters, as in `equinox.tree_at`: a tuple with one entry each. An entry is
     a number of the oscillator, or a tuple of numbers that are to be equal:
@@ -359,7 +375,8 @@ def fit(
     estimates it from how far neighbouring data scatter about a smooth curve. bounds: for each
     parameter (lower, upper) or None, which keeps positive what cannot be negative; a parameter
     stays inside by reparametrisation, so an estimate at a bound is one that wants to leave. starts:
-    of the search, spread about the guess. report: is told of the progress, too, a line at a time,
+    of the search, spread about the guess; where none leads to a plausible fit, it is repeated from
+    as many others, twice. report: is told of the progress, too, a line at a time,
     such as `print`.
 
     What can be told from a record: the velocity of a belt that the mass sticks to, its static
@@ -379,9 +396,8 @@ def fit(
     data = int(np.sum(np.isfinite(values)))
     freedom = data - u.size - 2
     require(freedom > 0, "ts", f"more data than the {u.size + 2} unknowns", data)
-    tell(f"search: {starts} starts, {len(record.starts)} windows of {WINDOW} time units")
     best, count, evaluations = None, 0, 0
-    for guess, states, misfit in _first_guesses(selection, u, oscillator, record, starts):
+    for guess, states, misfit in _guesses(selection, u, oscillator, record, starts, tell):
         count += 1
         tell(f"candidate {count}: misfit {misfit:.3g} of the smooth formulation")
         point, joined = _follow_up(linearized, guess, states, data, tell)
