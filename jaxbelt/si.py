@@ -79,7 +79,7 @@ def in_si(
         BasinFractions,
         "xarray.Dataset",
     ],
-    machine: Machine | Callable[..., Machine],
+    machine: Machine | Units | Callable[..., Machine | Units],
 ) -> "xarray.Dataset":
     """A result in SI units, as a dataset whose variables carry their units.
 
@@ -90,7 +90,9 @@ def in_si(
     returns it, for its units may be others in each run. `ValueError` where that of the machine is
     not the oscillator of the result, but for what was fitted or varied. Trajectories, basin
     stabilities and fractions, and datasets keep none: of the first only the velocity at which it
-    sticks is compared, of the others nothing.
+    sticks is compared, of the others nothing. `machine.units` in place of the machine takes its
+    units alone and compares nothing, for an oscillator with other numbers in the same units; then
+    a trajectory comes without `force`.
 
     Of a trajectory: `t` in s, `x1` in m, `x2` in m/s, `force`, the friction on the mass, in N
     (exact formulation only), and `mode` at each sample; `t_event`, `x1_event`, `x2_event`,
@@ -116,20 +118,20 @@ def in_si(
 
     match result:
         case Trajectory():
-            return _trajectory(result, _one(machine))
+            return _trajectory(result, machine)
         case Cycle():
-            return _cycle(result, _one(machine))
+            return _cycle(result, machine)
         case Portrait():
-            return _portrait(result, _one(machine))
+            return _portrait(result, machine)
         case FatalShock():
-            return _shock(result, _one(machine))
+            return _shock(result, machine)
         case Basins():
             check_machine(result, machine)
             return _dataset(result.dataset, machine)
         case BasinStability():
-            return _columns(result.table(), _one(machine).units)
+            return _columns(result.table(), units_of(machine))
         case Fit():
-            return _fitted(result, _one(machine))
+            return _fitted(result, machine)
         case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
             return _along(result, machine)
         case xarray.Dataset():
@@ -144,27 +146,26 @@ def in_si(
     )
 
 
-def _one(machine: Any) -> Machine:
-    require(isinstance(machine, Machine), "machine", "a Machine", repr(machine))
-    return machine
+def units_of(machine: Any) -> Units:
+    """The units of a machine, or these themselves; `ValueError` for anything else."""
+    require(isinstance(machine, Machine | Units), "machine", "a Machine", repr(machine))
+    return machine if isinstance(machine, Units) else machine.units
 
 
 def check_machine(result: Any, machine: Any) -> None:
     """Raise a `ValueError` where a result keeps its oscillator, and that of the machine is another.
 
     What was fitted, or varied along a path, may be; of a function the one at the first value is
-    compared.
+    compared. Of units alone nothing is.
     """
     free: set[str] = set()
-    if isinstance(result, BifurcationDiagram | OrbitDiagram):
-        free = {result.name}
-        if result.is_argument:
-            machine = machine(**{result.name: _first_value(result)})
     match result:
-        case BifurcationDiagram():
-            osc = result.oscillator
-        case OrbitDiagram() if result.sampling is not None:
-            osc = result.sampling.variation.oscillator(np.array([_first_value(result)]))
+        case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
+            osc, free = _at_first_value(result), {result.name}
+            if osc is None:
+                return
+            if result.is_argument:
+                machine = machine(**{result.name: _first_value(result)})
         case Fit():
             osc = result.oscillator
             free = {name for tied in result.names for name in tied.split(" = ")}
@@ -184,12 +185,22 @@ def check_machine(result: Any, machine: Any) -> None:
     for name, value in other.items():
         fits = name in free or np.allclose(one[name], value, rtol=SAME_NUMBER, atol=0)
         expected = f"the one of the result, whose oscillator has {name} = {value:.12g}"
-        require(fits, "machine", expected, f"{one[name]:.12g}")
+        came = f"{one[name]:.12g}; in place of it machine.units takes its units alone"
+        require(fits, "machine", expected, came)
 
 
-def _first_value(result: BifurcationDiagram | OrbitDiagram) -> float:
-    first = result.values if isinstance(result, OrbitDiagram) else np.ravel(result.regions[0][:1])
-    return float(first[0])
+def _first_value(result: BifurcationDiagram | OrbitDiagram | BasinFractions) -> float:
+    is_diagram = isinstance(result, BifurcationDiagram)
+    return float(result.regions[0][0] if is_diagram else result.values[0])
+
+
+def _at_first_value(result: AlongParameter) -> Oscillator | None:
+    """The oscillator of a result at the first value of its parameter, where it keeps one."""
+    if isinstance(result, BifurcationDiagram):
+        return result.oscillator
+    if isinstance(result, OrbitDiagram) and result.sampling is not None:
+        return result.sampling.variation.oscillator(np.array([_first_value(result)]))
+    return None
 
 
 def _numbers_of(osc: Oscillator) -> dict[str, float]:
@@ -219,21 +230,15 @@ def _friction_force(osc: Oscillator, codes: Array, ys: Array) -> Array:
     return jax.vmap(at)(codes.astype(jnp.float64), ys)
 
 
-def _trajectory(run: Trajectory, machine: Machine) -> "xarray.Dataset":
+def _trajectory(run: Trajectory, machine: Machine | Units) -> "xarray.Dataset":
     import xarray
 
-    units, osc = machine.units, machine.oscillator
+    units, belts = units_of(machine), run.modes.shape[-1]
     require(run.ts.ndim == 1, "result", "one trajectory, not a batch", repr(run))
-    belts = len(osc.belts)
-    require(run.modes.shape[-1] == belts, "result", f"of a machine of {belts} belts", repr(run))
-    if run.arcs.t.size:
-        # A trajectory keeps no oscillator, but where it sticks it has the velocity of a belt.
-        stuck = np.asarray(run.modes) == STUCK
-        for belt, held in enumerate(stuck.T):
-            own, its = float(osc.belts[belt].velocity), np.asarray(run.ys)[held, 1]
-            fits = np.allclose(its, own, rtol=SAME_NUMBER, atol=SAME_NUMBER)
-            came = f"one that sticks to belt {belt} at {its[0]:.12g}" if not fits else ""
-            require(fits, "result", f"of the machine, its belt {belt} at velocity {own:.12g}", came)
+    if isinstance(machine, Machine):
+        own = len(machine.belts)
+        require(belts == own, "result", f"of a machine of {own} belts", repr(run))
+        _check_sticking(run, machine.oscillator)
 
     def variable(dims, values, name, long_name):
         return _variable(dims, values, name, units, long_name)
@@ -253,17 +258,30 @@ def _trajectory(run: Trajectory, machine: Machine) -> "xarray.Dataset":
         ),
         "event_belt": ("event", np.asarray(events.belt), {"long_name": "belt of the event"}),
     }
-    if run.arcs.t.size:
-        force = _friction_force(osc, run.modes, run.ys)
+    if run.arcs.t.size and isinstance(machine, Machine):
+        force = _friction_force(machine.oscillator, run.modes, run.ys)
         found["force"] = variable("t", force, "force", "friction on the mass")
     time = variable("t", run.ts, "t", "time")
     attrs = {"status": Status(int(run.status)).name}
     return xarray.Dataset(found, {"t": time, "belt": np.arange(belts)}, attrs)
 
 
-def _cycle(cycle: Cycle, machine: Machine) -> "xarray.Dataset":
+def _check_sticking(run: Trajectory, osc: Oscillator) -> None:
+    """Raise where a trajectory, which keeps no oscillator, sticks at another belt's velocity."""
+    if not run.arcs.t.size:
+        return
+    stuck = np.asarray(run.modes) == STUCK
+    for belt, held in enumerate(stuck.T):
+        own, its = float(osc.belts[belt].velocity), np.asarray(run.ys)[held, 1]
+        fits = np.allclose(its, own, rtol=SAME_NUMBER, atol=SAME_NUMBER)
+        came = f"one that sticks to belt {belt} at {its[0]:.12g}" if not fits else ""
+        require(fits, "result", f"of the machine, its belt {belt} at velocity {own:.12g}", came)
+
+
+def _cycle(cycle: Cycle, machine: Machine | Units) -> "xarray.Dataset":
     import xarray
 
+    units = units_of(machine)
     require(cycle.unknowns.ndim == 2, "result", "one cycle, not a batch", repr(cycle))
     check_machine(cycle, machine)
     told = {
@@ -276,27 +294,26 @@ def _cycle(cycle: Cycle, machine: Machine) -> "xarray.Dataset":
         "amplitude": ((), (cycle.x1_max - cycle.x1_min) / 2, "half of the span of displacement"),
         "energy": ((), energy_dissipated(cycle), "energy dissipated in one period"),
     }
-    units = machine.units
     found = {
         name: _variable(dims, values, name, units, long_name)
         for name, (dims, values, long_name) in told.items()
     }
     attrs = {"status": Status(int(cycle.status)).name}
-    return xarray.Dataset(found, {"belt": np.arange(len(machine.belts))}, attrs)
+    return xarray.Dataset(found, {"belt": np.arange(len(cycle.oscillator.belts))}, attrs)
 
 
-def _portrait(portrait: Portrait, machine: Machine) -> "xarray.Dataset":
+def _portrait(portrait: Portrait, machine: Machine | Units) -> "xarray.Dataset":
     check_machine(portrait, machine)
-    units, table = machine.units, portrait.table()
+    units, table = units_of(machine), portrait.table()
     rate = table["rate"].to_numpy(float) / float(units.time)
     told = {"long_name": "rate at which small motions about it grow", "units": "s-1"}
     found = _columns(table.drop(columns="rate"), units).assign(rate=("row", rate, told))
     return found.assign_attrs(status=Status(int(portrait.status)).name)
 
 
-def _shock(shock: FatalShock, machine: Machine) -> "xarray.Dataset":
+def _shock(shock: FatalShock, machine: Machine | Units) -> "xarray.Dataset":
     check_machine(shock, machine)
-    table, units = shock.table(), machine.units
+    table, units = shock.table(), units_of(machine)
     distance, told = float(shock.distance), {"long_name": "size of the shock"}
     if shock.direction == "x2":
         distance, told["units"] = distance * float(units.velocity), SYMBOLS["velocity"]
@@ -306,11 +323,11 @@ def _shock(shock: FatalShock, machine: Machine) -> "xarray.Dataset":
     return found.assign(distance=((), distance, told)).assign_attrs(attrs)
 
 
-def _fitted(fit: Fit, machine: Machine) -> "xarray.Dataset":
+def _fitted(fit: Fit, machine: Machine | Units) -> "xarray.Dataset":
     import xarray
 
     check_machine(fit, machine)
-    units, table = machine.units, fit.table()
+    units, table = units_of(machine), fit.table()
     told = [*(_unit_of(name, fit.oscillator, units) for name in fit.names), *_units_of_start(units)]
     symbols, sizes = zip(*told, strict=True)
     columns = ("estimate", "standard_error", "lower", "upper")
@@ -386,9 +403,12 @@ def units_along(
     if result.is_argument:
         given = {result.name: values}
         expected = f"a function of {result.name} that returns the Machine at a value of it"
-        require(not isinstance(machine, Machine), "machine", expected, "one Machine")
+        require(not isinstance(machine, Machine | Units), "machine", expected, "one Machine")
         return _units_at(machine, given), ("", 1.0)
-    units, osc = _one(machine).units, machine.oscillator
+    units, osc = units_of(machine), _at_first_value(result)
+    if isinstance(machine, Machine):
+        osc = machine.oscillator
+    require(osc is not None, "machine", "a Machine, as the result keeps no oscillator", "its units")
     name, belts = result.name, len(osc.belts)
     belt = name.removeprefix("belts[").partition("]")[0] if name.startswith("belts[") else "0"
     require(int(belt) < belts, "machine", f"of a belt {belt}, of which result is", f"{belts} belts")
@@ -431,10 +451,10 @@ def _units_of_runs(dataset: "xarray.Dataset", machine: Any, own: list[str]) -> U
     """The units of every run, arrays over the axes that are not starts."""
     import xarray
 
-    if isinstance(machine, Machine):
+    if isinstance(machine, Machine | Units):
         expected = f"a function of {', '.join(own)} that returns the Machine of a run"
         require(not own, "machine", expected, "one Machine")
-        return jax.tree.map(np.asarray, machine.units)
+        return jax.tree.map(np.asarray, units_of(machine))
     if not own:
         return _units_at(machine, {})
     grid = xarray.broadcast(*(dataset[name] for name in own))
@@ -455,8 +475,9 @@ def _units_at(machine: Any, values: Mapping[str, np.ndarray]) -> Units:
 
     def units(arguments):
         found = machine(**arguments)
-        require(isinstance(found, Machine), "machine", "a function that returns a Machine", found)
-        return found.units
+        fits = isinstance(found, Machine | Units)
+        require(fits, "machine", "a function that returns a Machine", found)
+        return units_of(found)
 
     given = {name: jnp.asarray(column) for name, column in values.items()}
     return jax.tree.map(np.asarray, jax.vmap(units)(given) if given else units(given))

@@ -375,6 +375,7 @@ MISTAKES = [
     ("jax.jit(lambda one: jb.in_si(cycle, one))(machine)", "machine" + TRACED),
     # --- pictures
     ("jb.plot_friction_law(osc)", r"friction must be a law .*, got Oscillator\("),
+    ("jb.plot_friction_law(law, unit=3)", 'unit must be a text such as "m/s", got 3'),
     ("jb.plot_time_history(osc)", r"trajectory must be a Trajectory, .*, got Oscillator\("),
     ("jb.plot_phase_portrait((), osc)", OSC + r"\(\)"),
     ("jb.plot_phase_portrait(osc, osc)", r"trajectories must be .*, got Oscillator\("),

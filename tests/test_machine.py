@@ -79,6 +79,8 @@ def test_friction_force(run):
 def test_a_trajectory_of_another_machine(run):
     with pytest.raises(ValueError, match=r"its belt 0 at velocity 0\.189.*sticks .* at 0\.126"):
         jb.in_si(run, machine(0.03))
+    alone, whole = jb.in_si(run, machine(0.03).units), jb.in_si(run, machine())
+    assert alone.identical(whole.drop_vars("force"))
 
 
 def test_a_portrait_and_a_shock_in_si():
@@ -129,6 +131,9 @@ def test_a_cycle_in_si():
         for bring in (jb.in_si, jb.plot_in_si):
             with pytest.raises(ValueError, match=f"machine must be the one of the result.*{told}"):
                 bring(cycle, wrong)
+    # In other units, but of whatever motion.
+    assert float(jb.in_si(cycle, machine(0.03).units).period) == float(ours.period)
+    assert jb.plot_in_si(cycle, machine(0.03).units).get_xlabel() == "displacement $X$ (m)"
     one = jb.Machine(MASS, STIFFNESS, DAMPING, m.belts[:1])
     with pytest.raises(ValueError, match="machine must be of 2 belts, got 1 belts"):
         jb.in_si(cycle, one)
@@ -205,6 +210,16 @@ def test_a_fit_in_si():
     assert np.allclose(ours.x1, np.array([1, 3, 5]) * length) and ours.x1.units == "m"
     assert np.allclose(ours.x2_residual, np.array([0.02, 0.04, 0.06]) * length / time)
     assert np.allclose(ours.t, np.linspace(0, 1, 3) * time) and ours.t.units == "s"
+
+
+def test_a_misfit_tells_no_standard_errors():
+    """They would be those of a motion that is not that of the record."""
+    good = fit_of(machine().oscillator, damping=0.1)
+    bad = dataclasses.replace(good, status=jnp.asarray(jb.Status.MISFIT.value))
+    assert "damping = 0.1 +- 0.01" in repr(good) and not good.table().isna().any().any()
+    assert "damping = 0.1 (a misfit: without a standard error)" in repr(bad)
+    told = bad.table().set_index("name").loc["damping"]
+    assert told.estimate == 0.1 and told.drop("estimate").isna().all()
 
 
 def test_a_fit_of_a_law_of_ones_own_and_of_tied_parameters_in_si():
@@ -399,6 +414,9 @@ def test_results_along_a_parameter_in_si():
         shown = [float(label.get_text()) for label in ax.get_xticklabels()]
         assert np.allclose(shown, ax.get_xticks() * length / time, rtol=1e-5)
     diagram = along()[2]
+    assert jb.in_si(diagram, m.units).identical(jb.in_si(diagram, m))
+    with pytest.raises(ValueError, match="as the result keeps no oscillator, got its units"):
+        jb.in_si(along()[0], m.units)
     assert jb.in_si(diagram, m).stick_duration_1.units == "s"
     assert jb.plot_in_si(diagram, m, quantity="x1").get_ylabel() == "displacement $X$ (m)"
     root = np.sqrt(STIFFNESS * MASS)
@@ -419,6 +437,7 @@ def test_a_parameter_of_a_function_stays_as_the_function_takes_it():
         assert np.allclose(ours[name], table[name] * lengths, equal_nan=True)
         with pytest.raises(ValueError, match="machine must be a function of N that returns"):
             jb.in_si(one, machine())
+        assert jb.in_si(one, lambda N: machine(0.02, 10 * N).units).identical(ours)
         with pytest.raises(ValueError, match=r"no unit depends .* got along N"):
             jb.plot_in_si(one, lambda N: machine(0.02, 10 * N))
         with pytest.raises(ValueError, match=r"machine must be a function of N .* 'V'"):

@@ -12,8 +12,8 @@ from matplotlib.axis import Axis
 from matplotlib.ticker import AutoLocator, FuncFormatter
 
 from ..checks import require
-from ..model.machine import Machine, Units
-from ..si import AlongParameter, check_machine, units_along
+from ..model.machine import Units
+from ..si import AlongParameter, check_machine, units_along, units_of
 from .draw import draw_result
 from .style import figure_of, in_fractions, parameter_label
 
@@ -54,8 +54,9 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
 
     result: of the machine's oscillator, anything that has a `.plot()`, drawn into the axes (None:
     new ones); or the axes, one or several, that another function of this package has drawn into.
-    machine: the `Machine`; for a diagram or fractions along the argument of a function, a function
-    of that which returns it. options: of that `.plot()`. Returns the axes.
+    machine: the `Machine`, or its units alone, see `in_si`; for a diagram or fractions along the
+    argument of a function, a function of that which returns it. options: of that `.plot()`. Returns
+    the axes.
 
     The parameter of a diagram or of fractions is in SI units, too: that of a function's argument as
     the function takes it, whose unit only you know: `ax.set_xlabel("belt velocity $V$ (m/s)")`.
@@ -88,9 +89,8 @@ def _units_of(result: Any, machine: Any) -> tuple[Units, tuple[float, str] | Non
     """The units of a picture; and of its parameter what 1 is, and its label, where it has one that
     is not in SI units anyway."""
     if not isinstance(result, AlongParameter):
-        require(isinstance(machine, Machine), "machine", "a Machine", repr(machine))
         check_machine(result, machine)
-        return machine.units, None
+        return units_of(machine), None
     values = result.table()["value"].to_numpy(float)
     units, (symbol, size) = units_along(result, values, machine)
     check_machine(result, machine)
