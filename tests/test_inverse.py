@@ -126,30 +126,26 @@ def test_velocities_with_gaps_and_unknown_noise(motion):
 
 
 @pytest.mark.slow
-def test_other_starts_are_tried_where_the_first_lead_to_no_plausible_fit():
-    """A guess from which the first eight lead astray: 22, 20 and 25 per cent off."""
+def test_windows_that_creep_along_a_valley_are_followed_to_its_end():
+    """A guess 22, 20 and 25 per cent off, from which chi^2 falls slowly: it was given up."""
 
     def belt(*law):
         return jb.Oscillator(0.1, (jb.Belt(0.3, jb.Stribeck(*law)),))
 
     truth, ts = np.array([0.9, 0.5, 0.4]), np.linspace(0.0, 60.0, 400)
-    x1 = jb.simulate(belt(*truth), (1.0, 0.0), 60.0, ts=ts).ys[:, 0]
-    x1 = x1 + 1e-2 * np.random.default_rng(0).standard_normal(400)
-    told: list[str] = []
+    x1 = jb.simulate(belt(*truth), (1.2, 0.0), 60.0, ts=ts).ys[:, 0]
+    x1 = x1 + 1e-2 * np.random.default_rng(1).standard_normal(400)
+    words = ("static", "kinetic", "velocity")
     result = jb.fit(
         belt(1.1, 0.4, 0.3),
         ts,
         x1,
         noise=1e-2,
-        where=lambda o: tuple(
-            getattr(o.belts[0].friction, name) for name in ("static", "kinetic", "velocity")
-        ),
-        report=told.append,
+        where=lambda o: tuple(getattr(o.belts[0].friction, name) for name in words),
     )
     assert result.status == Status.OK, result
     off = np.abs(np.asarray(result.estimates) - truth)
     assert np.all(off < 5 * np.asarray(result.standard_errors))
-    assert any(line.startswith("search 2") for line in told)
 
 
 @pytest.mark.slow(first=True)

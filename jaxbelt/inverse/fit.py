@@ -49,8 +49,6 @@ if TYPE_CHECKING:
 JOIN = 3
 #: Steps of the search, and its learning rate in units of a parameter's size.
 SEARCH_STEPS, LEARNING_RATE = 200, 0.05
-#: How often other starts are searched from until a fit is plausible.
-SEARCHES = 3
 #: A start whose windows are further off than this (chi^2 per datum) is not followed further.
 HOPELESS = 6.0
 #: A fit as bad as this happens once in a million records, by noise.
@@ -122,33 +120,26 @@ def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, st
     return unknown, gradient(unknown)[0]
 
 
-def _guesses(selection, u, osc, record: Record, starts: int, tell):
-    """The ends of the search, best first, then those of the same from other starts."""
-    rng, met = np.random.default_rng(0), []
-    for number in range(SEARCHES):
-        again = f"search {number + 1}" if number else "search"
-        tell(f"{again}: {starts} starts, {len(record.starts)} windows of {WINDOW} time units")
-        yield from _ends_of_search(selection, u, osc, record, starts, rng, met)
-
-
-def _ends_of_search(selection, u, osc, record: Record, starts: int, rng, met: list):
-    """Each with its window starts and misfit, the best first; not those near to what was `met`."""
+def _first_guesses(selection, u, osc, record: Record, starts: int):
+    """The ends of the search, best first, each with its window starts; near ones count once."""
     # The velocity over which tanh changes its sign. Steps of the scheme are stable up to 2.8 over
     # the slope of the friction there; two belts of one velocity double it.
     eps = 0.1 * float(record.scale[1])
     slope = max(float(b.load * b.friction.static * osc.omega) for b in osc.belts) / eps
     steps = 16 * int(np.ceil(float(jnp.max(record.times)) * max(20.0, slope / 1.3) / 16))
+    rng = np.random.default_rng(0)
     spread = rng.standard_normal((starts, u.size + 1))
-    spread[0] *= bool(met)  # the guess itself, the first time
+    spread[0] = 0.0
     first = (jnp.asarray(u + 0.3 * spread[:, :-1]), jnp.asarray(spread[:, -1]))
     found: Any = _adam(first, selection, osc, record, jnp.asarray(eps), steps)
     ends, shifts, misfits = map(np.asarray, jax.tree.leaves(found))
-    shift = np.array([float(record.lacks), 0.0])
+    chosen: list[int] = []
     for i in np.argsort(misfits):
-        near = any(np.max(np.abs(ends[i] - other)) < 0.1 for other in met)
+        near = any(np.max(np.abs(ends[i] - ends[j])) < 0.1 for j in chosen)
         if np.isfinite(misfits[i]) and not near:
-            met.append(ends[i])
-            yield ends[i], np.asarray(record.starts) + shifts[i] * shift, misfits[i]
+            chosen.append(int(i))
+    shift = np.array([float(record.lacks), 0.0])
+    return [(ends[i], np.asarray(record.starts) + shifts[i] * shift, misfits[i]) for i in chosen]
 
 
 # --- 2 and 3: windows of the exact motion ---------------------------------------------------------
@@ -360,11 +351,11 @@ def fit(
 ) -> Fit:
     """Parameters of an oscillator from a measured record of its motion, with standard errors.
 
-    oscillator: the guess. How near it has to be depends on the record and on which parameters trade
-    with each other; 20 per cent off is mostly near enough. The status MISFIT may mean that it was
-    not: give a nearer one, or more starts. ts: the times, increasing, [samples]; x1, x2:
-    displacement, velocity, or both, [samples], NaN where a datum is missing. All dimensionless, as
-    in `simulate`. The start of the motion, its state at ts[0], is estimated too.
+    oscillator: the guess; 30 per cent off is mostly near enough for a stick-slip record of many
+    loops. The status MISFIT may mean that it was not: give a nearer one, or more starts. ts: the
+    times, increasing, [samples]; x1, x2: displacement, velocity, or both, [samples], NaN where a
+    datum is missing. All dimensionless, as in `simulate`. The start of the motion, its state at
+    ts[0], is estimated too.
 
     where: selects the parameters, as in `equinox.tree_at`: a tuple with one entry each. An entry is
     a number of the oscillator, or a tuple of numbers that are to be equal:
@@ -375,8 +366,7 @@ def fit(
     estimates it from how far neighbouring data scatter about a smooth curve. bounds: for each
     parameter (lower, upper) or None, which keeps positive what cannot be negative; a parameter
     stays inside by reparametrisation, so an estimate at a bound is one that wants to leave. starts:
-    of the search, spread about the guess; where none leads to a plausible fit, it is repeated from
-    as many others, twice. report: is told of the progress, too, a line at a time,
+    of the search, spread about the guess. report: is told of the progress, too, a line at a time,
     such as `print`.
 
     What can be told from a record: the velocity of a belt that the mass sticks to, its static
@@ -396,8 +386,9 @@ def fit(
     data = int(np.sum(np.isfinite(values)))
     freedom = data - u.size - 2
     require(freedom > 0, "ts", f"more data than the {u.size + 2} unknowns", data)
+    tell(f"search: {starts} starts, {len(record.starts)} windows of {WINDOW} time units")
     best, count, evaluations = None, 0, 0
-    for guess, states, misfit in _guesses(selection, u, oscillator, record, starts, tell):
+    for guess, states, misfit in _first_guesses(selection, u, oscillator, record, starts):
         count += 1
         tell(f"candidate {count}: misfit {misfit:.3g} of the smooth formulation")
         point, joined = _follow_up(linearized, guess, states, data, tell)
@@ -458,6 +449,10 @@ def _follow_up(linearized, u, starts, data: int, tell) -> tuple[_Point, bool]:
         last = every >= pieces
         point = _fit_windows(linearized, u, starts, fresh, 0.0 if last else 3e-3)
         spent += point.evaluations
+        if every == 1 and not point.chi2 < HOPELESS * data:
+            # It may but creep along a valley.
+            point = _fit_windows(linearized, point.u, point.starts, fresh, 0.0)
+            spent += point.evaluations
         tell(f"  {np.sum(fresh)} windows: chi^2 per datum {point.chi2 / data:.3f}")
         hopeless = not point.chi2 < HOPELESS * data
         if last or (every == 1 and hopeless):
