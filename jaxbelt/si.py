@@ -58,7 +58,7 @@ UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
 }
 #: Numbers of a machine's oscillator and of a result's that differ by less, relative to their size,
 #: are the same: those of the one may have been computed in another way.
-SAME_NUMBER = 1e-9
+SAME_MACHINE = 1e-9
 #: Results along a parameter.
 AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
 SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
@@ -122,14 +122,14 @@ def in_si(
         case Cycle():
             return _cycle(result, machine)
         case Portrait():
-            return _portrait(result, machine)
+            return _of_portrait(result, machine)
         case FatalShock():
-            return _shock(result, machine)
+            return _of_shock(result, machine)
         case Basins():
             check_machine(result, machine)
             return _dataset(result.dataset, machine)
         case BasinStability():
-            return _columns(result.table(), units_of(machine))
+            return _rows_in_units(result.table(), units_of(machine))
         case Fit():
             return _fitted(result, machine)
         case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
@@ -183,7 +183,7 @@ def check_machine(result: Any, machine: Any) -> None:
     for name in one.keys() | other.keys():
         require(name in one and name in other, "machine", "with the laws of the result", machine)
     for name, value in other.items():
-        fits = name in free or np.allclose(one[name], value, rtol=SAME_NUMBER, atol=0)
+        fits = name in free or np.allclose(one[name], value, rtol=SAME_MACHINE, atol=0)
         expected = f"the one of the result, whose oscillator has {name} = {value:.12g}"
         came = f"{one[name]:.12g}; in place of it machine.units takes its units alone"
         require(fits, "machine", expected, came)
@@ -273,7 +273,7 @@ def _check_sticking(run: Trajectory, osc: Oscillator) -> None:
     stuck = np.asarray(run.modes) == STUCK
     for belt, held in enumerate(stuck.T):
         own, its = float(osc.belts[belt].velocity), np.asarray(run.ys)[held, 1]
-        fits = np.allclose(its, own, rtol=SAME_NUMBER, atol=SAME_NUMBER)
+        fits = np.allclose(its, own, rtol=SAME_MACHINE, atol=SAME_MACHINE)
         came = f"one that sticks to belt {belt} at {its[0]:.12g}" if not fits else ""
         require(fits, "result", f"of the machine, its belt {belt} at velocity {own:.12g}", came)
 
@@ -302,23 +302,23 @@ def _cycle(cycle: Cycle, machine: Machine | Units) -> "xarray.Dataset":
     return xarray.Dataset(found, {"belt": np.arange(len(cycle.oscillator.belts))}, attrs)
 
 
-def _portrait(portrait: Portrait, machine: Machine | Units) -> "xarray.Dataset":
+def _of_portrait(portrait: Portrait, machine: Machine | Units) -> "xarray.Dataset":
     check_machine(portrait, machine)
     units, table = units_of(machine), portrait.table()
     rate = table["rate"].to_numpy(float) / float(units.time)
     told = {"long_name": "rate at which small motions about it grow", "units": "s-1"}
-    found = _columns(table.drop(columns="rate"), units).assign(rate=("row", rate, told))
+    found = _rows_in_units(table.drop(columns="rate"), units).assign(rate=("row", rate, told))
     return found.assign_attrs(status=Status(int(portrait.status)).name)
 
 
-def _shock(shock: FatalShock, machine: Machine | Units) -> "xarray.Dataset":
+def _of_shock(shock: FatalShock, machine: Machine | Units) -> "xarray.Dataset":
     check_machine(shock, machine)
     table, units = shock.table(), units_of(machine)
     distance, told = float(shock.distance), {"long_name": "size of the shock"}
     if shock.direction == "x2":
         distance, told["units"] = distance * float(units.velocity), SYMBOLS["velocity"]
     words = ("attractor", "direction", "boundary", "beyond", "status")
-    found = _columns(table.drop(columns=["distance", *words]), units).squeeze("row")
+    found = _rows_in_units(table.drop(columns=["distance", *words]), units).squeeze("row")
     attrs = {name: table[name][0] for name in words}
     return found.assign(distance=((), distance, told)).assign_attrs(attrs)
 
@@ -373,11 +373,11 @@ def _along(result: AlongParameter, machine: Any) -> "xarray.Dataset":
     units, (symbol, size) = units_along(result, values, machine)
     check_machine(result, machine)
     told = {"long_name": result.name, **({"units": symbol} if symbol else {})}
-    rest = _columns(table.drop(columns="value"), units)
+    rest = _rows_in_units(table.drop(columns="value"), units)
     return rest.assign(value=("row", values * size, told))
 
 
-def _columns(table: "pandas.DataFrame", units: Units) -> "xarray.Dataset":
+def _rows_in_units(table: "pandas.DataFrame", units: Units) -> "xarray.Dataset":
     """The columns of a table over `row`, what has a unit in that."""
     import xarray
 

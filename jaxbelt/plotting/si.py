@@ -64,7 +64,7 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     no axis can be converted, as in the picture of a sweep (draw what `in_si` returns instead),
     where the units vary along the parameter, and for a wrong argument.
     """
-    units, parameter = _units_of(result, machine)
+    units, parameter = _units_of_picture(result, machine)
     several = isinstance(result, Sequence) and all(isinstance(one, Axes) for one in result)
     is_drawn = isinstance(result, Axes) or several
     axes: Any = result if is_drawn else draw_result(result, ax, **options)
@@ -85,7 +85,7 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     return axes
 
 
-def _units_of(result: Any, machine: Any) -> tuple[Units, tuple[float, str] | None]:
+def _units_of_picture(result: Any, machine: Any) -> tuple[Units, tuple[float, str] | None]:
     """The units of a picture; and of its parameter what 1 is, and its label, where it has one that
     is not in SI units anyway."""
     if not isinstance(result, AlongParameter):
