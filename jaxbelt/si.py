@@ -116,22 +116,23 @@ def in_si(
     """
     import xarray
 
+    one: Any = machine  # what it is, is asked where it is used
     match result:
         case Trajectory():
-            return _trajectory(result, machine)
+            return _trajectory(result, one)
         case Cycle():
-            return _cycle(result, machine)
+            return _cycle(result, one)
         case Portrait():
-            return _of_portrait(result, machine)
+            return _of_portrait(result, one)
         case FatalShock():
-            return _of_shock(result, machine)
+            return _of_shock(result, one)
         case Basins():
             check_machine(result, machine)
             return _dataset(result.dataset, machine)
         case BasinStability():
             return _rows_in_units(result.table(), units_of(machine))
         case Fit():
-            return _fitted(result, machine)
+            return _fitted(result, one)
         case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
             return _along(result, machine)
         case xarray.Dataset():
@@ -405,9 +406,8 @@ def units_along(
         expected = f"a function of {result.name} that returns the Machine at a value of it"
         require(not isinstance(machine, Machine | Units), "machine", expected, "one Machine")
         return _units_at(machine, given), ("", 1.0)
-    units, osc = units_of(machine), _at_first_value(result)
-    if isinstance(machine, Machine):
-        osc = machine.oscillator
+    units, kept = units_of(machine), _at_first_value(result)
+    osc: Any = machine.oscillator if isinstance(machine, Machine) else kept
     require(osc is not None, "machine", "a Machine, as the result keeps no oscillator", "its units")
     name, belts = result.name, len(osc.belts)
     belt = name.removeprefix("belts[").partition("]")[0] if name.startswith("belts[") else "0"
