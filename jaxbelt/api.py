@@ -4,7 +4,11 @@
 is asked for, so that the command line answers at once what it can answer without computing.
 """
 
-from typing import TYPE_CHECKING
+import inspect
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from jaxtyping import ArrayLike
 
 from . import presets
 from .activity import show_progress
@@ -166,3 +170,34 @@ __all__ = [
     "unstable_cycle",
     "verify",
 ]
+
+
+class _Words:
+    """An annotation as `help` shows it."""
+
+    def __init__(self, text: str):
+        self.text = text
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+def _let_help_be_read(function: Callable) -> None:
+    """Let `help` say ArrayLike, not what that is, which takes more room than all the rest."""
+    signature = inspect.signature(function)
+    arrays = inspect.formatannotation(ArrayLike).removeprefix("Union[").removesuffix("]")
+
+    def in_words(annotation: Any) -> Any:
+        text = inspect.formatannotation(annotation)
+        short = text.replace(f"Union[{arrays}]", "ArrayLike").replace(arrays, "ArrayLike")
+        return annotation if short == text else _Words(short)
+
+    parameters = [
+        one.replace(annotation=in_words(one.annotation)) for one in signature.parameters.values()
+    ]
+    function.__dict__["__signature__"] = signature.replace(parameters=parameters)
+
+
+for _name in __all__:
+    if inspect.isfunction(_one := globals().get(_name)):
+        _let_help_be_read(_one)

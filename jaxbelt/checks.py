@@ -6,6 +6,7 @@ known, so only their dtype and shape are checked there; results then carry a sta
 of an exception.
 """
 
+import functools
 import inspect
 import operator
 import os
@@ -19,7 +20,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from .numerics.compiling import is_concrete, require_own_threads
+from .numerics.compiling import is_concrete, is_outermost, require_own_threads
 from .spelling import did_you_mean
 
 TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
@@ -181,6 +182,26 @@ def traceable(function: Callable[[], Any], field: str, expected: str) -> Any:
             f"{field} must be {expected}, made of what JAX can trace (jnp.sqrt and jnp.where, say, "
             f"not math.sqrt, np.sqrt, float or if), got {type(error).__name__}: {came}"
         ) from error
+
+
+def outside_of_traces(function: Callable) -> Any:
+    """Makes an entry one that refuses to be called under `jit`, `vmap` or derivatives, by what is
+    traced: how much there is in its numbers decides what it computes."""
+    name, signature = function.__name__, inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        require_own_threads()
+        scope = f"{name} is not for jit, vmap or derivatives"
+        if not is_concrete((args, kwargs)):
+            given = signature.bind_partial(*args, **kwargs).arguments
+            field = next(field for field, one in given.items() if not is_concrete(one))
+            require(False, field, f"known: {scope}", "a traced one")
+        if not is_outermost():
+            raise ValueError(f"{name} must be called outside of jax.jit: {scope}")
+        return function(*args, **kwargs)
+
+    return call
 
 
 def require_usable_jax() -> None:

@@ -14,22 +14,26 @@ import numpy as np
 from jaxtyping import Array
 
 from .bifurcations.diagrams import BifurcationDiagram
-from .checks import require
+from .checks import outside_of_traces, require
 from .cycles.cycle import Cycle
 from .cycles.functionals import energy_dissipated
+from .cycles.portrait import Portrait
+from .cycles.shocks import FatalShock
 from .inverse.fit import Fit
 from .model.friction import Conti, Coulomb, Stribeck
 from .model.machine import Machine, Units
-from .model.modes import mode_acceleration, mode_of
+from .model.modes import STUCK, mode_acceleration, mode_of
 from .model.oscillator import Oscillator
+from .model.parameters import names_of
 from .motion.simulate import Trajectory
 from .results import EventKind, Status
-from .sweeps.basins import Basins
+from .sweeps.basins import Basins, BasinStability
 from .sweeps.datasets import flags
 from .sweeps.fractions import BasinFractions
 from .sweeps.orbit_diagram import OrbitDiagram
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
 
 #: What the variables of this package are, by their names.
@@ -38,6 +42,7 @@ DIMENSIONS = {
     **dict.fromkeys(("x1", "x1_event", "x1_end", "x1_min", "x1_max", "amplitude"), "length"),
     **dict.fromkeys(("x2", "x2_event", "x2_end", "x2_min", "x2_max"), "velocity"),
     **{"x1_residual": "length", "x2_residual": "velocity"},
+    **{"shock_x1": "length", "shock_x2": "velocity"},
     "force": "force",
     "energy": "energy",
 }
@@ -51,37 +56,54 @@ UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "steepness": ("s m-1", lambda units: 1 / units.velocity),
     "quadratic": ("s2 m-2", lambda units: 1 / units.velocity**2),
 }
+#: Numbers of a machine's oscillator and of a result's that differ by less, relative to their size,
+#: are the same: those of the one may have been computed in another way.
+SAME_MACHINE = 1e-9
 #: Results along a parameter.
 AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
 SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
 
 
+@outside_of_traces
 def in_si(
     result: Union[
         Trajectory,
         Cycle,
+        Portrait,
+        FatalShock,
         Basins,
+        BasinStability,
         Fit,
         BifurcationDiagram,
         OrbitDiagram,
         BasinFractions,
         "xarray.Dataset",
     ],
-    machine: Machine | Callable[..., Machine],
+    machine: Machine | Units | Callable[..., Machine | Units],
 ) -> "xarray.Dataset":
     """A result in SI units, as a dataset whose variables carry their units.
 
-    result: of the machine's oscillator, a `Trajectory`, a `Cycle`, `Basins`, a `Fit`, a
-    `BifurcationDiagram`, an `OrbitDiagram`, `BasinFractions`, or the dataset of a sweep. machine:
-    the `Machine`; where the sweep has axes other than starts, or a function was given in place of
-    an oscillator, a function of these that returns it, for its units may be others in each run.
+    result: of the machine's oscillator, a `Trajectory`, a `Cycle`, a `Portrait`, a `FatalShock`,
+    `Basins`, `BasinStability`, a `Fit`, a `BifurcationDiagram`, an `OrbitDiagram`,
+    `BasinFractions`, or the dataset of a sweep. machine: the `Machine`; where the sweep has axes
+    other than starts, or a function was given in place of an oscillator, a function of these that
+    returns it, for its units may be others in each run. `ValueError` where that of the machine is
+    not the oscillator of the result, but for what was fitted or varied. Trajectories, basin
+    stabilities and fractions, and datasets keep none: of the first only the velocity at which it
+    sticks is compared, of the others nothing. `machine.units` in place of the machine takes its
+    units alone and compares nothing, for an oscillator with other numbers in the same units; then
+    a trajectory comes without `force`.
 
     Of a trajectory: `t` in s, `x1` in m, `x2` in m/s, `force`, the friction on the mass, in N
     (exact formulation only), and `mode` at each sample; `t_event`, `x1_event`, `x2_event`,
     `event_kind` and `event_belt`. Of a cycle: `period`, `stick_duration` of each belt, `x1_min`,
     `x1_max`, `x2_min`, `x2_max`, `amplitude`, and `energy`, what friction and dashpot turn into
-    heat in one period. Of a fit: over `parameter`, the names in its table, `estimate`,
-    `standard_error`, `lower` and `upper` (the confidence interval of 95 per cent), each in the
+    heat in one period. Of a portrait: over `row`, the columns of its `table()`, `rate` in 1/s. Of a
+    shock: `x1` and `x2` of its start, `shock_x1`, `shock_x2`, and `distance`, in m/s where it
+    changes the velocity alone; of both, a distance in the dimensionless plane, it stays as it is.
+    Of a basin stability: its `table()`, which has no units. Of a fit: over `parameter`, the names
+    in its table, `estimate`, `standard_error`, `lower` and `upper` (the confidence interval of 95
+    per cent), each in the
     `unit` beside it (a `load` is the normal force), and a parameter of a law of one's own stays as
     the law has it, with the unit ""; over `t` the fitted motion, `x1` and `x2`, and `x1_residual`
     and `x2_residual`, datum minus motion. Of a diagram, or of fractions: over `row`, the columns of
@@ -94,15 +116,23 @@ def in_si(
     """
     import xarray
 
+    one: Any = machine  # what it is, is asked where it is used
     match result:
         case Trajectory():
-            return _trajectory(result, _one(machine))
+            return _trajectory(result, one)
         case Cycle():
-            return _cycle(result, _one(machine))
+            return _cycle(result, one)
+        case Portrait():
+            return _of_portrait(result, one)
+        case FatalShock():
+            return _of_shock(result, one)
         case Basins():
+            check_machine(result, machine)
             return _dataset(result.dataset, machine)
+        case BasinStability():
+            return _rows_in_units(result.table(), units_of(machine))
         case Fit():
-            return _fitted(result, _one(machine))
+            return _fitted(result, one)
         case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
             return _along(result, machine)
         case xarray.Dataset():
@@ -111,14 +141,72 @@ def in_si(
             require(not is_done, "result", "dimensionless", "a dataset that is in SI units")
             return _dataset(result, machine)
     raise TypeError(
-        "result must be a Trajectory, a Cycle, Basins, a Fit, a BifurcationDiagram, an "
-        f"OrbitDiagram, BasinFractions, or the dataset of a sweep, got {type(result).__name__}"
+        "result must be a Trajectory, a Cycle, a Portrait, a FatalShock, Basins, BasinStability, "
+        "a Fit, a BifurcationDiagram, an OrbitDiagram, BasinFractions, or the dataset of a sweep, "
+        f"got {type(result).__name__}"
     )
 
 
-def _one(machine: Any) -> Machine:
-    require(isinstance(machine, Machine), "machine", "a Machine", repr(machine))
-    return machine
+def units_of(machine: Any) -> Units:
+    """The units of a machine, or these themselves; `ValueError` for anything else."""
+    require(isinstance(machine, Machine | Units), "machine", "a Machine", repr(machine))
+    return machine if isinstance(machine, Units) else machine.units
+
+
+def check_machine(result: Any, machine: Any) -> None:
+    """Raise a `ValueError` where a result keeps its oscillator, and that of the machine is another.
+
+    What was fitted, or varied along a path, may be; of a function the one at the first value is
+    compared. Of units alone nothing is.
+    """
+    free: set[str] = set()
+    match result:
+        case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
+            osc, free = _at_first_value(result), {result.name}
+            if osc is None:
+                return
+            if result.is_argument:
+                machine = machine(**{result.name: _first_value(result)})
+        case Fit():
+            osc = result.oscillator
+            free = {name for tied in result.names for name in tied.split(" = ")}
+        case Cycle() | Basins() | Portrait():
+            osc = result.oscillator
+        case FatalShock():
+            osc = result.portrait.oscillator
+        case _:
+            return
+    if not isinstance(machine, Machine):
+        return
+    own, belts = machine.oscillator, len(osc.belts)
+    require(len(own.belts) == belts, "machine", f"of {belts} belts", f"{len(own.belts)} belts")
+    one, other = _numbers_of(own), _numbers_of(osc)
+    for name in one.keys() | other.keys():
+        require(name in one and name in other, "machine", "with the laws of the result", machine)
+    for name, value in other.items():
+        fits = name in free or np.allclose(one[name], value, rtol=SAME_MACHINE, atol=0)
+        expected = f"the one of the result, whose oscillator has {name} = {value:.12g}"
+        came = f"{one[name]:.12g}; in place of it machine.units takes its units alone"
+        require(fits, "machine", expected, came)
+
+
+def _first_value(result: BifurcationDiagram | OrbitDiagram | BasinFractions) -> float:
+    is_diagram = isinstance(result, BifurcationDiagram)
+    return float(result.regions[0][0] if is_diagram else result.values[0])
+
+
+def _at_first_value(result: AlongParameter) -> Oscillator | None:
+    """The oscillator of a result at the first value of its parameter, where it keeps one."""
+    if isinstance(result, BifurcationDiagram):
+        return result.oscillator
+    if isinstance(result, OrbitDiagram) and result.sampling is not None:
+        return result.sampling.variation.oscillator(np.array([_first_value(result)]))
+    return None
+
+
+def _numbers_of(osc: Oscillator) -> dict[str, float]:
+    pairs = zip(names_of(osc), jax.tree.leaves(osc), strict=True)
+    return {name: float(leaf) for name, leaf in pairs if np.ndim(leaf) == 0}
 
 
 def _variable(dims: Any, values: Any, name: str, units: Units, long_name: str) -> tuple:
@@ -143,13 +231,15 @@ def _friction_force(osc: Oscillator, codes: Array, ys: Array) -> Array:
     return jax.vmap(at)(codes.astype(jnp.float64), ys)
 
 
-def _trajectory(run: Trajectory, machine: Machine) -> "xarray.Dataset":
+def _trajectory(run: Trajectory, machine: Machine | Units) -> "xarray.Dataset":
     import xarray
 
-    units, osc = machine.units, machine.oscillator
+    units, belts = units_of(machine), run.modes.shape[-1]
     require(run.ts.ndim == 1, "result", "one trajectory, not a batch", repr(run))
-    belts = len(osc.belts)
-    require(run.modes.shape[-1] == belts, "result", f"of a machine of {belts} belts", repr(run))
+    if isinstance(machine, Machine):
+        own = len(machine.belts)
+        require(belts == own, "result", f"of a machine of {own} belts", repr(run))
+        _check_sticking(run, machine.oscillator)
 
     def variable(dims, values, name, long_name):
         return _variable(dims, values, name, units, long_name)
@@ -169,18 +259,32 @@ def _trajectory(run: Trajectory, machine: Machine) -> "xarray.Dataset":
         ),
         "event_belt": ("event", np.asarray(events.belt), {"long_name": "belt of the event"}),
     }
-    if run.arcs.t.size:
-        force = _friction_force(osc, run.modes, run.ys)
+    if run.arcs.t.size and isinstance(machine, Machine):
+        force = _friction_force(machine.oscillator, run.modes, run.ys)
         found["force"] = variable("t", force, "force", "friction on the mass")
     time = variable("t", run.ts, "t", "time")
     attrs = {"status": Status(int(run.status)).name}
     return xarray.Dataset(found, {"t": time, "belt": np.arange(belts)}, attrs)
 
 
-def _cycle(cycle: Cycle, machine: Machine) -> "xarray.Dataset":
+def _check_sticking(run: Trajectory, osc: Oscillator) -> None:
+    """Raise where a trajectory, which keeps no oscillator, sticks at another belt's velocity."""
+    if not run.arcs.t.size:
+        return
+    stuck = np.asarray(run.modes) == STUCK
+    for belt, held in enumerate(stuck.T):
+        own, its = float(osc.belts[belt].velocity), np.asarray(run.ys)[held, 1]
+        fits = np.allclose(its, own, rtol=SAME_MACHINE, atol=SAME_MACHINE)
+        came = f"one that sticks to belt {belt} at {its[0]:.12g}" if not fits else ""
+        require(fits, "result", f"of the machine, its belt {belt} at velocity {own:.12g}", came)
+
+
+def _cycle(cycle: Cycle, machine: Machine | Units) -> "xarray.Dataset":
     import xarray
 
+    units = units_of(machine)
     require(cycle.unknowns.ndim == 2, "result", "one cycle, not a batch", repr(cycle))
+    check_machine(cycle, machine)
     told = {
         "period": ((), cycle.period, "period"),
         "stick_duration": ("belt", cycle.stick_durations, "time stuck to the belt in one loop"),
@@ -191,20 +295,40 @@ def _cycle(cycle: Cycle, machine: Machine) -> "xarray.Dataset":
         "amplitude": ((), (cycle.x1_max - cycle.x1_min) / 2, "half of the span of displacement"),
         "energy": ((), energy_dissipated(cycle), "energy dissipated in one period"),
     }
-    units = machine.units
     found = {
         name: _variable(dims, values, name, units, long_name)
         for name, (dims, values, long_name) in told.items()
     }
     attrs = {"status": Status(int(cycle.status)).name}
-    return xarray.Dataset(found, {"belt": np.arange(len(machine.belts))}, attrs)
+    return xarray.Dataset(found, {"belt": np.arange(len(cycle.oscillator.belts))}, attrs)
 
 
-def _fitted(fit: Fit, machine: Machine) -> "xarray.Dataset":
+def _of_portrait(portrait: Portrait, machine: Machine | Units) -> "xarray.Dataset":
+    check_machine(portrait, machine)
+    units, table = units_of(machine), portrait.table()
+    rate = table["rate"].to_numpy(float) / float(units.time)
+    told = {"long_name": "rate at which small motions about it grow", "units": "s-1"}
+    found = _rows_in_units(table.drop(columns="rate"), units).assign(rate=("row", rate, told))
+    return found.assign_attrs(status=Status(int(portrait.status)).name)
+
+
+def _of_shock(shock: FatalShock, machine: Machine | Units) -> "xarray.Dataset":
+    check_machine(shock, machine)
+    table, units = shock.table(), units_of(machine)
+    distance, told = float(shock.distance), {"long_name": "size of the shock"}
+    if shock.direction == "x2":
+        distance, told["units"] = distance * float(units.velocity), SYMBOLS["velocity"]
+    words = ("attractor", "direction", "boundary", "beyond", "status")
+    found = _rows_in_units(table.drop(columns=["distance", *words]), units).squeeze("row")
+    attrs = {name: table[name][0] for name in words}
+    return found.assign(distance=((), distance, told)).assign_attrs(attrs)
+
+
+def _fitted(fit: Fit, machine: Machine | Units) -> "xarray.Dataset":
     import xarray
 
-    machine.of_oscillator(fit.oscillator)  # a `ValueError` where it is of another machine
-    units, table = machine.units, fit.table()
+    check_machine(fit, machine)
+    units, table = units_of(machine), fit.table()
     told = [*(_unit_of(name, fit.oscillator, units) for name in fit.names), *_units_of_start(units)]
     symbols, sizes = zip(*told, strict=True)
     columns = ("estimate", "standard_error", "lower", "upper")
@@ -245,14 +369,21 @@ def _units_of_start(units: Units) -> list[tuple[str, float]]:
 
 
 def _along(result: AlongParameter, machine: Any) -> "xarray.Dataset":
-    import xarray
-
     table = result.table()
     values = table["value"].to_numpy(float)
     units, (symbol, size) = units_along(result, values, machine)
+    check_machine(result, machine)
     told = {"long_name": result.name, **({"units": symbol} if symbol else {})}
-    found: dict[str, Any] = {"value": ("row", values * size, told)}
-    for name in map(str, table.columns.drop("value")):
+    rest = _rows_in_units(table.drop(columns="value"), units)
+    return rest.assign(value=("row", values * size, told))
+
+
+def _rows_in_units(table: "pandas.DataFrame", units: Units) -> "xarray.Dataset":
+    """The columns of a table over `row`, what has a unit in that."""
+    import xarray
+
+    found: dict[str, Any] = {}
+    for name in map(str, table.columns):
         quantity = "stick_duration" if name.startswith("stick_duration_") else name
         if quantity in DIMENSIONS:
             words = name.replace("_", " ")
@@ -273,9 +404,11 @@ def units_along(
     if result.is_argument:
         given = {result.name: values}
         expected = f"a function of {result.name} that returns the Machine at a value of it"
-        require(not isinstance(machine, Machine), "machine", expected, "one Machine")
+        require(not isinstance(machine, Machine | Units), "machine", expected, "one Machine")
         return _units_at(machine, given), ("", 1.0)
-    units, osc = _one(machine).units, machine.oscillator
+    units, kept = units_of(machine), _at_first_value(result)
+    osc: Any = machine.oscillator if isinstance(machine, Machine) else kept
+    require(osc is not None, "machine", "a Machine, as the result keeps no oscillator", "its units")
     name, belts = result.name, len(osc.belts)
     belt = name.removeprefix("belts[").partition("]")[0] if name.startswith("belts[") else "0"
     require(int(belt) < belts, "machine", f"of a belt {belt}, of which result is", f"{belts} belts")
@@ -318,10 +451,10 @@ def _units_of_runs(dataset: "xarray.Dataset", machine: Any, own: list[str]) -> U
     """The units of every run, arrays over the axes that are not starts."""
     import xarray
 
-    if isinstance(machine, Machine):
+    if isinstance(machine, Machine | Units):
         expected = f"a function of {', '.join(own)} that returns the Machine of a run"
         require(not own, "machine", expected, "one Machine")
-        return jax.tree.map(np.asarray, machine.units)
+        return jax.tree.map(np.asarray, units_of(machine))
     if not own:
         return _units_at(machine, {})
     grid = xarray.broadcast(*(dataset[name] for name in own))
@@ -342,8 +475,9 @@ def _units_at(machine: Any, values: Mapping[str, np.ndarray]) -> Units:
 
     def units(arguments):
         found = machine(**arguments)
-        require(isinstance(found, Machine), "machine", "a function that returns a Machine", found)
-        return found.units
+        fits = isinstance(found, Machine | Units)
+        require(fits, "machine", "a function that returns a Machine", found)
+        return units_of(found)
 
     given = {name: jnp.asarray(column) for name, column in values.items()}
     return jax.tree.map(np.asarray, jax.vmap(units)(given) if given else units(given))

@@ -29,6 +29,7 @@ WHOLE = "must be a positive integer, got "
 POINT = r"point must be a BifurcationPoint, such as jb.refine\(...\), got "
 TARGETS = r"targets must be a list of pairs \(functional, value\), such as .* got "
 OBSERVE = '"final", "attractor" or an object with init, update, finish, got '
+TRACED = r" must be known: \w+ is not for jit, vmap or derivatives, got a traced one"
 
 #: What is called, and a pattern of the message; what begins with "jaxbelt" is a command.
 MISTAKES = [
@@ -344,8 +345,37 @@ MISTAKES = [
     ),
     ("jb.distance_to(jb.Hopf, where=nu0)", "conditions must be a tuple .*, got the class Hopf"),
     ("jb.distance_to(jb.Hopf(), where='nu0')", "where must be a function .*, got 'nu0'"),
+    # --- in jit, vmap or derivatives
+    ("jax.jit(lambda osc: jb.scan(osc, nu0, (0.1, 0.7)))(osc)", "osc" + TRACED),
+    ("jax.vmap(lambda end: jb.scan(osc, nu0, (0.1, end)))(row)", "span" + TRACED),
+    ("jax.jit(lambda osc: jb.bifurcation_diagram(osc, nu0, (0.1, 0.7)))(osc)", "osc" + TRACED),
+    ("jax.jit(lambda osc: jb.orbit_diagram(osc, nu0, (0.1, 0.7)))(osc)", "osc" + TRACED),
+    (
+        "jax.jit(lambda s: jb.bifurcation_curve(point, (nu0, nu1), PLANE, step=s))(1)",
+        "step" + TRACED,
+    ),
+    ("jax.jit(lambda k: jb.region_map(jb.presets.class_b, k))(AXES)", "axes" + TRACED),
+    ("jax.jit(lambda k: jb.sweep(jb.presets.class_b, k, t1=9.0))(AXES)", "axes" + TRACED),
+    (
+        "jax.jit(lambda _: jb.sweep(jb.presets.class_b, AXES, t1=9.0))(0.1)",
+        "sweep must be called outside of jax.jit: sweep is not for jit, vmap or derivatives",
+    ),
+    ("jax.jit(lambda k: jb.explain(jb.presets.class_b, k, t1=9.0))(AXES)", "axes" + TRACED),
+    ("jax.jit(lambda osc: jb.basins(osc, x1=row, x2=row))(osc)", "oscillator" + TRACED),
+    ("jax.vmap(lambda x: jb.basins(osc, x1=row, x2=x))(AXES['nu0'][None])", "x2" + TRACED),
+    ("jax.jit(lambda key: jb.basin_stability(osc, box=BOX, key=key))(key)", "key" + TRACED),
+    (
+        "jax.jit(lambda osc: jb.basin_fractions(osc, nu0, (0.1, 0.7), box=BOX, key=key))(osc)",
+        "osc" + TRACED,
+    ),
+    ("jax.jit(lambda x: jb.fit(osc, row, x, where=nu0))(row)", "x1" + TRACED),
+    ("jax.grad(lambda x: jb.design(osc, [(jb.amplitude, x)], where=nu0))(1.0)", "targets" + TRACED),
+    ("jax.jit(jb.portrait)(osc)", "osc" + TRACED),
+    ("jax.jit(lambda osc: jb.minimal_fatal_shock(osc, (3.0, 0.0)))(osc)", "osc" + TRACED),
+    ("jax.jit(lambda one: jb.in_si(cycle, one))(machine)", "machine" + TRACED),
     # --- pictures
     ("jb.plot_friction_law(osc)", r"friction must be a law .*, got Oscillator\("),
+    ("jb.plot_friction_law(law, unit=3)", 'unit must be a text such as "m/s", got 3'),
     ("jb.plot_time_history(osc)", r"trajectory must be a Trajectory, .*, got Oscillator\("),
     ("jb.plot_phase_portrait((), osc)", OSC + r"\(\)"),
     ("jb.plot_phase_portrait(osc, osc)", r"trajectories must be .*, got Oscillator\("),
@@ -362,20 +392,41 @@ MISTAKES = [
     ("jaxbelt simulate --nu0 nan", "velocity of belt must be finite, got nan"),
     ("jaxbelt simulate --belt fast", "velocity of belt 'fast' must be a number, got 'fast'"),
     ("jaxbelt simulate --belt 1,law=conty", "law of belt .* got conty .did you mean 'conti'"),
+    ("jaxbelt simulate --belt 0.3,load=-1", r"load of belt '0\.3,load=-1' must be >= 0, got -1\.0"),
+    ("jaxbelt simulate --belt nan", "velocity of belt 'nan' must be finite, got nan"),
+    ("jaxbelt simulate --belt 1,lower=2,upper=1", r"lower of belt .* must be < 1\.0, got 2\.0"),
+    ("jaxbelt simulate --belt 1,quadratic=inf", "quadratic of belt .* must be finite, got inf"),
+    (
+        "jaxbelt simulate --belt 1,law=coulomb,static=0.5,kinetic=0.8",
+        r"kinetic of belt .* must be <= static = 0\.5, got 0\.8",
+    ),
+    (
+        "jaxbelt simulate --belt 1,law=stribeck,static=1,kinetic=0.5,stribeck_velocity=0",
+        r"stribeck_velocity of belt .* must be > 0, got 0\.0",
+    ),
+    ("jaxbelt simulate --tolerance 1", r"tolerance must be > 0 and at most 0\.01, got 1\.0"),
+    ("jaxbelt sweep nu0=0:1:9 --tolerance nan", "tolerance must be > 0 and at most .*, got nan"),
     ("jaxbelt simulate --formulation exact", "formulation must be .*, got exact"),
     ("jaxbelt simulate --out /dev/null/here/run", "out must be a place that can be .*here/run"),
-    ("jaxbelt diagram --vary sgma", "vary must be one of .*, got sgma .did you mean 'sigma'"),
+    (
+        "jaxbelt diagram --class c --vary sgma",
+        "vary must be one of nu0, nu1, sigma, zeta, or .*, got sgma .did you mean 'sigma'",
+    ),
+    (
+        "jaxbelt diagram --vary 'belts[0].friction.stepness'",
+        r"vary must be one of nu0, nu1, zeta, or a path such as \S+ or \S+, got .*steepness'",
+    ),
     ("jaxbelt diagram --vary sigma", "class b must have only nu0, nu1, got sigma"),
     ("jaxbelt diagram --span 1 0", r"span must be FROM TO with FROM < TO, got 1\.0 0\.0"),
     ("jaxbelt diagram --quantity x3", "quantity must be one of .*, got x3"),
     ("jaxbelt map --axes nu0 nu0", "axes must be different ones, got nu0 twice"),
-    ("jaxbelt map --axes nu0 zta", "axes must be among nu0, .* got zta .did you mean 'zeta'"),
+    ("jaxbelt map --axes nu0 zta", "axes must be one of nu0, .* got zta .did you mean 'zeta'"),
     ("jaxbelt map --cells 1", "cells must be at least 2, got 1"),
     ("jaxbelt basins --points 1", "points must be at least 2, got 1"),
     ("jaxbelt basins --x1 3 0", r"x1 must be FROM TO with FROM < TO, got 3\.0 0\.0"),
     ("jaxbelt sweep nu0", "an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got 'nu0'"),
     ("jaxbelt sweep nu0=1 'belts[0].velocity=2'", r"different ones, got belts\[0\].velocity twice"),
-    ("jaxbelt sweep nu1=0:1:9 --belt 0.3", "axes must be among nu0, zeta, .*, got nu1"),
+    ("jaxbelt sweep nu1=0:1:9 --belt 0.3", "axes must be one of .*nu0, zeta, .*, got nu1"),
     ("jaxbelt sweep nu0=0:1:9 --variable nope", "variable must be one of kind, .*, got nope"),
     ("jaxbelt sweep nu0=0:1:9 --observe atractor", "observe must be .* got atractor .did you mean"),
     ("jaxbelt sweep nu0=0:1:9 --out plane.csv", "out must end in .nc or .zarr, got plane.csv"),

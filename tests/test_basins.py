@@ -74,7 +74,7 @@ def test_the_bound_is_told_where_all_starts_agree():
         return jb.BasinStability(fractions, errors, n)
 
     assert repr(stability(1.0, 1000)) == (
-        "BasinStability(cycle 1 (above 0.99700 with 95% confidence); 1000 starts)"
+        "BasinStability(all cycle, a fraction above 0.99700 with 95% confidence; 1000 starts)"
     )
     assert "equilibrium 0.25000 +- 0.01369, cycle 0.75000" in repr(stability(0.75, 1000))
 

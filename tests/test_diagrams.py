@@ -12,6 +12,7 @@ import pytest
 import jaxbelt as jb
 from jaxbelt import EventKind
 from jaxbelt.bifurcations.cells import in_plane_of_paper, region_name
+from jaxbelt.bifurcations.diagrams import Branch
 from jaxbelt.bifurcations.faces import Faces
 from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.regions import RegionMap
@@ -432,3 +433,13 @@ def test_lines_are_smooth_between_rows_and_sharp_at_special_points():
     assert np.max(np.abs(np.abs(y) - np.sqrt(x))) < 3e-3 and x[0] == x[-1] == there[0]
     unknown = np.append(np.nan, heights[1:])
     np.testing.assert_array_equal(_between_rows(there, unknown, np.array([]))[1][:9], unknown[:9])
+
+
+def test_a_stick_phase_that_vanishes_has_no_negative_duration():
+    """What Newton's method leaves of it is rounding."""
+    two, columns = np.zeros(2), [np.zeros(2)] * 9
+    durations = np.array([[-2.8e-22, np.nan], [0.3, np.nan]])
+    branch = Branch("equilibrium", *columns, durations, two[:, None], ())
+    told = branch.columns()
+    assert told["stick_duration_0"].tolist() == [0.0, 0.3]
+    assert np.all(np.isnan(told["stick_duration_1"]))

@@ -76,6 +76,47 @@ def test_friction_force(run):
     assert np.allclose(ours.force[~stuck], force[~stuck], rtol=0, atol=1e-9)
 
 
+def test_a_trajectory_of_another_machine(run):
+    with pytest.raises(ValueError, match=r"its belt 0 at velocity 0\.189.*sticks .* at 0\.126"):
+        jb.in_si(run, machine(0.03))
+    alone, whole = jb.in_si(run, machine(0.03).units), jb.in_si(run, machine())
+    assert alone.identical(whole.drop_vars("force"))
+
+
+def test_a_portrait_and_a_shock_in_si():
+    """Of one that was put together by hand; a cycle and an equilibrium are real ones."""
+    m = machine()
+    cycle, points = jb.find_cycle(m.oscillator, m.start(0.003, 0.0)), jb.equilibria(m.oscillator)
+    nothing, ok = jnp.zeros((0, 2)), jnp.asarray(jb.Status.OK.value)
+    picture = jb.Portrait(m.oscillator, points, (cycle,), (), (), False, 3.0, nothing, ok)
+    ours, table = jb.in_si(picture, m), picture.table()
+    length, time = 5.0 / STIFFNESS, np.sqrt(MASS / STIFFNESS)
+    assert set(ours) == set(table) and len(ours.row) == len(table)
+    assert np.allclose(ours.x1_max, table.x1_max * length) and ours.x1_max.units == "m"
+    assert np.allclose(ours.x2_min, table.x2_min * length / time)
+    assert np.allclose(ours.period, table.period * time, equal_nan=True)
+    assert np.allclose(ours.rate, table.rate / time, equal_nan=True) and ours.rate.units == "s-1"
+    start, by = jnp.array([1.0, 0.2]), jnp.array([0.0, 0.3])
+    for direction, size in (("x2", length / time), ("both", 1.0)):
+        words = (direction, "cycle 0", "none", "infinity")
+        shock = jb.FatalShock(picture, *words, jnp.asarray(0.3), start, by, ok)
+        ours = jb.in_si(shock, m)
+        assert float(ours.distance) == pytest.approx(0.3 * size)
+        assert float(ours.shock_x2) == pytest.approx(0.3 * length / time)
+        assert float(ours.x1) == pytest.approx(length) and ours.x1.units == "m"
+        assert ours.distance.attrs.get("units") == ("m s-1" if direction == "x2" else None)
+        assert ours.attrs["attractor"] == "cycle 0" and ours.attrs["status"] == "OK"
+    for one in (picture, shock):
+        with pytest.raises(ValueError, match="machine must be the one of the result"):
+            jb.in_si(one, machine(0.03))
+
+
+def test_a_basin_stability_has_no_units():
+    kinds = {"cycle": 0.25, "equilibrium": 0.75}
+    ours = jb.in_si(jb.BasinStability(kinds, dict.fromkeys(kinds, 0.04), 100), machine())
+    assert ours.fraction.values.tolist() == [0.25, 0.75] and ours.kind.values[0] == "cycle"
+
+
 def test_a_cycle_in_si():
     m = machine()
     cycle = jb.find_cycle(m.oscillator, m.start(0.003, 0.0))
@@ -86,6 +127,19 @@ def test_a_cycle_in_si():
     fed = float(jb.energy_fed(cycle) * m.units.energy)
     assert float(ours.energy) == pytest.approx(fed, rel=1e-8)
     assert ours.energy.units == "J" and ours.stick_duration.dims == ("belt",)
+    for wrong, told in ((machine(N=50.0), "velocity"), (machine(0.03), "velocity = 0.126")):
+        for bring in (jb.in_si, jb.plot_in_si):
+            with pytest.raises(ValueError, match=f"machine must be the one of the result.*{told}"):
+                bring(cycle, wrong)
+    # In other units, but of whatever motion.
+    assert float(jb.in_si(cycle, machine(0.03).units).period) == float(ours.period)
+    assert jb.plot_in_si(cycle, machine(0.03).units).get_xlabel() == "displacement $X$ (m)"
+    one = jb.Machine(MASS, STIFFNESS, DAMPING, m.belts[:1])
+    with pytest.raises(ValueError, match="machine must be of 2 belts, got 1 belts"):
+        jb.in_si(cycle, one)
+    other = jb.PhysicalBelt(0.05, jb.Coulomb(0.3, 0.2), 2.0, lower=0.001)
+    with pytest.raises(ValueError, match="machine must be with the laws of the result"):
+        jb.in_si(cycle, jb.Machine(MASS, STIFFNESS, DAMPING, (m.belts[0], other)))
 
 
 def fit_of(osc, **values):
@@ -158,6 +212,16 @@ def test_a_fit_in_si():
     assert np.allclose(ours.t, np.linspace(0, 1, 3) * time) and ours.t.units == "s"
 
 
+def test_a_misfit_tells_no_standard_errors():
+    """They would be those of a motion that is not that of the record."""
+    good = fit_of(machine().oscillator, damping=0.1)
+    bad = dataclasses.replace(good, status=jnp.asarray(jb.Status.MISFIT.value))
+    assert "damping = 0.1 +- 0.01" in repr(good) and not good.table().isna().any().any()
+    assert "damping = 0.1 (a misfit: without a standard error)" in repr(bad)
+    told = bad.table().set_index("name").loc["damping"]
+    assert told.estimate == 0.1 and told.drop("estimate").isna().all()
+
+
 def test_a_fit_of_a_law_of_ones_own_and_of_tied_parameters_in_si():
     law = Lorentz(jnp.asarray(0.5), jnp.asarray(0.3), jnp.asarray(0.1))
     m = jb.Machine(MASS, STIFFNESS, DAMPING, [jb.PhysicalBelt(0.02, law, 5.0)] * 2)
@@ -171,8 +235,11 @@ def test_a_fit_of_a_law_of_ones_own_and_of_tied_parameters_in_si():
     assert ours.unit.values.tolist()[:2] == ["", "N"]
     with pytest.raises(ValueError, match="of tied parameters with one unit, got damping = belts"):
         jb.in_si(fit_of(m.oscillator, **{"damping = belts[0].load": 1.0}), m)
-    with pytest.raises(ValueError, match="osc must be of 2 belts"):
+    with pytest.raises(ValueError, match="machine must be of 1 belts, got 2 belts"):
         jb.in_si(fit_of(jb.presets.class_a(0.3), damping=0.1), m)
+    doubled = dataclasses.replace(m, damping=2 * m.damping)
+    with pytest.raises(ValueError, match=r"has damping = 0\.0316.*, got 0\.0632"):
+        jb.in_si(fit_of(m.oscillator, **{tied: 1.0}), doubled)
 
 
 def test_a_picture_of_a_fit_in_si():
@@ -347,6 +414,9 @@ def test_results_along_a_parameter_in_si():
         shown = [float(label.get_text()) for label in ax.get_xticklabels()]
         assert np.allclose(shown, ax.get_xticks() * length / time, rtol=1e-5)
     diagram = along()[2]
+    assert jb.in_si(diagram, m.units).identical(jb.in_si(diagram, m))
+    with pytest.raises(ValueError, match="as the result keeps no oscillator, got its units"):
+        jb.in_si(along()[0], m.units)
     assert jb.in_si(diagram, m).stick_duration_1.units == "s"
     assert jb.plot_in_si(diagram, m, quantity="x1").get_ylabel() == "displacement $X$ (m)"
     root = np.sqrt(STIFFNESS * MASS)
@@ -367,11 +437,13 @@ def test_a_parameter_of_a_function_stays_as_the_function_takes_it():
         assert np.allclose(ours[name], table[name] * lengths, equal_nan=True)
         with pytest.raises(ValueError, match="machine must be a function of N that returns"):
             jb.in_si(one, machine())
+        assert jb.in_si(one, lambda N: machine(0.02, 10 * N).units).identical(ours)
         with pytest.raises(ValueError, match=r"no unit depends .* got along N"):
             jb.plot_in_si(one, lambda N: machine(0.02, 10 * N))
         with pytest.raises(ValueError, match=r"machine must be a function of N .* 'V'"):
             jb.in_si(one, lambda V: machine(V))
-    label = jb.plot_in_si(along("V", True)[2], machine).get_xlabel()
+    shown = dataclasses.replace(along("V", True)[2], oscillator=machine(0.5).oscillator)
+    label = jb.plot_in_si(shown, machine).get_xlabel()
     assert label == "parameter $V$"
     plt.close("all")
 

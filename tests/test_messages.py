@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -80,3 +81,21 @@ def test_a_point_that_was_not_found_names_the_search_that_finds_every_point(stat
     for name, value in known.items():
         object.__setattr__(point, name, value)
     assert "jb.scan" in repr(point) and jb.describe(status) in repr(point)
+
+
+def test_what_a_function_closes_over_has_to_be_known():
+    """A derivative through it would not be that of the result."""
+
+    def damped(damping, nu0=0.3):
+        return jb.Oscillator(damping, (jb.Belt(nu0, jb.Coulomb(0.5, 0.4)),))
+
+    def swept(damping):
+        return jb.sweep(lambda nu0: damped(damping, nu0), {"nu0": [0.1, 0.2]}, t1=9.0)
+
+    def scanned(damping):
+        return jb.scan(lambda nu: damped(damping, nu), span=(0.1, 0.7))
+
+    with pytest.raises(ValueError, match="make must be one of known numbers: sweeps are"):
+        jax.grad(swept)(0.1)
+    with pytest.raises(ValueError, match="osc must be of known numbers: paths are"):
+        jax.grad(scanned)(0.1)

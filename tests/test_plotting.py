@@ -6,10 +6,15 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.colors import to_hex
+from matplotlib.text import Text
 
 import jaxbelt as jb
 from jaxbelt import paper as reproduce
+from jaxbelt.bifurcations.diagrams import Branch
+from jaxbelt.cycles.chains import Chain
+from jaxbelt.motion.arcs import Ends
 from jaxbelt.plotting.phase import _vector_field, draw_overview, stick_phases
 from jaxbelt.plotting.style import BELT_COLOURS, journal_style, save
 
@@ -276,3 +281,106 @@ def test_missing_region_below_nu_delta():
         sticks = (events.t > 20) & (events.kind == jb.EventKind.STICK)
         belts[nu0] = set(events.belt[sticks].tolist())
     assert belts == {-0.07: {0}, -0.09: {0, 1}}
+
+
+def made_up_diagram(values=(0.10, 0.1355, 0.139, 0.1458, 0.1488, 0.1569, 0.28)):
+    """A diagram of one equilibrium, with points at these values; not in their order."""
+    osc = jb.presets.class_a(0.3)
+    rows = np.linspace(0.0, 0.3, 5)
+    nothing = np.full(5, np.nan)
+    extent = (np.full(5, 0.7), np.full(5, 0.7), np.zeros(5), np.zeros(5))
+    branch = Branch(
+        *("equilibrium", rows, np.ones(5, bool), np.zeros(5, bool), *extent, nothing, nothing),
+        *(nothing[:, None], nothing[:, None], ()),
+    )
+    nan = jnp.asarray(jnp.nan)
+    chain = Chain(jnp.ones((1, 1)), jnp.full(1, Ends(1).unused), jnp.zeros((1, 1)))
+    cycle = jb.Cycle(osc, chain, jnp.full((1, 3), nan), nan, nan, nan, jnp.asarray(0))
+    kinds = [jb.Hopf(), *[jb.CrossingSliding(belt=0), jb.NonsmoothFold(belt=1)] * 3]
+    points = [
+        jb.BifurcationPoint(kind, jnp.asarray(value), *[nan] * 5, osc, cycle, jnp.asarray(0))
+        for kind, value in zip(kinds, values)
+    ]
+    regions = ((0.0, 0.3, "1"),)
+    return jb.BifurcationDiagram(
+        (*points[3:], *points[:3]), (branch,), regions, osc, "belts[0].velocity", False
+    )
+
+
+def made_up_sweep():
+    words = "equilibrium cycle stuck undecided".split()
+    told = {"flag_values": np.arange(4), "flag_meanings": " ".join(words)}
+    kinds = np.arange(16).reshape(4, 4) % 4
+    axes = {"nu0": np.linspace(0.0, 1.0, 4), "nu1": np.linspace(0.0, 1.0, 4)}
+    return xr.Dataset({"kind": (("nu0", "nu1"), kinds, told)}, axes)
+
+
+def made_up_fractions():
+    values, shares = np.linspace(0.1, 0.3, 3), np.array([[0.5, 0.5]] * 3)
+    return jb.BasinFractions(
+        *(values, ("cycle 0", "equilibrium 0"), shares, shares / 50, 0 * values),
+        *([shares] * 5),
+        *(100, "nu0", True),
+    )
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda ax: jb.plot_sweep(made_up_sweep(), "kind", ax=ax),
+        lambda ax: made_up_fractions().plot(ax),
+        lambda ax: made_up_diagram().plot(ax),
+    ],
+)
+def test_what_stands_beside_axes_of_ones_own_is_within_the_figure(draw):
+    """A figure as pyplot makes it, and what is saved of it."""
+    figure, ax = plt.subplots()
+    draw(ax)
+    figure.canvas.draw()
+    page, renderer = figure.bbox, figure.canvas.get_renderer()
+    keys = [key for key in (ax.get_legend(), *figure.legends) if key]
+    names = [text for text in ax.texts if text.get_text()]
+    assert keys or names
+    for artist in (*keys, *names, ax.xaxis, ax.yaxis):
+        box = artist.get_tightbbox(renderer)
+        # A pixel more is the width of a line.
+        assert min(box.x0 - page.x0, box.y0 - page.y0) > -1, artist
+        assert min(page.x1 - box.x1, page.y1 - box.y1) > -1, artist
+    for key in keys:
+        assert not key.get_tightbbox(renderer).overlaps(ax.xaxis.get_tightbbox(renderer))
+
+
+def test_a_layout_that_a_figure_has_is_kept():
+    figure, ax = plt.subplots(layout="tight")
+    before = figure.get_layout_engine()
+    made_up_fractions().plot(ax)
+    assert figure.get_layout_engine() is before
+
+
+def test_lines_to_the_names_of_points_do_not_cross_and_names_do_not_overlap():
+    ax = made_up_diagram().plot()
+    ax.figure.canvas.draw()
+    names = [text for text in ax.texts if text.get_text()]
+    values = [text.xy[0] for text in names]
+    boxes = [Text.get_window_extent(text) for text in names]  # without its line
+    order = np.argsort(values)
+    lefts, rights = (np.array([getattr(box, end) for box in boxes])[order] for end in ("x0", "x1"))
+    assert len(names) == 7 and np.all(lefts[1:] > rights[:-1])
+
+
+def test_a_phase_portrait_has_a_key(two_sided):
+    osc, trajectory = two_sided
+    key = jb.plot_phase_portrait(osc, trajectory).get_legend()
+    labels = {text.get_text() for text in key.get_texts()}
+    assert {"orbit", "sliding set", "unstable fixed point"} <= labels
+    _, ax = plt.subplots()
+    assert jb.plot_phase_portrait(osc, trajectory, ax=ax).get_legend() is None
+
+
+def test_a_friction_law_in_units_of_its_own():
+    ax = jb.plot_friction_law(jb.Conti(0.4, 0.25, 100.0), speed=0.1, unit="m/s")
+    assert ax.get_xlabel() == "relative velocity $R$ (m/s)"
+    belt = jb.PhysicalBelt(0.02, jb.Conti(0.4, 0.25, 100.0), 5.0)
+    machine = jb.Machine(0.5, 2000.0, 1.0, (belt,))
+    with pytest.raises(ValueError, match="result must be a picture with an axis of time"):
+        jb.plot_in_si(ax, machine)  # it is in SI units

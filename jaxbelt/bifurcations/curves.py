@@ -16,7 +16,15 @@ import equinox as eqx
 import numpy as np
 
 from ..activity import announced, tell
-from ..checks import as_array, as_interval, as_positive, as_whole, require, require_value
+from ..checks import (
+    as_array,
+    as_interval,
+    as_positive,
+    as_whole,
+    outside_of_traces,
+    require,
+    require_value,
+)
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import Variation
@@ -133,6 +141,7 @@ class BifurcationCurve(eqx.Module):
 
 
 @announced("bifurcation_curve")
+@outside_of_traces
 def bifurcation_curve(
     point: BifurcationPoint,
     where: tuple[Callable[[Oscillator], Any], Callable[[Oscillator], Any]]

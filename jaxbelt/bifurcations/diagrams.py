@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..activity import announced, tell
-from ..checks import as_whole, require
+from ..checks import as_whole, outside_of_traces, require
 from ..cycles.chains import Loop, cut
 from ..cycles.cycle import Cycle, polish
 from ..model.equilibria import candidates
@@ -96,7 +96,8 @@ class Branch(eqx.Module):
             "type": [""] * len(self),
             "value": self.values,
             **{name: getattr(self, name) for name in (*names, "multiplier")},
-            **per_belt("stick_duration", self.stick_durations),
+            # Where a stick phase vanishes Newton's method leaves a rounding error of it.
+            **per_belt("stick_duration", np.maximum(self.stick_durations, 0.0)),
             "signature": events or [""] * len(self),
         }
 
@@ -179,6 +180,7 @@ class BifurcationDiagram(eqx.Module):
 
 
 @announced("bifurcation_diagram")
+@outside_of_traces
 def bifurcation_diagram(
     osc: Oscillator | Callable[..., Oscillator],
     where: Callable[[Oscillator], Any] | None = None,

@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..checks import is_concrete, require
 from ..cycles.attractors import (
     SOLVED,
     Itinerary,
@@ -73,6 +74,8 @@ class ParameterPath:
             leaf_index(osc, where)
         self.first, self.last = as_span(span, where)
         self.variation = varied(osc, where, (self.first,))
+        known = "of known numbers: paths are not for jit, vmap or derivatives"
+        require(is_concrete(self.at(self.first)), "osc", known, "a traced one")
         conditions = check_conditions(conditions)
         for value in (self.first, self.last):
             self.variation.check(value)

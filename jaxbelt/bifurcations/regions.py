@@ -21,6 +21,7 @@ from ..checks import (
     as_whole,
     check_arguments,
     check_finite,
+    outside_of_traces,
     require_one_of,
     require_value,
 )
@@ -172,6 +173,7 @@ def interior(inside: np.ndarray) -> tuple[int, int]:
 
 
 @announced("region_map")
+@outside_of_traces
 def region_map(
     make: Callable[..., Oscillator],
     axes: Mapping[str, ArrayLike],

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..activity import announced, tell
-from ..checks import as_whole
+from ..checks import as_whole, outside_of_traces
 from ..cycles.attractors import SOLVED, apart, is_same, itinerary, place_of
 from ..cycles.cycle import as_loop
 from ..model.oscillator import Oscillator
@@ -61,6 +61,7 @@ NEAR = 1 / 400
 
 
 @announced("scan")
+@outside_of_traces
 def scan(
     osc: Oscillator | Callable[..., Oscillator],
     where: Callable[[Oscillator], Any] | None = None,

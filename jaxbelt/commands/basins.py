@@ -54,7 +54,11 @@ def basins(
     ] = 10_000,
     seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
     out: Annotated[
-        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
+        Path,
+        typer.Option(
+            help="Where to write, without an ending: OUT.png, OUT.csv, ... Folders that are "
+            "missing are made."
+        ),
     ] = Path("basins"),
     as_json: Json = False,
 ) -> None:
@@ -68,7 +72,8 @@ def basins(
     - **OUT.nc**: the same and all that is known of each run, as **sweep** writes it.
 
     Prints the fraction of the window that leads to each kind of attractor, with its standard error
-    (basin stability), from random starts. An oscillator is described as for **simulate**.
+    (basin stability), from random starts. An oscillator is described as for **simulate**. Takes
+    some ten seconds, mostly to compile.
 
     Examples:
 

@@ -11,6 +11,7 @@ import jaxbelt as jb
 
 from ..spelling import did_you_mean
 from .options import (
+    CLASSES,
     Belts,
     Class,
     Damping,
@@ -25,6 +26,7 @@ from .options import (
     check_description,
     check_range,
     make_console,
+    names_in_words,
     oscillator,
     outputs,
     parameters,
@@ -70,7 +72,11 @@ def diagram(
         ),
     ] = None,
     out: Annotated[
-        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
+        Path,
+        typer.Option(
+            help="Where to write, without an ending: OUT.png, OUT.csv, ... Folders that are "
+            "missing are made."
+        ),
     ] = Path("diagram"),
     as_json: Json = False,
 ) -> None:
@@ -86,6 +92,7 @@ def diagram(
       one), error (a bound), status of every bifurcation point.
 
     An oscillator is described as for **simulate**; what is varied needs no value.
+    Takes some ten seconds, mostly to compile; longer with contact edges.
 
     Examples:
 
@@ -106,10 +113,11 @@ def diagram(
         arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
         varied = {parameter: span[0]} if parameter in EDGES else {}
         check_description(system, arguments | varied, belt)
-        paths = {**dict.fromkeys(EDGES, ""), **parameters(system, belt)}
-        if parameter not in paths:
-            known, meant = ", ".join(paths), did_you_mean(parameter, paths)
-            raise ValueError(f"vary must be one of {known}, got {parameter}{meant}")
+        paths = parameters(system, belt)
+        short = () if belt else CLASSES[system]
+        if parameter not in (*short, *paths):
+            known, meant = names_in_words(short, paths), did_you_mean(parameter, (*short, *paths))
+            raise ValueError(f"vary must be {known}, got {parameter}{meant}")
         turn_on_float64()
 
         def along(p):

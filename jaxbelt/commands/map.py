@@ -57,7 +57,11 @@ def region_map(
     ] = (-0.7, 0.7),
     cells: Annotated[int, typer.Option(help="Cells along each side, about.")] = 200,
     out: Annotated[
-        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
+        Path,
+        typer.Option(
+            help="Where to write, without an ending: OUT.png, OUT.csv, ... Folders that are "
+            "missing are made."
+        ),
     ] = Path("map"),
     as_json: Json = False,
 ) -> None:
@@ -74,6 +78,7 @@ def region_map(
       codimension two stand at their places, named in the last column.
 
     An oscillator is described as for **simulate**; what is varied needs no value.
+    Takes a minute or more, mostly to compile and for its curves: the cells cost little.
 
     Examples:
 

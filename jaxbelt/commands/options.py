@@ -89,6 +89,16 @@ def check_number(name: str, value: float) -> None:
         raise ValueError(f"{name} must be finite and > 0, got {value}")
 
 
+#: The largest tolerance of a step. Beyond, what comes out is no motion of the oscillator.
+LOOSEST = 1e-2
+
+
+def check_tolerance(value: float) -> None:
+    """Raise unless it is one that an integrator can be asked for."""
+    if not 0 < value <= LOOSEST:
+        raise ValueError(f"tolerance must be > 0 and at most {LOOSEST}, got {value}")
+
+
 def check_range(name: str, ends: tuple[float, float]) -> None:
     """Raise unless an option FROM TO is an interval."""
     first, last = ends
@@ -256,11 +266,19 @@ def check_axis_names(
     names, seen = (*({} if belt else CLASSES[system]), *paths, *others), set()
     for name in axes:
         if name not in names:
-            meant, known = did_you_mean(name, names), ", ".join(dict.fromkeys(names))
-            raise ValueError(f"axes must be among {known}, got {name}{meant}")
+            known = names_in_words((*({} if belt else CLASSES[system]), *others), paths)
+            meant = did_you_mean(name, names)
+            raise ValueError(f"axes must be {known}, got {name}{meant}")
         if paths.get(name, name) in seen:
             raise ValueError(f"axes must be different ones, got {name} twice")
         seen.add(paths.get(name, name))
+
+
+def names_in_words(names: Iterable[str], paths: dict[str, str]) -> str:
+    """What a parameter may be called: a short name, or one of many paths."""
+    short = dict.fromkeys([*names, *(name for name, path in paths.items() if name != path)])
+    one = next(path for path in paths if ".friction." in path)
+    return f"one of {', '.join(short)}, or a path such as {one} or belts[0].load"
 
 
 def family(
@@ -299,6 +317,27 @@ def parse_belt(text: str) -> "jb.Belt":
     return Belt(friction=getattr(laws, law)(**friction), **numbers)
 
 
+def _check_numbers(text: str, friction: dict[str, float], numbers: dict[str, float]) -> None:
+    """Raise where a belt or its law would refuse them, which ask only when they are imported."""
+
+    def fits(name: str, holds: bool, expected: str, came: float) -> None:
+        if not holds:
+            raise ValueError(f"{name} of belt {text!r} must be {expected}, got {came}")
+
+    ends = {"lower": -math.inf, "upper": math.inf} | numbers
+    own = {name: numbers.get(name, 1.0) for name in ("velocity", "load")}
+    for name, value in (*own.items(), *friction.items()):
+        fits(name, math.isfinite(value), "finite", value)
+    for name, value in (("load", own["load"]), *friction.items()):
+        fits(name, value >= 0 or name == "quadratic", ">= 0", value)
+    fits("lower", ends["lower"] < ends["upper"], f"< {ends['upper']}", ends["lower"])
+    if "kinetic" in friction:
+        kinetic, static = friction["kinetic"], friction["static"]
+        fits("kinetic", kinetic <= static, f"<= static = {static}", kinetic)
+    if "velocity" in friction:
+        fits("stribeck_velocity", friction["velocity"] > 0, "> 0", friction["velocity"])
+
+
 def _parts_of_belt(text: str) -> tuple[str, dict[str, float], dict[str, float]]:
     """The class of its law, and the arguments of that and of the belt."""
     velocity, *parts = text.split(",")
@@ -331,4 +370,5 @@ def _parts_of_belt(text: str) -> tuple[str, dict[str, float], dict[str, float]]:
         if value is None:
             raise ValueError(f"belt {text!r} must have {name}, which {name_of_law} needs")
         friction[name.removeprefix("stribeck_")] = value
+    _check_numbers(text, friction, numbers)
     return law, friction, numbers

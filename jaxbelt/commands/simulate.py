@@ -24,6 +24,7 @@ from .options import (
     as_json_value,
     check_description,
     check_number,
+    check_tolerance,
     make_console,
     oscillator,
     outputs,
@@ -65,11 +66,17 @@ def simulate(
         float, typer.Option(help="Relative and absolute tolerance of the integrator.")
     ] = 1e-10,
     out: Annotated[
-        Path, typer.Option(help="Where to write, without an ending: OUT.png, OUT.csv, ...")
+        Path,
+        typer.Option(
+            help="Where to write, without an ending: OUT.png, OUT.csv, ... Folders that are "
+            "missing are made."
+        ),
     ] = Path("trajectory"),
     as_json: Json = False,
 ) -> None:
     """Follow one oscillator from one start; write a picture and the numbers.
+
+    Takes some seconds, mostly to compile.
 
     - **OUT.png**: time histories with the stick phases shaded, and the phase portrait.
 
@@ -108,7 +115,7 @@ def simulate(
             names = ", ".join(FORMULATIONS)
             raise ValueError(f"formulation must be one of {names}, got {formulation}{meant}")
         check_number("t1", t1)
-        check_number("tolerance", tolerance)
+        check_tolerance(tolerance)
         if not all(map(math.isfinite, start)):
             raise ValueError(f"start must be finite, got {start[0]} {start[1]}")
         written = outputs(out, ".png", ".csv", "_events.csv")

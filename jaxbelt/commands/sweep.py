@@ -18,6 +18,7 @@ from .options import (
     check_axis_names,
     check_number,
     check_out,
+    check_tolerance,
     family,
     make_console,
     plain_errors,
@@ -79,7 +80,7 @@ def sweep(
         Path,
         typer.Option(
             help="Where to write: NetCDF if it ends in .nc; if in .zarr, a store, from which the "
-            "same command goes on where it was interrupted."
+            "same command goes on where it was interrupted. Folders that are missing are made."
         ),
     ] = Path("sweep.nc"),
     blocks: Annotated[
@@ -101,6 +102,8 @@ def sweep(
     - **OUT**: the dataset, labelled, with what it came from in its attributes.
 
     - the same name with **.png**: a picture, for one or two axes.
+
+    Takes some seconds to compile; **--dry-run** tells how long the runs will take.
 
     An oscillator is described as for **simulate**, and has the values given there, or those that
     **simulate** takes, but for what is an axis.
@@ -132,7 +135,7 @@ def sweep(
         shown = variable or VARIABLES[observe][0]
         drawn = part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2)
         _check_variable(shown, observe)
-        check_number("tolerance", tolerance)
+        check_tolerance(tolerance)
         if t1 is not None:
             check_number("t1", t1)
         if out.suffix == ".nc":

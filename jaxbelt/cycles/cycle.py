@@ -388,8 +388,9 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     hundred); then all arcs are polished together by Newton's
     method. Differentiable with respect to the parameters (the derivative with respect to y0 is
     zero: a cycle does not depend on where it was approached from), forward and reverse, and under
-    `jax.vmap`. Where the start leads to an equilibrium, to one of a continuum of closed orbits, or
-    nothing repeats, the status says so.
+    `jax.vmap`. At a bifurcation point, as where two belts run at one velocity, the derivatives of
+    its two sides differ, and what is given may be neither, see `simulate`. Where the start leads to
+    an equilibrium, to one of a continuum of closed orbits, or nothing repeats, the status says so.
     `ValueError` names an argument that is impossible.
     """
     check_oscillator(osc)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..activity import announced
-from ..checks import is_concrete, pick, require
+from ..checks import outside_of_traces, pick
 from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.events import signature_name
 from ..model.modes import edges
@@ -148,6 +148,7 @@ def _row(what: str, number: int, kind: str, stable: Any, ys: np.ndarray, **more:
 
 
 @announced("portrait")
+@outside_of_traces
 def portrait(osc: Oscillator) -> Portrait:
     """All equilibria, attracting and unstable cycles, and separatrices of an oscillator.
 
@@ -158,7 +159,6 @@ def portrait(osc: Oscillator) -> Portrait:
     decides what is computed. `ValueError` names an argument that is impossible, or traced.
     """
     check_oscillator(osc)
-    require(is_concrete(osc), "osc", "known: portraits are not for jit or vmap", "a traced one")
     points, reach = equilibria(osc), reach_of(osc)
     rests = pick(points, np.asarray(points.kind) != EquilibriumKind.SADDLE)
     found = branches(osc, rests, TRACED * reach)

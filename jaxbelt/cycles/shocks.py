@@ -18,7 +18,16 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import as_array, as_whole, check_finite, is_concrete, number, require, require_one_of
+from ..checks import (
+    as_array,
+    as_whole,
+    check_finite,
+    is_concrete,
+    number,
+    outside_of_traces,
+    require,
+    require_one_of,
+)
 from ..model.oscillator import Oscillator, check_oscillator
 from ..results import Status, describe, draw
 from ..tables import table_of
@@ -119,6 +128,7 @@ class FatalShock(eqx.Module):
 
 
 @announced("minimal_fatal_shock")
+@outside_of_traces
 def minimal_fatal_shock(
     osc: Oscillator | Portrait, y0: ArrayLike | tuple, *, direction: str = "both"
 ) -> FatalShock:

@@ -16,7 +16,15 @@ from jaxtyping import Array, ArrayLike
 from ..activity import announced
 from ..bifurcations.base import AbstractCondition, check_conditions
 from ..bifurcations.refine import refine
-from ..checks import as_array, as_numbers, check_finite, require, require_callable, require_value
+from ..checks import (
+    as_array,
+    as_numbers,
+    check_finite,
+    outside_of_traces,
+    require,
+    require_callable,
+    require_value,
+)
 from ..cycles.cycle import Cycle, find_cycle
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
@@ -110,6 +118,7 @@ def distance_to(
 
 
 @announced("design")
+@outside_of_traces
 def design(
     oscillator: Oscillator,
     targets: Sequence[Any],

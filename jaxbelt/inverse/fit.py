@@ -32,7 +32,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import as_array, as_whole, check_finite, require, require_value
+from ..checks import as_array, as_whole, check_finite, outside_of_traces, require, require_value
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import simulate
 from ..motion.smoothing import smooth_field
@@ -263,7 +263,8 @@ class Fit(eqx.Module):
     candidates: how many starts were followed; evaluations: of the motion and its Jacobian; status:
     OK, NOT_IDENTIFIED (an infinite standard error), MISFIT (plausibility below 1e-6),
     NO_CONVERGENCE or NOT_FINITE. Standard errors are those of the linearised problem: right where
-    the model is and the errors are small.
+    the model is and the errors are small. With a MISFIT they mean nothing, and `table` and the text
+    leave them out.
     """
 
     oscillator: Oscillator
@@ -291,10 +292,12 @@ class Fit(eqx.Module):
 
     def table(self) -> "pandas.DataFrame":
         """A row for each parameter, and for x1 and x2 at the first time: name, estimate,
-        standard_error, lower, upper (the confidence interval of 95 per cent)."""
+        standard_error, lower, upper (the confidence interval of 95 per cent); these three are NaN
+        where the status is MISFIT."""
         names = (*self.names, "x1 at the start", "x2 at the start")
         estimates = np.concatenate([self.estimates, self.y0])
         errors = np.concatenate([self.standard_errors, self.y0_standard_errors])
+        errors = np.where(int(self.status) == Status.MISFIT, np.nan, errors)
         reach = _standard_errors_in(0.95) * errors
         return table_of(
             {
@@ -313,8 +316,10 @@ class Fit(eqx.Module):
 
     def __repr__(self) -> str:
         status = Status(int(self.status))
+        fits = status != Status.MISFIT
         rows = [
-            f"  {name} = {float(value):.6g} +- {float(error):.2g}"
+            f"  {name} = {float(value):.6g} "
+            + (f"+- {float(error):.2g}" if fits else "(a misfit: without a standard error)")
             for name, value, error in zip(self.names, self.estimates, self.standard_errors)
         ]
         head = (
@@ -331,6 +336,7 @@ def _standard_errors_in(level: float) -> float:
 
 
 @announced("fit")
+@outside_of_traces
 def fit(
     oscillator: Oscillator,
     ts: ArrayLike,
@@ -345,10 +351,11 @@ def fit(
 ) -> Fit:
     """Parameters of an oscillator from a measured record of its motion, with standard errors.
 
-    oscillator: the guess; 30 per cent off is near enough for a stick-slip record of many loops.
-    ts: the times, increasing, [samples]; x1, x2: displacement, velocity, or both, [samples], NaN
-    where a datum is missing. All dimensionless, as in `simulate`. The start of the motion, its
-    state at ts[0], is estimated too.
+    oscillator: the guess; 30 per cent off is mostly near enough for a stick-slip record of many
+    loops. The status MISFIT may mean that it was not: give a nearer one, or more starts. ts: the
+    times, increasing, [samples]; x1, x2: displacement, velocity, or both, [samples], NaN where a
+    datum is missing. All dimensionless, as in `simulate`. The start of the motion, its state at
+    ts[0], is estimated too.
 
     where: selects the parameters, as in `equinox.tree_at`: a tuple with one entry each. An entry is
     a number of the oscillator, or a tuple of numbers that are to be equal:
@@ -442,6 +449,10 @@ def _follow_up(linearized, u, starts, data: int, tell) -> tuple[_Point, bool]:
         last = every >= pieces
         point = _fit_windows(linearized, u, starts, fresh, 0.0 if last else 3e-3)
         spent += point.evaluations
+        if every == 1 and not point.chi2 < HOPELESS * data:
+            # It may but creep along a valley.
+            point = _fit_windows(linearized, point.u, point.starts, fresh, 0.0)
+            spent += point.evaluations
         tell(f"  {np.sum(fresh)} windows: chi^2 per datum {point.chi2 / data:.3f}")
         hopeless = not point.chi2 < HOPELESS * data
         if last or (every == 1 and hopeless):

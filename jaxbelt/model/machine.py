@@ -26,7 +26,7 @@ from ..checks import (
     require_value,
 )
 from .friction import AbstractFriction, as_friction
-from .oscillator import Belt, Oscillator, as_belts, check_oscillator
+from .oscillator import Belt, Oscillator, as_belts, as_edge, check_oscillator, scaled_edge
 
 
 class Units(eqx.Module):
@@ -62,10 +62,10 @@ class PhysicalBelt(eqx.Module):
         converter=lambda value: as_array(value, "normal_force")
     )
     lower: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_array(value, "lower"), default=-float("inf")
+        converter=lambda value: as_edge(value, "lower"), default=-float("inf")
     )
     upper: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_array(value, "upper"), default=float("inf")
+        converter=lambda value: as_edge(value, "upper"), default=float("inf")
     )
 
     def __check_init__(self):
@@ -137,8 +137,8 @@ class Machine(eqx.Module):
                 belt.velocity / units.velocity,
                 belt.friction.in_units_of(units.velocity),
                 belt.normal_force / units.force,
-                belt.lower / units.length,
-                belt.upper / units.length,
+                scaled_edge(belt.lower, 1 / units.length),
+                scaled_edge(belt.upper, 1 / units.length),
             )
             for belt in self.belts
         ]
@@ -172,8 +172,8 @@ class Machine(eqx.Module):
                 belt.velocity * units.velocity,
                 belt.friction.in_units_of(1 / units.velocity),
                 belt.load * units.force,
-                belt.lower * units.length,
-                belt.upper * units.length,
+                scaled_edge(belt.lower, units.length),
+                scaled_edge(belt.upper, units.length),
             )
             for belt in osc.belts
         ]

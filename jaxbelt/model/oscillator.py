@@ -28,7 +28,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
 
 from ..checks import (
     Rule,
@@ -46,22 +47,59 @@ from ..numerics.compiling import traced_once
 from .friction import AbstractFriction, as_friction
 
 
+@jax.custom_jvp
+def _as_it_is(edge: Array) -> Array:
+    return edge
+
+
+@_as_it_is.defjvp
+def _(primals, tangents):
+    (edge,), (tangent,) = primals, tangents
+    return edge, jnp.where(jnp.isinf(edge), 0.0, tangent)
+
+
+def as_edge(value: Any, field: str) -> Array:
+    """`value` as the edge of a contact interval, or a `ValueError`.
+
+    An edge at infinity has no part in the motion, and so no slope: that of inf/L is infinite.
+    """
+    edge = as_array(value, field)
+    if not isinstance(edge, Tracer):
+        return edge
+    try:
+        # Under derivatives alone it is known, and then known to be no edge as well.
+        at_infinity = next((end for end in (-np.inf, np.inf) if bool(edge == end)), None)
+    except jax.errors.ConcretizationTypeError:
+        return _as_it_is(edge)
+    return edge if at_infinity is None else as_array(at_infinity, field)
+
+
+def scaled_edge(edge: Array, factor: ArrayLike) -> Array:
+    """An edge in another unit, without a slope where it is at infinity, in reverse mode neither."""
+    if is_concrete(edge):
+        return edge if np.isinf(edge) else edge * factor
+    is_edge = jnp.isfinite(edge)
+    return jnp.where(is_edge, jnp.where(is_edge, edge, 0.0) * factor, edge)
+
+
 class Belt(eqx.Module):
     """A rough belt that moves at constant velocity and touches the mass while lower < x1 < upper.
 
     Arguments, dimensionless scalars: velocity (nu), friction (a law), load (u0 = Fn/k >= 0,
-    default 1), lower and upper (edges of the contact interval, default unbounded).
-    `ValueError` for non-finite, negative or wrongly shaped values or an interval turned round.
+    default 1), lower and upper (edges of the contact interval, default unbounded; one at infinity
+    has no derivative. Write it `jnp.inf`: of `jnp.inf / L` the reverse derivative by L is NaN under
+    `jit`, in JAX). `ValueError` for non-finite, negative or wrongly shaped values or an interval
+    turned round.
     """
 
     velocity: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "velocity"))
     friction: AbstractFriction = eqx.field(converter=as_friction)
     load: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "load"), default=1.0)
     lower: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_array(value, "lower"), default=-float("inf")
+        converter=lambda value: as_edge(value, "lower"), default=-float("inf")
     )
     upper: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_array(value, "upper"), default=float("inf")
+        converter=lambda value: as_edge(value, "upper"), default=float("inf")
     )
 
     def __check_init__(self):

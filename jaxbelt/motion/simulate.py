@@ -227,7 +227,11 @@ def simulate(
     of time.
 
     Works under `jax.jit`, `jax.vmap` (batches), `jax.jacfwd` and `jax.jacrev`. There the lengths
-    are padded (see `Events`); outside they are cut to what happened.
+    are padded (see `Events`); outside they are cut to what happened. Derivatives are those of the
+    arcs in their present order. Where this changes at the very numbers given, as where two belts
+    run at one velocity or an orbit grazes a boundary, the derivatives of the two sides differ, and
+    what is given may be neither: step aside by 1e-6 for that of one side. Velocities that stay
+    equal are varied together.
 
     `ValueError` names the argument that is impossible. See `Trajectory` for what comes back.
     """

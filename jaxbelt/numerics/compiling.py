@@ -464,34 +464,37 @@ LINEAR = frozenset(
     concatenate slice""".split()
 )
 
+#: What calls another program, and the parameter that holds it.
+CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "custom_jvp_call": "call_jaxpr"}
+
 
 def _is_affine(function: Callable[..., Sequence[Any]], count: int) -> bool:
     number = jax.ShapeDtypeStruct((), jnp.float64)
-    return _depending(jax.make_jaxpr(function)(*[number] * count).jaxpr, [True] * count) is not None
+    jaxpr = jax.make_jaxpr(function)(*[number] * count).jaxpr
+    return all(degree <= 1 for degree in _degrees(jaxpr, [1] * count))
 
 
-def _depending(jaxpr: Any, given: Sequence[bool]) -> list[bool] | None:
-    """Which results depend on the arguments `given`; None where one is not linear in them."""
+def _degrees(jaxpr: Any, given: Sequence[int]) -> list[int]:
+    """How the results depend on the arguments, and these on numbers: not at all (0), linearly (1),
+    or perhaps in another way (2)."""
     from jax.extend.core import Var
 
-    depending = {one for one, depends in zip(jaxpr.invars, given, strict=True) if depends}
+    degrees = dict(zip(jaxpr.invars, given, strict=True))
 
-    def which(atoms):
-        return [isinstance(one, Var) and one in depending for one in atoms]
+    def of(atoms):
+        return [degrees.get(one, 0) if isinstance(one, Var) else 0 for one in atoms]
 
     for equation in jaxpr.eqns:
-        given, name = which(equation.invars), equation.primitive.name
+        given, name = of(equation.invars), equation.primitive.name
         if not any(given):
             continue
-        inner = equation.params.get("jaxpr") if name in ("jit", "pjit") else None
-        scales = (name == "mul" and sum(given) == 1) or (name == "div" and not given[1])
+        inner = equation.params.get(CALLS[name]) if name in CALLS else None
+        scales = (name == "mul" and 0 in given) or (name == "div" and not given[1])
         picks = name == "select_n" and not given[0]
-        linear = [True] * len(equation.outvars) if name in LINEAR or scales or picks else None
-        out = linear if inner is None else _depending(inner.jaxpr, given)
-        if out is None:
-            return None
-        depending |= {one for one, depends in zip(equation.outvars, out, strict=True) if depends}
-    return which(jaxpr.outvars)
+        degree = max(given) if name in LINEAR or scales or picks else 2
+        out = [degree] * len(equation.outvars) if inner is None else _degrees(inner.jaxpr, given)
+        degrees |= dict(zip(equation.outvars, out, strict=True))
+    return of(jaxpr.outvars)
 
 
 # --- forked processes -----------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from ..sweeps.datasets import decoded
-from .style import figure_of
+from .style import figure_of, make_room
 
 BLANK, OTHER = "not done", "other"
 #: What has the same colour in every picture; cycles that stick: see `_colour_of_kind`.
@@ -60,7 +60,9 @@ def draw_categories(ax: Axes, x: np.ndarray, y: np.ndarray, words: np.ndarray) -
     keys = [Patch(facecolor=colour, edgecolor="0.4") for colour in colours]
     labels = [_in_lines(word) for word in present]
     columns = 2 if max(map(len, labels)) < LINE // 2 else 1
-    figure_of(ax).legend(keys, labels, loc="outside lower center", ncols=columns, fontsize="small")
+    figure = figure_of(ax)
+    make_room(figure)
+    figure.legend(keys, labels, loc="outside lower center", ncols=columns, fontsize="small")
 
 
 def _in_key(word: str) -> tuple[bool, bool, int, str]:

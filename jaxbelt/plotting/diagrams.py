@@ -19,7 +19,7 @@ from ..bifurcations.special import SpecialPoint
 from ..checks import require
 from ..cycles.cycle import Cycle
 from ..cycles.functionals import amplitude, period
-from .style import figure_of, new_axes, parameter_label, spread
+from .style import figure_of, make_room, new_axes, parameter_label, spread
 
 UNSTABLE_COLOUR = "0.6"
 
@@ -193,25 +193,41 @@ def _join_stick_phases(ax: Axes, diagram: BifurcationDiagram) -> None:
                     ax.annotate("", (at, high), (at, low), arrowprops=style, zorder=2)
 
 
+#: How far above the axes the names of points stand, in points, and farther where they lie close
+#: together: by this fraction of how far the names are moved aside.
+NAMES_ABOVE, STEEPNESS = 9.0, 0.5
+
+
 def _name_points(ax: Axes, diagram: BifurcationDiagram) -> None:
-    width = ax.get_window_extent().width * 72 / figure_of(ax).dpi
+    figure = figure_of(ax)
+    make_room(figure)
+    width = ax.get_window_extent().width * 72 / figure.dpi
     first, last = ax.get_xlim()
-    values = np.array([float(point.value) for point in diagram.points])
+    points = sorted(diagram.points, key=lambda point: float(point.value))
+    values = np.array([float(point.value) for point in points])
     at = (values - first) / (last - first) * width
-    shifts = spread(at, matplotlib.rcParams["font.size"]) - at
-    for point, value, shift in zip(diagram.points, values, shifts, strict=True):
+    shifts = spread(at, 1.15 * matplotlib.rcParams["font.size"]) - at
+    above = NAMES_ABOVE + STEEPNESS * np.max(np.abs(shifts), initial=0.0)
+    for point, value, shift in zip(points, values, shifts, strict=True):
         ax.axvline(value, color="0.45", linewidth=0.6, linestyle=":", zorder=1)
         ax.annotate(
             point.condition.words,
             (value, 1.0),
             xycoords=ax.get_xaxis_transform(),
-            xytext=(shift, 9),
+            xytext=(shift, above),
             textcoords="offset points",
             rotation=90,
             ha="center",
             va="bottom",
             fontsize="x-small",
-            arrowprops={"arrowstyle": "-", "color": "0.45", "linewidth": 0.5, "shrinkB": 0},
+            arrowprops={
+                "arrowstyle": "-",
+                "color": "0.45",
+                "linewidth": 0.5,
+                "shrinkA": 1.5,
+                "shrinkB": 0,
+                "relpos": (0.5, 0.0),
+            },
             annotation_clip=False,
         )
 

@@ -18,15 +18,18 @@ def _coefficient(friction: AbstractFriction, speed: Array) -> Array:
 
 
 def plot_friction_law(
-    friction: AbstractFriction, ax: Axes | None = None, *, speed: float = 1.0
+    friction: AbstractFriction, ax: Axes | None = None, *, speed: float = 1.0, unit: str = ""
 ) -> Axes:
     """Friction coefficient mu(|nu_R|) sgn(nu_R) over the relative velocity nu_R, up to `speed`.
 
-    A stuck mass takes any value on the vertical bar at nu_R = 0. Returns the axes.
+    unit: of the speeds that the law takes, for the label of the axis: "m/s" for the law of a
+    `PhysicalBelt`, with a `speed` that its machine reaches. A stuck mass takes any value on the
+    vertical bar at nu_R = 0. Returns the axes.
     """
     law = "a law such as jb.Conti(...)"
     require_value(isinstance(friction, AbstractFriction), "friction", law, friction)
     speed = as_positive(speed, "speed")
+    require_value(isinstance(unit, str), "unit", 'a text such as "m/s"', unit)
     ax = new_axes() if ax is None else ax
     r = jnp.linspace(0.0, speed, 401)
     mu, static = np.asarray(_coefficient(friction, r)), float(friction.static)
@@ -36,8 +39,9 @@ def plot_friction_law(
         ax.plot(sign * r, sign * mu, color="black", linewidth=1.4)
     ax.plot([0, 0], [-static, static], color="black", linewidth=1.4)
     ax.set_xlim(-speed, speed)
-    ax.set_xlabel(r"relative velocity $\nu_{\mathrm{R}}$")
-    ax.set_ylabel(r"friction coefficient $\mu\,\mathrm{sgn}\,\nu_{\mathrm{R}}$")
+    symbol = "R" if unit else r"\nu_{\mathrm{R}}"
+    ax.set_xlabel(f"relative velocity ${symbol}$" + f" ({unit})" * bool(unit))
+    ax.set_ylabel(rf"friction coefficient $\mu\,\mathrm{{sgn}}\,{symbol}$")
     return ax
 
 

@@ -35,6 +35,7 @@ from ..model.transitions import mode_of_state
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
 from .style import (
+    add_key,
     belt_colour,
     figure_of,
     journal_figure,
@@ -186,7 +187,8 @@ def plot_phase_portrait(
 
     trajectories: one or several from `simulate`, thin. cycles: see `ClosedOrbit`; stable ones are
     thick and solid, unstable ones dashed. equilibria: None takes those of `osc`. xlim, ylim: the
-    window; None fits what is drawn. Returns the axes.
+    window; None fits what is drawn. ax: None makes new axes, with a key below them; `ax.legend()`
+    gives others one. Returns the axes.
     """
     check_oscillator(osc)
     if isinstance(trajectories, Trajectory):
@@ -198,7 +200,7 @@ def plot_phase_portrait(
     fits = isinstance(cycles, Sequence) and all(hasattr(cycle, "sample") for cycle in cycles)
     require_value(fits, "cycles", "a list of cycles, such as [jb.find_cycle(...)]", cycles)
     _check_window(xlim, ylim)
-    ax = new_axes() if ax is None else ax
+    is_new, ax = ax is None, new_axes() if ax is None else ax
     paths = [path_of(trajectory)[1] for trajectory in trajectories]
     loops = [path_around(cycle) for cycle in cycles]
     equilibria = find_equilibria(osc) if equilibria is None else equilibria
@@ -219,6 +221,8 @@ def plot_phase_portrait(
         draw_equilibrium(ax, equilibrium)
     ax.set_xlabel("displacement $x_1$")
     ax.set_ylabel("velocity $x_2$")
+    if is_new:
+        add_key(ax)
     return ax
 
 

@@ -12,8 +12,8 @@ from matplotlib.axis import Axis
 from matplotlib.ticker import AutoLocator, FuncFormatter
 
 from ..checks import require
-from ..model.machine import Machine, Units
-from ..si import AlongParameter, units_along
+from ..model.machine import Units
+from ..si import AlongParameter, check_machine, units_along, units_of
 from .draw import draw_result
 from .style import figure_of, in_fractions, parameter_label
 
@@ -54,15 +54,17 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
 
     result: of the machine's oscillator, anything that has a `.plot()`, drawn into the axes (None:
     new ones); or the axes, one or several, that another function of this package has drawn into.
-    machine: the `Machine`; for a diagram or fractions along the argument of a function, a function
-    of that which returns it. options: of that `.plot()`. Returns the axes.
+    machine: the `Machine`, or its units alone, see `in_si`; for a diagram or fractions along the
+    argument of a function, a function of that which returns it. options: of that `.plot()`. Returns
+    the axes.
 
     The parameter of a diagram or of fractions is in SI units, too: that of a function's argument as
-    the function takes it. Other axes that show something else stay as they are. `ValueError` where
+    the function takes it, whose unit only you know: `ax.set_xlabel("belt velocity $V$ (m/s)")`.
+    Other axes that show something else, or tell their unit, stay as they are. `ValueError` where
     no axis can be converted, as in the picture of a sweep (draw what `in_si` returns instead),
     where the units vary along the parameter, and for a wrong argument.
     """
-    units, parameter = _units_of(result, machine)
+    units, parameter = _units_of_picture(result, machine)
     several = isinstance(result, Sequence) and all(isinstance(one, Axes) for one in result)
     is_drawn = isinstance(result, Axes) or several
     axes: Any = result if is_drawn else draw_result(result, ax, **options)
@@ -83,14 +85,15 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     return axes
 
 
-def _units_of(result: Any, machine: Any) -> tuple[Units, tuple[float, str] | None]:
+def _units_of_picture(result: Any, machine: Any) -> tuple[Units, tuple[float, str] | None]:
     """The units of a picture; and of its parameter what 1 is, and its label, where it has one that
     is not in SI units anyway."""
     if not isinstance(result, AlongParameter):
-        require(isinstance(machine, Machine), "machine", "a Machine", repr(machine))
-        return machine.units, None
+        check_machine(result, machine)
+        return units_of(machine), None
     values = result.table()["value"].to_numpy(float)
     units, (symbol, size) = units_along(result, values, machine)
+    check_machine(result, machine)
     vary = sorted(name for name, unit in vars(units).items() if np.ptp(np.asarray(unit)) > 0)
     expected = "along a parameter on which no unit depends (jb.in_si converts each row)"
     require(not vary, "result", expected, f"along {result.name}, with other {', '.join(vary)}")
@@ -123,6 +126,8 @@ def _relabel_key(ax: Axes, units: Units) -> None:
 def _relabel(axis: Axis, units: Units) -> bool:
     """Put an axis in SI units, if it shows one quantity that has some; whether it does."""
     text = axis.get_label_text()
+    if text.endswith(")"):  # it tells its unit
+        return False
     shown = [
         LABELS[begins] for part in text.split(", ") for begins in LABELS if part.startswith(begins)
     ]

@@ -116,11 +116,19 @@ def draw_key(
     )
 
 
+def make_room(figure: Figure) -> None:
+    """Let what stands outside of the axes, a key or names, have room: a figure without a layout, as
+    `matplotlib.pyplot.subplots` makes it, gets the constrained one. Any other is left alone."""
+    if figure.get_layout_engine() is None:
+        figure.set_layout_engine("constrained")
+
+
 def add_key(ax: Axes) -> None:
     """Below the axes a key for all that they label, each thing once."""
     entries = key_entries([ax])
     if not entries:
         return
+    make_room(figure_of(ax))
     # Below the numbers and the name of the axis, whatever the height of the axes.
     figure, size = figure_of(ax), matplotlib.rcParams["font.size"]
     below = ScaledTranslation(0, -(3.4 * size + 4) / 72, figure.dpi_scale_trans)

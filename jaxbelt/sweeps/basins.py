@@ -26,6 +26,7 @@ from ..checks import (
     as_whole,
     check_finite,
     in_words,
+    outside_of_traces,
     require,
     require_value,
 )
@@ -238,13 +239,14 @@ class BasinStability(eqx.Module):
         ]
         # All starts agree: the standard error is 0, and tells nothing of the others.
         parts += [
-            f"{kind} 1 (above {max(0.0, 1 - 3 / self.n):.5f} with 95% confidence)"
+            f"all {kind}, a fraction above {max(0.0, 1 - 3 / self.n):.5f} with 95% confidence"
             for kind, fraction in self.fractions.items()
             if fraction == 1
         ]
         return f"BasinStability({', '.join(parts)}; {self.n} starts)"
 
 
+@outside_of_traces
 def basins(
     oscillator: Oscillator,
     *,
@@ -383,6 +385,7 @@ def _words_for(kind: str, sticks: np.ndarray, x1: float) -> str:
 
 
 @announced("basin_stability")
+@outside_of_traces
 def basin_stability(
     oscillator: Oscillator,
     *,

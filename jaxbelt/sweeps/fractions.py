@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, tell
-from ..checks import as_positive, as_whole
+from ..checks import as_positive, as_whole, outside_of_traces
 from ..cycles.attractors import APART, RUN, Runs, place_of
 from ..cycles.cycle import find_cycle
 from ..model.equilibria import equilibria
@@ -123,6 +123,7 @@ class BasinFractions(eqx.Module):
 
 
 @announced("basin_fractions")
+@outside_of_traces
 def basin_fractions(
     osc: Oscillator | Callable[..., Oscillator],
     where: Callable[[Oscillator], Any] | None = None,

@@ -57,6 +57,8 @@ class Grid:
         self.example = make(**first)
         came = f"one that returns {type(self.example).__name__}"
         require(isinstance(self.example, Oscillator), "make", returns, came)
+        known = "one of known numbers: sweeps are not for jit, vmap or derivatives"
+        require(is_concrete(self.example), "make", known, "a traced one")
         check_scalars(self.example)
         leaves, self.structure = jax.tree.flatten(self.example)
         self.mapped = traceable(self._varying, "make", returns)

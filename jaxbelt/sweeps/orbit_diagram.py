@@ -24,6 +24,7 @@ from ..checks import (
     as_positive,
     as_whole,
     check_finite,
+    outside_of_traces,
     require_value,
 )
 from ..cycles.attractors import RUN
@@ -116,6 +117,7 @@ class OrbitDiagram(eqx.Module):
 
 
 @announced("orbit_diagram")
+@outside_of_traces
 def orbit_diagram(
     osc: Oscillator | Callable[..., Oscillator],
     where: Callable[[Oscillator], Any] | None = None,

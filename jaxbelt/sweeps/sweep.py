@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from ..activity import announced
-from ..checks import as_array, as_path, require, require_value
+from ..checks import as_array, as_path, outside_of_traces, require, require_value
 from ..model.oscillator import Oscillator
 from ..results import draw
 from ..tables import table_of
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     import xarray
 
 
+@outside_of_traces
 def sweep(
     make: Callable[..., Oscillator],
     axes: Mapping[str, Any],
@@ -250,6 +251,7 @@ class Explanation:
 
 
 @announced("explain")
+@outside_of_traces
 def explain(
     make: Callable[..., Oscillator],
     axes: Mapping[str, Any],
