@@ -209,7 +209,7 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, steps: Steps)
 
     @one_kernel
     def made(shared, own, *rows):
-        return _columns(result, by_run, *eqx.combine(shared, own), *rows)
+        return _slopes_together(result, by_run, *eqx.combine(shared, own), *rows)
 
     def group(rows):
         *rows, wanted = rows
@@ -225,7 +225,7 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, steps: Steps)
     return tuple(jnp.split(slopes, slopes.shape[1] // columns, axis=1))
 
 
-def _columns(result, by_run, varied, rest, arcs: Arc, steps: Steps, times):
+def _slopes_together(result, by_run, varied, rest, arcs: Arc, steps: Steps, times):
     """The derivatives of flights that are made together, arrays [3 + varied, flights], see
     `slopes_of`."""
     axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
