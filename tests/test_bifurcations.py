@@ -235,14 +235,17 @@ def test_convergence_is_quadratic():
 
 
 def test_a_batch_of_hopf_points_and_the_slope_of_their_curve():
-    """Of class (a), 1 + p3 nu = sqrt(p3 (mus - p1)/zeta)."""
+    """Of class (a), 1 + p3 nu = sqrt(p3 (mus - p1)/zeta). With more damping than friction can undo
+    there is none: NaN, and so is its derivative."""
 
     def value(zeta):
         osc = jb.Oscillator(zeta, (jb.Belt(0.2, jb.Conti(1.0, 0.6, 10.0)),))
         return jb.refine(jb.Hopf(), osc, where=nu0).value
 
-    zetas = jnp.array([0.45, 0.5, 0.55])
+    zetas = jnp.array([0.45, 0.5, 0.55, 5.0])
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(value)))(zetas)
+    assert jnp.isnan(values[3]) and jnp.isnan(slopes[3])
+    zetas, values, slopes = (numbers[:3] for numbers in (zetas, values, slopes))
     np.testing.assert_allclose(values, (2 / np.sqrt(zetas) - 1) / 10, atol=1e-14)
     np.testing.assert_allclose(slopes, -0.1 * zetas**-1.5, rtol=1e-12)
 

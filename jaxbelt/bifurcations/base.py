@@ -18,7 +18,6 @@ is static.
 """
 
 import abc
-import functools
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -432,26 +431,31 @@ def point_of(
 ) -> BifurcationPoint:
     """The point of a solution, NaN where the status is not OK."""
     status = judged_by(solution.error, family, status)
-    known = functools.partial(jnp.where, status == Status.OK)
+    known = _where_known(status)
     return BifurcationPoint(
         condition=UNNAMED,
-        value=known(solution.p[0], jnp.nan),
-        residual=known(solution.residual, jnp.nan),
+        value=solution.p[0] * known,
+        residual=solution.residual * known,
         iterations=solution.iterations,
         steps=solution.steps,
-        error=known(solution.error, jnp.nan),
-        multiplier=known(multiplier, jnp.nan),
-        oscillator=family.at(known(solution.p, jnp.nan)),
+        error=solution.error * known,
+        multiplier=multiplier * known,
+        oscillator=family.at(solution.p * known),
         cycle=cycle,
         status=status,
     )
 
 
+def _where_known(status: Array) -> Array:
+    """1, or NaN where there is no point: a factor, so that derivatives are NaN there, too."""
+    return jnp.where(status == Status.OK, 1.0, jnp.nan)
+
+
 def point_without_cycle(family: Family, p, steps, size, error, status, why) -> BifurcationPoint:
     """A point at p where there is no cycle: why not."""
     iterations = jnp.sum(~jnp.isnan(steps))
-    known = functools.partial(jnp.where, status == Status.OK)
-    at_point = family.at(known(p, jnp.nan))
+    known = _where_known(status)
+    at_point = family.at(p * known)
     nan = jnp.full((SIZES[0], 3), jnp.nan)
     n = len(at_point.belts)
     chain = Chain(
@@ -461,11 +465,11 @@ def point_without_cycle(family: Family, p, steps, size, error, status, why) -> B
     cycle = Cycle(at_point, chain, nan, none, none, iterations, why)
     return BifurcationPoint(
         condition=UNNAMED,
-        value=known(p[0], jnp.nan),
-        residual=known(size, jnp.nan),
+        value=p[0] * known,
+        residual=size * known,
         iterations=iterations,
         steps=steps,
-        error=known(error, jnp.nan),
+        error=error * known,
         multiplier=none,
         oscillator=at_point,
         cycle=cycle,

@@ -62,8 +62,8 @@ def refine(
     the condition. So of points on coexisting cycles it need not find the nearest; `scan` finds all.
     Where it does not converge, what `scan` does is done around the guess, up to 0.2 to both sides,
     and the nearest point of that kind is taken, of any cycle; so it is where it ends further from
-    the guess than 0.05, or, after a first step of more than 0.25, than 0.015 (of what edges do,
-    than 1e-4). This takes a second rather than milliseconds.
+    the guess than 0.05, or, after a first step of more than 0.25, or of what edges do, than 1e-4
+    (in units of the parameter). This takes some tenths of a second to two rather than milliseconds.
 
     Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`, without that
     second look; `value` and `cycle` are differentiable with respect to the other parameters. A
