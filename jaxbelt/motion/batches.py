@@ -112,7 +112,8 @@ def followed_together(
     inside = (jnp.arange(batch.rounds) < rounds)[:, None]
     repeat: LoopSearch = lanes.memory
     arcs, used, loop, fits = _arcs(book, inside, repeat, batch)
-    ts = ts - time_back(ts, repeat.loops, repeat.t, repeat.period)
+    passed = (leaf[None] for leaf in (repeat.loops, repeat.t, repeat.period))
+    ts = ts - time_back(ts, *passed)
     samples = _samples(osc, book, inside, ones, ts, batch)
     begins_nowhere = lanes.status == Status.NOT_FINITE.value
     known = lanes.done & fits & ~jnp.any(book.rests & inside, axis=0) & are_finite(lanes)
@@ -243,7 +244,8 @@ def _arcs_from(first, size: int, book: Round, chains: _Chains, repeat: LoopSearc
     kind, belt = event_between(tuple(codes), tuple(next_codes))
     begins = at(book.ts[0], row)
     # Behind the stick phase at whose end a loop repeats, the run goes on behind the last loop.
-    released = jnp.where((row == repeat.last) & (repeat.loops > 0), repeat.t, begins)
+    repeats = (repeat.loops > 0)[None] & (row == repeat.last[None])
+    released = jnp.where(repeats, repeat.t[None], begins)
     t, t_end = either(begins, at(book.t, row)), either(at(book.ts[-1], last_row), released)
     x1_start, x2_start = at(book.x1s[0], row), at(book.x2s[0], row)
     x2_end = either(at(book.x2s[-1], last_row), x2_start)
