@@ -24,7 +24,6 @@ from ..checks import (
     check_finite,
     is_concrete,
     number,
-    outside_of_traces,
     require,
     require_one_of,
 )
@@ -128,7 +127,6 @@ class FatalShock(eqx.Module):
 
 
 @announced("minimal_fatal_shock")
-@outside_of_traces
 def minimal_fatal_shock(
     osc: Oscillator | Portrait, y0: ArrayLike | tuple, *, direction: str = "both"
 ) -> FatalShock:
