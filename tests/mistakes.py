@@ -371,7 +371,10 @@ MISTAKES = [
     ("jax.jit(lambda x: jb.fit(osc, row, x, where=nu0))(row)", "x1" + TRACED),
     ("jax.grad(lambda x: jb.design(osc, [(jb.amplitude, x)], where=nu0))(1.0)", "targets" + TRACED),
     ("jax.jit(jb.portrait)(osc)", "osc" + TRACED),
-    ("jax.jit(lambda osc: jb.minimal_fatal_shock(osc, (3.0, 0.0)))(osc)", "osc" + TRACED),
+    (
+        "jax.jit(lambda osc: jb.minimal_fatal_shock(osc, (3.0, 0.0)))(osc)",
+        "osc must be known: shocks are not for jit or vmap, got a traced one",
+    ),
     ("jax.jit(lambda one: jb.in_si(cycle, one))(machine)", "machine" + TRACED),
     # --- pictures
     ("jb.plot_friction_law(osc)", r"friction must be a law .*, got Oscillator\("),
