@@ -81,7 +81,7 @@ def test_an_interrupt_ends_a_sweep_and_says_what_became_of_it(when, delay):
     seconds, code, errors = interrupted(command, delay, ready=True, cache=cache)
     assert code == -signal.SIGINT, errors
     last = errors.strip().splitlines()[-1]
-    told = last.startswith("KeyboardInterrupt: interrupted after ") and 'store="results.zarr"' in last
+    told = "KeyboardInterrupt: interrupted after " in last and 'store="results.zarr"' in last
     # On a slow machine it has not come to the kernel by then.
     early = when == "compiling" and "interrupted before the first run; nothing is lost" in last
     assert told or early, last
