@@ -133,9 +133,8 @@ class Rest(NamedTuple):
 
 
 RESTS = [
-    Rest("fixed point of a slip mode", EQUAL, (1.0, 0.0), (1, 1), Status.EQUILIBRIUM),
-    Rest("stuck to a belt at rest", (belt(0.0), belt(-0.5)),
-         (0.4, 0.0), (0, -1), Status.STUCK_FOREVER),
+    Rest("fixed point of a slip mode",   ONE,   (0.5, 0.0), (1,), Status.EQUILIBRIUM),
+    Rest("stuck to a belt at rest",      STILL, (0.9, 0.0), (0,), Status.STUCK_FOREVER),
     Rest("pushed back by both sides of an edge", (belt(0.5, upper=0.0), belt(-0.5, lower=0.0)),
          (0.0, 0.0), (1, BELOW), Status.PSEUDO_FOCUS),
 ]

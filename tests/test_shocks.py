@@ -43,9 +43,7 @@ def test_shocks_of_the_velocity_are_longer_and_point_symmetric(told):
 
 @pytest.mark.slow(first=True)
 def test_one_attractor_has_no_boundary():
-    # Both belts touch everywhere that it comes to; with edges, for the programs of the others.
-    osc = jb.presets.class_d(0.1, 0.35, -50.0, 50.0)
-    shock = jb.minimal_fatal_shock(osc, (3.0, 0.0))
+    shock = jb.minimal_fatal_shock(jb.presets.class_b(0.1, 0.35), (3.0, 0.0))
     assert int(shock.status) == jb.Status.OK and shock.boundary == shock.beyond == "none"
     assert float(shock.distance) == np.inf and np.all(np.isnan(shock.shock))
     assert np.all(np.isinf(shock.at_phases(3).distance))

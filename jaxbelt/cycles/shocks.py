@@ -18,15 +18,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import (
-    as_array,
-    as_whole,
-    check_finite,
-    is_concrete,
-    number,
-    require,
-    require_one_of,
-)
+from ..checks import as_array, as_whole, check_finite, is_concrete, number, require, require_one_of
 from ..model.oscillator import Oscillator, check_oscillator
 from ..results import Status, describe, draw
 from ..tables import table_of
