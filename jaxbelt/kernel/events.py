@@ -15,7 +15,8 @@ from ..model.events import Signature, event_between
 from ..model.modes import Mode, mode_acceleration, select, without_rounding
 from ..model.oscillator import Oscillator
 from ..model.rest import is_at_rest, is_slow
-from ..model.transitions import guard_passed, leave_slip, leave_stick, stick_phase, where_any
+from ..model.transitions import guard_passed, leave_slip, leave_stick, stick_phase
+from ..numerics.compiling import where_any
 from ..results import EventKind, Status
 from .lanes import Lanes, Passage
 from .step import NO_STEP, STEP_SAFETY, first_step

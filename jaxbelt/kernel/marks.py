@@ -59,6 +59,10 @@ class Mark(eqx.Module):
         loops = jnp.maximum(jnp.floor(left - LEAST_REST), 0.0)
         return lax.stop_gradient(jnp.where(repeats, loops, 0.0))
 
+    def behind(self, run: Any, loops: Array) -> Array:
+        """The times of runs that pass the loop since their marks so many more times."""
+        return jnp.where(loops > 0, run.t + loops * (run.t - self.t), run.t)
+
     def renewed(
         self, run: Any, at: Array, count: Array, ones: Array, met: Array | bool = False
     ) -> tuple["Mark", Array]:
@@ -82,11 +86,11 @@ class Mark(eqx.Module):
 
 
 class LoopSearch(eqx.Module):
-    """The loop that a run repeats, and by which it was found, arrays [lanes].
+    """A search for a loop that a run repeats, and what it has found, arrays [lanes].
 
-    number: counts along the run, arcs or rounds; first, last: the numbers behind which the loop
-    began and ended; loops: how many more times it is passed then, 0 where none was found; t: when
-    it ended first; period: of the loop.
+    number: how many arcs, or rounds, of the run there were so far. Of the loop: first, last: that
+    number where it began and where it first ended; t: the time where it first ended; period; loops:
+    how many more times the run passes it from there on, 0 where no loop was found.
     """
 
     mark: Mark
@@ -103,17 +107,21 @@ class LoopSearch(eqx.Module):
         zero, count = jnp.zeros_like(t), jnp.zeros_like(t, jnp.int32)
         return cls(Mark.none(t), count, count, count, count, zero, zero)
 
-    def looked_for(
+    def advanced(
         self, run: Any, released: Array, t1: Array, ones: Array, room: int | None = None
     ) -> tuple["LoopSearch", Array]:
-        """The repeats where runs stand behind that number, and their times: behind the loops, where
-        they repeat one. Not where the numbers would be more than there is room for."""
+        """The search where the runs stand now, and the times at which they go on: behind all loops
+        that they would only repeat.
+
+        room: the largest number that a run may have by t1; one that would have more goes on as it
+        is.
+        """
         mark = self.mark
         loops = mark.loops_left(run, released, t1)
         if room is not None:
             number, length = (n.astype(float) for n in (self.number, self.number - mark.count))
             loops = jnp.where(number + (loops + 1) * length <= room, loops, 0.0)
-        found, period = loops > 0, run.t - mark.t
+        found = loops > 0
         return LoopSearch(
             mark=mark.renewed(run, released, self.number, ones)[0],
             number=self.number,
@@ -121,14 +129,15 @@ class LoopSearch(eqx.Module):
             last=jnp.where(found, self.number, self.last),
             loops=jnp.where(found, loops.astype(self.loops.dtype), self.loops),
             t=jnp.where(found, run.t, self.t),
-            period=jnp.where(found, period, self.period),
-        ), jnp.where(found, run.t + loops * period, run.t)
+            period=jnp.where(found, run.t - mark.t, self.period),
+        ), mark.behind(run, loops)
 
 
 def time_back(ts: Array, loops: Array, t: Array, period: Array) -> Array:
-    """How much earlier a run was where it is at the times ts, in the loop that it repeats.
+    """How long before each of the times ts a run was in the same state when it first passed the
+    loop that it repeats.
 
-    loops, t, period: see `LoopSearch`; 0 before it repeats the loop, and behind that.
+    loops, t, period: see `LoopSearch`. 0 before t, and behind the last of these loops.
     """
     since, loops = ts - t, loops.astype(float)
     period = jnp.where(loops > 0, period, 1.0)

@@ -83,7 +83,7 @@ def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol, *, edges: boo
         osc, lanes, t1, rtol, edges=edges, captures=True, derivatives=False
     )
     released = passage.released & ~lanes.mode.any_stuck
-    repeat, t = lanes.memory.looked_for(lanes, released, t1, ones)
+    repeat, t = lanes.memory.advanced(lanes, released, t1, ones)
     lanes = replace(lanes, t=t, memory=replace(repeat, number=repeat.number + 1))
     window = window_of(osc, lanes, edges=edges, extrema=None)
 

@@ -6,7 +6,7 @@ whether the contacts that are to be stuck can hold the force needed.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,14 +14,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..numerics.compiling import any_lane
+from ..numerics.compiling import where_any
 from .modes import (
     ABOVE,
     BELOW,
     STUCK,
     ULPS,
     Mode,
-    Tree,
     any_of,
     boundary_guards,
     bounds_rightward,
@@ -270,7 +269,8 @@ def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) 
     transition.
     """
     at = _guard_of(osc, mode, guard, x1, x2)
-    # Modes are piecewise constant: they have no derivatives.
+    # Few lanes are at an event at a time, and fewer at one of a kind. Modes are piecewise constant,
+    # so they have no derivatives.
     still, place, mode, v = lax.stop_gradient((osc, at, mode, x2))
 
     def from_boundary():
@@ -305,12 +305,6 @@ def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) 
         at_edge=at.at_edge,
         captured=slow & where_any(slow, capture, jnp.zeros_like(slow)),
     )
-
-
-def where_any(flags: Array, function: Callable[[], Tree], otherwise: Tree) -> Tree:
-    """What the function gives, if the flag of any lane is set: few lanes are at an event at a time,
-    and fewer at one of a kind."""
-    return lax.cond(any_lane(jnp.any(flags)), function, lambda: otherwise)
 
 
 def _released_at_edge(osc: Oscillator, held: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:

@@ -8,10 +8,10 @@ from ..kernel.marks import time_back
 
 
 class RepeatedLoop(eqx.Module):
-    """The loop that a run repeats, numbers of arcs that were followed.
+    """The loop that a run repeats: its arcs, by their numbers among those that were followed.
 
-    Its arcs are those from `first` to before `last`; behind them it is passed `loops` more times,
-    which are not followed, and then the arc `last` begins. loops = 0: there is none.
+    They are those from `first` to before `last`. Behind them the run passes the loop `loops` more
+    times, which are not followed; then the arc `last` begins. loops = 0: there is no such loop.
     """
 
     first: Array
@@ -19,13 +19,14 @@ class RepeatedLoop(eqx.Module):
     loops: Array
 
     def end(self, event_t: Array) -> tuple[Array, Array]:
-        """When the loop ended first, and its period; event_t: of the arcs that were followed."""
+        """When the loop first ended, and its period; event_t: the ends of the followed arcs."""
         repeats = self.loops > 0
         first, last = (event_t[jnp.maximum(number - 1, 0)] for number in (self.first, self.last))
         return jnp.where(repeats, last, 0.0), jnp.where(repeats, last - first, 0.0)
 
     def total(self, counts: Array) -> Array:
-        """How many there are in the whole run, of what is counted along the followed arcs."""
+        """How many things there are in the whole run; counts: how many up to the end of each
+        followed arc."""
         return counts[-1] + self.loops * self._in_loop(counts)
 
     def _in_loop(self, counts: Array) -> Array:
@@ -33,16 +34,17 @@ class RepeatedLoop(eqx.Module):
         return jnp.where(self.loops > 0, last - first, 0)
 
     def place(self, wanted: Array, counts: Array) -> tuple[Array, Array]:
-        """The arcs in which the things of these numbers lie, from 1 on, and how many periods
-        earlier than in the run that is; counts: see `total`."""
+        """For the things of these numbers, from 1 on: the followed arcs in which they lie, and how
+        many periods later than there they happen; counts: see `total`."""
         each = self._in_loop(counts)
         beyond = wanted - counts[jnp.maximum(self.last - 1, 0)]
         again = jnp.clip((beyond - 1) // jnp.maximum(each, 1) + 1, 0, self.loops)
         again = jnp.where(each > 0, again, 0)
         rows = jnp.searchsorted(counts, wanted - again * each)
-        earlier = jnp.where(beyond > self.loops * each, 0, again).astype(float)
-        return jnp.minimum(rows, counts.size - 1), earlier
+        later = jnp.where(beyond > self.loops * each, 0, again).astype(float)
+        return jnp.minimum(rows, counts.size - 1), later
 
     def followed(self, ts: Array, event_t: Array) -> Array:
-        """The times ts, those in loops that were not followed as times in the one that was."""
+        """The times ts; of those in loops that were not followed, the same moments in the one that
+        was."""
         return ts - time_back(ts, self.loops, *self.end(event_t))

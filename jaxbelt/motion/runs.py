@@ -190,7 +190,7 @@ def _followed_arcs(
             new, record = _segment(osc, state, t1, rtol, atol)
             ended = replace(repeat, number=repeat.number + 1)
             released = state.mode.any_stuck & ~new.mode.any_stuck & ~new.done
-            found, t = ended.looked_for(new, released, t1, jnp.ones(()), rules.max_segments)
+            found, t = ended.advanced(new, released, t1, jnp.ones(()), rules.max_segments)
             keep = functools.partial(jnp.where, state.done)
             after = jax.tree.map(keep, carry, (replace(new, t=t), found))
             return after, jax.tree.map(keep, blank, record)

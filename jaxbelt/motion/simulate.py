@@ -167,9 +167,9 @@ def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution)
     count = jnp.cumsum(records.kind > 0)
     wanted = jnp.arange(1, max_events + 1)
     happened = wanted <= loop.total(count)
-    rows, earlier = loop.place(wanted, count)
+    rows, later = loop.place(wanted, count)
     events = Events(
-        t=jnp.where(happened, records.event_t[rows] + earlier * period, jnp.nan),
+        t=jnp.where(happened, records.event_t[rows] + later * period, jnp.nan),
         y=jnp.where(happened[:, None], records.event_y[rows], jnp.nan),
         kind=jnp.where(happened, records.kind[rows], 0),
         belt=jnp.where(happened, records.belt[rows], -1),
@@ -178,8 +178,8 @@ def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution)
     status = jnp.where(too_many, Status.TOO_MANY_SEGMENTS.value, final.status)
     ys, modes = states_at(osc, final, records, loop, samples, grid)
     numbers = jnp.arange(1, max(rules.max_segments, count.size) + 1)
-    rows, earlier = loop.place(numbers, numbers[: count.size])
-    t = records.t[rows] + earlier * period
+    rows, later = loop.place(numbers, numbers[: count.size])
+    t = records.t[rows] + later * period
     arcs = Arcs(t, records.y[rows], records.mode[rows], records.duration[rows])
     if ts is None:
         # An even grid, and between its points the entries of the arcs, which are known already.
@@ -282,8 +282,9 @@ def simulate(
     require(is_count, "max_segments", expected, max_segments)
     followed = max_segments
     if is_default and padded and not edges:
-        # Padding costs more than the arcs here. A unit of time has one arc for its length; a loop,
-        # of 2 pi or more, two for its extrema and three for a boundary that is met from both sides.
+        # Padding costs more than the arcs here. No arc is longer than a unit of time; and a loop,
+        # which takes 2 pi or so, has two more for its extrema, and three for each belt, where the
+        # mass sticks to it and crosses it: 1 + (2 + 3 belts) / (2 pi), or less.
         rate = 1.5 + 0.5 * len(osc.belts)
         followed = min(max_segments, max(128, 64 * math.ceil(rate * span / 64)))
     if max_events is None:

@@ -1,7 +1,7 @@
 """All that leans on what JAX, XLA and Equinox do not promise, behind one switch.
 
-- `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `with_batches`, `wide` and
-  `any_lane` save time of running.
+- `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `with_batches`, `wide`,
+  `any_lane` and `where_any` save time of running.
 - `depends` and `is_affine` look at what a function does with its arguments.
 - `require_own_threads` looks at whether JAX was in use before a process was forked.
 
@@ -414,6 +414,12 @@ def any_lane(flag: jax.Array) -> jax.Array:
 
         return unvmap_any(flag)
     return flag
+
+
+def where_any(flags: jax.Array, function: Callable[[], Any], otherwise: Any) -> Any:
+    """What the function gives where any of the flags is set, in any lane; else `otherwise`, a tree
+    of the same shapes. For what few lanes need, and seldom."""
+    return lax.cond(any_lane(jnp.any(flags)), function, lambda: otherwise)
 
 
 def depends(function: Callable, *args: Any) -> tuple[bool, ...]:

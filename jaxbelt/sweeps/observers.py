@@ -50,10 +50,9 @@ class Final(Observer):
         mark: Mark = lanes.memory
         released = passage.released & ~lanes.mode.any_stuck
         loops = mark.loops_left(lanes, released, t1)
-        t = jnp.where(loops > 0, lanes.t + loops * (lanes.t - mark.t), lanes.t)
         events = lanes.events + loops.astype(mark.count.dtype) * (lanes.events - mark.count)
         renewed, _ = mark.renewed(lanes, released, lanes.events, ones)
-        return replace(lanes, t=t, events=events, memory=renewed)
+        return replace(lanes, t=mark.behind(lanes, loops), events=events, memory=renewed)
 
     def finish(self, osc, lanes):
         return {
