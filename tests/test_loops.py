@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracle
 import pytest
 
 import jaxbelt as jb
@@ -73,25 +74,39 @@ def test_a_run_is_that_of_its_pieces(name):
 
 @pytest.mark.slow(first=True)
 def test_times_of_later_loops_move_by_the_period():
-    """d t(n + k m)/dp = d t(n)/dp + k d period/dp, the period by shooting."""
+    """d t(n + k m)/dp = d t(n)/dp + k d period/dp, the period by shooting. And states behind the
+    loops, in the first arc there and in the last, by differences of the oracle, which follows all.
+    """
     loops, size = 7, 2  # events of a loop: STICK and SLIP
+    whole = oracle.simulate(oracle.class_b(0.45, 0.35), (3.0, 0.0), SPAN)
+    # The last loop ends at the last slip onset.
+    late = [max(one.t for one in whole.events if one.kind == "SLIP") + 0.2, SPAN]
 
     def times(p):
         run = jb.simulate(
-            jb.presets.class_b(p[0], 0.35), (p[1], 0.0), SPAN, ts=jnp.array([SPAN]), max_events=64
+            jb.presets.class_b(p[0], 0.35), (p[1], 0.0), SPAN, ts=jnp.array(late), max_events=64
         )
-        return run.events.t[jnp.array([2, 2 + loops * size])]
+        return jnp.append(run.events.t[jnp.array([2, 2 + loops * size])], run.ys.ravel())
 
     def period(p):
         return jb.find_cycle(jb.presets.class_b(p[0], 0.35), (3.0, 0.0)).period
 
     p = jnp.array([0.45, 3.0])
-    (first, last), slopes = times(p), jax.jacfwd(times)(p)
+    (first, last, *_), slopes = times(p), jax.jacfwd(times)(p)
     one, slope = jax.value_and_grad(period)(p)
     np.testing.assert_allclose(last - first, loops * one, rtol=0, atol=1e-10)
     np.testing.assert_allclose(slopes[1] - slopes[0], loops * slope, rtol=0, atol=1e-8)
     # The start moves the first loop, and all others with it by just as much.
     assert slopes[0, 1] == slopes[1, 1] != 0
+
+    def states(nu0):
+        run = oracle.simulate(oracle.class_b(nu0, 0.35), (3.0, 0.0), SPAN)
+        return np.ravel([run.at(t) for t in late])
+
+    for i in range(4):
+        difference, error = oracle.richardson(lambda nu0, i=i: states(nu0)[i], 0.45, 1e-3)
+        assert error < 1e-7
+        np.testing.assert_allclose(slopes[2 + i, 0], difference, rtol=0, atol=1e-7)
 
 
 @pytest.mark.slow(first=True)
