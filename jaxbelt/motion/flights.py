@@ -5,6 +5,7 @@ control; flights that take about as many steps are made together, in one piece o
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..kernel.lanes import materialise
 from ..model.modes import Mode, mode_of
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import LARGEST, any_lane, more_rows, one_kernel, with_batches
@@ -33,6 +35,8 @@ SIDE_BY_SIDE = 64
 #: Runs, at most, and arcs of each, that are sorted by their numbers of steps together; and how many
 #: arcs these are, at most.
 RUNS, ROWS, MOST_FLIGHTS = 128, 128, 2048
+#: Arcs whose steps are found at once.
+LOOKED_AT = 128
 #: Groups into which these are divided, at least.
 LEAST_GROUPS = 16
 #: Largest density of steps, so that all numbers stay finite.
@@ -78,16 +82,18 @@ class Steps(NamedTuple):
     ratio: Array
 
 
-def steps_of(osc: Oscillator, arc: Arc) -> Steps:
+def steps_of(osc: Oscillator, arc: Arc, ones: Array) -> Steps:
     """The steps from the entry of an arc to its end; they have no derivatives.
 
-    Their number and their grading follow from the density of steps that is wanted at both.
+    Their number and their grading follow from the density of steps that is wanted at both. ones:
+    see `materialise`.
     """
     osc, arc = lax.stop_gradient((osc, arc))
     mode, duration, y, end = arc.mode, arc.duration, arc.entry, arc.end
     first, last = (
         jnp.clip(jnp.nan_to_num(density(osc, mode, *at), nan=1.0), 1.0, DENSEST) for at in (y, end)
     )
+    first, last = materialise(first, ones), materialise(last, ones)
     is_even = jnp.abs(last - first) < 1e-3 * first
     ratio = jnp.where(is_even, 2.0, last / first)
     mean = jnp.where(is_even, first, (last - first) / jnp.log(ratio))
@@ -185,47 +191,95 @@ def largest_power(number: int) -> int:
     return 1 << (number.bit_length() - 1)
 
 
-def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, steps: Steps):
+def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     """Derivatives of flights, arrays [flights, 3 + varied] for each number of the result: by x1 and
     x2 of the entry, by a time, and by the parameters.
 
     result(osc, arc, end, y, time): of one flight, scalars, by its end; arcs: the flights, their
-    leaves arrays [flights, ..]; times: arrays [flights]; run: to which run each belongs; steps: of
-    each, for those of about as many are made side by side; a number of -1: it is not wanted.
+    leaves arrays [flights, ..]; times, and whether each is wanted: arrays [flights], a power of two
+    of them; run: to which run each belongs. Those of about as many steps are made side by side.
     """
     flights, columns = times.size, 3 + sum(sizes_of(by_run, varied))
-    most = min(SIDE_BY_SIDE, largest_power(max(1, LARGEST // columns)))
-    # A few groups at least, for all of a group wait for the longest.
-    size = min(most, max(1, flights // LEAST_GROUPS))
-    short = jnp.clip(jnp.nan_to_num(steps.number), -1, MOST_STEPS).astype(jnp.int32) + 1
-    # Sorted with their places as one number: a sort of pairs takes ten times as long.
-    in_order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32))
-    order, wanted = in_order % flights, in_order >= flights
-    places = jnp.zeros_like(order).at[order].set(jnp.arange(flights, dtype=jnp.int32))
     own, shared = eqx.partition((varied, rest), by_run)
     own = jax.tree.map(lambda leaf: leaf[run], own)
-    rows = jax.tree.map(lambda leaf: leaf[order], (own, arcs, steps, times))
-    rows = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), (*rows, wanted))
+    # In one array, because XLA gathers, and takes the part of each group from, one at a time.
+    table, unpack = _packed((own, arcs, times))
 
     @one_kernel
-    def made(shared, own, *rows):
-        return _slopes_together(result, by_run, *eqx.combine(shared, own), *rows)
+    def looked(shared, columns, ones):
+        own, arcs, _ = unpack(columns)
+        return jnp.stack(_steps_together(by_run, *eqx.combine(shared, own), arcs, ones))
 
-    def group(rows):
-        *rows, wanted = rows
-        shapes = jax.eval_shape(made, shared, *rows)
+    def in_groups(table, size):
+        return jnp.swapaxes(table.reshape(-1, size, table.shape[1]), 1, 2)
+
+    size = min(flights, LOOKED_AT)
+    steps = lax.map(lambda columns: looked(shared, columns, jnp.ones(size)), in_groups(table, size))
+    number, is_even, ratio = jnp.moveaxis(steps, 1, 0).reshape(3, -1)
+    short = jnp.clip(jnp.nan_to_num(number), 0, MOST_STEPS).astype(jnp.int32) + 1
+    short = jnp.where(wanted, short, 0)
+    # Sorted with their places as one number: a sort of pairs takes ten times as long.
+    order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32)) % flights
+    places = jnp.zeros_like(order).at[order].set(jnp.arange(flights, dtype=jnp.int32))
+    # A few groups at least, for all of a group wait for the longest.
+    most = min(SIDE_BY_SIDE, largest_power(max(1, LARGEST // columns)))
+    size = min(most, max(1, flights // LEAST_GROUPS))
+    graded = jnp.stack([number, is_even, ratio, wanted.astype(float)], axis=1)
+    table = in_groups(jnp.concatenate([table, graded], axis=1)[order], size)
+
+    @one_kernel
+    def made(shared, columns):
+        (own, *rows), (number, is_even, ratio, _) = unpack(columns[:-4]), columns[-4:]
+        steps = Steps(number, is_even > 0, ratio)
+        return _slopes_together(result, by_run, *eqx.combine(shared, own), *rows, steps)
+
+    def group(columns):
+        shapes = jax.eval_shape(made, shared, columns)
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
         # A kernel that is not in a branch of its own has no second derivatives in a loop (JAX
         # 0.10).
-        return lax.cond(any_lane(jnp.any(wanted)), lambda: made(shared, *rows), lambda: nothing)
+        some = any_lane(jnp.any(columns[-1] > 0))
+        return lax.cond(some, lambda: made(shared, columns), lambda: nothing)
 
     # In one array, so that a flight's numbers stand side by side.
-    slopes = jnp.concatenate(lax.map(group, rows), axis=1)
+    slopes = jnp.concatenate(lax.map(group, table), axis=1)
     slopes = jnp.moveaxis(slopes, 1, 2).reshape(flights, -1)[places]
     return tuple(jnp.split(slopes, slopes.shape[1] // columns, axis=1))
 
 
-def _slopes_together(result, by_run, varied, rest, arcs: Arc, steps: Steps, times):
+def _steps_together(by_run, varied, rest, arcs: Arc, ones: Array) -> Steps:
+    """`steps_of` flights side by side, as numbers."""
+    axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
+
+    def of_one(varied, rest, arc, one):
+        return jax.tree.map(
+            lambda leaf: leaf.astype(float), steps_of(eqx.combine(varied, rest), arc, one)
+        )
+
+    return jax.vmap(of_one, (*axes, 0, 0))(varied, rest, arcs, ones)
+
+
+def _packed(tree) -> tuple[Array, Callable]:
+    """The numbers of a tree of arrays [rows, ..] as one array, [rows, numbers]; and how to have the
+    tree again from its columns, [numbers, rows]."""
+    leaves, structure = jax.tree.flatten(tree)
+    rows = leaves[0].shape[0]
+    parts = [leaf.reshape(rows, -1).astype(float) for leaf in leaves]
+    ends = list(itertools.accumulate(part.shape[1] for part in parts))
+
+    def unpack(columns):
+        found = [
+            jnp.moveaxis(
+                columns[first:end].reshape(*leaf.shape[1:], columns.shape[1]), -1, 0
+            ).astype(leaf.dtype)
+            for first, end, leaf in zip([0, *ends], ends, leaves)
+        ]
+        return jax.tree.unflatten(structure, found)
+
+    return jnp.concatenate(parts, axis=1), unpack
+
+
+def _slopes_together(result, by_run, varied, rest, arcs: Arc, times, steps: Steps):
     """The derivatives of flights that are made together, arrays [3 + varied, flights], see
     `slopes_of`."""
     axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)

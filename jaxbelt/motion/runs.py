@@ -298,7 +298,7 @@ def _followed_rows(lane, axis_size: int, batched, args, rules: Rules):
     blank = blank_book(of_group([leaf[0] for leaf in rows_of_groups[0]]), batch)
     _, (found, alone) = lax.scan(group, blank, rows_of_groups)
     found, alone = jax.tree.map(
-        lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:axis_size], (found, alone)
+        lambda leaf: leaf.reshape(groups * width, *leaf.shape[2:])[:axis_size], (found, alone)
     )
 
     def again():
@@ -445,12 +445,24 @@ def states_at(
     ts: Array,
 ):
     """States and modes at the times ts, with derivatives; samples: the states, without."""
-    # Past the end of the last arc the run either rests, with a reason, or is unknown.
-    rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
-    arcs, _, since = arcs_at(records, loop.followed(ts, records.event_t))
+    arcs, numbers, since = arcs_at(records, loop.followed(ts, records.event_t))
     beyond = ts > final.t
     since = jnp.where(beyond, 0.0, since)
-    ys = with_derivatives(osc, arcs.y, since, arcs.mode, lax.stop_gradient(samples))
-    afterwards = jnp.where(rests, jnp.stack(final.y), jnp.nan)
+    rows = arcs.y, since, numbers, arcs.mode
+    ys = with_derivatives(osc, *rows, lax.stop_gradient(samples))
     modes = jnp.where(beyond[:, None], stacked_codes(final.mode), arcs.mode)
-    return jnp.where(beyond[:, None], afterwards, ys), modes
+    return jnp.where(beyond[:, None], _afterwards(final), ys), modes
+
+
+def _afterwards(final: RunState) -> Array:
+    """The state past the end of the last arc: the run rests there, with a reason, or is unknown."""
+    rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
+    return jnp.where(rests, jnp.stack(final.y), jnp.nan)
+
+
+def state_at_end(final: RunState, records: ArcRecord, loop: RepeatedLoop, t1: Array):
+    """State and mode at t1, with derivatives: those that the last arc ends with."""
+    beyond = t1 > final.t
+    (arc, *_) = arcs_at(records, loop.followed(t1[None], records.event_t))
+    mode = jnp.where(beyond, stacked_codes(final.mode), arc.mode[0])
+    return jnp.where(beyond, _afterwards(final), jnp.stack(final.y)), mode

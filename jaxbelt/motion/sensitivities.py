@@ -42,7 +42,6 @@ from .flights import (
     of_one_run,
     sizes_of,
     slopes_of,
-    steps_of,
 )
 from .integrators import State, slip_field
 
@@ -216,13 +215,11 @@ def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, carry: Carry):
     of_runs = jax.tree.map(lambda leaf, flag: leaf[run] if flag else leaf, (varied, rest), by_run)
     axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
 
-    def looked(parts, arc):
-        osc = eqx.combine(*parts)
-        return steps_of(osc, arc), _creep(osc, arc.mode, *arc.entry)
+    def creep(parts, arc):
+        return _creep(eqx.combine(*parts), arc.mode, *arc.entry)
 
-    steps, creeps = jax.vmap(looked, (axes, 0))(of_runs, arcs)
-    steps = steps._replace(number=jnp.where(arcs.used, steps.number, -1.0))
-    slopes = slopes_of(_passed, by_run, varied, rest, run, arcs, remaining, steps)
+    creeps = jax.vmap(creep, (axes, 0))(of_runs, arcs)
+    slopes = slopes_of(_passed, by_run, varied, rest, run, arcs, remaining, arcs.used)
     # As many rows at once as fit into one piece of machine code.
     size = min(depth, largest_power(max(1, LARGEST // carry[1].size)))
     rows = jax.tree.map(
@@ -278,40 +275,58 @@ def _made_safe(arcs: Arc) -> Arc:
 
 
 @eqx.filter_custom_jvp
-def with_derivatives(osc: Oscillator, entries: Array, since: Array, codes: Array, states: Array):
+def with_derivatives(
+    osc: Oscillator, entries: Array, since: Array, numbers: Array, codes: Array, states: Array
+):
     """The states, [samples, 2], with derivatives: each is reached in the mode of its codes,
-    [belts], from its entry, (x1, x2), after a time since then."""
+    [belts], in the arc of that number, from its entry, (x1, x2), after a time since then."""
     return states
 
 
 @with_derivatives.def_jvp
 def _(primals, tangents):
-    osc, entries, since, codes, states = primals
+    osc, entries, since, numbers, codes, _ = primals
     along, entries_along, since_along, *_ = tangents
+    states = with_derivatives(*primals)
+    if not states.size:
+        return states, jnp.zeros(states.shape)
     varied, rest = split(osc, along)
-    rows = entries, since, codes, lax.stop_gradient(states)
+    if entries_along is None:
+        entries_along = jnp.zeros_like(entries)
+    if since_along is None:
+        since_along = jnp.zeros_like(since)
+    # Where the mass hardly moves, a later entry is as good as another start.
+    modes = mode_of(jnp.moveaxis(codes.astype(float), -1, 0))
+    creeps, *field = _creep(osc, modes, entries[:, 0], entries[:, 1])
+    earlier = jnp.where(creeps, since_along, 0.0)
+    entries_along = entries_along + jnp.stack(field, axis=1) * earlier[:, None]
+    since_along = since_along - earlier
+    # From the sample before, where it lies in the same arc: the way is shorter.
+    before = jnp.roll(since, 1)
+    goes_on = (numbers == jnp.roll(numbers, 1)) & (before <= since)
+    goes_on = goes_on.at[0].set(False)
+    starts = jnp.where(goes_on[:, None], jnp.roll(states, 1, axis=0), entries)
+    times = since - jnp.where(goes_on, before, 0.0)
+    times_along = since_along - jnp.where(goes_on, jnp.roll(since_along, 1), 0.0)
+    rows = starts, times, codes, lax.stop_gradient(states)
     slopes = of_one_run(_slopes_of_samples, varied, rest, *rows)
-    by_x1, by_x2, by_time, *by_parameters = jnp.moveaxis(slopes, -1, 0)
-    if since_along is not None:
-        modes = mode_of(jnp.moveaxis(codes.astype(float), -1, 0))
-        creeps, *field = _creep(osc, modes, entries[:, 0], entries[:, 1])
-        earlier = jnp.where(creeps, since_along, 0.0)
-        field = jnp.stack(field, axis=1) * earlier[:, None]
-        entries_along = field if entries_along is None else entries_along + field
-        since_along = since_along - earlier
-    moved = jnp.zeros(states.shape)
-    if entries_along is not None:
-        moved = moved + by_x1 * entries_along[:, :1] + by_x2 * entries_along[:, 1:]
-    if since_along is not None:
-        moved = moved + by_time * since_along[:, None]
-    for slope, by in zip(in_one_row(along) if by_parameters else (), by_parameters, strict=True):
-        moved = moved + slope * by
-    return with_derivatives(*primals), moved
+    by_start, by_time, by_parameters = slopes[..., :2], slopes[..., 2], slopes[..., 3:]
+    moved = by_time * times_along[:, None]
+    if by_parameters.shape[2]:
+        moved = moved + by_parameters @ in_one_row(along)
+
+    def advance(before, row):
+        goes_on, entry, by_start, moved = row
+        after = by_start @ jnp.where(goes_on, before, entry) + moved
+        return after, after
+
+    _, moved = lax.scan(advance, jnp.zeros(2), (goes_on, entries_along, by_start, moved))
+    return states, moved
 
 
-def _slopes_of_samples(by_run, varied, rest, entries: Array, since: Array, codes: Array, ends):
-    """Derivatives of samples, [runs, samples, 2, 3 + parameters]: by the entry, the time since it,
-    and the parameters."""
+def _slopes_of_samples(by_run, varied, rest, starts: Array, since: Array, codes: Array, ends):
+    """Derivatives of samples, [runs, samples, 2, 3 + parameters]: by the state that each is reached
+    from, the time since then, and the parameters."""
     runs, samples = since.shape
     total = runs * samples
     size = min(MOST_FLIGHTS, largest_power(2 * total - 1))
@@ -322,14 +337,13 @@ def _slopes_of_samples(by_run, varied, rest, entries: Array, since: Array, codes
         return jnp.pad(leaf, padding, "edge").reshape(-1, size, *leaf.shape[1:])
 
     run = jnp.broadcast_to(jnp.arange(runs)[:, None], since.shape)
-    axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
 
     def of_chunk(rows):
-        run, entries, since, codes, ends = rows
+        run, starts, since, codes, ends = rows
         known = ~jnp.isnan(since)
         never = jnp.zeros_like(known)
         arcs = Arc(
-            entry=(entries[:, 0], entries[:, 1]),
+            entry=(starts[:, 0], starts[:, 1]),
             end=(ends[:, 0], ends[:, 1]),
             codes=codes,
             duration=since,
@@ -341,16 +355,8 @@ def _slopes_of_samples(by_run, varied, rest, entries: Array, since: Array, codes
             again=jnp.zeros(since.shape, int),
         )
 
-        def looked(parts, arc):
-            return steps_of(eqx.combine(*parts), arc)
-
-        of_runs = jax.tree.map(
-            lambda leaf, flag: leaf[run] if flag else leaf, (varied, rest), by_run
-        )
-        steps = jax.vmap(looked, (axes, 0))(of_runs, arcs)
-        steps = steps._replace(number=jnp.where(known, steps.number, -1.0))
-        slopes = slopes_of(_carried, by_run, varied, rest, run, arcs, since, steps)
+        slopes = slopes_of(_carried, by_run, varied, rest, run, arcs, since, known)
         return jnp.where(known[:, None, None], jnp.stack(slopes, axis=1), 0.0)
 
-    slopes = lax.map(of_chunk, tuple(map(chunks, (run, entries, since, codes, ends))))
+    slopes = lax.map(of_chunk, tuple(map(chunks, (run, starts, since, codes, ends))))
     return slopes.reshape(-1, *slopes.shape[2:])[:total].reshape(runs, samples, *slopes.shape[2:])

@@ -21,7 +21,7 @@ from ..model.transitions import contact
 from ..numerics.compiling import jit
 from ..results import EventKind, Status, describe, draw
 from ..tables import per_belt, require_single, table_of
-from .runs import Rules, arcs_of_run, stacked_codes, states_at
+from .runs import Rules, arcs_of_run, stacked_codes, state_at_end, states_at
 from .smoothing import integrate, smooth_field, switch_field, switch_mode
 
 if TYPE_CHECKING:
@@ -159,10 +159,15 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
 
 
 @jit
-def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution) -> Trajectory:
-    grid = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution) if ts is None else ts
+def _filippov(
+    osc, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution, ends_at_t1
+) -> Trajectory:
+    if ts is None:
+        wanted_times = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)[:-1]
+    else:
+        wanted_times = ts[:-1] if ends_at_t1 else ts
     y0 = jnp.stack(start_at_focus(osc, *y0))
-    final, records, loop, samples = arcs_of_run(osc, y0, t0, t1, grid, rtol, atol, rules)
+    final, records, loop, samples = arcs_of_run(osc, y0, t0, t1, wanted_times, rtol, atol, rules)
     _, period = loop.end(records.event_t)
     count = jnp.cumsum(records.kind > 0)
     wanted = jnp.arange(1, max_events + 1)
@@ -176,20 +181,39 @@ def _filippov(osc, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution)
     )
     too_many = loop.total(count) > max_events
     status = jnp.where(too_many, Status.TOO_MANY_SEGMENTS.value, final.status)
-    ys, modes = states_at(osc, final, records, loop, samples, grid)
+    ys, modes = states_at(osc, final, records, loop, samples, wanted_times)
     numbers = jnp.arange(1, max(rules.max_segments, count.size) + 1)
     rows, later = loop.place(numbers, numbers[: count.size])
     t = records.t[rows] + later * period
     arcs = Arcs(t, records.y[rows], records.mode[rows], records.duration[rows])
-    if ts is None:
-        # An even grid, and between its points the entries of the arcs, which are known already.
-        unused = jnp.isnan(arcs.t)
-        ts = jnp.concatenate([grid, jnp.where(unused, t1, arcs.t)])
-        ys = jnp.concatenate([ys, jnp.where(unused[:, None], ys[-1], arcs.y)])
-        modes = jnp.concatenate([modes, jnp.where(unused[:, None], modes[-1], arcs.mode)])
-        order = jnp.argsort(ts)
-        ts, ys, modes = ts[order], ys[order], modes[order]
+    if ends_at_t1:
+        # The last row stands by itself: where it alone is used, no other sample is made.
+        y1, mode1 = state_at_end(final, records, loop, t1)
+        rows = wanted_times, ys, modes
+        if ts is None:
+            # An even grid, and between its points the entries of the arcs, which are known already.
+            unused = jnp.isnan(arcs.t)
+            entries = (
+                jnp.where(unused, t1, arcs.t),
+                jnp.where(unused[:, None], y1, arcs.y),
+                jnp.where(unused[:, None], mode1, arcs.mode),
+            )
+            order = _merged(wanted_times, entries[0])
+            rows = jax.tree.map(lambda *both: jnp.concatenate(both)[order], rows, entries)
+        ts, ys, modes = jax.tree.map(
+            lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, (t1, y1, mode1)
+        )
     return Trajectory(ts, ys, modes, events, arcs, status)
+
+
+def _merged(first: Array, second: Array) -> Array:
+    """The numbers of the rows of both in order; each of them is in order already."""
+    places = [
+        jnp.arange(rows.size) + jnp.searchsorted(others, rows, side=side).astype(int)
+        for rows, others, side in ((first, second, "left"), (second, first, "right"))
+    ]
+    places = jnp.concatenate(places)
+    return jnp.zeros_like(places).at[places].set(jnp.arange(places.size), unique_indices=True)
 
 
 @announced("simulate")
@@ -212,8 +236,9 @@ def simulate(
 
     osc: `Oscillator`. y0: start (x1, x2), shape [2]. t0 < t1: time span (dimensionless time
     tau = omega t). ts: the times wanted, increasing, shape [n]; None gives an even grid with the
-    ends of all arcs in it. rtol, atol: tolerances of the integrator per step; in a batch the
-    smallest ones hold for all.
+    ends of all arcs in it, and t1 last. For the reverse mode of a function of the final state alone
+    give ts=[t1]: else it makes the derivatives of every sample. rtol, atol: tolerances of the
+    integrator per step; in a batch the smallest ones hold for all.
 
     formulation: "filippov", the exact event-driven motion; "switch", the paper's switch model,
     eqs. (21)-(23), with a band of half-width v_star around each boundary; "smooth", with
@@ -291,9 +316,21 @@ def simulate(
         room = _power_of_two((16 if edges else 4) * span, 64) if padded else max_segments
         max_events = min(max_segments, room)
     require(isinstance(max_events, int) and max_events > 0, "max_events", expected, max_events)
-    rules = Rules(max_segments, followed, edges)
+    ends_at_t1 = ts is None or (
+        is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
+    )
     trajectory = _filippov(
-        osc, y0, t0, t1, ts, rtol, atol, rules=rules, max_events=max_events, resolution=resolution
+        osc,
+        y0,
+        t0,
+        t1,
+        ts,
+        rtol,
+        atol,
+        rules=Rules(max_segments, followed, edges),
+        max_events=max_events,
+        resolution=resolution,
+        ends_at_t1=ends_at_t1,
     )
     return _without_padding(trajectory, trim_samples=ts is None)
 
