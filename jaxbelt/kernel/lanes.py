@@ -78,16 +78,6 @@ class Passage(eqx.Module):
     forever: Array
 
 
-def without_edges(osc: Oscillator) -> Oscillator:
-    """The oscillator whose belts touch the mass everywhere, by constants of the compiled kernel."""
-    with jax.ensure_compile_time_eval():
-        lower, upper = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
-    belts = tuple(
-        eqx.tree_at(lambda b: (b.lower, b.upper), belt, (lower, upper)) for belt in osc.belts
-    )
-    return eqx.tree_at(lambda o: o.belts, osc, belts)
-
-
 def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
     """Lane by lane one of two trees of arrays [lanes, ...]."""
 

@@ -12,7 +12,7 @@ from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.transitions import at_focus, mode_of_state
 from ..results import Status
 from .events import pass_events
-from .lanes import Lanes, code_of, without_edges
+from .lanes import Lanes, code_of
 from .step import STEP_SAFETY, attempt, first_step, take_step, window_of
 
 #: Steps between two looks at the events: these cost about as much as a step, and a lane that waits
@@ -78,7 +78,6 @@ def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol, *, edges: boo
     Their memory is a `marks.LoopSearch`, whose numbers are those of rounds: loops that a lane would
     repeat it passes at once, behind the stick phase.
     """
-    osc = osc if edges else without_edges(osc)
     lanes, passage = pass_events(
         osc, lanes, t1, rtol, edges=edges, captures=True, derivatives=False
     )
@@ -115,7 +114,6 @@ def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol, *, edges: boo
 
 def flown_on(osc: Oscillator, ones, mode: Mode, x1, x2, h, *, edges: bool) -> tuple[Array, Array]:
     """The states (x1, x2) one step of size h later, in the field of a slip mode, arrays [lanes]."""
-    osc = osc if edges else without_edges(osc)
     run = jnp.zeros(x1.shape, jnp.int32)
     lanes = lanes_at_start(osc, run, x1, x2, jnp.zeros((), jnp.int32), jnp.ones(()), edges=edges)
     a = mode_acceleration(osc, mode, x1, x2)

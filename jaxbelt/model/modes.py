@@ -176,6 +176,8 @@ def boundary_guards(osc: Oscillator, mode: Mode, x2: Array) -> list[Array]:
 
 def edge_guards(osc: Oscillator, mode: Mode, x1: Array) -> list[Array]:
     """Distances to the edges that bound the mode: the lower ones of all belts, then the upper."""
+    if not has_edges(osc):
+        return [jnp.full_like(x1, jnp.inf)] * (2 * len(osc.belts))
     lower = [
         jnp.where(code == ABOVE, jnp.inf, jnp.where(code == BELOW, -1.0, 1.0) * (x1 - belt.lower))
         for belt, code in zip(osc.belts, mode.codes, strict=True)
@@ -206,7 +208,15 @@ def edges_ahead(mode: Mode, v: Array) -> list[Array]:
 
 
 def edges(osc: Oscillator) -> list[Array]:
-    """Positions of the contact edges in the order of `edge_guards`."""
+    """Positions of the contact edges in the order of `edge_guards`; infinite: there is none."""
+    n = len(osc.belts)
+    infinite = [-jnp.inf] * n + [jnp.inf] * n
+    pairs = zip(_bounds(osc), infinite, strict=True)
+    return [jnp.asarray(none) if bound is None else bound for bound, none in pairs]
+
+
+def _bounds(osc: Oscillator) -> list[Array | None]:
+    """As `edges`; None see `without_edges`."""
     return [belt.lower for belt in osc.belts] + [belt.upper for belt in osc.belts]
 
 
@@ -225,4 +235,14 @@ def has_edges(osc: Oscillator) -> bool:
 
     Known inside a trace, too, where the bounds are constants: what edges need is then left out.
     """
-    return not is_concrete(edges(osc)) or bool(np.any(np.isfinite(edges(osc))))
+    bounds = [bound for bound in _bounds(osc) if bound is not None]
+    return not is_concrete(bounds) or bool(np.any(np.isfinite(bounds)))
+
+
+def without_edges(osc: Oscillator) -> Oscillator:
+    """The oscillator whose belts touch the mass everywhere, known in every trace: their bounds are
+    None."""
+    belts = tuple(
+        eqx.tree_at(lambda b: (b.lower, b.upper), belt, (None, None)) for belt in osc.belts
+    )
+    return eqx.tree_at(lambda o: o.belts, osc, belts)

@@ -113,12 +113,16 @@ class Belt(eqx.Module):
     def rules(self) -> list[Rule]:
         """What its parameters have to be, those of its law included."""
         law = type(self.friction).rules(self.friction)
+        interval = [
+            Rule("lower", (self.lower, self.lower), operator.eq, "a number"),
+            Rule("lower", (self.lower, self.upper), operator.lt, "< {1}"),
+        ]
         return [
             *be_finite("velocity", self.velocity),
             *be_nonnegative("load", self.load),
             *(rule._replace(field=f"{rule.field} of friction") for rule in law),
-            Rule("lower", (self.lower, self.lower), operator.eq, "a number"),
-            Rule("lower", (self.lower, self.upper), operator.lt, "< {1}"),
+            # None: see `modes.without_edges`.
+            *(interval if self.lower is not None else []),
         ]
 
     def __repr__(self) -> str:

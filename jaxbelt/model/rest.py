@@ -115,8 +115,10 @@ def is_neutral(
     always = []
     for belt in osc.belts:
         pulls = belt.load != 0
-        touches = pulls & (belt.lower < x1[1]) & (belt.upper > x1[0])
-        within = pulls & (belt.lower <= x1[0]) & (belt.upper >= x1[1])
+        touches = within = pulls
+        if has_edges(osc):
+            touches = pulls & (belt.lower < x1[1]) & (belt.upper > x1[0])
+            within = pulls & (belt.lower <= x1[0]) & (belt.upper >= x1[1])
         sign = jnp.sign(belt.velocity - 0.5 * osc.omega * (x2[0] + x2[1]))
         r = [sign * (belt.velocity - osc.omega * v) for v in x2]
         reached = jnp.minimum(*r) < -slack

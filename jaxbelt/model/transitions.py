@@ -167,17 +167,17 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
     moves = v != 0
     v_or_one = jnp.where(moves, v, 1.0)
     x1_onset = onset_position(osc, mode)
-    onset_distance = jnp.where(moves, jnp.sign(v) * (x1_onset - x1), jnp.inf)
-
-    edge_distances = [
-        jnp.where(is_ahead, guard, jnp.inf)
-        for is_ahead, guard in zip(edges_ahead(mode, v), edge_guards(osc, mode, x1), strict=True)
-    ]
-    to_edge = functools.reduce(jnp.minimum, edge_distances)
-    rounding = ON_GUARD * (1 + jnp.abs(x1_onset) + capacity(osc, mode))
-    slips = (onset_distance + rounding < to_edge) | jnp.isinf(to_edge)
-    at_edge = [~slips & (distance <= to_edge) for distance in edge_distances]
-    x1_end = jnp.where(slips, x1_onset, foremost(osc, at_edge, edges(osc), x1))
+    x1_end, slips = x1_onset, jnp.ones_like(moves)
+    at_edge = [~slips] * (2 * len(osc.belts))
+    if has_edges(osc):
+        onset_distance = jnp.where(moves, jnp.sign(v) * (x1_onset - x1), jnp.inf)
+        guards = zip(edges_ahead(mode, v), edge_guards(osc, mode, x1), strict=True)
+        distances = [jnp.where(is_ahead, guard, jnp.inf) for is_ahead, guard in guards]
+        to_edge = functools.reduce(jnp.minimum, distances)
+        rounding = ON_GUARD * (1 + jnp.abs(x1_onset) + capacity(osc, mode))
+        slips = (onset_distance + rounding < to_edge) | jnp.isinf(to_edge)
+        at_edge = [~slips & (distance <= to_edge) for distance in distances]
+        x1_end = jnp.where(slips, x1_onset, foremost(osc, at_edge, edges(osc), x1))
     # Not distance/|v|: x1_end does not depend on x1, and so neither do its derivatives.
     duration = (x1_end - x1) / v_or_one
     # Negative by rounding only; its derivatives are those of the quotient there, too.
@@ -374,10 +374,12 @@ def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
 
     An edge that x1 lies on counts as passed to the right (rightward) or to the left.
     """
+    signs = [_slip_sign(belt.velocity, osc.omega * x2) for belt in osc.belts]
+    if not has_edges(osc):
+        return Mode(tuple(signs))
     codes = []
-    for belt in osc.belts:
+    for belt, sign in zip(osc.belts, signs, strict=True):
         is_below = x1 < belt.lower if rightward else x1 <= belt.lower
         is_above = x1 >= belt.upper if rightward else x1 > belt.upper
-        sign = _slip_sign(belt.velocity, osc.omega * x2)
         codes.append(jnp.where(is_below, BELOW, jnp.where(is_above, ABOVE, sign)))
     return Mode(tuple(codes))

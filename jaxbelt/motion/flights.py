@@ -90,10 +90,11 @@ def steps_of(osc: Oscillator, arc: Arc, ones: Array) -> Steps:
     """
     osc, arc = lax.stop_gradient((osc, arc))
     mode, duration, y, end = arc.mode, arc.duration, arc.entry, arc.end
-    first, last = (
-        jnp.clip(jnp.nan_to_num(density(osc, mode, *at), nan=1.0), 1.0, DENSEST) for at in (y, end)
+    # Of both places at once, which takes half as long to compile.
+    wanted = jax.vmap(lambda x1, x2: density(osc, mode, x1, x2))(
+        jnp.stack([y[0], end[0]]), jnp.stack([y[1], end[1]])
     )
-    first, last = materialise(first, ones), materialise(last, ones)
+    first, last = materialise(jnp.clip(jnp.nan_to_num(wanted, nan=1.0), 1.0, DENSEST), ones)
     is_even = jnp.abs(last - first) < 1e-3 * first
     ratio = jnp.where(is_even, 2.0, last / first)
     mean = jnp.where(is_even, first, (last - first) / jnp.log(ratio))

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import as_numbers, check_finite, check_positive, is_concrete, require
-from ..model.modes import has_edges
+from ..model.modes import has_edges, without_edges
 from ..model.oscillator import Oscillator, check_oscillator, has_possible_numbers
 from ..model.rest import start_at_focus
 from ..model.transitions import contact
@@ -166,6 +166,7 @@ def _filippov(
         wanted_times = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)[:-1]
     else:
         wanted_times = ts[:-1] if ends_at_t1 else ts
+    osc = osc if rules.edges else without_edges(osc)
     y0 = jnp.stack(start_at_focus(osc, *y0))
     final, records, loop, samples = arcs_of_run(osc, y0, t0, t1, wanted_times, rtol, atol, rules)
     _, period = loop.end(records.event_t)

@@ -22,9 +22,10 @@ from jax import lax
 from jaxtyping import Array
 
 from ..kernel.events import pass_events
-from ..kernel.lanes import Lanes, Program, are_finite, choose, without_edges
+from ..kernel.lanes import Lanes, Program, are_finite, choose
 from ..kernel.rounds import STEPS_PER_ROUND, lanes_at_start
 from ..kernel.step import take_step, window_of
+from ..model.modes import without_edges
 from ..model.oscillator import Oscillator
 from ..model.rest import start_at_focus
 from ..numerics.compiling import one_kernel
