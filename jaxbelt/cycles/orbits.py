@@ -26,9 +26,9 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.rest import settles
 from ..model.transitions import at_focus, begins_at_rest, contact, mode_of_state, onset_position
-from ..motion.arcs import ArcEnd, Ends, Signs, after_slip, signs_after, slip_arc, stick_arc
+from ..motion.arcs import ArcEnd, Ends, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
 from ..motion.integrators import STRIDE, Graded
-from ..numerics.compiling import any_lane, one_kernel
+from ..numerics.compiling import any_lane, lanes_in_one_kernel, one_kernel_alone
 from ..results import Status
 from .chains import Loop
 from .settling import AT_REST, has_repeated
@@ -76,11 +76,16 @@ def _arc(osc: Oscillator, orbit: Orbit, stride: float) -> ArcEnd:
     mode, y = mode_of(orbit.code), (orbit.y[0], orbit.y[1])
 
     def slip():
-        integrator = Graded(osc, mode, stride)
-        arc = slip_arc(osc, mode, orbit.signs, y, integrator, every_extremum=True)
+        arc = _graded_slip_arc(osc, mode, orbit.signs, y, jnp.asarray(stride))
         return after_slip(osc, mode, orbit.signs, arc)
 
     return lax.cond(mode.any_stuck, lambda: stick_arc(osc, mode, y, jnp.asarray(jnp.inf)), slip)
+
+
+@lanes_in_one_kernel
+def _graded_slip_arc(osc: Oscillator, mode: Mode, signs: Signs, y, stride: Array) -> SlipArc:
+    integrator = Graded(osc, mode, stride)
+    return slip_arc(osc, mode, signs, y, integrator, every_extremum=True)
 
 
 def _next_arc(osc: Oscillator, orbit: Orbit, stride: float) -> tuple[dict[str, Array], Orbit]:
@@ -162,12 +167,12 @@ def _followed_while(
     return lax.while_loop(unfinished_lanes, turn, (jnp.zeros((), jnp.int32), start))[1]
 
 
-@one_kernel
+@one_kernel_alone
 def _follow_from(osc: Oscillator, start: Orbit) -> Orbit:
     return _followed_while(lambda orbit: ~orbit.done, osc, start)
 
 
-@one_kernel
+@one_kernel_alone
 def _to_top_from(osc: Oscillator, start: Orbit) -> Orbit:
     def going(orbit):
         return ~orbit.done & jnp.isnan(orbit.top)
@@ -175,7 +180,7 @@ def _to_top_from(osc: Oscillator, start: Orbit) -> Orbit:
     return _followed_while(going, osc, start)
 
 
-@one_kernel
+@one_kernel_alone
 def _finely_from(osc: Oscillator, start: Orbit, reach: Array) -> Orbit:
     def going(orbit):
         near = jnp.max(jnp.abs(orbit.y)) < reach

@@ -44,7 +44,7 @@ from ..model.oscillator import Oscillator
 from ..model.transitions import held_at_boundary, onset_position
 from ..motion.arcs import Ends
 from ..motion.integrators import density
-from ..numerics.compiling import any_lane, one_kernel
+from ..numerics.compiling import any_lane, lanes_in_one_kernel, one_kernel_alone
 from ..numerics.extrapolation import Scheme, increments, scheme
 from ..numerics.newton import HOLDS, Equations, moving_and_fixed, solution, solve
 from .chains import Chain, Loop, following_codes
@@ -58,6 +58,20 @@ MAGNIFIED = 1e4
 # Of order 12 for the arcs, of order 4 for placing the steps.
 _FINE = scheme((2, 4, 6, 8, 10, 12))
 _COARSE = scheme((2, 4))
+
+
+def _arc_by_arc(function: Callable) -> Callable:
+    """What function(*shared, *row) gives of each arc of a chain, its rows, as a function of the
+    shared and of the columns, a tuple each. All arcs are one piece of machine code; in a batch each
+    of them is one, of all lanes."""
+    of_lanes = lanes_in_one_kernel(function)
+
+    @functools.wraps(function)
+    @one_kernel_alone
+    def call(shared, columns):
+        return lax.map(lambda row: of_lanes(*shared, *row), columns)
+
+    return call
 
 
 def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -> Array:
@@ -79,21 +93,26 @@ def meshed(osc: Oscillator, loop: Loop, steps: int = ARC_STEPS) -> tuple[Chain, 
     """The chain of a loop with its mesh, and the guess of its unknowns."""
     stuck = jnp.any(loop.codes == 0, axis=-1)
     slip = jnp.where(stuck, 0.0, loop.durations)
-    mesh = jax.vmap(functools.partial(_mesh, osc, steps))(loop.codes, loop.entries, slip)
+    mesh = _meshes(steps)(osc, (loop.codes, loop.entries, slip))
     z = jnp.concatenate([loop.entries, loop.durations[:, None]], axis=1)
     return lax.stop_gradient((Chain(loop.codes, loop.ends, mesh), z))
+
+
+@functools.cache
+def _meshes(steps: int) -> Callable:
+    """`_mesh` of all arcs."""
+
+    @one_kernel_alone
+    def call(osc, columns):
+        return lax.map(lambda row: _mesh(osc, steps, *row), columns)
+
+    return call
 
 
 def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
     """Steps as fractions of the duration, [steps], so that each has about the same share of it."""
     n = 24
-    h = duration / n
-
-    def advance(y, _):
-        y = _step(functools.partial(_slip_slopes, osc, codes), y, h, _COARSE)
-        return y, density(osc, mode_of(codes), *y)
-
-    _, rest = lax.scan(advance, y, None, length=n)
+    _, rest = lax.scan(lambda y, _: _coarse_step(osc, codes, y, duration / n), y, None, length=n)
     rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
     # Clipped: where a guess is poor the mesh is only less good.
     rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
@@ -102,6 +121,13 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
         jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
     )
     return jnp.diff(grid)
+
+
+@lanes_in_one_kernel
+def _coarse_step(osc: Oscillator, codes: Array, y: Array, h: Array) -> tuple[Array, Array]:
+    """The state after a step, and the density of steps that is wanted there."""
+    y = _step(functools.partial(_slip_slopes, osc, codes), y, h, _COARSE)
+    return y, density(osc, mode_of(codes), *y)
 
 
 def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, extra=None):
@@ -224,39 +250,27 @@ def _followed(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> A
     return jnp.where(is_tangent, jnp.concatenate([point, after - unknown[:2]]), ordinary)
 
 
-@one_kernel
-def _all_arc_equations(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
-    """`_arc_equations` of all arcs, [N, 4]."""
-
-    def one(row):
-        return _arc_equations(osc, *row)
-
-    return lax.map(one, (chain.codes, chain.ends, chain.mesh, backwards, z))
+_all_arc_equations = _arc_by_arc(_arc_equations)
 
 
-@one_kernel
+@_arc_by_arc
 def _equations_and_blocks(
-    osc: Oscillator, along: Oscillator | None, chain: Chain, backwards: Array, z: Array
+    osc: Oscillator, along: Oscillator | None, codes, end, mesh, backwards, unknown: Array
 ):
-    """`_arc_equations` of all arcs, [N, 4], and their derivatives, [N, 4, 3 + k]."""
+    """`_arc_equations`, [4], and their derivatives, [4, 3 + k]."""
     more = 0 if along is None else jax.tree.leaves(along)[0].size
 
-    def one(row):
-        codes, end, mesh, back, unknown = row
+    def equations(osc, u):
+        return _arc_equations(osc, codes, end, mesh, backwards, u)
 
-        def equations(osc, u):
-            return _arc_equations(osc, codes, end, mesh, back, u)
+    def column(direction):
+        if along is None:
+            of_unknown = functools.partial(equations, osc)
+            return jax.jvp(of_unknown, (unknown,), (direction,))
+        moved = jax.tree.map(functools.partial(_weighted, direction[3:]), along)
+        return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
 
-        def column(direction):
-            if along is None:
-                of_unknown = functools.partial(equations, osc)
-                return jax.jvp(of_unknown, (unknown,), (direction,))
-            moved = jax.tree.map(functools.partial(_weighted, direction[3:]), along)
-            return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
-
-        return jax.vmap(column, out_axes=(None, -1))(jnp.eye(3 + more))
-
-    return lax.map(one, (chain.codes, chain.ends, chain.mesh, backwards, z))
+    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(3 + more))
 
 
 def _weighted(weights: Array, slopes: Array) -> Array:
@@ -276,18 +290,22 @@ def _directions_of(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, A
     return along, jax.flatten_util.ravel_pytree(tangents)[0]
 
 
+def _arc_columns(chain: Chain, *others: Array) -> tuple[Array, ...]:
+    return chain.codes, chain.ends, chain.mesh, *others
+
+
 @eqx.filter_custom_jvp
 def _by_columns(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
     """`_all_arc_equations`, with derivatives by columns, arc by arc: backwards through all steps
     takes ten times as long."""
-    return _all_arc_equations(osc, chain, backwards, z)
+    return _all_arc_equations((osc,), _arc_columns(chain, backwards, z))
 
 
 @_by_columns.def_jvp
 def _(primals, tangents):
     osc, chain, backwards, z = primals
     along, weights = _directions_of(osc, tangents[0])
-    out, blocks = _equations_and_blocks(osc, along, chain, backwards, z)
+    out, blocks = _equations_and_blocks((osc, along), _arc_columns(chain, backwards, z))
     change = blocks[..., 3:] @ weights
     if tangents[3] is not None:
         change = change + jnp.sum(blocks[..., :3] * tangents[3][:, None], axis=-1)
@@ -326,7 +344,7 @@ def residual_and_blocks(
     (x1, x2, T), and along the k directions `along` in the space of oscillators, if they are given
     (an oscillator of arrays [k]), [N, 4, 3 + k]."""
     backwards = _none(z) if backwards is None else backwards
-    out, blocks = _equations_and_blocks(osc, along, chain, backwards, z)
+    out, blocks = _equations_and_blocks((osc, along), _arc_columns(chain, backwards, z))
     return _mismatch(out, z, backwards), jnp.sum(out[:, 3]), blocks
 
 
@@ -420,7 +438,8 @@ def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
     one: their saltation matrix is [[1, 0], [jump of x2' / x2, 1]].
     """
     entries = jnp.roll(z[:, :2], -1, axis=0)
-    errors, factors = _errors_and_factors(osc, chain, following_codes(chain), z, entries)
+    columns = _arc_columns(chain, following_codes(chain), z, entries)
+    errors, factors = _errors_and_factors((osc,), columns)
     return jnp.max(errors), jnp.prod(factors)
 
 
@@ -436,15 +455,6 @@ def _(primals, tangents):
     return closure(osc, chain, z), (jnp.zeros(()), change)
 
 
-@one_kernel
-def _errors_and_factors(osc: Oscillator, chain: Chain, following: Array, z: Array, entries: Array):
-    """What each arc contributes to `closure`."""
-    return lax.map(
-        lambda row: _error_and_factor(osc, *row),
-        (chain.codes, chain.ends, chain.mesh, following, z, entries),
-    )
-
-
 def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, entry):
     """The largest error in the equations of an arc, and what it contributes to the determinant."""
 
@@ -457,6 +467,9 @@ def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, ent
 
     some = any_lane(end != Ends(len(osc.belts)).unused)
     return lax.cond(some, followed, nothing, unknown, entry)
+
+
+_errors_and_factors = _arc_by_arc(_error_and_factor)
 
 
 def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, entry):
@@ -487,7 +500,8 @@ def multiplier_and_slopes(
     Arc by arc: backwards through all of them the program takes three times as long to compile.
     """
     entries = jnp.roll(z[:, :2], -1, axis=0)
-    factors, slopes = _factors_and_slopes(osc, along, chain, following_codes(chain), z, entries)
+    columns = _arc_columns(chain, following_codes(chain), z, entries)
+    factors, slopes = _factors_and_slopes((osc, along), columns)
     product = jnp.prod(factors)
     slopes = slopes * _products_of_others(factors)[:, None]
     by_z = slopes[:, :3].at[:, :2].add(jnp.roll(slopes[:, 3:5], 1, axis=0))
@@ -502,26 +516,23 @@ def _products_of_others(factors: Array) -> Array:
     return before * after
 
 
-@one_kernel
-def _factors_and_slopes(osc, along: Oscillator, chain: Chain, following, z: Array, entries: Array):
-    """The factor of each arc, [N], and its derivatives with respect to its unknowns, the entry of
-    the next one, and along the directions, [N, 5 + k]."""
+@_arc_by_arc
+def _factors_and_slopes(
+    osc: Oscillator, along: Oscillator, codes, end, mesh, following, unknown: Array, entry: Array
+):
+    """The factor of an arc and its derivatives with respect to its unknowns, the entry of the next
+    one, and along the directions, [5 + k]."""
     more = jax.tree.leaves(along)[0].size
 
-    def one(row):
-        codes, end, mesh, following, unknown, entry = row
+    def factor(osc, unknown, entry):
+        return _error_and_factor(osc, codes, end, mesh, following, unknown, entry)[1]
 
-        def factor(osc, unknown, entry):
-            return _error_and_factor(osc, codes, end, mesh, following, unknown, entry)[1]
+    def column(direction):
+        moved = jax.tree.map(functools.partial(_weighted, direction[5:]), along)
+        tangents = moved, direction[:3], direction[3:5]
+        return jax.jvp(factor, (osc, unknown, entry), tangents)
 
-        def column(direction):
-            moved = jax.tree.map(functools.partial(_weighted, direction[5:]), along)
-            tangents = moved, direction[:3], direction[3:5]
-            return jax.jvp(factor, (osc, unknown, entry), tangents)
-
-        return jax.vmap(column, out_axes=(None, -1))(jnp.eye(5 + more))
-
-    return lax.map(one, (chain.codes, chain.ends, chain.mesh, following, z, entries))
+    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(5 + more))
 
 
 def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:

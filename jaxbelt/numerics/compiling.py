@@ -211,6 +211,34 @@ def with_batches(function: Callable, batch: Callable) -> Callable:
     return call
 
 
+def lanes_in_one_kernel(function: Callable) -> Callable:
+    """The same function of arrays, that closes over none; a batch of it is `one_kernel`."""
+
+    def batch(_, axis_size, batched, *args):
+        return one_kernel(jax.vmap(function, _axes(batched), axis_size=axis_size))(*args)
+
+    lanes = with_batches(function, batch)
+
+    @functools.wraps(function)
+    def call(*args):
+        return (function if _is_part.get() else lanes)(*args)
+
+    return call
+
+
+def one_kernel_alone(function: Callable) -> Callable:
+    """`one_kernel`, whose batch is what the function makes of one: pieces of its own, say."""
+
+    def batch(_, axis_size, batched, *args):
+        return jax.vmap(function, _axes(batched), axis_size=axis_size)(*args)
+
+    return with_batches(one_kernel(function), batch)
+
+
+def _axes(batched) -> tuple:
+    return jax.tree.map(lambda flag: 0 if flag else None, tuple(batched))
+
+
 #: Lanes of a group: more of them wait for the slowest, and leave the processor's caches; fewer take
 #: less time than XLA's calls of what they do.
 GROUP = 64
