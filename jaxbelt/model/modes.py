@@ -215,7 +215,7 @@ def edges(osc: Oscillator) -> list[Array]:
     return [jnp.asarray(none) if bound is None else bound for bound, none in pairs]
 
 
-def _bounds(osc: Oscillator) -> list[Array | None]:
+def _bounds(osc: Oscillator) -> Sequence[Array | None]:
     """As `edges`; None see `without_edges`."""
     return [belt.lower for belt in osc.belts] + [belt.upper for belt in osc.belts]
 

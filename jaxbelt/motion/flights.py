@@ -206,17 +206,7 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     # In one array, because XLA gathers, and takes the part of each group from, one at a time.
     table, unpack = _packed((own, arcs, times))
 
-    @one_kernel
-    def looked(shared, columns, ones):
-        own, arcs, _ = unpack(columns)
-        return jnp.stack(_steps_together(by_run, *eqx.combine(shared, own), arcs, ones))
-
-    def in_groups(table, size):
-        return jnp.swapaxes(table.reshape(-1, size, table.shape[1]), 1, 2)
-
-    size = min(flights, LOOKED_AT)
-    steps = lax.map(lambda columns: looked(shared, columns, jnp.ones(size)), in_groups(table, size))
-    number, is_even, ratio = jnp.moveaxis(steps, 1, 0).reshape(3, -1)
+    number, is_even, ratio = _all_steps(by_run, shared, table, unpack)
     short = jnp.clip(jnp.nan_to_num(number), 0, MOST_STEPS).astype(jnp.int32) + 1
     short = jnp.where(wanted, short, 0)
     # Sorted with their places as one number: a sort of pairs takes ten times as long.
@@ -226,13 +216,14 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     most = min(SIDE_BY_SIDE, largest_power(max(1, LARGEST // columns)))
     size = min(most, max(1, flights // LEAST_GROUPS))
     graded = jnp.stack([number, is_even, ratio, wanted.astype(float)], axis=1)
-    table = in_groups(jnp.concatenate([table, graded], axis=1)[order], size)
+    table = _in_groups(jnp.concatenate([table, graded], axis=1)[order], size)
 
     @one_kernel
     def made(shared, columns):
-        (own, *rows), (number, is_even, ratio, _) = unpack(columns[:-4]), columns[-4:]
+        (own, arcs, times), (number, is_even, ratio, _) = unpack(columns[:-4]), columns[-4:]
         steps = Steps(number, is_even > 0, ratio)
-        return _slopes_together(result, by_run, *eqx.combine(shared, own), *rows, steps)
+        varied, rest = eqx.combine(shared, own)
+        return _slopes_together(result, by_run, varied, rest, arcs, times, steps)
 
     def group(columns):
         shapes = jax.eval_shape(made, shared, columns)
@@ -248,16 +239,29 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     return tuple(jnp.split(slopes, slopes.shape[1] // columns, axis=1))
 
 
-def _steps_together(by_run, varied, rest, arcs: Arc, ones: Array) -> Steps:
-    """`steps_of` flights side by side, as numbers."""
+def _all_steps(by_run, shared, table: Array, unpack: Callable) -> Array:
+    """`steps_of` all flights, [3, flights]: number, is_even as a number, ratio; see `_packed`."""
     axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
 
     def of_one(varied, rest, arc, one):
-        return jax.tree.map(
-            lambda leaf: leaf.astype(float), steps_of(eqx.combine(varied, rest), arc, one)
-        )
+        steps = steps_of(eqx.combine(varied, rest), arc, one)
+        return jnp.stack([leaf.astype(float) for leaf in steps])
 
-    return jax.vmap(of_one, (*axes, 0, 0))(varied, rest, arcs, ones)
+    @one_kernel
+    def looked(shared, columns, ones):
+        own, arcs, _ = unpack(columns)
+        varied, rest = eqx.combine(shared, own)
+        return jax.vmap(of_one, (*axes, 0, 0), 1)(varied, rest, arcs, ones)
+
+    size = min(len(table), LOOKED_AT)
+    groups = _in_groups(table, size)
+    steps = lax.map(lambda columns: looked(shared, columns, jnp.ones(size)), groups)
+    return jnp.moveaxis(steps, 1, 0).reshape(3, -1)
+
+
+def _in_groups(table: Array, size: int) -> Array:
+    """The rows of a table in groups of so many, as columns, [groups, columns, size]."""
+    return jnp.swapaxes(table.reshape(-1, size, table.shape[1]), 1, 2)
 
 
 def _packed(tree) -> tuple[Array, Callable]:

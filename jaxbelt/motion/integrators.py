@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from ..model.modes import Mode, fastest_rate, mode_acceleration
 from ..model.oscillator import Oscillator
@@ -207,7 +207,7 @@ class Graded(AbstractIntegrator):
 
     osc: Oscillator
     mode: Mode
-    stride: ArrayLike = STRIDE
+    stride: float | Array = STRIDE
 
     def march(self, field, y, is_outside):
         # A stuck lane of a batch has no slip arc to follow; it must not keep the others waiting.

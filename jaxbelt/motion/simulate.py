@@ -187,10 +187,10 @@ def _filippov(
     rows, later = loop.place(numbers, numbers[: count.size])
     t = records.t[rows] + later * period
     arcs = Arcs(t, records.y[rows], records.mode[rows], records.duration[rows])
+    rows = wanted_times, ys, modes
     if ends_at_t1:
         # The last row stands by itself: where it alone is used, no other sample is made.
         y1, mode1 = state_at_end(final, records, loop, t1)
-        rows = wanted_times, ys, modes
         if ts is None:
             # An even grid, and between its points the entries of the arcs, which are known already.
             unused = jnp.isnan(arcs.t)
@@ -201,9 +201,9 @@ def _filippov(
             )
             order = _merged(wanted_times, entries[0])
             rows = jax.tree.map(lambda *both: jnp.concatenate(both)[order], rows, entries)
-        ts, ys, modes = jax.tree.map(
-            lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, (t1, y1, mode1)
-        )
+        ends = t1, y1, mode1
+        rows = jax.tree.map(lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, ends)
+    ts, ys, modes = rows
     return Trajectory(ts, ys, modes, events, arcs, status)
 
 
