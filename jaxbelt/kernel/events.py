@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..model.events import Signature, event_between
-from ..model.modes import Mode, mode_acceleration, select, without_rounding
+from ..model.modes import Mode, has_edges, mode_acceleration, select, without_rounding
 from ..model.oscillator import Oscillator
 from ..model.rest import is_at_rest, is_slow
 from ..model.transitions import guard_passed, leave_slip, leave_stick, stick_phase
@@ -28,14 +28,13 @@ def pass_events(
     t1: Array,
     rtol: Array,
     *,
-    edges: bool,
     captures: bool,
     derivatives: bool,
 ) -> tuple[Lanes, Passage]:
     """Lanes that stand on a guard go on; stick phases are passed to their end, or to t1.
 
-    edges: whether a contact edge may be met; captures: whether a run ends where a pseudo-focus
-    captures it; derivatives: see `step.take_step`, lanes at rest go on then.
+    captures: whether a run ends where a pseudo-focus captures it; derivatives: see
+    `step.take_step`, lanes at rest go on then.
     """
     landed = (lanes.h < 0) & ~lanes.done
     # A lane may also have landed where x2 = 0, which is no guard.
@@ -63,7 +62,7 @@ def pass_events(
         a = mode_acceleration(osc, mode, new_x1, x2)
         creeps = (landed | released) & ~mode.any_stuck & is_slow(x2, a)
         t, new_x1, x2 = _at_fixed_time(creeps, t, new_x1, x2, a)
-    a, h = _set_off(edges, osc, lanes, mode, new_x1, x2, fired, released, rtol)
+    a, h = _set_off(osc, lanes, mode, new_x1, x2, fired, released, rtol)
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
     passage = Passage(
         landed=landed,
@@ -141,13 +140,13 @@ def _(primals, tangents):
     return (t, x1, x2), (d_t - away, d_x1 - x2 * away, d_x2 - a * away)
 
 
-def _set_off(edges, osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> tuple[Array, Array]:
+def _set_off(osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> tuple[Array, Array]:
     """x2' and the step size with which the lanes go on in a mode."""
     a = mode_acceleration(osc, mode, x1, x2)
     # Slip onset is tangent: x2' = 0 there up to rounding, for a law without a jump.
     a = without_rounding(a, x1)
     h = jnp.where(fired, first_step(rtol), jnp.abs(lanes.h))
-    if edges:
+    if has_edges(osc):
         # In a corner one event follows the other at once: a lane that stands on the next guard,
         # and goes on through it, has landed there.
         corner = (fired | released) & ~mode.any_stuck & (guard_passed(osc, mode, x1, x2) >= 0)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import Mode, mode_acceleration
+from ..model.modes import Mode, has_edges, mode_acceleration
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.transitions import at_focus, mode_of_state
 from ..results import Status
@@ -20,11 +20,11 @@ from .step import STEP_SAFETY, attempt, first_step, take_step, window_of
 STEPS_PER_ROUND = 4
 
 
-def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, *, edges: bool) -> Lanes:
+def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol) -> Lanes:
     """Lanes at the start of their runs, without what an observer adds; edges: see `window_of`."""
     mode = mode_of_state(osc, x1, x2)
     finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
-    rests = at_focus(osc, x1, x2) if edges else jnp.zeros_like(finite)
+    rests = at_focus(osc, x1, x2) if has_edges(osc) else jnp.zeros_like(finite)
     status = jnp.where(rests, Status.PSEUDO_FOCUS.value, Status.OK.value)
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
     zero = jnp.zeros_like(x1)
@@ -72,19 +72,17 @@ class Round(eqx.Module):
     mode_after: Array
 
 
-def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol, *, edges: bool):
+def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol):
     """The lanes past the events and STEPS_PER_ROUND steps further, and the `Round`.
 
     Their memory is a `marks.LoopSearch`, whose numbers are those of rounds: loops that a lane would
     repeat it passes at once, behind the stick phase.
     """
-    lanes, passage = pass_events(
-        osc, lanes, t1, rtol, edges=edges, captures=True, derivatives=False
-    )
+    lanes, passage = pass_events(osc, lanes, t1, rtol, captures=True, derivatives=False)
     released = passage.released & ~lanes.mode.any_stuck
     repeat, t = lanes.memory.advanced(lanes, released, t1, ones)
     lanes = replace(lanes, t=t, memory=replace(repeat, number=repeat.number + 1))
-    window = window_of(osc, lanes, edges=edges, extrema=None)
+    window = window_of(osc, lanes, extrema=None)
 
     def step(lanes, _):
         lanes = take_step(osc, window, ones, lanes, t1, rtol, atol)
@@ -112,12 +110,12 @@ def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol, *, edges: boo
     return after, kept
 
 
-def flown_on(osc: Oscillator, ones, mode: Mode, x1, x2, h, *, edges: bool) -> tuple[Array, Array]:
+def flown_on(osc: Oscillator, ones, mode: Mode, x1, x2, h) -> tuple[Array, Array]:
     """The states (x1, x2) one step of size h later, in the field of a slip mode, arrays [lanes]."""
     run = jnp.zeros(x1.shape, jnp.int32)
-    lanes = lanes_at_start(osc, run, x1, x2, jnp.zeros((), jnp.int32), jnp.ones(()), edges=edges)
+    lanes = lanes_at_start(osc, run, x1, x2, jnp.zeros((), jnp.int32), jnp.ones(()))
     a = mode_acceleration(osc, mode, x1, x2)
     lanes = eqx.tree_at(lambda n: (n.mode, n.a), lanes, (mode, a))
-    window = window_of(osc, lanes, edges=edges, extrema=None)
+    window = window_of(osc, lanes, extrema=None)
     new = attempt(osc, window, ones, lanes, h, jnp.ones(()), jnp.ones(()), None)
     return new.x1, new.x2

@@ -32,7 +32,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import ULPS, bounds_leftward, bounds_rightward, fastest_rate, foremost, select
+from ..model.modes import (
+    ULPS,
+    bounds_leftward,
+    bounds_rightward,
+    fastest_rate,
+    foremost,
+    has_edges,
+    select,
+)
 from ..model.modes import edges as edge_positions
 from ..model.oscillator import Oscillator
 from ..model.rest import is_at_rest
@@ -97,7 +105,7 @@ class _Window(eqx.Module):
     active: Array
 
 
-def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | None) -> _Window:
+def window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None) -> _Window:
     """The bounds of the current modes. Where x1 has to be monotone, x2 = 0 is a bound, too."""
     mode, inf = lanes.mode, jnp.full_like(lanes.t, jnp.inf)
 
@@ -111,7 +119,7 @@ def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | No
     low = innermost(jnp.maximum, [code == -1 for code in mode.codes], boundaries, -inf)
     high = innermost(jnp.minimum, [code == 1 for code in mode.codes], boundaries, inf)
     x1, split = None, jnp.zeros_like(lanes.done) if extrema is None else extrema
-    if edges:
+    if has_edges(osc):
         left = innermost(jnp.maximum, bounds_leftward(mode), edge_positions(osc), -inf)
         right = innermost(jnp.minimum, bounds_rightward(mode), edge_positions(osc), inf)
         x1 = left, right
@@ -119,7 +127,7 @@ def window_of(osc: Oscillator, lanes: Lanes, *, edges: bool, extrema: Array | No
         # at every x2 = 0 would become as small as rounding where a lane comes to rest.
         reach = 4 * (jnp.abs(lanes.x2) + jnp.abs(lanes.a))
         split = split | (jnp.minimum(lanes.x1 - left, right - lanes.x1) <= reach)
-    if edges or extrema is not None:
+    if has_edges(osc) or extrema is not None:
         up = split & ((lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0)))
         down = split & ((lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0)))
         # Of the boundary of a belt at rest the derivatives stay.

@@ -211,11 +211,11 @@ def edges(osc: Oscillator) -> list[Array]:
     """Positions of the contact edges in the order of `edge_guards`; infinite: there is none."""
     n = len(osc.belts)
     infinite = [-jnp.inf] * n + [jnp.inf] * n
-    pairs = zip(_bounds(osc), infinite, strict=True)
+    pairs = zip(_interval_ends(osc), infinite, strict=True)
     return [jnp.asarray(none) if bound is None else bound for bound, none in pairs]
 
 
-def _bounds(osc: Oscillator) -> Sequence[Array | None]:
+def _interval_ends(osc: Oscillator) -> Sequence[Array | None]:
     """As `edges`; None see `without_edges`."""
     return [belt.lower for belt in osc.belts] + [belt.upper for belt in osc.belts]
 
@@ -235,7 +235,7 @@ def has_edges(osc: Oscillator) -> bool:
 
     Known inside a trace, too, where the bounds are constants: what edges need is then left out.
     """
-    bounds = [bound for bound in _bounds(osc) if bound is not None]
+    bounds = [bound for bound in _interval_ends(osc) if bound is not None]
     return not is_concrete(bounds) or bool(np.any(np.isfinite(bounds)))
 
 

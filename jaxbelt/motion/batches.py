@@ -50,8 +50,7 @@ class Batch(NamedTuple):
     """What all groups of a batch have in common.
 
     width: lanes of a group; rounds: room for so many; rows: room for the arcs of a run that are
-    followed; most: arcs of a run, at most; belts: how many; edges: whether a contact edge may be
-    met.
+    followed; most: arcs of a run, at most; belts: how many.
     """
 
     width: int
@@ -59,7 +58,6 @@ class Batch(NamedTuple):
     rows: int
     most: int
     belts: int
-    edges: bool
 
 
 class Group(NamedTuple):
@@ -84,7 +82,7 @@ def blank_book(osc, batch: Batch) -> Round:
 
     def kept(osc):
         lanes = _first_lanes(osc, (ones, ones), ones[0], batch)
-        return one_round(osc, lanes, ones, ones, ones[0], ones[0], edges=batch.edges)[1]
+        return one_round(osc, lanes, ones, ones, ones[0], ones[0])[1]
 
     shapes = jax.eval_shape(kept, osc)
     return jax.tree.map(lambda s: jnp.zeros((batch.rounds, *s.shape), s.dtype), shapes)
@@ -93,7 +91,7 @@ def blank_book(osc, batch: Batch) -> Round:
 def _first_lanes(osc, y0, rtol, batch: Batch) -> Lanes:
     run, (x1, x2) = jnp.zeros(batch.width, jnp.int32), y0
     passes = jnp.zeros((), jnp.int32)
-    lanes = lanes_at_start(osc, run, x1, x2, passes, rtol, edges=batch.edges)
+    lanes = lanes_at_start(osc, run, x1, x2, passes, rtol)
     return replace(lanes, memory=LoopSearch.none(lanes.t))
 
 
@@ -127,7 +125,7 @@ def _written(osc, lanes, ones, span, tolerances, batch: Batch, book) -> tuple[La
     @one_kernel
     def page(osc, lanes, ones, span, rtol, atol):
         def advance(lanes, _):
-            return one_round(osc, lanes, ones, span, rtol, atol, edges=batch.edges)
+            return one_round(osc, lanes, ones, span, rtol, atol)
 
         return lax.scan(advance, lanes, length=PAGE)
 
@@ -304,7 +302,7 @@ def _samples(osc, book: Round, inside: Array, ones, ts, batch: Batch) -> Array:
     @one_kernel
     def sample(osc, ones, x1, x2, since, mode, is_first):
         slip = Mode(tuple(jnp.where(is_first, 1.0, c) for c in codes_in(mode, batch.belts)))
-        flown = flown_on(osc, ones, slip, x1, x2, since, edges=batch.edges)
+        flown = flown_on(osc, ones, slip, x1, x2, since)
         # In the first place a lane is stuck.
         carried = x1 + x2 * since, x2
         return tuple(jnp.where(is_first, a, b) for a, b in zip(carried, flown, strict=True))

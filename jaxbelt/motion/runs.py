@@ -164,12 +164,11 @@ class Rules(NamedTuple):
     """What is fixed when runs are compiled.
 
     max_segments: arcs of a run, at most; followed: those that are followed, without the loops that
-    are only repeated; edges: whether edges may be met.
+    are only repeated.
     """
 
     max_segments: int
     followed: int
-    edges: bool
 
 
 def _followed_arcs(
@@ -268,7 +267,7 @@ def _followed_rows(lane, axis_size: int, batched, args, rules: Rules):
     room = shapes[1].t.shape[0]
     rounds = -(-room // PAGE) * PAGE
     width = min(LANES_AT_ONCE, -(-axis_size // 8) * 8, max(8, BOOK // rounds))
-    batch = Batch(width, rounds, room, rules.max_segments, len(osc.belts), rules.edges)
+    batch = Batch(width, rounds, room, rules.max_segments, len(osc.belts))
     groups = -(-axis_size // width)
 
     def by_group(leaf):

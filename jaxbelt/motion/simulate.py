@@ -166,7 +166,6 @@ def _filippov(
         wanted_times = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)[:-1]
     else:
         wanted_times = ts[:-1] if ends_at_t1 else ts
-    osc = osc if rules.edges else without_edges(osc)
     y0 = jnp.stack(start_at_focus(osc, *y0))
     final, records, loop, samples = arcs_of_run(osc, y0, t0, t1, wanted_times, rtol, atol, rules)
     _, period = loop.end(records.event_t)
@@ -321,14 +320,14 @@ def simulate(
         is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
     )
     trajectory = _filippov(
-        osc,
+        osc if edges else without_edges(osc),
         y0,
         t0,
         t1,
         ts,
         rtol,
         atol,
-        rules=Rules(max_segments, followed, edges),
+        rules=Rules(max_segments, followed),
         max_events=max_events,
         resolution=resolution,
         ends_at_t1=ends_at_t1,

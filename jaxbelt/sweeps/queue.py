@@ -54,7 +54,7 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
     """Lanes at the start of their runs."""
     if program.derivatives:
         x1, x2 = start_at_focus(osc, x1, x2)
-    lanes = lanes_at_start(osc, run, x1, x2, passes, rtol, edges=program.edges)
+    lanes = lanes_at_start(osc, run, x1, x2, passes, rtol)
     memory, integrals = program.observer.start(osc, lanes), program.observer.integrals(osc, lanes)
     return replace(lanes, memory=memory, integrals=integrals)
 
@@ -198,12 +198,12 @@ def _work(program: Program, common: Common, stream: Stream) -> Stream:
     osc, observer = _oscillators(program, common.shared, stream.rows), program.observer
     t1, rtol, atol, ones = common.t1, common.rtol, common.atol, stream.ones
     forward = functools.partial(take_step, derivatives=program.derivatives)
-    rules = dict(edges=program.edges, captures=program.captures, derivatives=program.derivatives)
+    rules = dict(captures=program.captures, derivatives=program.derivatives)
 
     def round_(_, lanes):
         lanes, passage = pass_events(osc, lanes, t1, rtol, **rules)
         lanes = observer.watch(osc, lanes, passage, ones, t1, rtol)
-        window = window_of(osc, lanes, edges=program.edges, extrema=observer.extrema(lanes))
+        window = window_of(osc, lanes, extrema=observer.extrema(lanes))
 
         def step(_, lanes):
             return observer.follow(forward, osc, window, ones, lanes, t1, rtol, atol)
