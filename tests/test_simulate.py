@@ -732,3 +732,70 @@ def test_times_that_do_not_increase_under_a_trace():
 
     order = np.argsort(ts)
     np.testing.assert_allclose(jax.jit(states)(ts)[order], states(ts[order]), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("edges", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_derivatives_of_a_sample_are_those_of_it_alone(edges):
+    """Those of many samples are made each from the one before; round numbers and others, in both
+    modes of derivatives."""
+
+    def states(numbers, ts):
+        nu0, nu1, damping, load, sigma, *y0 = numbers
+        ends = ({"upper": sigma}, {"lower": sigma}) if edges else ({}, {})
+        law = jb.Conti(1.0, 0.6, 8.0)
+        belts = jb.Belt(nu0, law, load, **ends[0]), jb.Belt(nu1, law, **ends[1])
+        return jb.simulate(jb.Oscillator(damping, belts), tuple(y0), 30.0, ts=ts).ys
+
+    forward = jax.jit(jax.jacfwd(states))
+    one_by_one = jax.jit(jax.vmap(lambda n, t: jax.jacfwd(states)(n, t[None])[0], (None, 0)))
+    backward = jax.jit(jax.grad(lambda n, ts, weights: jnp.sum(weights * states(n, ts))))
+    rng = np.random.default_rng(3)
+    ts = np.sort(np.concatenate([np.linspace(0.0, 30.0, 257), rng.uniform(0.0, 30.0, 30)]))
+    for numbers in [
+        (0.75, -0.75, 0.5, 1.0, 0.3, 1.0, 0.0),
+        (1.0, -0.5, 0.5, 1.0, -0.25, 3.0, 0.0),
+        (0.5, 0.5, 0.5, 1.0, 0.25, -1.0, 0.5),
+        (0.5, 0.25, 0.5, 0.0, -0.5, 0.5, 0.5),
+        (0.0, 0.5, 0.5, 1.0, 0.25, 2.0, -1.0),
+        (0.3, 0.3, 0.05, 1.0, 0.125, 0.0, 0.0),
+        (0.45, 0.35, -0.05, 1.0, -0.2, 1.3, 0.2),
+        (0.4512, -0.3391, 0.3, 0.87, 0.21, -1.234, 0.456),
+    ]:
+        numbers = jnp.array(numbers)
+        found, alone = np.asarray(forward(numbers, ts)), np.asarray(one_by_one(numbers, ts))
+        scale = 1 + np.maximum.accumulate(np.nanmax(np.abs(alone), axis=(1, 2), keepdims=True))
+        np.testing.assert_array_less(np.abs(found - alone), 1e-8 * scale * np.ones_like(found))
+        weights = rng.normal(size=found.shape[:2])
+        told = np.einsum("ij,ijk->k", weights, found)
+        size = np.einsum("ij,ijk->k", np.abs(weights), np.abs(found))
+        assert np.all(np.abs(backward(numbers, ts, weights) - told) <= 1e-11 * (1 + size))
+
+
+def test_samples_that_are_not_used_are_not_made():
+    """The last of the default samples is the final state alone, for values and for derivatives in
+    forward mode: the compiled program does not contain the others."""
+
+    def final(nu0, ts):
+        return jb.simulate(jb.presets.class_b(nu0, 0.35), (3.0, 0.0), 20.0, ts=ts).ys[-1]
+
+    for ways in (lambda f: f, lambda f: lambda x: jax.jvp(f, (x,), (1.0,))):
+        programs = [
+            jax.jit(ways(lambda x, ts=ts: final(x, ts))).lower(0.45).compile()
+            for ts in (None, [20.0])
+        ]
+        default, alone = (program.as_text().count(" fusion(") for program in programs)
+        assert default <= 1.02 * alone
+        for one, other in zip(*(jax.tree.leaves(program(0.45)) for program in programs)):
+            np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+def test_no_samples_in_a_batch():
+    """An empty `ts` is possible under every transformation."""
+
+    def run(nu0):
+        return jb.simulate(jb.presets.class_b(nu0, 0.35), (3.0, 0.0), 20.0, ts=[])
+
+    runs = jax.vmap(run)(jnp.array([0.3, 0.45]))
+    assert runs.ys.shape == (2, 0, 2)
+    slopes = jax.vmap(jax.jacfwd(lambda nu0: run(nu0).events.t))(jnp.array([0.3, 0.45]))
+    assert np.all(np.any(np.nan_to_num(slopes) != 0, axis=1))

@@ -216,7 +216,7 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     most = min(SIDE_BY_SIDE, largest_power(max(1, LARGEST // columns)))
     size = min(most, max(1, flights // LEAST_GROUPS))
     graded = jnp.stack([number, is_even, ratio, wanted.astype(float)], axis=1)
-    table = _in_groups(jnp.concatenate([table, graded], axis=1)[order], size)
+    table = _as_columns(jnp.concatenate([table, graded], axis=1)[order], size)
 
     @one_kernel
     def made(shared, columns):
@@ -254,12 +254,12 @@ def _all_steps(by_run, shared, table: Array, unpack: Callable) -> Array:
         return jax.vmap(of_one, (*axes, 0, 0), 1)(varied, rest, arcs, ones)
 
     size = min(len(table), LOOKED_AT)
-    groups = _in_groups(table, size)
+    groups = _as_columns(table, size)
     steps = lax.map(lambda columns: looked(shared, columns, jnp.ones(size)), groups)
     return jnp.moveaxis(steps, 1, 0).reshape(3, -1)
 
 
-def _in_groups(table: Array, size: int) -> Array:
+def _as_columns(table: Array, size: int) -> Array:
     """The rows of a table in groups of so many, as columns, [groups, columns, size]."""
     return jnp.swapaxes(table.reshape(-1, size, table.shape[1]), 1, 2)
 

@@ -223,7 +223,7 @@ def simulate(
     t1: ArrayLike,
     *,
     t0: ArrayLike = 0.0,
-    ts: ArrayLike | None = None,
+    ts: ArrayLike | list | tuple | None = None,
     rtol: ArrayLike = 1e-10,
     atol: ArrayLike = 1e-10,
     formulation: str = "filippov",
@@ -335,7 +335,7 @@ def simulate(
     return _without_padding(trajectory, trim_samples=ts is None)
 
 
-def _checked_times(ts: ArrayLike, t0: ArrayLike, t1: ArrayLike) -> ArrayLike:
+def _checked_times(ts: ArrayLike | list | tuple, t0: ArrayLike, t1: ArrayLike) -> ArrayLike:
     """The wanted times, or a `ValueError`."""
     ts = as_numbers(ts, "ts", (None,))
     check_finite(ts, "ts")
