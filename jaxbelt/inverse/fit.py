@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
@@ -105,11 +106,15 @@ def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, st
     def misfit(unknown):
         return _smooth_misfit(unknown, selection, osc, record, eps, steps)
 
-    gradient = jax.vmap(jax.value_and_grad(misfit))
+    @jax.vmap
+    def slopes(unknown):
+        # Forwards: a handful of unknowns, and backwards every step would have to be kept.
+        numbers, unravel = ravel_pytree(unknown)
+        return unravel(jax.jacfwd(lambda numbers: misfit(unravel(numbers)))(numbers))
 
     def improve(state, _):
         unknown, memory = state
-        _, slope = gradient(unknown)
+        slope = slopes(unknown)
         # Optax multiplies its integer counts with floats.
         with jax.numpy_dtype_promotion("standard"):
             change, memory = optimizer.update(slope, memory)
@@ -117,7 +122,7 @@ def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, st
 
     state = (starts, optimizer.init(starts))
     (unknown, _), _ = lax.scan(improve, state, None, length=SEARCH_STEPS)
-    return unknown, gradient(unknown)[0]
+    return unknown, jax.vmap(misfit)(unknown)
 
 
 def _first_guesses(selection, u, osc, record: Record, starts: int):
