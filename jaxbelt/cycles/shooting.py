@@ -112,7 +112,15 @@ def _meshes(steps: int) -> Callable:
 def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
     """Steps as fractions of the duration, [steps], so that each has about the same share of it."""
     n = 24
-    _, rest = lax.scan(lambda y, _: _coarse_step(osc, codes, y, duration / n), y, None, length=n)
+
+    def march():
+        def advance(y, _):
+            return _coarse_step(osc, codes, y, duration / n)
+
+        return lax.scan(advance, y, None, length=n)[1]
+
+    # Stick phases, and what pads a chain, take no steps.
+    rest = lax.cond(any_lane(duration != 0), march, lambda: jnp.ones(n))
     rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
     # Clipped: where a guess is poor the mesh is only less good.
     rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
