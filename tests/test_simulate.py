@@ -749,6 +749,7 @@ def test_derivatives_of_a_sample_are_those_of_it_alone(edges):
     forward = jax.jit(jax.jacfwd(states))
     one_by_one = jax.jit(jax.vmap(lambda n, t: jax.jacfwd(states)(n, t[None])[0], (None, 0)))
     backward = jax.jit(jax.grad(lambda n, ts, weights: jnp.sum(weights * states(n, ts))))
+    of_last = jax.jit(jax.jacfwd(lambda numbers: states(numbers, [30.0])[0]))
     rng = np.random.default_rng(3)
     ts = np.sort(np.concatenate([np.linspace(0.0, 30.0, 257), rng.uniform(0.0, 30.0, 30)]))
     for numbers in [
@@ -765,6 +766,7 @@ def test_derivatives_of_a_sample_are_those_of_it_alone(edges):
         found, alone = np.asarray(forward(numbers, ts)), np.asarray(one_by_one(numbers, ts))
         scale = 1 + np.maximum.accumulate(np.nanmax(np.abs(alone), axis=(1, 2), keepdims=True))
         np.testing.assert_array_less(np.abs(found - alone), 1e-8 * scale * np.ones_like(found))
+        assert np.all(np.abs(of_last(numbers) - alone[-1]) < 1e-9 * scale[-1])
         weights = rng.normal(size=found.shape[:2])
         told = np.einsum("ij,ijk->k", weights, found)
         size = np.einsum("ij,ijk->k", np.abs(weights), np.abs(found))

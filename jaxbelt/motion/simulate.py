@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
@@ -198,7 +199,8 @@ def _filippov(
                 jnp.where(unused[:, None], y1, arcs.y),
                 jnp.where(unused[:, None], mode1, arcs.mode),
             )
-            order = _merged(wanted_times, entries[0])
+            # Of loops that were not followed they may be out of order by a rounding.
+            order = _merged(wanted_times, lax.cummax(lax.stop_gradient(entries[0])))
             rows = jax.tree.map(lambda *both: jnp.concatenate(both)[order], rows, entries)
         ends = t1, y1, mode1
         rows = jax.tree.map(lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, ends)

@@ -1,7 +1,7 @@
 """All that leans on what JAX, XLA and Equinox do not promise, behind one switch.
 
-- `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `with_batches`, `wide`,
-  `any_lane` and `where_any` save time of running.
+- `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `one_kernel_alone`,
+  `lanes_in_one_kernel`, `with_batches`, `wide`, `any_lane` and `where_any` save time of running.
 - `depends` and `is_affine` look at what a function does with its arguments.
 - `require_own_threads` looks at whether JAX was in use before a process was forked.
 
