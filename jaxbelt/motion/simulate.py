@@ -299,25 +299,9 @@ def simulate(
             formulation=formulation,
             resolution=resolution,
         )
-    edges, expected = has_edges(osc), "a positive integer"
     padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
-    is_default = max_segments is None
-    if max_segments is None:
-        # Around a pseudo-focus at a contact edge a run has many short arcs.
-        max_segments = _power_of_two((64 if edges else 8) * span, 512)
-    is_count = isinstance(max_segments, int) and max_segments > 0
-    require(is_count, "max_segments", expected, max_segments)
-    followed = max_segments
-    if is_default and padded and not edges:
-        # Padding costs more than the arcs here. No arc is longer than a unit of time; and a loop,
-        # which takes 2 pi or so, has two more for its extrema, and three for each belt, where the
-        # mass sticks to it and crosses it: 1 + (2 + 3 belts) / (2 pi), or less.
-        rate = 1.5 + 0.5 * len(osc.belts)
-        followed = min(max_segments, max(128, 64 * math.ceil(rate * span / 64)))
-    if max_events is None:
-        room = _power_of_two((16 if edges else 4) * span, 64) if padded else max_segments
-        max_events = min(max_segments, room)
-    require(isinstance(max_events, int) and max_events > 0, "max_events", expected, max_events)
+    edges = has_edges(osc)
+    rules, max_events = _budgets(max_segments, max_events, span, len(osc.belts), edges, padded)
     ends_at_t1 = ts is None or (
         is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
     )
@@ -329,12 +313,42 @@ def simulate(
         ts,
         rtol,
         atol,
-        rules=Rules(max_segments, followed),
+        rules=rules,
         max_events=max_events,
         resolution=resolution,
         ends_at_t1=ends_at_t1,
     )
     return _without_padding(trajectory, trim_samples=ts is None)
+
+
+def _budgets(
+    max_segments: int | None,
+    max_events: int | None,
+    span: float,
+    belts: int,
+    edges: bool,
+    padded: bool,
+) -> tuple[Rules, int]:
+    """How many arcs a run may have and how many events are given, by default or as told, or a
+    `ValueError`; padded: whether there has to be room for all of them."""
+    expected, is_default = "a positive integer", max_segments is None
+    if max_segments is None:
+        # Around a pseudo-focus at a contact edge a run has many short arcs.
+        max_segments = _power_of_two((64 if edges else 8) * span, 512)
+    is_count = isinstance(max_segments, int) and max_segments > 0
+    require(is_count, "max_segments", expected, max_segments)
+    followed = max_segments
+    if is_default and padded and not edges:
+        # Padding costs more than the arcs here. No arc is longer than a unit of time; and a loop,
+        # which takes 2 pi or so, has two more for its extrema, and three for each belt, where the
+        # mass sticks to it and crosses it: 1 + (2 + 3 belts) / (2 pi), or less.
+        rate = 1.5 + 0.5 * belts
+        followed = min(max_segments, max(128, 64 * math.ceil(rate * span / 64)))
+    if max_events is None:
+        room = _power_of_two((16 if edges else 4) * span, 64) if padded else max_segments
+        max_events = min(max_segments, room)
+    require(isinstance(max_events, int) and max_events > 0, "max_events", expected, max_events)
+    return Rules(max_segments, followed), max_events
 
 
 def _checked_times(ts: ArrayLike | list | tuple, t0: ArrayLike, t1: ArrayLike) -> ArrayLike:
