@@ -15,6 +15,8 @@ from jaxbelt.sweeps import store
 from jaxbelt.sweeps.datasets import Memory
 from jaxbelt.sweeps.question import Question
 
+#: What is started in the background of a shell would else ignore interrupts, and so its children.
+HEARS = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
 #: A sweep that would take hours: many short runs, or a few long ones, each longer than a call of
 #: the kernel is to take. Before it, one of the same program that compiles it.
 SWEEP = """
@@ -52,6 +54,7 @@ else:
     threads._Team.compile = told
 sweep(20, 1e6) if sys.argv[1] == "long" else sweep(3000, 300.0)
 """
+COMMAND = "from jaxbelt.cli import app; app()"
 #: Seconds from the interrupt to the end of the process.
 SOON = 2.0
 
@@ -87,7 +90,7 @@ def interrupted(
     ],
 )
 def test_an_interrupt_ends_a_sweep_and_says_what_became_of_it(when, delay):
-    command, cache = [sys.executable, "-c", SWEEP, when], when != "compiling"
+    command, cache = [sys.executable, "-c", HEARS + SWEEP, when], when != "compiling"
     seconds, code, errors = interrupted(command, delay, ready=True, cache=cache)
     assert code == -signal.SIGINT, errors
     last = errors.strip().splitlines()[-1]
@@ -102,7 +105,7 @@ def test_an_interrupt_ends_a_sweep_and_says_what_became_of_it(when, delay):
 def test_an_interrupt_ends_the_command(tmp_path):
     axes = ["nu0=-0.6:0.55:3000", "nu1=-0.5:0.5:3000"]
     out = ["--out", str(tmp_path / "plane.nc")]
-    command = [sys.executable, "-c", "from jaxbelt.cli import app; app()", "sweep", *axes, *out]
+    command = [sys.executable, "-c", HEARS + COMMAND, "sweep", *axes, *out]
     seconds, code, errors = interrupted(command, 10.0, ready=False, cache=True)
     assert code == 130 and "interrupted after " in errors and "Traceback" not in errors
     assert seconds < SOON
