@@ -167,7 +167,8 @@ def times_done(store: Path) -> np.ndarray:
 #: A session: for every line that comes, it goes on with a sweep, and is back at the prompt when the
 #: sweep ends or is interrupted. With "compile" in the line nothing is left of earlier compilations.
 SESSION = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.path.append(sys.argv[1])
 import jax
 jax.config.update("jax_enable_x64", True)
