@@ -734,7 +734,7 @@ def test_times_that_do_not_increase_under_a_trace():
     np.testing.assert_allclose(jax.jit(states)(ts)[order], states(ts[order]), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("edges", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("edges", [False, pytest.param(True, marks=pytest.mark.slow(first=True))])
 def test_derivatives_of_a_sample_are_those_of_it_alone(edges):
     """Those of many samples are made each from the one before; round numbers and others, in both
     modes of derivatives."""

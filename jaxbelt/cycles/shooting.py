@@ -100,7 +100,8 @@ def meshed(osc: Oscillator, loop: Loop, steps: int = ARC_STEPS) -> tuple[Chain, 
 
 @functools.cache
 def _meshes(steps: int) -> Callable:
-    """`_mesh` of all arcs."""
+    """`_mesh` of all arcs. Not by `_arc_by_arc`: in a batch a whole march is too large for a piece,
+    so each step of it is one."""
 
     @one_kernel_alone
     def call(osc, columns):

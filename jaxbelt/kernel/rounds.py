@@ -21,7 +21,7 @@ STEPS_PER_ROUND = 4
 
 
 def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol) -> Lanes:
-    """Lanes at the start of their runs, without what an observer adds; edges: see `window_of`."""
+    """Lanes at the start of their runs, without what an observer adds."""
     mode = mode_of_state(osc, x1, x2)
     finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
     rests = at_focus(osc, x1, x2) if has_edges(osc) else jnp.zeros_like(finite)

@@ -19,7 +19,14 @@ from jaxtyping import Array
 from ..kernel.lanes import materialise
 from ..model.modes import Mode, mode_of
 from ..model.oscillator import Oscillator
-from ..numerics.compiling import LARGEST, any_lane, more_rows, one_kernel, with_batches
+from ..numerics.compiling import (
+    LARGEST,
+    any_lane,
+    axes_of,
+    more_rows,
+    one_kernel,
+    with_batches,
+)
 from ..numerics.extrapolation import increments, scheme
 from .integrators import State, density, slip_field
 
@@ -200,7 +207,7 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     leaves arrays [flights, ..]; times, and whether each is wanted: arrays [flights], a power of two
     of them; run: to which run each belongs. Those of about as many steps are made side by side.
     """
-    flights, columns = times.size, 3 + sum(sizes_of(by_run, varied))
+    flights, count = times.size, 3 + sum(sizes_of(by_run, varied))
     own, shared = eqx.partition((varied, rest), by_run)
     own = jax.tree.map(lambda leaf: leaf[run], own)
     # In one array, because XLA gathers, and takes the part of each group from, one at a time.
@@ -213,7 +220,7 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32)) % flights
     places = jnp.zeros_like(order).at[order].set(jnp.arange(flights, dtype=jnp.int32))
     # A few groups at least, for all of a group wait for the longest.
-    most = min(SIDE_BY_SIDE, largest_power(max(1, LARGEST // columns)))
+    most = min(SIDE_BY_SIDE, largest_power(max(1, LARGEST // count)))
     size = min(most, max(1, flights // LEAST_GROUPS))
     graded = jnp.stack([number, is_even, ratio, wanted.astype(float)], axis=1)
     table = _as_columns(jnp.concatenate([table, graded], axis=1)[order], size)
@@ -236,12 +243,12 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     # In one array, so that a flight's numbers stand side by side.
     slopes = jnp.concatenate(lax.map(group, table), axis=1)
     slopes = jnp.moveaxis(slopes, 1, 2).reshape(flights, -1)[places]
-    return tuple(jnp.split(slopes, slopes.shape[1] // columns, axis=1))
+    return tuple(jnp.split(slopes, slopes.shape[1] // count, axis=1))
 
 
 def _all_steps(by_run, shared, table: Array, unpack: Callable) -> Array:
     """`steps_of` all flights, [3, flights]: number, is_even as a number, ratio; see `_packed`."""
-    axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
+    axes = axes_of(by_run)
 
     def of_one(varied, rest, arc, one):
         steps = steps_of(eqx.combine(varied, rest), arc, one)
@@ -287,7 +294,7 @@ def _packed(tree) -> tuple[Array, Callable]:
 def _slopes_together(result, by_run, varied, rest, arcs: Arc, times, steps: Steps):
     """The derivatives of flights that are made together, arrays [3 + varied, flights], see
     `slopes_of`."""
-    axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
+    axes = axes_of(by_run)
 
     def each(function, varied, *rows):
         def of_one(varied, rest, *rows):

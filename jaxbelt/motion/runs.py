@@ -462,6 +462,6 @@ def _afterwards(final: RunState) -> Array:
 def state_at_end(final: RunState, records: ArcRecord, loop: RepeatedLoop, t1: Array):
     """State and mode at t1, with derivatives: those that the last arc ends with."""
     beyond = t1 > final.t
-    (arc, *_) = arcs_at(records, loop.followed(t1[None], records.event_t))
-    mode = jnp.where(beyond, stacked_codes(final.mode), arc.mode[0])
+    arcs, *_ = arcs_at(records, loop.followed(t1[None], records.event_t))
+    mode = jnp.where(beyond, stacked_codes(final.mode), arcs.mode[0])
     return jnp.where(beyond, _afterwards(final), jnp.stack(final.y)), mode

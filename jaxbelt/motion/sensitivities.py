@@ -31,7 +31,7 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator
 from ..model.rest import is_slow
 from ..model.transitions import on_guard
-from ..numerics.compiling import LARGEST, any_lane, one_kernel
+from ..numerics.compiling import LARGEST, any_lane, axes_of, one_kernel
 from .arcs import stick_arc
 from .flights import (
     MOST_FLIGHTS,
@@ -213,7 +213,7 @@ def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, carry: Carry):
     arcs, remaining = _made_safe(flat[0]), flat[1]
     run = jnp.arange(remaining.size) % width
     of_runs = jax.tree.map(lambda leaf, flag: leaf[run] if flag else leaf, (varied, rest), by_run)
-    axes = jax.tree.map(lambda flag: 0 if flag else None, by_run)
+    axes = axes_of(by_run)
 
     def creep(parts, arc):
         return _creep(eqx.combine(*parts), arc.mode, *arc.entry)

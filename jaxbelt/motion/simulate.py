@@ -281,25 +281,16 @@ def simulate(
         '"filippov", "switch" or "smooth"',
         repr(formulation),
     )
+    given = y0, t0, t1, ts, rtol, atol
     span = float(t1 - t0) if is_concrete((t0, t1)) else 100.0
     resolution = 0 if ts is not None else _power_of_two(10 * span, 512)
     if formulation != "filippov":
         name = "v_star" if formulation == "switch" else "eps"
         width = as_numbers(v_star if formulation == "switch" else eps, name)
         check_positive(width, name)
-        return _smoothed(
-            osc,
-            y0,
-            t0,
-            t1,
-            ts,
-            rtol,
-            atol,
-            width=width,
-            formulation=formulation,
-            resolution=resolution,
-        )
-    padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
+        fixed = dict(formulation=formulation, resolution=resolution)
+        return _smoothed(osc, *given, width=width, **fixed)
+    padded = not is_concrete((osc, given))
     edges = has_edges(osc)
     rules, max_events = _budgets(max_segments, max_events, span, len(osc.belts), edges, padded)
     ends_at_t1 = ts is None or (
@@ -307,12 +298,7 @@ def simulate(
     )
     trajectory = _filippov(
         osc if edges else without_edges(osc),
-        y0,
-        t0,
-        t1,
-        ts,
-        rtol,
-        atol,
+        *given,
         rules=rules,
         max_events=max_events,
         resolution=resolution,

@@ -215,7 +215,7 @@ def lanes_in_one_kernel(function: Callable) -> Callable:
     """The same function of arrays, that closes over none; a batch of it is `one_kernel`."""
 
     def batch(_, axis_size, batched, *args):
-        return one_kernel(jax.vmap(function, _axes(batched), axis_size=axis_size))(*args)
+        return one_kernel(jax.vmap(function, axes_of(tuple(batched)), axis_size=axis_size))(*args)
 
     lanes = with_batches(function, batch)
 
@@ -230,13 +230,14 @@ def one_kernel_alone(function: Callable) -> Callable:
     """`one_kernel`, whose batch is what the function makes of one: pieces of its own, say."""
 
     def batch(_, axis_size, batched, *args):
-        return jax.vmap(function, _axes(batched), axis_size=axis_size)(*args)
+        return jax.vmap(function, axes_of(tuple(batched)), axis_size=axis_size)(*args)
 
     return with_batches(one_kernel(function), batch)
 
 
-def _axes(batched) -> tuple:
-    return jax.tree.map(lambda flag: 0 if flag else None, tuple(batched))
+def axes_of(flags):
+    """For `jax.vmap`: the first axis of what is flagged; the rest is the same for all."""
+    return jax.tree.map(lambda flag: 0 if flag else None, flags)
 
 
 #: Lanes of a group: more of them wait for the slowest, and leave the processor's caches; fewer take
@@ -400,8 +401,7 @@ def _in_one_piece(jaxpr: Any, *args) -> list[jax.Array]:
 
     @alone.def_vmap
     def _(axis_size, batched, *args):
-        axes = jax.tree.map(lambda one: 0 if one else None, tuple(batched))
-        out = jax.vmap(evaluate, axes, axis_size=axis_size)(*args)
+        out = jax.vmap(evaluate, axes_of(tuple(batched)), axis_size=axis_size)(*args)
         return out, jax.tree.map(lambda _: True, out)
 
     return alone(*args)
