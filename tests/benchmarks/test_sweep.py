@@ -19,6 +19,7 @@ from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
 from jaxbelt.sweeps import threads as sweep_threads
+from tests.benchmarks.timing import least
 
 SPAN, TOLERANCE = 100.0, 1e-8
 
@@ -26,16 +27,6 @@ SPAN, TOLERANCE = 100.0, 1e-8
 def w1(n):
     i = (np.arange(n) + 0.5) / n
     return {"nu0": -0.7 + 1.4 * i, "nu1": -0.6987 + 1.4 * i}
-
-
-def processor_time(function, repeat=3):
-    """Least seconds of processor time of a few calls, after one that compiles; and the result."""
-    result, times = function(), []
-    for _ in range(repeat):
-        start = time.process_time()
-        result = function()
-        times.append(time.process_time() - start)
-    return min(times), result
 
 
 def swept(n, **options):
@@ -190,6 +181,78 @@ def numba_runs(n):
     return lambda: loop(grid)
 
 
+def heyoka_runs(n):
+    """Heyoka's adaptive Taylor integrator, in batches as wide as a register (32 and 64 are slower),
+    with terminal events that callbacks answer; or None without heyoka."""
+    try:
+        import heyoka as hy
+    except ImportError:
+        return None
+    x1, x2 = hy.make_vars("x1", "x2")
+    # Rows of parameters: velocities, signs, stuck (0 or 1), x1 and direction of slip onset.
+    nus, signs = (hy.par[0], hy.par[1]), (hy.par[2], hy.par[3])
+    stuck, onset, direction = hy.par[4], hy.par[5], hy.par[6]
+    force = -x1 - 0.5 * x2
+    for nu, sign in zip(nus, signs, strict=True):
+        force += sign * (0.4 / (1 + 10 * sign * (nu - x2)) + 0.6)
+
+    def arrives(k):
+        """At the boundary of belt k: stick or cross."""
+
+        def callback(integrator, _, lane):
+            state, par = integrator.state, integrator.pars
+            nu, other = par[k, lane], par[1 - k, lane]
+            side, sign = np.sign(other - nu), np.sign(nu)
+            rest = -0.5 * nu + side * (0.4 / (1 + 10 * abs(other - nu)) + 0.6)
+            state[1, lane] = nu
+            if abs(rest - state[0, lane]) < 1:
+                par[2 + k, lane], par[3 - k, lane] = sign, side
+                par[4:, lane] = 1.0, rest + sign, sign
+            else:
+                par[2 + k, lane] *= -1
+            return True
+
+        return callback
+
+    def slips(integrator, _, lane):
+        # A hair beside the boundary, to which slip is tangent: else it is found again at once.
+        par = integrator.pars
+        integrator.state[:, lane] = par[5, lane], integrator.state[1, lane] - 1e-10 * par[6, lane]
+        par[4, lane] = 0.0
+        return True
+
+    slides = [(1 - stuck) * s * (nu - x2) + stuck for nu, s in zip(nus, signs, strict=True)]
+    falling = dict(direction=hy.event_direction.negative)
+    events = [
+        *(hy.t_event_batch(slides[k], callback=arrives(k), **falling) for k in (0, 1)),
+        hy.t_event_batch(stuck * direction * (onset - x1) + (1 - stuck), callback=slips, **falling),
+    ]
+    lanes = hy.recommended_simd_size()
+    integrator = hy.taylor_adaptive_batch(
+        [(x1, x2), (x2, (1 - stuck) * force)],
+        state=np.zeros((2, lanes)),
+        pars=np.zeros((7, lanes)),
+        tol=TOLERANCE,
+        t_events=events,
+    )
+    grid = np.stack([part.ravel() for part in np.meshgrid(*w1(n).values(), indexing="ij")])
+
+    def call():
+        ends = []
+        for first in range(0, n * n, lanes):
+            velocities = grid[:, first : first + lanes]
+            integrator.set_time(np.zeros(lanes))
+            integrator.reset_cooldowns()
+            integrator.state[:] = [[1.5], [0.0]]
+            integrator.pars[:] = [*velocities, *np.sign(velocities), *np.zeros((3, lanes))]
+            # Without a bound the step of a lane that sticks is infinite.
+            integrator.propagate_until(np.full(lanes, SPAN), max_delta_t=np.full(lanes, 4.0))
+            ends.append(integrator.state[0].copy())
+        return np.concatenate(ends)
+
+    return call
+
+
 def test_w1_side_by_side(benchmark, tmp_path, monkeypatch):
     """A table: runs per second of one core, the ratio to Boost.odeint, and the sum of |x1(T)|."""
     monkeypatch.setattr(sweep_threads, "workers", lambda: 1)
@@ -208,17 +271,23 @@ def test_w1_side_by_side(benchmark, tmp_path, monkeypatch):
         if bits < 512:
             print(f"by hand: no AVX-512, so this is the limit of registers of {bits} bits")
         rows.append((f"by hand, {bits}-bit SIMD (C++)", n, *fastest(limit, n)))
-    seconds, dataset = processor_time(lambda: swept(n))
+    _, seconds, dataset = least(lambda: swept(n))
     rows.append(("sweep", n, seconds, float(np.abs(dataset.x1_end).sum())))
     looped = numba_runs(64)
     if looped is None:
         print("numba: skipped, not installed")
     else:
-        seconds, x1 = processor_time(looped)
+        _, seconds, x1 = least(looped, 3)
         rows.append(("numba event loop", 64, seconds, np.abs(x1).sum()))
-    seconds, x1 = processor_time(vmapped(16), repeat=1)
+    taylor = heyoka_runs(32)
+    if taylor is None:
+        print("heyoka: skipped, not installed")
+    else:
+        _, seconds, x1 = least(taylor, 3)
+        rows.append(("heyoka (Taylor, LLVM)", 32, seconds, np.abs(x1).sum()))
+    _, seconds, x1 = least(vmapped(16), 3)
     rows.append(("vmap of simulate", 16, seconds, np.abs(x1).sum()))
-    seconds, x1 = processor_time(scipy_runs(3), repeat=1)
+    _, seconds, x1 = least(scipy_runs(3), 1)
     rows.append(("SciPy, no events", 3, seconds, np.abs(x1).sum()))
     base = n * n / rows[0][2]
     print()
@@ -239,18 +308,18 @@ def test_growth(benchmark):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sweep_threads, "workers", lambda: 1)
         for n in (10, 32, 100, 316):
-            seconds, _ = processor_time(functools.partial(swept, n))
+            _, seconds, _ = least(functools.partial(swept, n))
             print(f"batch of {n * n:7d}      {1e6 * seconds / n**2:9.1f} us a run")
         for tolerance in (1e-4, 1e-6, 1e-8, 1e-10, 1e-11):
             options = dict(rtol=tolerance, atol=tolerance)
-            seconds, _ = processor_time(functools.partial(swept, 64, **options))
+            _, seconds, _ = least(functools.partial(swept, 64, **options))
             print(f"tolerance {tolerance:.0e}      {1e6 * seconds / 64**2:9.1f} us a run")
         for belts in (1, 2, 3, 4):
             call = belts_swept(belts)
             start = time.perf_counter()
             call()
             first = time.perf_counter() - start
-            seconds, _ = processor_time(call)
+            _, seconds, _ = least(call)
             cost = f"{1e6 * seconds / 64**2:9.1f} us a run"
             print(f"belts {belts}              {cost}, first call {first:.1f} s")
     times = {}
