@@ -14,7 +14,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     tables          results as tables
     numerics/       derivatives extrapolation newton continuation roots
     model/          friction oscillator machine parameters variations modes pseudofocus transitions
-    model/          rest events equilibria
+    model/          rest events equilibria far_out
     presets         the published systems
     kernel/         lanes marks step events rounds
     motion/         integrators arcs flights sensitivities sampling loops batches runs smoothing

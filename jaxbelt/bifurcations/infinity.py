@@ -1,17 +1,8 @@
 """Cycles that come from infinity: `HopfAtInfinity`.
 
-Of a loop of large amplitude A, nearly a circle, viscous damping takes the energy pi zeta A^2, and
-dry friction, which opposes motion, some more, D(A) > 0. Far out loops shrink where
-
-    zeta + lim D(A) / (pi A^2) > 0
-
-and grow where that is negative. Where it vanishes a cycle goes to infinity: the bound between what
-grows beyond all bounds and what does not. On the side of less damping it exists, and repels.
-
-The limit is 0 for friction that is bounded. Where mu(r) grows as p2 r^2 it is 2/pi u0 p2 omega^2
-for each unit of length of the contact interval, if that is finite; if it is not, D(A) grows as A^3,
-and nothing comes from infinity. Where mu(r) grows as c r it is u0 c omega for contact everywhere,
-half of that for contact to one side.
+Where loops far out neither grow nor shrink, see `model.far_out`, a cycle goes to infinity: the
+bound between what grows beyond all bounds and what does not. On the side of less damping it exists,
+and repels.
 
 Such points are known as Hopf bifurcations at infinity: J. N. Glover, Hopf bifurcations at infinity,
 Nonlinear Analysis 13 (1989) 1393-1398.
@@ -20,59 +11,13 @@ Nonlinear Analysis 13 (1989) 1393-1398.
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array
 
-from ..model.friction import AbstractFriction
+from ..model.far_out import contraction_far_out, has_limit
 from ..model.modes import any_of
-from ..model.oscillator import Oscillator
-from ..numerics.compiling import jit
 from ..results import Status
 from .base import Line
 from .rests import NOTHING, AbstractRestCondition
 from .systems import RestSystem
-
-#: Relative velocities at which laws are as they are far out; to both they are to have one growth.
-FAST = (1e6, 1e8)
-#: Coefficients of growth below these are those of bounded friction.
-LEAST_LINEAR, LEAST_QUADRATIC = 1e-7, 1e-13
-
-
-def contraction_far_out(osc: Oscillator) -> Array:
-    """The rate at which loops far out shrink, as a damping: negative where they grow, inf where
-    friction grows beyond all bounds there."""
-    contraction = osc.damping
-    for belt in osc.belts:
-        linear, quadratic = _growth(belt.friction)
-        length = belt.upper - belt.lower
-        sides = sum(jnp.where(jnp.isinf(end), 0.5, 0.0) for end in (belt.lower, belt.upper))
-        finite = jnp.where(jnp.isfinite(length), length, 0.0)
-        taken = osc.omega * linear * sides + 2 / jnp.pi * osc.omega**2 * quadratic * finite
-        unbounded = (sides > 0) & (belt.load * quadratic > 0)
-        contraction = contraction + jnp.where(unbounded, jnp.inf, belt.load * taken)
-    return contraction
-
-
-def _growth(law: AbstractFriction, r: float = FAST[1]) -> tuple[Array, Array]:
-    """Coefficients of r and r^2 in mu(r), by its values at r, 2r and 3r."""
-    once, twice, thrice = (law.mu(jnp.asarray(k * r)) for k in (1.0, 2.0, 3.0))
-    quadratic = 0.5 * (once - 2 * twice + thrice) / r**2
-    linear = (-2.5 * once + 4 * twice - 1.5 * thrice) / r
-    rounding = 1e-14 * jnp.abs(quadratic) * r
-    none = jnp.zeros_like(once)
-    linear = jnp.where(linear > LEAST_LINEAR + rounding, linear, none)
-    return linear, jnp.where(quadratic > LEAST_QUADRATIC, quadratic, none)
-
-
-def _has_limit(law: AbstractFriction) -> Array:
-    """Whether its growth is told by these numbers: that of a square root, say, is not."""
-    pairs = zip(*(_growth(law, r) for r in FAST), strict=True)
-    return jnp.all(jnp.stack([jnp.abs(a - b) <= 1e-4 * (a + b) for a, b in pairs]))
-
-
-@jit
-def is_bounded(osc: Oscillator) -> Array:
-    """Whether loops far out shrink: where these rates are in balance, too, by what D(A) is more."""
-    return contraction_far_out(osc) >= 0
 
 
 class FarOut(RestSystem):
@@ -88,7 +33,7 @@ class FarOut(RestSystem):
     def exists(self, osc, x):
         # Without any friction each loop is a cycle.
         rubs = any_of([belt.load * belt.friction.static > 0 for belt in osc.belts])
-        return rubs & jnp.all(jnp.stack([_has_limit(belt.friction) for belt in osc.belts]))
+        return rubs & jnp.all(jnp.stack([has_limit(belt.friction) for belt in osc.belts]))
 
 
 class HopfAtInfinity(AbstractRestCondition):

@@ -37,6 +37,7 @@ from ..cycles.chains import SIZES, Loop, cut
 from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
 from ..cycles.settling import AT_REST
 from ..model.equilibria import candidates
+from ..model.far_out import is_bounded
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import as_span, varied
@@ -45,7 +46,6 @@ from ..results import Status
 from .base import AbstractCondition, check_conditions
 from .connections import SaddleCourse, courses_of
 from .guesses import settled_loops
-from .infinity import is_bounded
 from .labels import AttractingCycle, Label
 
 #: Values of the parameter in one batch.
