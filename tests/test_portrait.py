@@ -114,6 +114,29 @@ def test_saddle_is_an_equilibrium_where_nothing_rests():
     assert not np.any(jb.equilibria(jb.presets.class_c(-0.3, 0.3, 0.8)).kind == 4)
 
 
+def test_friction_that_grows_holds_a_cycle_far_out():
+    """Friction that grows as the square of the speed outweighs negative damping: nothing goes to
+    infinity, and what would, without it, from twice the reach of friction that is bounded, is on a
+    cycle."""
+    damping, velocity, law = -0.1, 0.3, (1.0, 0.6, 10.0, 0.01)
+    osc = jb.Oscillator(damping, (jb.Belt(velocity, jb.Conti(*law), lower=1.0),))
+    found = jb.portrait(osc)
+    assert found.status == jb.Status.OK and not found.escapes
+    near, far = found.cycles
+    assert len(found.unstable) == 1
+    assert float(far.x1_max) > 10 * float(near.x1_max) and found.reach > float(far.x1_max)
+    mus, p1, p3, p2 = law
+    belt = oracle.Belt(velocity, *oracle.conti(mus, p1, p3, p2), lower=1.0)
+    other = oracle.Oscillator(damping, (belt,))
+    for cycle in (near, far, *found.unstable):
+        top = float(cycle.x1_max)
+        once = oracle.simulate(other, (top, 0.0), float(cycle.period))
+        # Cycles are solved to 1e-10 of their size.
+        assert once.y_end == pytest.approx((top, 0.0), abs=1e-9 * top)
+    # From farther out loops shrink.
+    assert oracle.simulate(other, (60.0, 0.0), float(far.period)).y_end[0] < 59.0
+
+
 # --- slow: other programs, the engine ---------------------------------------------------------
 
 

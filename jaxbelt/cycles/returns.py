@@ -28,6 +28,7 @@ from jaxtyping import Array
 
 from ..checks import pick
 from ..model.equilibria import Equilibria
+from ..model.far_out import contraction_far_out
 from ..model.modes import edges, mode_acceleration, settle
 from ..model.oscillator import Oscillator
 from ..model.transitions import contact
@@ -68,6 +69,8 @@ NEUTRAL = 1e-9
 NARROWEST = 1e-12
 #: The largest distance from the origin that is looked at, where no bound is known.
 FARTHEST = 1e4
+#: The growth of loops is as it is far out if it is off by less than this fraction.
+AS_EXPECTED = 0.25
 
 
 class Bracket(NamedTuple):
@@ -329,7 +332,8 @@ def reach_of(osc: Oscillator) -> float:
     force between -F and F takes it farther; q = 0 from zeta = 2 on. So with q < 1 no top beyond
     F (1 + q)/(1 - q) comes back as far out. With q > 1, F (1 + q)/(q - 1) is where the least that
     half a loop leads to, q x - F (1 + q), is x, and from farther out orbits go to infinity.
-    Friction that opposes the motion and grows with the speed brings orbits further in.
+    Friction that opposes the motion and grows with the speed brings orbits further in; with q > 1 it
+    holds cycles farther out, see `_where_all_is_as_far_out`.
     """
     zeta = float(osc.damping)
     frequency = np.sqrt(max(1 - zeta**2 / 4, 0.0))
@@ -339,7 +343,31 @@ def reach_of(osc: Oscillator) -> float:
     # Equilibria and all that may be an end of an interval lie within.
     inner = [friction, *(abs(edge) for edge in map(float, edges(osc)) if np.isfinite(edge))]
     inner += [abs(float(belt.velocity / osc.omega)) for belt in osc.belts]
-    return float(max(min(1.01 * bound + 1.0, FARTHEST), max(inner) + 1.0))
+    reach = float(max(min(1.01 * bound + 1.0, FARTHEST), max(inner) + 1.0))
+    if zeta < 0 and reach < FARTHEST and any(map(_pulls_more_far_out, osc.belts)):
+        return _where_all_is_as_far_out(osc, reach)
+    return reach
+
+
+def _where_all_is_as_far_out(osc: Oscillator, reach: float) -> float:
+    """The least of some tops beyond which loops grow, or shrink, as they do at infinity."""
+    tops = np.geomspace(reach, FARTHEST, TOPS_AT_ONCE)
+    after, _ = _next_tops(osc, jax.device_put(np.column_stack([tops, np.zeros_like(tops)])))
+    growth = np.log(np.abs(after) / tops)
+    rate = float(contraction_far_out(osc))
+    if np.isinf(rate):
+        differs = growth >= 0
+    else:
+        expected = -np.pi * rate / np.sqrt(max(1 - rate**2 / 4, 1e-12))
+        differs = (np.abs(growth - expected) > AS_EXPECTED * abs(expected)) & (abs(rate) < 2)
+        differs |= growth * expected <= 0
+    first = np.flatnonzero(differs).max(initial=-1) + 1
+    return float(tops[min(first, tops.size - 1)])
+
+
+def _pulls_more_far_out(belt) -> bool:
+    fast = belt.friction.mu(jnp.asarray(np.geomspace(1.0, FARTHEST, 65)))
+    return float(belt.load) * float(np.max(fast)) > _largest_pull(belt) * (1 + 1e-9)
 
 
 def _largest_pull(belt) -> float:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 #: Each stage joins so many neighbouring windows.
 JOIN = 3
 #: Steps of the search, and its learning rate in units of a parameter's size.
-SEARCH_STEPS, LEARNING_RATE = 200, 0.05
+SEARCH_STEPS, LEARNING_RATE = 60, 0.1
 #: A start whose windows are further off than this (chi^2 per datum) is not followed further.
 HOPELESS = 6.0
 #: A fit as bad as this happens once in a million records, by noise.
