@@ -514,7 +514,7 @@ def names() -> dict:
     cycle = jb.Cycle(osc, *[None] * 5, jnp.asarray(0))
     point, failed = (
         jb.BifurcationPoint(
-            jb.Hopf(), *[np.float64("nan")] * 6, osc, cycle, np.asarray(status.value)
+            jb.Hopf(), *[np.float64("nan")] * 7, osc, cycle, np.asarray(status.value)
         )
         for status in (jb.Status.OK, jb.Status.NO_CONVERGENCE)
     )

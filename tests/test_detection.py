@@ -513,3 +513,30 @@ def test_the_unit_of_the_parameter_makes_no_difference(unit):
 def test_a_span_that_is_hardly_longer_than_a_point():
     (rest,) = jb.scan(lambda nu: jb.presets.class_b(nu, 0.35), span=(-5e-7, 5e-7))
     assert rest.kind == "SuddenSliding" and abs(rest.value) < 1e-14
+
+
+@pytest.mark.parametrize("varied", ["velocity", "damping"])
+def test_two_equilibria_that_change_at_one_value(varied):
+    """A mirror image of itself: two fixed points, the same distance from the middle."""
+    law = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
+
+    def of_both(speed, damping):
+        belts = jb.Belt(speed, law, lower=0.1), jb.Belt(-speed, law, upper=-0.1)
+        return jb.Oscillator(damping, belts)
+
+    # Eq. (28) of the paper: damping = (static - residual) steepness / (1 + steepness speed)^2.
+    if varied == "velocity":
+        make, exact = (lambda speed: of_both(speed, 0.5)), (np.sqrt(8) - 1) / 10
+    else:
+        make, exact = (lambda damping: of_both(0.2, damping)), 4 / 9
+    points = jb.scan(make, span=(exact - 0.03, exact + 0.03), resolution=4)
+    at = [float(point.x1) for point in points]
+    rest = 0.6 + 0.4 / (1 + 10 * (exact if varied == "velocity" else 0.2))
+    assert [point.kind for point in points] == ["Hopf", "Hopf"]
+    assert np.allclose(sorted(at), [-rest, rest], rtol=0, atol=1e-12)
+    assert all(float(point.value) == pytest.approx(exact, abs=1e-13) for point in points)
+    assert all(point.place[:2] == pytest.approx(x1) for point, x1 in zip(points, at))
+    if varied == "velocity":
+        for point in points:
+            curve = jb.bifurcation_curve(point, of_both, span=((0.15, 0.22), (0.4, 0.6)))
+            assert np.all(np.sign(curve.places[:, 0]) == np.sign(float(point.x1)))

@@ -298,7 +298,7 @@ def made_up_diagram(values=(0.10, 0.1355, 0.139, 0.1458, 0.1488, 0.1569, 0.28)):
     cycle = jb.Cycle(osc, chain, jnp.full((1, 3), nan), nan, nan, nan, jnp.asarray(0))
     kinds = [jb.Hopf(), *[jb.CrossingSliding(belt=0), jb.NonsmoothFold(belt=1)] * 3]
     points = [
-        jb.BifurcationPoint(kind, jnp.asarray(value), *[nan] * 5, osc, cycle, jnp.asarray(0))
+        jb.BifurcationPoint(kind, jnp.asarray(value), *[nan] * 6, osc, cycle, jnp.asarray(0))
         for kind, value in zip(kinds, values)
     ]
     regions = ((0.0, 0.3, "1"),)

@@ -26,7 +26,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from ..checks import is_concrete, number, require, require_value
 from ..cycles.attractors import place_of
@@ -202,29 +202,28 @@ class AbstractCondition(eqx.Module):
         return replace(data.solve(variation, osc, value, data.guess(osc, size)), condition=self)
 
     def found_from(
-        self, variation: Variation, value: float, loop: Loop | None = None
+        self, variation: Variation, value: float, beginning: Any = None
     ) -> "BifurcationPoint | None":
         """The point that is found from that value of what is varied, or None.
 
-        One of a family is named as what it is. loop: of the cycle that it is about, where that is
-        known.
+        One of a family is named as what it is. beginning: one of `beginnings`.
         """
-        point = self.solved_from(variation, value, loop)
+        point = self.solved_from(variation, value, beginning)
         if int(point.status) != Status.OK:
             return None
         return replace(point, condition=self.sought.named(point))
 
     def solved_from(
-        self, variation: Variation, value: float, loop: Loop | None = None
+        self, variation: Variation, value: float, beginning: Any = None
     ) -> "BifurcationPoint":
         """As `found_from`, without a name, whatever its status."""
         data, start = self.sought.as_data(), np.array([value])
         osc = variation.oscillator(start)
-        guess = data.guess(osc, data.room) if loop is None else data.guess_near(loop)
+        guess = data.guess(osc, data.room) if beginning is None else data.guess_near(beginning)
         return data.solve(variation, osc, start, guess)
 
-    def guess_near(self, loop: Loop) -> Any:
-        """The guess, where a loop of the cycle is known."""
+    def guess_near(self, beginning: Any) -> Any:
+        """The guess, where the motion that it is about is known: one of `beginnings`."""
         raise NotImplementedError
 
     # --- on a path ---
@@ -260,8 +259,9 @@ class AbstractCondition(eqx.Module):
         """What changes where it holds, beside a label; cycles: the attracting ones, in order."""
         return None
 
-    def beginnings(self, cycles: Sequence[AttractingCycle]) -> Sequence[Loop | None]:
-        """Of the attracting cycles those to begin from; None: its own guess."""
+    def beginnings(self, osc: Oscillator, cycles: Sequence[AttractingCycle]) -> Sequence[Any]:
+        """Of the motions there those to begin from, loops of the attracting cycles, say; None: its
+        own guess."""
         return (None,)
 
     def values(self, a: float, b: float) -> Sequence[float]:
@@ -290,8 +290,8 @@ class AbstractCondition(eqx.Module):
         """Of a kind that has several types that of a point, "" where there is but one."""
         return ""
 
-    def coefficient(self, osc: Oscillator) -> Array:
-        """Of a kind where a cycle is born the coefficient that tells which way, at the point."""
+    def coefficient(self, point: "BifurcationPoint") -> Array:
+        """Of a kind where a cycle is born the coefficient that tells which way."""
         return jnp.asarray(jnp.nan)
 
     def orbit(self, point: "BifurcationPoint") -> np.ndarray | None:
@@ -309,7 +309,8 @@ class BifurcationPoint(eqx.Module):
     cycle: at the point, with a status that says why where there is none (at a Hopf point it has
     shrunk to the equilibrium, at `SuddenSliding` its period is infinite); multiplier: of the cycle
     on the side where it does not stick to the belt, for `NonsmoothFold` and `GrazingSliding`, else
-    NaN; status: a `Status` code. Where it is not OK the value is NaN.
+    NaN; x1: where the mass is at rest at the point, NaN where that is no unknown of it; status: a
+    `Status` code. Where it is not OK the value is NaN.
     """
 
     condition: AbstractCondition = eqx.field(static=True)
@@ -319,6 +320,7 @@ class BifurcationPoint(eqx.Module):
     steps: Array
     error: Array
     multiplier: Array
+    x1: Array
     oscillator: Oscillator
     cycle: Cycle
     status: Array
@@ -351,7 +353,7 @@ class BifurcationPoint(eqx.Module):
         a pseudo-focus, obeys r' = rate r + a r^3, with the `rate` of `Equilibria`. So near the
         point there is a cycle with r^2 = -rate/a, which attracts where a < 0.
         """
-        found = self.condition.coefficient(self.oscillator)
+        found = self.condition.coefficient(self)
         return jnp.where(self.status == Status.OK, found, jnp.nan)
 
     @property
@@ -440,6 +442,7 @@ def point_of(
         steps=solution.steps,
         error=solution.error * known,
         multiplier=multiplier * known,
+        x1=jnp.asarray(jnp.nan),
         oscillator=family.at(solution.p * known),
         cycle=cycle,
         status=status,
@@ -451,8 +454,10 @@ def _where_known(status: Array) -> Array:
     return jnp.where(status == Status.OK, 1.0, jnp.nan)
 
 
-def point_without_cycle(family: Family, p, steps, size, error, status, why) -> BifurcationPoint:
-    """A point at p where there is no cycle: why not."""
+def point_without_cycle(
+    family: Family, p, steps, size, error, status, why, x1: ArrayLike = jnp.nan
+) -> BifurcationPoint:
+    """A point at p where there is no cycle: why not. x1: where the mass is at rest."""
     iterations = jnp.sum(~jnp.isnan(steps))
     known = _where_known(status)
     at_point = family.at(p * known)
@@ -471,6 +476,7 @@ def point_without_cycle(family: Family, p, steps, size, error, status, why) -> B
         steps=steps,
         error=error * known,
         multiplier=none,
+        x1=jnp.asarray(x1) * known,
         oscillator=at_point,
         cycle=cycle,
         status=status,

@@ -49,10 +49,10 @@ class AbstractCycleCondition(AbstractCondition):
     def solved(self, family, system, x, p, status):
         return _solved_point(family, system, x, p, status)
 
-    def guess_near(self, loop):
-        return cut([loop], more=self.more_arcs)[0], jnp.asarray(Status.OK.value)
+    def guess_near(self, beginning):
+        return cut([beginning], more=self.more_arcs)[0], jnp.asarray(Status.OK.value)
 
-    def beginnings(self, cycles):
+    def beginnings(self, osc, cycles):
         return [one.loop for one in cycles]
 
     def followed(self, point):

@@ -244,8 +244,8 @@ class PseudoHopf(_EdgeCondition):
     def type_of(self, point):
         return criticality(*_pseudo_growth(point.oscillator, self.belt))
 
-    def coefficient(self, osc):
-        return _pseudo_growth(osc, self.belt)[0]
+    def coefficient(self, point):
+        return _pseudo_growth(point.oscillator, self.belt)[0]
 
 
 def check_edge(osc: Oscillator, belt: Any, field: str = "belt") -> None:

@@ -129,9 +129,9 @@ class AbstractEdgeTouch(AbstractCycleCondition):
             return separating_loop(osc, size)[:2]
         return nearest(osc, size, self)
 
-    def guess_near(self, loop):
+    def guess_near(self, beginning):
         # In as many rows as those of the guess, so that one program serves both.
-        return loop, jnp.asarray(Status.OK.value)
+        return beginning, jnp.asarray(Status.OK.value)
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
         """How far the nearest end of an arc is from both at once."""

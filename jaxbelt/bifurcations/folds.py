@@ -90,7 +90,7 @@ class FoldOfCycles(AbstractCycleCondition):
     def between(cls, before, after, edged):
         return [cls()] if before.smooth != after.smooth else []
 
-    def beginnings(self, cycles):
+    def beginnings(self, osc, cycles):
         return [*(one.loop for one in cycles if one.path and not sticks(one.path)), None]
 
     def limit(self, trail):

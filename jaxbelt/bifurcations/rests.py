@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
@@ -87,7 +87,8 @@ def _solved_rest(family: Family, system: RestSystem, x0, p0, status, why):
     judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
     judged = jnp.where(size < HOLDS, judged, Status.NO_CONVERGENCE.value)
     status = judged_by(error, family, jnp.where(status == Status.OK, judged, status))
-    return point_without_cycle(family, p, steps, size, error, status, why), (x, p)
+    x1 = x[0] if x.size else jnp.nan
+    return point_without_cycle(family, p, steps, size, error, status, why, x1), (x, p)
 
 
 # --- the Hopf point -------------------------------------------------------------------------------
@@ -128,6 +129,15 @@ class Hopf(AbstractRestCondition):
     def guess(self, osc, size):
         return candidates(osc)
 
+    def guess_near(self, beginning: Equilibria):
+        return beginning
+
+    def beginnings(self, osc, cycles):
+        rests = candidates(osc)
+        fixed = np.flatnonzero(np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT)
+        order = fixed[np.argsort(np.abs(np.asarray(rests.rate)[fixed]))]
+        return [_only(rests, np.arange(len(rests)) == row) for row in order] or [None]
+
     def system(self, osc, guess: Equilibria):
         rests = lax.stop_gradient(guess)
         fixed = rests.kind == EquilibriumKind.FIXED_POINT
@@ -140,15 +150,31 @@ class Hopf(AbstractRestCondition):
     def between(cls, before, after, edged):
         return [cls()] if before.equilibria != after.equilibria else []
 
-    def type_of(self, point):
-        return criticality(*_hopf_growth(point.oscillator))
+    def followed(self, point):
+        osc, data = point.oscillator, self.as_data()
+        return data.prepared(osc, _rest_at(osc, point.x1))[:2]
 
-    def coefficient(self, osc):
-        return _hopf_growth(osc)[0]
+    def type_of(self, point):
+        return criticality(*_hopf_growth(point.oscillator, point.x1))
+
+    def coefficient(self, point):
+        return _hopf_growth(point.oscillator, point.x1)[0]
 
     def place(self, point):
-        system, x = self.followed(point)
-        return system.place(np.asarray(x))
+        return np.array([point.x1, point.x1, 0.0, 0.0, 0.0])
+
+
+def _only(rests: Equilibria, rows: ArrayLike) -> Equilibria:
+    """Equilibria as if there were those in some rows only."""
+    return eqx.tree_at(lambda one: one.kind, rests, jnp.where(rows, rests.kind, 0))
+
+
+def _rest_at(osc: Oscillator, x1: Array) -> Equilibria:
+    """The fixed point nearest to x1."""
+    rests = candidates(osc)
+    fixed = rests.kind == EquilibriumKind.FIXED_POINT
+    nearest = jnp.argmin(jnp.where(fixed, jnp.abs(rests.x1 - x1), jnp.inf))
+    return _only(rests, jnp.arange(len(rests)) == nearest)
 
 
 def criticality(coefficient: Array, size: Array) -> str:
@@ -159,9 +185,9 @@ def criticality(coefficient: Array, size: Array) -> str:
 
 
 @jit
-def _hopf_growth(osc: Oscillator) -> tuple[Array, Array]:
-    """The first Lyapunov coefficient at a Hopf point, and the size of its terms."""
-    system, x1, _ = Hopf().system(osc, candidates(osc))
+def _hopf_growth(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
+    """The first Lyapunov coefficient at the Hopf point at x1, and the size of its terms."""
+    system, x1, _ = Hopf().system(osc, _rest_at(osc, x1))
     sizes = []
     for belt, code in zip(osc.belts, system.codes, strict=True):
         alone = eqx.tree_at(lambda o: o.belts, osc, (belt,))

@@ -141,11 +141,12 @@ def is_at_one_value(point: BifurcationPoint, other: BifurcationPoint) -> bool:
 
 
 def _is_same_point(point: BifurcationPoint, other: BifurcationPoint) -> bool:
-    """Whether two points are of one condition, at one value, and of one cycle."""
+    """Whether two points are of one condition, at one value, and of one cycle or equilibrium."""
     if point.condition != other.condition or not is_at_one_value(point, other):
         return False
-    is_rest = int(point.cycle.status) != Status.OK
-    return is_rest or is_same(point.cycle, other.cycle)
+    if int(point.cycle.status) != Status.OK:
+        return not _is_elsewhere(point, other)
+    return is_same(point.cycle, other.cycle)
 
 
 def by_value(points: Sequence[BifurcationPoint]) -> tuple[BifurcationPoint, ...]:
@@ -229,11 +230,16 @@ def _beside_it(
 
 
 def _is_apart(point: BifurcationPoint, other: BifurcationPoint) -> bool:
-    """Whether two points at one value are of two families or belts, or of two cycles."""
-    if point.condition.sought != other.condition.sought:
-        return True
-    known = all(int(one.cycle.status) == Status.OK for one in (point, other))
-    return known and apart(place_of(point.cycle), place_of(other.cycle)) >= SOLVED
+    """Whether two points at one value are of two families or belts, or of two motions."""
+    return point.condition.sought != other.condition.sought or _is_elsewhere(point, other)
+
+
+def _is_elsewhere(point: BifurcationPoint, other: BifurcationPoint) -> bool:
+    """Whether two points at one value are of two cycles, or of two equilibria."""
+    if all(int(one.cycle.status) == Status.OK for one in (point, other)):
+        return apart(place_of(point.cycle), place_of(other.cycle)) >= SOLVED
+    away = abs(float(point.x1) - float(other.x1))
+    return away > SOLVED * max(abs(float(point.x1)), abs(float(other.x1)), 1.0)
 
 
 def _first_found(
@@ -252,8 +258,8 @@ def _all_found(
     slow = condition.slow
     low, high = (path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]) if slow else (a, b)
     for value in condition.values(a, b):
-        for loop in condition.beginnings(path.cycles.get(value, [])):
-            point = condition.found_from(path.variation, value, loop)
+        for one in condition.beginnings(path.at(value), path.cycles.get(value, [])):
+            point = condition.found_from(path.variation, value, one)
             if point is not None and low <= point.value <= high:
                 yield point
 
@@ -319,8 +325,8 @@ def _last_along(
 
 def _holds_along(path: ParameterPath, value: float, condition: AbstractCondition) -> bool:
     """Whether a condition holds at a value and beside it, all along the path."""
-    loops = condition.beginnings(path.cycles[value])
-    points = (condition.solved_from(path.variation, value, loop) for loop in loops)
+    beginnings = condition.beginnings(path.at(value), path.cycles[value])
+    points = (condition.solved_from(path.variation, value, one) for one in beginnings)
     return any(int(point.status) == Status.DEGENERATE for point in points)
 
 

@@ -149,7 +149,7 @@ class AbstractTangency(AbstractCycleCondition):
         chain, belts = Chain(chain.codes, ends, chain.mesh), jnp.stack([self.belt, self.belt])
         return Encounter(chain, belts, row, self.wanted), z, status
 
-    def beginnings(self, cycles):
+    def beginnings(self, osc, cycles):
         return [None, *(one.loop for one in cycles)]
 
     def limit(self, trail):
