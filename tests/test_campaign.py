@@ -275,6 +275,31 @@ def test_a_campaign_that_is_stopped_goes_on(swallows, monkeypatch, tmp_path, cap
         command.main([*call, "--seed", "1"])
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("derivatives --by find_cycle", "derivatives are asked of simulate or sweep"),
+        ("final --by sweep", "--by: final does not know it"),
+        ("maps --seed 3", "--seed: maps does not know it"),
+        ("paths --threads 2", "--threads: paths does not know it"),
+        ("grazing --extreme-share 0.1", "--extreme-share: grazing does not know it"),
+        ("grazing --by find_cycle --structure 0", "cycles that graze have none"),
+        ("final --structure 9", "expected 0 to 8, got 9"),
+        ("final --runs 0", "expected 1 or more, got 0"),
+        ("final --extreme-share 0.7", "expected 0 to 0.5, got 0.7"),
+        ("final --tol 0", "expected a positive number, got 0.0"),
+    ],
+)
+def test_what_a_campaign_does_not_know_is_refused(arguments, message, capsys):
+    with pytest.raises(SystemExit) as refused:
+        command.main(arguments.split())
+    assert refused.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_what_each_campaign_knows():
+    assert command.KNOWN.keys() == command.CAMPAIGNS.keys()
+
+
 @pytest.mark.parametrize("module", sorted(set(command.CAMPAIGNS.values())))
 def test_nothing_done_is_summed_up(module):
     campaign = importlib.import_module(f"tests.campaign.{module}")

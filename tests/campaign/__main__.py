@@ -18,6 +18,7 @@ import time
 import traceback
 from pathlib import Path
 
+from .cases import STRUCTURES
 from .outcome import Outcome, summed
 
 #: Of which module each campaign is.
@@ -25,6 +26,19 @@ CAMPAIGNS = {
     **dict.fromkeys(("final", "simulate", "derivatives", "attractors", "grazing"), "runs"),
     **{name: name for name in ("paths", "refine", "portraits", "shocks", "fractions", "maps")},
 }
+#: What can be asked of each campaign beside `--results`.
+PLAIN = frozenset({"seed", "runs"})
+RUNS = PLAIN | {"threads", "extreme_share", "structure", "tol", "table"}
+KNOWN = {
+    **dict.fromkeys(("paths", "refine", "portraits", "shocks"), PLAIN),
+    "maps": frozenset(),
+    "fractions": PLAIN | {"threads"},
+    **dict.fromkeys(("final", "simulate", "attractors"), RUNS),
+    "derivatives": RUNS | {"by"},
+    "grazing": RUNS - {"extreme_share"} | {"by"},
+}
+#: What is not told.
+DEFAULTS = dict(seed=0, runs=2000, extreme_share=0.0, by="simulate", threads=os.cpu_count())
 #: Seconds between two lines where everything agrees.
 QUIET = 15.0
 #: Lines printed of one case; the file has all of them.
@@ -32,13 +46,11 @@ SHOWN = 6
 
 
 def main(arguments=None):
-    options = _parser().parse_args(arguments)
+    options = _parsed(arguments)
     import jax
 
     jax.config.update("jax_enable_x64", True)
     campaign = importlib.import_module(f".{CAMPAIGNS[options.what]}", __package__)
-    if options.tol is None:
-        options.tol = 1e-10 if options.what in ("simulate", "derivatives", "grazing") else 1e-8
     header = dict(what=options.what, seed=options.seed, **campaign.settings(options))
     results = Results(options.results, header)
     numbers = campaign.numbers(options)
@@ -158,6 +170,53 @@ def _commit():
     return told.stdout.strip() or "unknown"
 
 
+def _parsed(arguments):
+    """What is asked; what a campaign does not know is refused."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    what = options.what
+    told = {name for name, value in vars(options).items() if value is not None}
+    for name in sorted(told - {"what", "results"} - KNOWN[what]):
+        parser.error(f"--{name.replace('_', '-')}: {what} does not know it")
+    if options.by == "find_cycle" and what == "derivatives":
+        parser.error("--by: derivatives are asked of simulate or sweep")
+    if options.by == "find_cycle" and options.structure is not None:
+        parser.error("--structure: cycles that graze have none")
+    for name, value in DEFAULTS.items():
+        if name not in told:
+            setattr(options, name, value)
+    if options.tol is None:
+        options.tol = 1e-10 if what in ("simulate", "derivatives", "grazing") else 1e-8
+    return options
+
+
+def _whole(least, below=None):
+    """A type of arguments: whole numbers from the least one on."""
+
+    def whole(text):
+        value = int(text)
+        if value < least or (below is not None and value >= below):
+            expected = f"{least} or more" if below is None else f"{least} to {below - 1}"
+            raise argparse.ArgumentTypeError(f"expected {expected}, got {value}")
+        return value
+
+    return whole
+
+
+def _share(text):
+    value = float(text)
+    if not 0 <= value <= 0.5:
+        raise argparse.ArgumentTypeError(f"expected 0 to 0.5, got {value}")
+    return value
+
+
+def _positive(text):
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a positive number, got {value}")
+    return value
+
+
 def _parser():
     parser = argparse.ArgumentParser(
         prog="python -m tests.campaign",
@@ -165,24 +224,26 @@ def _parser():
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("what", choices=CAMPAIGNS)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=_whole(0))
     parser.add_argument(
         "--runs",
-        type=int,
-        default=2000,
-        help="runs; paths, portraits or shocks; of fractions the engine's starts at each value",
+        type=_whole(1),
+        help="runs (2000), paths, portraits or shocks; of fractions the engine's starts at each value",
     )
     parser.add_argument("--results", type=Path, help="file of results, which a later call goes on")
-    parser.add_argument("--extreme-share", type=float, default=0.0)
+    parser.add_argument("--extreme-share", type=_share, help="of runs, of 0.5 at random (0)")
     parser.add_argument(
         "--by",
         choices=("simulate", "sweep", "find_cycle"),
-        default="simulate",
-        help="who is asked to graze, or for derivatives",
+        help="who is asked to graze, or for derivatives (simulate)",
     )
-    parser.add_argument("--structure", type=int, help="of runs only this one of laws and edges")
-    parser.add_argument("--tol", type=float, help="rtol and atol of runs; default: the package's")
-    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="threads of the engine")
+    parser.add_argument(
+        "--structure", type=_whole(0, STRUCTURES), help="of runs only this one of laws and edges"
+    )
+    parser.add_argument(
+        "--tol", type=_positive, help="rtol and atol of runs; default: the package's"
+    )
+    parser.add_argument("--threads", type=_whole(1), help="threads of the engine (all)")
     parser.add_argument("--table", type=Path, help="page to put the rows of runs in")
     return parser
 

@@ -13,6 +13,9 @@ import numpy as np
 from . import engine
 from .engine import Belt, Oscillator
 
+#: Structures of laws and edges of a campaign, each of which is compiled.
+STRUCTURES = 9
+
 LAWS = ("conti", "coulomb", "stribeck")
 PAPER = ("conti", 1.0, 0.6, 10.0, 0.0)
 

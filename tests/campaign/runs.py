@@ -12,8 +12,6 @@ import numpy as np
 from . import cases, compare, derivatives, engine, package
 from .outcome import Outcome
 
-#: Structures of laws and edges, each of which is compiled.
-STRUCTURES = 9
 #: Runs in one call.
 BATCH = 4096
 
@@ -74,7 +72,7 @@ def _batches(options):
     """A structure and a number of runs each."""
     if options.what == "grazing" and options.by == "find_cycle":
         return [(None, min(BATCH, options.runs - n)) for n in range(0, options.runs, BATCH)]
-    structures = cases.structures(np.random.default_rng(options.seed), STRUCTURES)
+    structures = cases.structures(np.random.default_rng(options.seed), cases.STRUCTURES)
     # Half of them in the commonest structure of two belts with edges; of grazing all alike.
     shares = np.array([2.0 / (1 + i) for i in range(len(structures))])
     if options.what == "grazing":
