@@ -228,7 +228,7 @@ def _parser():
     parser.add_argument(
         "--runs",
         type=_whole(1),
-        help="runs (2000), paths, portraits or shocks; of fractions the engine's starts at each value",
+        help="runs, paths, portraits or shocks; of fractions the engine's starts (2000)",
     )
     parser.add_argument("--results", type=Path, help="file of results, which a later call goes on")
     parser.add_argument("--extreme-share", type=_share, help="of runs, of 0.5 at random (0)")
