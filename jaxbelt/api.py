@@ -47,7 +47,7 @@ from .inverse.design import Design, design, distance_to
 from .inverse.fit import Fit, fit
 from .inverse.margins import distance_to_basin_boundary
 from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
-from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck
+from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck, Tabulated
 from .model.machine import Machine, PhysicalBelt, Units
 from .model.oscillator import Belt, Oscillator
 from .motion.simulate import Arcs, Events, Trajectory, simulate
@@ -120,6 +120,7 @@ __all__ = [
     "Status",
     "Stribeck",
     "SuddenSliding",
+    "Tabulated",
     "Trajectory",
     "Units",
     "Verified",

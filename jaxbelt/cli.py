@@ -1,8 +1,9 @@
 """The command line, `jaxbelt reproduce`, `jaxbelt simulate` and the rest."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 import jaxbelt
 
@@ -12,7 +13,38 @@ from .commands.map import region_map
 from .commands.reproduce import reproduce
 from .commands.simulate import simulate
 from .commands.sweep import sweep
+from .commands.options import CLASSES
 from .commands.verify import verify
+from .spelling import near
+
+
+class Command(TyperCommand):
+    """A command that tells which option was perhaps meant, and that `sweep` has axes for some."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:
+            # Whose class it is depends on the version of typer.
+            if type(error).__name__ == "NoSuchOption":
+                name = error.__dict__["option_name"]
+                # Of -nu0 this is -n.
+                words = [name] if name.startswith("--") else [one for one in given if name in one]
+                error.__dict__["possibilities"] = self._meant(words[0] if words else name)
+            raise
+
+    def _meant(self, word: str) -> list[str]:
+        """By the letters behind the dashes: every option has these."""
+        names = [name for one in self.params for name in one.opts]
+        known = {name[2:]: name for name in names if name.startswith("--")}
+        if "--damping" in names:
+            known["zeta"] = "--damping"
+        if "axes" in names:
+            own = {name for one in CLASSES.values() for name in one} | {"x1", "x2", "zeta"}
+            known |= {name: f"{name}=..." for name in sorted(own)}
+        return [known[name] for name in near(word.strip("-").partition("=")[0], known)]
+
 
 app = typer.Typer(name="jaxbelt", no_args_is_help=True, rich_markup_mode="markdown")
 
@@ -50,4 +82,4 @@ for name, command in (
     ("basins", basins),
     ("verify", verify),
 ):
-    app.command(name)(command)
+    app.command(name, cls=Command)(command)

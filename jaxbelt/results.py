@@ -83,7 +83,8 @@ ADVICE = {
     Status.NO_CONVERGENCE: (
         "Newton's method did not converge from this guess; there may be no such solution near it, "
         "or none that this side of it leads to: try a guess on the other side. Every bifurcation "
-        "point in an interval is found by jb.scan with a span around it."
+        "point in an interval is found by jb.scan with a span around it. A friction law of your own "
+        "has to be smooth; jb.Tabulated makes one of a table."
     ),
     Status.NOT_ADMISSIBLE: (
         "The solution of the equations leaves its modes (an arc passes a boundary, or ends before "

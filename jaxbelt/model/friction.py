@@ -9,20 +9,25 @@ continues smoothly a little beyond its boundary. A law of your own is a subclass
 
 import abc
 import operator
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..checks import (
     Rule,
     as_array,
+    as_numbers,
     be_finite,
     be_nonnegative,
     be_positive,
+    check_nonnegative,
+    is_concrete,
     number,
     require,
     require_value,
@@ -82,12 +87,15 @@ def _is_at_most(value: Any, _: Any, most: Any) -> Any:
     return value <= most
 
 
-#: Laws of one's own whose `mu` was traced.
+#: Laws of one's own whose `mu` was traced, and those that were searched for kinks: whether they
+#: have one.
 _traced: set[type] = set()
+_kinked: dict[type, bool] = {}
 
 
 def check_law(law: AbstractFriction) -> None:
-    """Raise a `ValueError` where `mu` of a law of one's own cannot be traced, once for each class.
+    """Raise a `ValueError` where `mu` of a law of one's own cannot be traced, and warn where it has
+    a kink, once for each class.
 
     A law that asks NumPy for an exponential gives right numbers by itself and fails inside of what
     is compiled.
@@ -107,11 +115,75 @@ def check_law(law: AbstractFriction) -> None:
     _traced.add(kind)
 
 
+def has_kink(law: AbstractFriction) -> bool:
+    """Whether a known law of one's own has a kink; its class is warned of where that is found."""
+    law, kind = _of_its_own_units(law), type(_of_its_own_units(law))
+    if kind.__module__ == __name__ or not is_concrete(law):
+        return False
+    if kind not in _kinked:
+        kink = _kink_of(law)
+        _kinked[kind] = kink is not None
+        if kink:
+            warnings.warn(
+                "mu of {} has a kink at the speed {:.6g}, its slope goes from {:.3g} to {:.3g}: "
+                "motions that slip at that speed are followed, but most of their cycles are not "
+                "found (NO_CONVERGENCE). Of a table jb.Tabulated(speeds, coefficients) makes a "
+                "smooth law.".format(kind.__name__, *kink),
+                stacklevel=2,
+            )
+    return _kinked[kind]
+
+
+def _of_its_own_units(law: AbstractFriction) -> AbstractFriction:
+    return law.law if isinstance(law, LawInUnits) else law
+
+
+#: Speeds between which kinks are looked for, and how often their intervals are halved.
+SEARCHED, HALVINGS = np.logspace(-5, 3, 2049), 30
+#: A slope that jumps by less than this fraction, or by less than this fraction of mu / speed, has
+#: no kink that numbers tell from rounding.
+LEAST_KINK, LEAST_BEND = 1e-3, 1e-6
+
+
+def _kink_of(law: AbstractFriction) -> tuple[float, float, float] | None:
+    """Where the slope of mu jumps most, and the slopes before and after; None where it does not.
+
+    Every interval between two of many speeds is halved again and again, and the half kept over
+    which the slope changes more: without a kink it changes less and less.
+    """
+
+    @jax.jit
+    def asked(speeds: Array) -> tuple[Array, Array]:
+        one = jnp.ones(())
+        return jax.vmap(lambda speed: jax.jvp(law.mu, (speed,), (one,)))(speeds)
+
+    with jax.ensure_compile_time_eval():
+        values, slopes = map(np.asarray, asked(jnp.asarray(SEARCHED)))
+        low, high = SEARCHED[:-1], SEARCHED[1:]
+        before, after = slopes[:-1], slopes[1:]
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            # As many as before, so that nothing is compiled anew.
+            slope = np.asarray(asked(jnp.asarray(np.append(middle, 1.0)))[1])[:-1]
+            left = np.abs(slope - before) > np.abs(after - slope)
+            low, high = np.where(left, low, middle), np.where(left, middle, high)
+            before, after = np.where(left, before, slope), np.where(left, slope, after)
+    least = LEAST_KINK * np.maximum(np.abs(before), np.abs(after))
+    least = np.maximum(least, LEAST_BEND * np.abs(values[1:]) / high)
+    jumps = np.abs(after - before)
+    found = np.flatnonzero(jumps > least)
+    if not len(found):
+        return None
+    most = found[np.argmax(jumps[found])]
+    return float(high[most]), float(before[most]), float(after[most])
+
+
 def as_friction(law: Any) -> AbstractFriction:
     """The law, or a `ValueError` where it is none."""
     fits = isinstance(law, AbstractFriction)
     require_value(fits, "friction", "a law such as jb.Conti(...)", law)
     check_law(law)
+    has_kink(law)
     return law
 
 
@@ -242,3 +314,80 @@ class Stribeck(AbstractFriction):
 def _of_static_and_kinetic(static: ArrayLike, kinetic: ArrayLike) -> list[Rule]:
     rules = be_nonnegative("static", static) + be_nonnegative("kinetic", kinetic)
     return [*rules, Rule("kinetic", (kinetic, static), operator.le, "<= static = {1}")]
+
+
+class Tabulated(AbstractFriction):
+    """A law from a table of measured coefficients: a smooth curve through all of its points.
+
+    mu(r) = level + sum of w_i sqrt((r - r_i)^2 + h_i^2) over the points (r_i, mu_i), Hardy's
+    multiquadrics: h_i is half the way from r_i to the nearer of its neighbours, and the w_i, whose
+    sum is zero, are such that mu(r_i) = mu_i. It has all derivatives, keeps close to straight lines
+    between the points, and levels out beyond the last one.
+
+    Arguments: speeds (increasing, >= 0, two or more) and coefficients (>= 0, as many), known
+    numbers, which are no parameters; static, a scalar (None: mu(0), what the curve has there).
+    `ValueError` for anything else, and where static is less than mu(0). What scatters in the table
+    is followed, too: smooth it before. See R. L. Hardy, Multiquadric equations of topography and
+    other irregular surfaces, J. Geophys. Res. 76 (1971) 1905-1915.
+    """
+
+    static: Float[Array, ""]
+    speeds: tuple[float, ...] = eqx.field(static=True)
+    coefficients: tuple[float, ...] = eqx.field(static=True)
+    weights: tuple[float, ...] = eqx.field(static=True)
+    level: float = eqx.field(static=True)
+
+    def __init__(
+        self, speeds: ArrayLike, coefficients: ArrayLike, static: ArrayLike | None = None
+    ):
+        speeds, coefficients = _table(speeds, coefficients)
+        self.speeds, self.coefficients = tuple(speeds.tolist()), tuple(coefficients.tolist())
+        basis, one = _multiquadrics(np, speeds, speeds), np.ones((len(speeds), 1))
+        matrix = np.block([[basis, one], [one.T, np.zeros((1, 1))]])
+        *weights, _ = np.linalg.solve(matrix, np.append(coefficients, 0.0)).tolist()
+        self.weights = tuple(weights)
+        # Exact at the first point, which is mostly the static one.
+        self.level = float(coefficients[0] - np.sum(weights * basis[0]))
+        off = np.max(np.abs(basis @ weights + self.level - coefficients))
+        fits = off <= 1e-9 * np.max(coefficients)
+        require(fits, "speeds", "far enough apart for a curve through all points", speeds)
+        begins = self.level + np.sum(weights * _multiquadrics(np, 0.0, speeds))
+        self.static = as_array(begins if static is None else static, "static")
+
+    def __check_init__(self):
+        self.check("Tabulated")
+
+    def mu(self, speed: Array) -> Array:
+        """Kinetic friction coefficient mu(r) at speed r >= 0, in the unit of the table, any shape.
+        """
+        terms = _multiquadrics(jnp, jnp.asarray(speed), np.array(self.speeds))
+        weights = np.reshape(self.weights, (1,) * jnp.ndim(speed) + (-1,))
+        return self.level + jnp.sum(weights * terms, axis=-1)
+
+    def __repr__(self) -> str:
+        ends = f"{self.speeds[0]:.6g} to {self.speeds[-1]:.6g}"
+        points = f"{len(self.speeds)} points at speeds from {ends}"
+        return f"Tabulated({points}, static={number(self.static)})"
+
+
+def _table(speeds: Any, coefficients: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The two columns of a table, or a `ValueError`."""
+    known = is_concrete((speeds, coefficients))
+    require(known, "speeds", "known, as coefficients: they are no parameters", "traced ones")
+    columns = []
+    for name, column in (("speeds", speeds), ("coefficients", coefficients)):
+        length = (len(columns[0]),) if columns else (None,)
+        columns.append(np.asarray(as_numbers(column, name, length)))
+        check_nonnegative(columns[-1], name)
+    require(len(columns[0]) >= 2, "speeds", "two or more", len(columns[0]))
+    require_value(np.all(np.diff(columns[0]) > 0), "speeds", "increasing", columns[0])
+    return columns[0], columns[1]
+
+
+def _multiquadrics(numpy: Any, at: Any, speeds: np.ndarray) -> Any:
+    """sqrt((at - r_i)^2 + h_i^2) for every point of a table, along a last axis of its own."""
+    gaps = np.pad(np.diff(speeds), 1, constant_values=np.inf)
+    halves = 0.5 * np.minimum(gaps[:-1], gaps[1:])
+    shape = (1,) * numpy.ndim(at) + (-1,)
+    away = numpy.expand_dims(at, -1) - speeds.reshape(shape)
+    return numpy.sqrt(away**2 + halves.reshape(shape) ** 2)
