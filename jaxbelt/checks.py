@@ -193,15 +193,22 @@ def outside_of_traces(function: Callable) -> Any:
     def call(*args: Any, **kwargs: Any) -> Any:
         require_own_threads()
         scope = f"{name} is not for jit, vmap or derivatives"
-        if not is_concrete((args, kwargs)):
+        if not _is_known((args, kwargs)):
             given = signature.bind_partial(*args, **kwargs).arguments
-            field = next(field for field, one in given.items() if not is_concrete(one))
+            field = next(field for field, one in given.items() if not _is_known(one))
             require(False, field, f"known: {scope}", "a traced one")
         if not is_outermost():
             raise ValueError(f"{name} must be called outside of jax.jit: {scope}")
         return function(*args, **kwargs)
 
     return call
+
+
+def _is_known(value: Any) -> bool:
+    try:
+        return is_concrete(value)
+    except ValueError:
+        return True  # a dictionary with keys that cannot be sorted is no argument of anything
 
 
 def require_usable_jax() -> None:

@@ -10,10 +10,10 @@ import jaxbelt
 from .commands.basins import basins
 from .commands.diagram import diagram
 from .commands.map import region_map
+from .commands.options import CLASSES
 from .commands.reproduce import reproduce
 from .commands.simulate import simulate
 from .commands.sweep import sweep
-from .commands.options import CLASSES
 from .commands.verify import verify
 from .spelling import near
 

@@ -83,8 +83,8 @@ ADVICE = {
     Status.NO_CONVERGENCE: (
         "Newton's method did not converge from this guess; there may be no such solution near it, "
         "or none that this side of it leads to: try a guess on the other side. Every bifurcation "
-        "point in an interval is found by jb.scan with a span around it. A friction law of your own "
-        "has to be smooth; jb.Tabulated makes one of a table."
+        "point in an interval is found by jb.scan with a span around it. A friction law of your "
+        "own has to be smooth; jb.Tabulated makes one of a table."
     ),
     Status.NOT_ADMISSIBLE: (
         "The solution of the equations leaves its modes (an arc passes a boundary, or ends before "
@@ -132,9 +132,10 @@ ADVICE = {
         "Simulate on both sides."
     ),
     Status.NOT_IDENTIFIED: (
-        "The record does not tell all of the parameters: those with an infinite standard error may "
-        "have any value, alone or together with another. Fit fewer of them, tie some, or measure a "
-        "motion that feels them: one that touches that belt, or slips at other speeds."
+        "The record does not tell all of the parameters: those with a standard error that is "
+        "infinite, or larger than they are, may have any value, alone or together with another. "
+        "Fit fewer of them, tie some, or measure a motion that feels them: one that touches that "
+        "belt, or slips at other speeds."
     ),
     Status.MISFIT: (
         "The best fit leaves more than the given noise. Where the autocorrelation of the residuals "

@@ -9,7 +9,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.inverse.fit import _inverse
+from jaxbelt.inverse.fit import _inverse, _sizes, _undetermined
 from jaxbelt.inverse.record import local_cubics
 from jaxbelt.inverse.selection import Selection
 
@@ -184,6 +184,38 @@ def test_what_a_record_does_not_tell_has_an_infinite_standard_error():
     columns[:, 1] = columns[:, 0]  # two that trade with each other
     trading = np.diag(_inverse(columns.T @ columns))
     assert np.all(np.isinf(trading[:2])) and np.all(np.isfinite(trading[2:]))
+
+
+def test_what_is_told_in_combination_only_is_named():
+    """Errors of a and b trade; c and d are well known, d beside zero; e is told by nothing."""
+    names, estimates = ("a", "b", "c", "d", "e"), np.array([1.0, -2.0, 3.0, 1e-3, 1.0])
+    trade = np.array([5.0, -7.0, 1e-2, 1e-3, 0.0])
+    covariance = np.outer(trade, trade) + np.diag([1e-4, 1e-4, 1e-2, 2e-3, np.inf])
+    assert _undetermined(names, covariance, _sizes(estimates)) == (("e",), ("a", "b"))
+    apart = np.diag([4.0, 1e-2, 100.0, 1e-4, 1e-2])
+    assert _undetermined(names, apart, _sizes(estimates)) == (("a",), ("c",))
+
+
+@pytest.mark.slow(first=True)
+def test_a_motion_that_touches_no_boundary_tells_only_a_combination():
+    """Near rest it tells how fast it settles and where: two numbers, and not these four."""
+    osc = jb.presets.class_b(0.45, 0.35)
+    ts = np.linspace(0.0, 40.0, 300)
+    run = jb.simulate(osc, (1.46, 0.0), 40.0, ts=ts)
+    assert not run.events.t.size
+    x1 = run.ys[:, 0] + 2e-3 * np.random.default_rng(0).standard_normal(300)
+
+    def some(o):
+        first, second = o.belts
+        return first.velocity, first.friction.steepness, second.velocity, o.damping
+
+    result = jb.fit(osc, ts, x1, where=some, noise=2e-3)
+    assert result.status == Status.NOT_IDENTIFIED
+    (group,) = result.undetermined
+    assert set(group) >= {"belts[0].velocity", "belts[0].friction.steepness"}
+    assert "only a combination is told" in repr(result)
+    two = jb.fit(osc, ts, x1, where=lambda o: some(o)[::3], noise=2e-3)
+    assert two.status == Status.OK and two.undetermined == ()
 
 
 def test_local_cubics_are_exact_for_cubics():

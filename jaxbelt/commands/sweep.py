@@ -1,5 +1,6 @@
 """`jaxbelt sweep`: an oscillator from every point of a grid."""
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -206,9 +207,10 @@ def parse_axis(text: str) -> tuple[str, list[float]]:
     name, equals, words = text.partition("=")
     parts = words.split(":")
     try:
-        if equals and len(parts) == 1:
+        if equals and len(parts) == 1 and not math.isnan(float(words)):
             return name, [float(words)]
-        if equals and len(parts) == 3 and int(parts[2]) > 0:
+        finite = all(map(math.isfinite, map(float, parts)))
+        if equals and finite and len(parts) == 3 and int(parts[2]) > 0:
             from ..numerics.spacing import evenly_spaced
 
             return name, evenly_spaced(float(parts[0]), float(parts[1]), int(parts[2])).tolist()

@@ -107,7 +107,8 @@ def _is_stuck(cycle: Cycle) -> Array:
 
 def _belt_index(cycle: Cycle, belt: int) -> int:
     n = len(_checked_cycle(cycle).oscillator.belts)
-    require_value(isinstance(belt, int) and 0 <= belt < n, "belt", f"0 to {n - 1}", belt)
+    there = isinstance(belt, int) and not isinstance(belt, bool) and 0 <= belt < n
+    require_value(there, "belt", f"0 to {n - 1}", belt)
     return belt
 
 

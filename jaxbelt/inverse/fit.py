@@ -55,6 +55,9 @@ HOPELESS = 6.0
 #: A fit as bad as this happens once in a million records, by noise.
 IMPLAUSIBLE = 1e-6
 TOLERANCE = 1e-8
+#: Parameters nearer to zero than this may have errors of this size; and those whose error in a
+#: direction that is not told is this many of their sizes have a share in it.
+SMALLEST, SHARE = 0.1, 0.3
 
 
 # --- 1: the search --------------------------------------------------------------------------------
@@ -266,10 +269,10 @@ class Fit(eqx.Module):
     lag one, about 0 +- 1/sqrt(data): what is left has a shape where it is larger.
 
     candidates: how many starts were followed; evaluations: of the motion and its Jacobian; status:
-    OK, NOT_IDENTIFIED (an infinite standard error), MISFIT (plausibility below 1e-6),
-    NO_CONVERGENCE or NOT_FINITE. Standard errors are those of the linearised problem: right where
-    the model is and the errors are small. With a MISFIT they mean nothing, and `table` and the text
-    leave them out.
+    OK, NOT_IDENTIFIED (a standard error that is infinite, or larger than its parameter and than
+    0.1), MISFIT (plausibility below 1e-6), NO_CONVERGENCE or NOT_FINITE. Standard errors are those
+    of the linearised problem: right where the model is and the errors are small. With a MISFIT they
+    mean nothing, and `table` and the text leave them out.
     """
 
     oscillator: Oscillator
@@ -289,6 +292,14 @@ class Fit(eqx.Module):
     candidates: int
     evaluations: int
     status: Array
+
+    @property
+    def undetermined(self) -> tuple[tuple[str, ...], ...]:
+        """What the record does not tell, by name: of each group one combination at least, and of a
+        name by itself the parameter. Empty unless the status is NOT_IDENTIFIED."""
+        if int(self.status) != Status.NOT_IDENTIFIED:
+            return ()
+        return _undetermined(self.names, self.covariance, _sizes(self.estimates))
 
     def intervals(self, level: float = 0.95) -> Array:
         """Confidence intervals of the parameters, (lower, upper) each, [p, 2]."""
@@ -332,7 +343,38 @@ class Fit(eqx.Module):
             f"autocorrelation {float(self.autocorrelation):+.3f}, {self.evaluations} evaluations)"
         )
         advice = [] if status == Status.OK else [f"  {describe(status)}"]
+        advice += [
+            f"  Not told: {group[0]}."
+            if len(group) == 1
+            else f"  Of these only a combination is told, none by itself: {', '.join(group)}."
+            for group in self.undetermined
+        ]
         return "\n".join([head, *rows, *advice])
+
+
+def _sizes(estimates: ArrayLike) -> np.ndarray:
+    """What a standard error is measured by: the parameter, or, of one that is near zero, this."""
+    return np.maximum(np.abs(np.asarray(estimates)), SMALLEST)
+
+
+def _undetermined(names: Sequence[str], covariance: ArrayLike, sizes: np.ndarray):
+    """The parameters whose standard errors are larger than their sizes, in groups of those that
+    errors in one direction change together."""
+    scaled = np.asarray(covariance) / sizes[:, None] / sizes
+    infinite = np.isinf(np.diag(scaled))
+    alone = [tuple(np.array(names)[infinite].tolist())] if np.any(infinite) else []
+    values, vectors = np.linalg.eigh(scaled[np.ix_(~infinite, ~infinite)])
+    # Parameters that have a share in a direction along which the error is too large.
+    wide = (np.abs(vectors) * np.sqrt(np.maximum(values, 0.0)))[:, values > 1] > SHARE
+    kept = np.array(names)[~infinite]
+    groups: list[set[str]] = []
+    for column in wide.T:
+        group = set(kept[column].tolist())
+        for other in [one for one in groups if one & group]:
+            groups.remove(other)
+            group |= other
+        groups.append(group)
+    return (*alone, *(tuple(name for name in names if name in group) for group in groups))
 
 
 def _standard_errors_in(level: float) -> float:
@@ -482,7 +524,9 @@ def _result(oscillator, selection, record, ts, values, point: _Point, freedom, c
     off = values - ys
     plausibility = _plausibility(point.chi2, freedom)
     status = Status.OK if plausibility > IMPLAUSIBLE else Status.MISFIT
-    status = status if np.all(np.isfinite(errors[:p])) else Status.NOT_IDENTIFIED
+    # Of a misfit finite errors mean nothing.
+    most = _sizes(estimates) if status == Status.OK else np.finfo(float).max
+    status = status if np.all(errors[:p] <= most) else Status.NOT_IDENTIFIED
     status = status if np.isfinite(point.chi2) else Status.NOT_FINITE
     with np.errstate(divide="ignore"):
         noise = 1 / np.max(weights, axis=0)

@@ -65,10 +65,7 @@ class AbstractFriction(eqx.Module):
 
     def rules(self) -> list[Rule]:
         """What its parameters have to be; a law of one's own may add to them."""
-        begins = self.mu(jnp.zeros(jnp.shape(self.static)))
-        most = self.static + MU_ROUNDING * (1 + self.static)
-        bound = Rule("mu(0)", (begins, self.static, most), _is_at_most, "<= static = {1}")
-        return [*be_nonnegative("static", self.static), bound]
+        return _of_static(self.static, self.mu(jnp.zeros(jnp.shape(self.static))))
 
     def check(self, owner: str) -> None:
         """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
@@ -81,6 +78,13 @@ class AbstractFriction(eqx.Module):
             for name, value in vars(self).items()
         )
         return f"{type(self).__name__}({values})"
+
+
+def _of_static(static: ArrayLike, begins: ArrayLike) -> list[Rule]:
+    """The rules of a law whose mu(0) is that."""
+    most = static + MU_ROUNDING * (1 + static)
+    bound = Rule("mu(0)", (begins, static, most), _is_at_most, "<= static = {1}")
+    return [*be_nonnegative("static", static), bound]
 
 
 def _is_at_most(value: Any, _: Any, most: Any) -> Any:
@@ -320,8 +324,8 @@ class Tabulated(AbstractFriction):
     """A law from a table of measured coefficients: a smooth curve through all of its points.
 
     mu(r) = level + sum of w_i sqrt((r - r_i)^2 + h_i^2) over the points (r_i, mu_i), Hardy's
-    multiquadrics: h_i is half the way from r_i to the nearer of its neighbours, and the w_i, whose
-    sum is zero, are such that mu(r_i) = mu_i. It has all derivatives, keeps close to straight lines
+    multiquadrics: h_i is the way from r_i to the nearer of its neighbours, and the w_i, whose sum
+    is zero, are such that mu(r_i) = mu_i. It has all derivatives, keeps close to straight lines
     between the points, and levels out beyond the last one.
 
     Arguments: speeds (increasing, >= 0, two or more) and coefficients (>= 0, as many), known
@@ -337,9 +341,7 @@ class Tabulated(AbstractFriction):
     weights: tuple[float, ...] = eqx.field(static=True)
     level: float = eqx.field(static=True)
 
-    def __init__(
-        self, speeds: ArrayLike, coefficients: ArrayLike, static: ArrayLike | None = None
-    ):
+    def __init__(self, speeds: ArrayLike, coefficients: ArrayLike, static: ArrayLike | None = None):
         speeds, coefficients = _table(speeds, coefficients)
         self.speeds, self.coefficients = tuple(speeds.tolist()), tuple(coefficients.tolist())
         basis, one = _multiquadrics(np, speeds, speeds), np.ones((len(speeds), 1))
@@ -351,23 +353,31 @@ class Tabulated(AbstractFriction):
         off = np.max(np.abs(basis @ weights + self.level - coefficients))
         fits = off <= 1e-9 * np.max(coefficients)
         require(fits, "speeds", "far enough apart for a curve through all points", speeds)
-        begins = self.level + np.sum(weights * _multiquadrics(np, 0.0, speeds))
-        self.static = as_array(begins if static is None else static, "static")
+        self.static = as_array(self._begins if static is None else static, "static")
 
     def __check_init__(self):
         self.check("Tabulated")
 
     def mu(self, speed: Array) -> Array:
-        """Kinetic friction coefficient mu(r) at speed r >= 0, in the unit of the table, any shape.
-        """
+        """Kinetic friction coefficient mu(r) at speed r >= 0 (the table's unit), any shape."""
         terms = _multiquadrics(jnp, jnp.asarray(speed), np.array(self.speeds))
         weights = np.reshape(self.weights, (1,) * jnp.ndim(speed) + (-1,))
         return self.level + jnp.sum(weights * terms, axis=-1)
 
+    @property
+    def _begins(self) -> float:
+        """mu(0), known."""
+        terms = _multiquadrics(np, 0.0, np.array(self.speeds))
+        return self.level + float(np.sum(self.weights * terms))
+
+    def rules(self) -> list[Rule]:
+        known = is_concrete(self.static)
+        return _of_static(np.asarray(self.static) if known else self.static, self._begins)
+
     def __repr__(self) -> str:
-        ends = f"{self.speeds[0]:.6g} to {self.speeds[-1]:.6g}"
-        points = f"{len(self.speeds)} points at speeds from {ends}"
-        return f"Tabulated({points}, static={number(self.static)})"
+        # All of it: stores are known by this text.
+        columns = (", ".join(map("{:.12g}".format, c)) for c in (self.speeds, self.coefficients))
+        return "Tabulated([{}], [{}], static={})".format(*columns, number(self.static))
 
 
 def _table(speeds: Any, coefficients: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -387,7 +397,7 @@ def _table(speeds: Any, coefficients: Any) -> tuple[np.ndarray, np.ndarray]:
 def _multiquadrics(numpy: Any, at: Any, speeds: np.ndarray) -> Any:
     """sqrt((at - r_i)^2 + h_i^2) for every point of a table, along a last axis of its own."""
     gaps = np.pad(np.diff(speeds), 1, constant_values=np.inf)
-    halves = 0.5 * np.minimum(gaps[:-1], gaps[1:])
+    widths = np.minimum(gaps[:-1], gaps[1:])
     shape = (1,) * numpy.ndim(at) + (-1,)
     away = numpy.expand_dims(at, -1) - speeds.reshape(shape)
-    return numpy.sqrt(away**2 + halves.reshape(shape) ** 2)
+    return numpy.sqrt(away**2 + widths.reshape(shape) ** 2)

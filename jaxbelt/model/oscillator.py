@@ -115,6 +115,7 @@ class Belt(eqx.Module):
         law = type(self.friction).rules(self.friction)
         interval = [
             Rule("lower", (self.lower, self.lower), operator.eq, "a number"),
+            Rule("upper", (self.upper, self.upper), operator.eq, "a number"),
             Rule("lower", (self.lower, self.upper), operator.lt, "< {1}"),
         ]
         return [

@@ -45,6 +45,8 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     `ValueError` if there is no such variable, or if its axes are not one or two: choose with
     `dataset.isel(belt=0)` and the like.
     """
+    known = isinstance(dataset, xr.Dataset)
+    require_value(known, "dataset", "an xarray.Dataset, such as sweep(...) returns", dataset)
     require_one_of(variable, map(str, dataset.data_vars), "variable")
     told = dataset[variable].attrs
     is_category = variable == "kind" or "flag_meanings" in told

@@ -66,6 +66,8 @@ class Question:
         wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
         fits = isinstance(wanted, Sequence)
         require_value(fits, "derivatives", "a tuple of names of axes", wanted)
+        different = len(set(wanted)) == len(wanted)
+        require_value(different, "derivatives", "free of repeats", wanted)
         for name in wanted:
             known, came = ", ".join(grid.axes), in_words(name) + did_you_mean(name, grid.axes)
             require(name in grid.axes, "derivatives", f"names of axes, {known}", came)

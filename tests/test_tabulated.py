@@ -1,0 +1,116 @@
+"""Laws from tables: their curve, cycles with them against the oracle; and kinks, told of."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import oracle_cycles
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import Status
+from jaxbelt.model.friction import _kink_of
+from jaxbelt.sweeps.question import Question
+
+SPEEDS = np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0])
+MEASURED = np.array([0.60, 0.55, 0.52, 0.46, 0.41, 0.38, 0.36, 0.355, 0.36, 0.375])
+
+
+def curve(speed):
+    """Hardy's multiquadrics once more, solved for in another way: all weights but the last."""
+    gaps = np.diff(SPEEDS)
+    widths = np.array([min(gaps[max(i - 1, 0)], gaps[min(i, 8)]) for i in range(10)])
+
+    def terms(r):
+        return np.array([np.hypot(r - a, h) for a, h in zip(SPEEDS, widths, strict=True)])
+
+    def differences(r):
+        return np.append(terms(r)[:-1] - terms(r)[-1], 1.0)
+
+    weights = np.linalg.solve([differences(r) for r in SPEEDS], MEASURED)
+    return float(weights @ differences(speed))
+
+
+def test_the_curve_goes_through_every_point_and_keeps_close_to_lines_between():
+    law = jb.Tabulated(SPEEDS, MEASURED)
+    # Rounding of sums of ten terms of size five.
+    np.testing.assert_allclose(law.mu(jnp.asarray(SPEEDS)), MEASURED, rtol=0, atol=1e-14)
+    between = np.linspace(0.0, 5.0, 501)
+    values = np.asarray(law.mu(jnp.asarray(between)))
+    np.testing.assert_allclose(values, [curve(r) for r in between], rtol=0, atol=1e-13)
+    assert np.max(np.abs(values - np.interp(between, SPEEDS, MEASURED))) < 0.006
+    assert law.static == pytest.approx(0.6, abs=1e-15)
+    assert jb.Tabulated(SPEEDS, MEASURED, static=0.7).static == 0.7
+    far = law.mu(jnp.array([1e3, 1e6]))
+    assert np.ptp(far) < 0.01 and 0.3 < far[1] < 0.45
+
+
+def test_a_cycle_with_a_table_is_the_oracles():
+    osc = jb.Oscillator(0.03, (jb.Belt(0.3, jb.Tabulated(SPEEDS, MEASURED)),))
+    cycle = jb.find_cycle(osc, (3.0, 0.0))
+    assert cycle.status == Status.OK
+    belt = oracle.Belt(0.3, np.vectorize(curve), 0.6)
+    expected = oracle_cycles.sticking_cycle(
+        oracle.Oscillator(0.03, (belt,), 1.0), T=100.0, rtol=1e-12, atol=1e-12
+    )
+    # The tolerance of the oracle, over some loops.
+    assert float(cycle.period) == pytest.approx(expected.period, rel=1e-9)
+
+
+def test_stores_tell_tables_apart():
+    def question(coefficients):
+        law = jb.Tabulated(SPEEDS, coefficients)
+
+        def make(nu0):
+            return jb.Oscillator(0.03, (jb.Belt(nu0, law),))
+
+        axes = {"nu0": np.array([0.1, 0.2])}
+        asked = Question.of(make, axes, (3.0, 0.0), 9.0, 1e-8, 1e-8, "final", ())
+        return asked.identity()
+
+    other = MEASURED + 0.01 * (SPEEDS == 0.4)
+    assert question(MEASURED) == question(MEASURED) != question(other)
+
+
+class Lines(jb.AbstractFriction):
+    static: float
+
+    def mu(self, speed):
+        return jnp.interp(speed, SPEEDS, MEASURED)
+
+
+class Corner(jb.AbstractFriction):
+    static: float
+
+    def mu(self, speed):
+        return 0.4 + jnp.maximum(0.2 - 0.5 * speed, 0.1)
+
+
+class Smooth(jb.AbstractFriction):
+    static: float
+
+    def mu(self, speed):
+        # As steep as a law gets, and cut off below zero.
+        return 0.4 + 0.2 * jnp.exp(-jnp.maximum(speed / 1e-3, -1.0)) + 0.1 * jnp.tanh(40 * speed)
+
+
+def test_kinks_are_found_where_they_are_and_nowhere_else():
+    speed, before, after = _kink_of(Corner(0.6))
+    assert (speed, before, after) == (pytest.approx(0.2, rel=1e-6), -0.5, 0.0)
+    assert _kink_of(Lines(0.6))[0] == pytest.approx(0.1, rel=1e-6)
+    assert _kink_of(Smooth(0.6)) is None
+    assert _kink_of(jb.Tabulated(SPEEDS, MEASURED)) is None
+
+
+def test_a_law_of_straight_lines_is_told_of_and_the_search_ends_early():
+    with pytest.warns(UserWarning, match=r"mu of Lines has a kink at the speed 0\.1, .*Tabulated"):
+        belt = jb.Belt(0.3, Lines(0.6))
+    osc = jb.Oscillator(0.03, (belt,))  # and no second time
+    cycle = jb.find_cycle(osc, (3.0, 0.0))
+    assert cycle.status == Status.NO_CONVERGENCE and "smooth" in repr(cycle)
+
+
+def test_a_table_is_no_parameter_and_static_is_one():
+    osc = jb.Oscillator(0.03, (jb.Belt(0.3, jb.Tabulated(SPEEDS, MEASURED, 0.65)),))
+    slope = jax.grad(lambda s: jb.Tabulated(SPEEDS, MEASURED, s).static)(0.7)
+    assert slope == 1.0 and len(jax.tree.leaves(osc.belts[0].friction)) == 1
