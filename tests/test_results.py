@@ -25,7 +25,8 @@ from jaxbelt.plotting.style import parameter_label
 
 #: Public classes that are no results: what a user writes down.
 NO_RESULTS = {
-    *(jb.AbstractFriction, jb.Conti, jb.Coulomb, jb.Stribeck, jb.Belt, jb.Oscillator),
+    *(jb.AbstractFriction, jb.Conti, jb.Coulomb, jb.Stribeck, jb.Tabulated),
+    *(jb.Belt, jb.Oscillator),
     *(jb.Machine, jb.PhysicalBelt, jb.Units),
     *(jb.AtEvents, jb.AtExtrema, jb.AtSection, jb.AtTimes),
     *(jb.EquilibriumKind, jb.EventKind, jb.Status),
