@@ -114,3 +114,19 @@ def test_a_table_is_no_parameter_and_static_is_one():
     osc = jb.Oscillator(0.03, (jb.Belt(0.3, jb.Tabulated(SPEEDS, MEASURED, 0.65)),))
     slope = jax.grad(lambda s: jb.Tabulated(SPEEDS, MEASURED, s).static)(0.7)
     assert slope == 1.0 and len(jax.tree.leaves(osc.belts[0].friction)) == 1
+
+
+@pytest.mark.slow(first=True)
+def test_a_branch_does_not_end_where_the_law_wants_more_steps():
+    """Knots a hundredth of the unit of velocity apart: 16 steps an arc are too few."""
+    law = jb.Tabulated(SPEEDS / 8, MEASURED)
+
+    def make(nu):
+        return jb.Oscillator(0.026, (jb.Belt(nu, law),))
+
+    diagram = jb.bifurcation_diagram(make, span=(0.03, 0.2), rows=12)
+    table = diagram.table()
+    cycles = table[(table.kind == "cycle") & table.stable]
+    assert cycles.value.min() == pytest.approx(0.03) and cycles.value.max() == pytest.approx(0.2)
+    # As many as there are fixed points, one for each value and each end.
+    assert len(cycles) == np.sum(table.kind == "equilibrium")

@@ -23,7 +23,7 @@ import numpy as np
 from ..activity import announced, tell
 from ..checks import as_whole, outside_of_traces, require
 from ..cycles.chains import Loop, cut
-from ..cycles.cycle import Cycle, polish
+from ..cycles.cycle import Cycle, exactly, polish
 from ..model.equilibria import candidates
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator
@@ -393,8 +393,14 @@ def _stacked(program, items: Iterable[Any]) -> Any:
 
 def _attracting(path: ParameterPath, values: np.ndarray, loops: Sequence[Loop]) -> list[Cycle]:
     ok = jnp.asarray(Status.OK.value)
+
+    def solved(osc: Oscillator, loop: Loop) -> Cycle:
+        cycle = polish(osc, loop, ok)
+        # Steps that are too long for the law; a branch must not end for that.
+        return exactly(osc, loop, ok) if int(cycle.status) == Status.NO_CONVERGENCE else cycle
+
     pairs = zip(values, cut(loops), strict=True)
-    return [polish(path.at(value), loop, ok) for value, loop in pairs]
+    return [solved(path.at(value), loop) for value, loop in pairs]
 
 
 def _repelling(path: ParameterPath, values: np.ndarray, arounds: np.ndarray) -> list[Cycle]:

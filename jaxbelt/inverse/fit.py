@@ -57,7 +57,7 @@ IMPLAUSIBLE = 1e-6
 TOLERANCE = 1e-8
 #: Parameters nearer to zero than this may have errors of this size; and those whose error in a
 #: direction that is not told is this many of their sizes have a share in it.
-SMALLEST, SHARE = 0.1, 0.3
+SMALLEST, LEAST_PART = 0.1, 0.3
 
 
 # --- 1: the search --------------------------------------------------------------------------------
@@ -365,7 +365,7 @@ def _undetermined(names: Sequence[str], covariance: ArrayLike, sizes: np.ndarray
     alone = [tuple(np.array(names)[infinite].tolist())] if np.any(infinite) else []
     values, vectors = np.linalg.eigh(scaled[np.ix_(~infinite, ~infinite)])
     # Parameters that have a share in a direction along which the error is too large.
-    wide = (np.abs(vectors) * np.sqrt(np.maximum(values, 0.0)))[:, values > 1] > SHARE
+    wide = (np.abs(vectors) * np.sqrt(np.maximum(values, 0.0)))[:, values > 1] > LEAST_PART
     kept = np.array(names)[~infinite]
     groups: list[set[str]] = []
     for column in wide.T:
