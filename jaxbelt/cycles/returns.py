@@ -332,8 +332,8 @@ def reach_of(osc: Oscillator) -> float:
     force between -F and F takes it farther; q = 0 from zeta = 2 on. So with q < 1 no top beyond
     F (1 + q)/(1 - q) comes back as far out. With q > 1, F (1 + q)/(q - 1) is where the least that
     half a loop leads to, q x - F (1 + q), is x, and from farther out orbits go to infinity.
-    Friction that opposes the motion and grows with the speed brings orbits further in; with q > 1 it
-    holds cycles farther out, see `_where_all_is_as_far_out`.
+    Friction that opposes the motion and grows with the speed brings orbits further in; with q > 1
+    it holds cycles farther out, see `_where_all_is_as_far_out`.
     """
     zeta = float(osc.damping)
     frequency = np.sqrt(max(1 - zeta**2 / 4, 0.0))
