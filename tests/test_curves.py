@@ -1,5 +1,7 @@
 """Curves in two parameters: against refined points, closed forms, the oracle and symmetry."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import oracle
@@ -9,10 +11,12 @@ from laws import BELL, bell
 from scipy.optimize import brentq
 
 import jaxbelt as jb
+from jaxbelt.bifurcations.systems import Seen
 from jaxbelt.bifurcations.tangencies import _departure
+from jaxbelt.bifurcations.tracks import Track, special_between
 from jaxbelt.model.parameters import leaf_index
 from jaxbelt.model.variations import Variation
-from jaxbelt.numerics.continuation import Stop
+from jaxbelt.numerics.continuation import Corrected, CurvePoint, Stop
 
 
 def nu0(osc):
@@ -330,3 +334,31 @@ def test_a_curve_ends_where_its_cycle_shrinks_to_a_point():
         assert special.residual < 1e-8
         assert special.values == pytest.approx((0.0, 0.0), abs=special.residual)
     assert curve.ends == (Stop.STOPPED, Stop.LEFT_SPAN)
+
+
+@pytest.mark.parametrize(
+    ("watched", "values"),
+    [
+        (lambda nu: nu - 0.3, [0.3]),
+        (lambda nu: np.cbrt(nu - 0.3), [0.3]),
+        (lambda nu: 1.0 if nu > 0.3 else -1.0, []),
+    ],
+    ids=["smooth", "steep", "jump"],
+)
+def test_what_jumps_over_zero_does_not_vanish(watched, values):
+    class Straight(Track):
+        def corrected(self, u, tangent, length):
+            return Corrected(np.asarray(u) + length * np.asarray(tangent), tangent, 1, 1.0, True)
+
+        def look(self, u):
+            return Seen({("Special", ()): watched(u[-2])}, True, np.nan, 0.0)
+
+    nothing: Any = None
+    track, tangent = Straight(nothing, nothing, nothing), np.array([1.0, 0.0])
+    ends = [
+        (CurvePoint(np.array([nu, 0.1]), tangent, 1, None, 1.0), track.look([nu, 0.1]))
+        for nu in (0.0, 1.0)
+    ]
+    limits = np.array([[-1.0, 1.0], [-1.0, 1.0]])
+    found = special_between(track, limits, *ends)
+    assert [point.values[0] for point in found] == pytest.approx(values, abs=1e-12)
