@@ -145,7 +145,7 @@ def _is_same_point(point: BifurcationPoint, other: BifurcationPoint) -> bool:
     if point.condition != other.condition or not is_at_one_value(point, other):
         return False
     if int(point.cycle.status) != Status.OK:
-        return not _is_elsewhere(point, other)
+        return not _is_another(point, other)
     return is_same(point.cycle, other.cycle)
 
 
@@ -231,10 +231,10 @@ def _beside_it(
 
 def _is_apart(point: BifurcationPoint, other: BifurcationPoint) -> bool:
     """Whether two points at one value are of two families or belts, or of two motions."""
-    return point.condition.sought != other.condition.sought or _is_elsewhere(point, other)
+    return point.condition.sought != other.condition.sought or _is_another(point, other)
 
 
-def _is_elsewhere(point: BifurcationPoint, other: BifurcationPoint) -> bool:
+def _is_another(point: BifurcationPoint, other: BifurcationPoint) -> bool:
     """Whether two points at one value are of two cycles, or of two equilibria."""
     if all(int(one.cycle.status) == Status.OK for one in (point, other)):
         return apart(place_of(point.cycle), place_of(other.cycle)) >= SOLVED

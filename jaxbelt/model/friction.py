@@ -10,7 +10,7 @@ continues smoothly a little beyond its boundary. A law of your own is a subclass
 import abc
 import operator
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -341,7 +341,12 @@ class Tabulated(AbstractFriction):
     weights: tuple[float, ...] = eqx.field(static=True)
     level: float = eqx.field(static=True)
 
-    def __init__(self, speeds: ArrayLike, coefficients: ArrayLike, static: ArrayLike | None = None):
+    def __init__(
+        self,
+        speeds: ArrayLike | Sequence[float],
+        coefficients: ArrayLike | Sequence[float],
+        static: ArrayLike | None = None,
+    ):
         speeds, coefficients = _table(speeds, coefficients)
         self.speeds, self.coefficients = tuple(speeds.tolist()), tuple(coefficients.tolist())
         basis, one = _multiquadrics(np, speeds, speeds), np.ones((len(speeds), 1))
