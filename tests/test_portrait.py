@@ -116,8 +116,7 @@ def test_saddle_is_an_equilibrium_where_nothing_rests():
 
 def test_friction_that_grows_holds_a_cycle_far_out():
     """Friction that grows as the square of the speed outweighs negative damping: nothing goes to
-    infinity, and what would, without it, from twice the reach of friction that is bounded, is on a
-    cycle."""
+    infinity, and a cycle attracts what does without that growth."""
     damping, velocity, law = -0.1, 0.3, (1.0, 0.6, 10.0, 0.01)
     osc = jb.Oscillator(damping, (jb.Belt(velocity, jb.Conti(*law), lower=1.0),))
     found = jb.portrait(osc)
@@ -135,6 +134,18 @@ def test_friction_that_grows_holds_a_cycle_far_out():
         assert once.y_end == pytest.approx((top, 0.0), abs=1e-9 * top)
     # From farther out loops shrink.
     assert oracle.simulate(other, (60.0, 0.0), float(far.period)).y_end[0] < 59.0
+
+
+@pytest.mark.parametrize(
+    ("damping", "quadratic", "lower"), [(-0.1, 1e-6, 1.0), (-1e-5, 0.0, -np.inf)], ids=["in", "out"]
+)
+def test_a_cycle_beyond_all_that_is_looked_at_is_told_as_a_gap(damping, quadratic, lower):
+    """One attracts, of amplitude 2e5, in inverse proportion to the coefficient; the other, of
+    amplitude 4/pi 0.6/1e-5 = 7.6e4, is the bound of what goes to infinity."""
+    law = jb.Conti(1.0, 0.6, 10.0, quadratic)
+    found = jb.portrait(jb.Oscillator(damping, (jb.Belt(0.3, law, lower=lower),)))
+    assert found.status == jb.Status.INCOMPLETE and not found.escapes
+    assert found.gaps[-1].tolist() == [found.reach, np.inf]
 
 
 # --- slow: other programs, the engine ---------------------------------------------------------
@@ -248,7 +259,7 @@ def test_an_edge_cuts_off_what_only_the_static_limit_holds(sign):
     np.testing.assert_array_equal(pieces.entries[0], [corner[0], -corner[1]])
 
 
-@pytest.mark.slow
+@pytest.mark.slow(first=True)
 def test_cycle_whose_multiplier_is_1e20_is_solved_for_backwards():
     """It passes along the boundary of a slow belt. Starts on its two sides go to two cycles."""
     belts = (

@@ -197,7 +197,8 @@ def _finely_from(osc: Oscillator, start: Orbit, reach: Array) -> Orbit:
 def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
     """The orbit from y0 until a loop repeats, it comes to rest, or the budget is used up."""
     osc, y0 = lax.stop_gradient((osc, y0))
-    return _settled_or_not(_follow_from(osc, _beginning(osc, y0, budget)))
+    start = _beginning(osc, y0, budget, has_possible_numbers(osc))
+    return _settled_or_not(_follow_from(osc, start))
 
 
 def follow_from(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: int) -> Orbit:
@@ -208,9 +209,9 @@ def follow_from(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: i
 
 def follow_to_top(osc: Oscillator, y0: Array, budget: int) -> tuple[Orbit, Array]:
     """The orbit from y0 until a top, or it comes to rest; and x1 at the top, NaN where it has come
-    to none."""
+    to none. Of an oscillator that is known to be possible, or that is one reversed in time."""
     osc, y0 = lax.stop_gradient((osc, y0))
-    orbit = _to_top_from(osc, _beginning(osc, y0, budget))
+    orbit = _to_top_from(osc, _beginning(osc, y0, budget, jnp.asarray(True)))
     return orbit, orbit.top
 
 
@@ -241,13 +242,13 @@ def _settled_or_not(orbit: Orbit) -> Orbit:
     return eqx.tree_at(lambda orbit: orbit.status, orbit, status)
 
 
-def _beginning(osc: Oscillator, y0: Array, budget: int) -> Orbit:
+def _beginning(osc: Oscillator, y0: Array, budget: int, possible: Array) -> Orbit:
     """An orbit that stands at y0, with room for as many arcs as the budget."""
     rests = begins_at_rest(osc, y0[0], y0[1])
     focus = at_focus(osc, y0[0], y0[1])
     status = jnp.where(rests, Status.EQUILIBRIUM.value, Status.OK.value)
     status = jnp.where(focus, Status.PSEUDO_FOCUS.value, status)
-    finite = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
+    finite = jnp.all(jnp.isfinite(y0)) & possible
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
     return _standing(osc, mode_of_state(osc, y0[0], y0[1]), y0, status, budget)
 
