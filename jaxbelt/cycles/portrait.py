@@ -52,10 +52,11 @@ class Portrait(eqx.Module):
       unstable cycles do.
     - escapes: whether starts far out go to infinity.
     - reach: the bounds of what was looked at, |x1| and |x2| < reach. No cycle is farther out, as
-      far as a bound is known, which it is not where damping is 0, nor for damping < 0 with friction
-      that grows with the speed.
+      far as a bound is known, which it is not where damping is 0. For damping < 0 with friction
+      that grows with the speed loops beyond were seen to grow, or shrink, as they do at infinity.
     - gaps: intervals (from, to) of x1 at rest in which it is not told whether cycles pass, [gaps,
-      2]; those of a continuum of closed orbits, which are neither attracting nor unstable, too.
+      2]; those of a continuum of closed orbits, which are neither attracting nor unstable, too; and
+      (reach, inf) where there is a cycle farther out.
     - status: OK, or INCOMPLETE where there is a gap, or where an equilibrium on a contact edge is a
       stable node: the orbit that comes to it in its fast direction is a separatrix, too, and is not
       given.

@@ -28,7 +28,7 @@ from jaxtyping import Array
 
 from ..checks import pick
 from ..model.equilibria import Equilibria
-from ..model.far_out import contraction_far_out
+from ..model.far_out import contraction_far_out, is_bounded
 from ..model.modes import edges, mode_acceleration, settle
 from ..model.oscillator import Oscillator
 from ..model.transitions import contact
@@ -122,7 +122,7 @@ class Returns:
     intervals: of tops, (from, to) each, from left to right. cycles: all cycles found, each once, in
     order of their tops. gaps: intervals of tops, (from, to) each, of which it is not told whether
     there are cycles in them, such as a continuum of closed orbits. escapes: whether orbits from the
-    outermost tops go on outwards.
+    outermost tops go to infinity.
     """
 
     def __init__(
@@ -142,7 +142,10 @@ class Returns:
             self._search(low, high)
         self.cycles = self._solved()
         outermost = self.intervals[-1][1]
-        self.escapes = bool(self(np.array([outermost]))[0] > outermost)
+        grows, bounded = bool(self(np.array([outermost]))[0] > outermost), bool(is_bounded(osc))
+        self.escapes = grows and not bounded
+        if grows == bounded:  # there is a cycle farther out
+            self.gaps.append((outermost, np.inf))
 
     def __call__(self, tops: np.ndarray) -> np.ndarray:
         """The tops that follow these: see `_next_tops`."""
@@ -333,7 +336,7 @@ def reach_of(osc: Oscillator) -> float:
     F (1 + q)/(1 - q) comes back as far out. With q > 1, F (1 + q)/(q - 1) is where the least that
     half a loop leads to, q x - F (1 + q), is x, and from farther out orbits go to infinity.
     Friction that opposes the motion and grows with the speed brings orbits further in; with q > 1
-    it holds cycles farther out, see `_where_all_is_as_far_out`.
+    it holds cycles farther out, see `_reach_of_friction_that_grows`.
     """
     zeta = float(osc.damping)
     frequency = np.sqrt(max(1 - zeta**2 / 4, 0.0))
@@ -345,11 +348,11 @@ def reach_of(osc: Oscillator) -> float:
     inner += [abs(float(belt.velocity / osc.omega)) for belt in osc.belts]
     reach = float(max(min(1.01 * bound + 1.0, FARTHEST), max(inner) + 1.0))
     if zeta < 0 and reach < FARTHEST and any(map(_pulls_more_far_out, osc.belts)):
-        return _where_all_is_as_far_out(osc, reach)
+        return _reach_of_friction_that_grows(osc, reach)
     return reach
 
 
-def _where_all_is_as_far_out(osc: Oscillator, reach: float) -> float:
+def _reach_of_friction_that_grows(osc: Oscillator, reach: float) -> float:
     """The least of some tops beyond which loops grow, or shrink, as they do at infinity."""
     tops = np.geomspace(reach, FARTHEST, TOPS_AT_ONCE)
     after, _ = _next_tops(osc, jax.device_put(np.column_stack([tops, np.zeros_like(tops)])))
