@@ -102,7 +102,7 @@ def test_kinks_are_found_where_they_are_and_nowhere_else():
     assert _kink_of(jb.Tabulated(SPEEDS, MEASURED)) is None
 
 
-def test_a_law_of_straight_lines_is_told_of_and_the_search_ends_early():
+def test_a_law_of_straight_lines_is_told_of():
     with pytest.warns(UserWarning, match=r"mu of Lines has a kink at the speed 0\.1, .*Tabulated"):
         belt = jb.Belt(0.3, Lines(0.6))
     osc = jb.Oscillator(0.03, (belt,))  # and no second time

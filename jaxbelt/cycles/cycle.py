@@ -28,7 +28,6 @@ from ..checks import (
 )
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.events import Signature, signature_name
-from ..model.friction import has_kink
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.rest import is_neutral
@@ -300,13 +299,12 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
         return _exactly_in_lanes(osc, loop, status)
     cycle, error = _polished(osc, loop, status, ARC_STEPS)
     coarser = ARC_STEPS
-    kinked = any(has_kink(belt.friction) for belt in osc.belts)
     for steps in (FINE_STEPS, *FINER_STEPS):
         if int(status) != Status.OK or not _is_inexact(cycle, error):
             break
         fails = int(cycle.status) == Status.NO_CONVERGENCE
-        if fails and (kinked or _mesh_error(osc, loop, coarser) < EXACT):
-            break  # shorter steps do not help
+        if fails and _mesh_error(osc, loop, coarser) < EXACT:
+            break  # not for its steps
         coarser = steps
         finer, remaining = _polished(osc, loop, status, steps)
         if int(cycle.status) == Status.OK and remaining > 0.1 * error:

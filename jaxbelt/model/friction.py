@@ -91,15 +91,13 @@ def _is_at_most(value: Any, _: Any, most: Any) -> Any:
     return value <= most
 
 
-#: Laws of one's own whose `mu` was traced, and those that were searched for kinks: whether they
-#: have one.
+#: Laws of one's own whose `mu` was traced, and those that were searched for kinks.
 _traced: set[type] = set()
-_kinked: dict[type, bool] = {}
+_asked_of_kinks: set[type] = set()
 
 
 def check_law(law: AbstractFriction) -> None:
-    """Raise a `ValueError` where `mu` of a law of one's own cannot be traced, and warn where it has
-    a kink, once for each class.
+    """Raise a `ValueError` where `mu` of a law of one's own cannot be traced, once for each class.
 
     A law that asks NumPy for an exponential gives right numbers by itself and fails inside of what
     is compiled.
@@ -119,27 +117,20 @@ def check_law(law: AbstractFriction) -> None:
     _traced.add(kind)
 
 
-def has_kink(law: AbstractFriction) -> bool:
-    """Whether a known law of one's own has a kink; its class is warned of where that is found."""
-    law, kind = _of_its_own_units(law), type(_of_its_own_units(law))
-    if kind.__module__ == __name__ or not is_concrete(law):
-        return False
-    if kind not in _kinked:
-        kink = _kink_of(law)
-        _kinked[kind] = kink is not None
-        if kink:
-            warnings.warn(
-                "mu of {} has a kink at the speed {:.6g}, its slope goes from {:.3g} to {:.3g}: "
-                "motions that slip at that speed are followed, but most of their cycles are not "
-                "found (NO_CONVERGENCE). Of a table jb.Tabulated(speeds, coefficients) makes a "
-                "smooth law.".format(kind.__name__, *kink),
-                stacklevel=2,
-            )
-    return _kinked[kind]
-
-
-def _of_its_own_units(law: AbstractFriction) -> AbstractFriction:
-    return law.law if isinstance(law, LawInUnits) else law
+def _warn_of_kink(law: AbstractFriction) -> None:
+    """Warn where a known law of one's own has a kink, once for each class."""
+    kind = type(law)
+    if kind in _asked_of_kinks or kind.__module__ == __name__ or not is_concrete(law):
+        return
+    _asked_of_kinks.add(kind)
+    if kink := _kink_of(law):
+        warnings.warn(
+            "mu of {} has a kink at the speed {:.6g}, its slope goes from {:.3g} to {:.3g}: "
+            "motions that slip at that speed are followed, but most of their cycles are not "
+            "found (NO_CONVERGENCE). Of a table jb.Tabulated(speeds, coefficients) makes a "
+            "smooth law.".format(kind.__name__, *kink),
+            stacklevel=2,
+        )
 
 
 #: Speeds between which kinks are looked for, and how often their intervals are halved.
@@ -187,7 +178,7 @@ def as_friction(law: Any) -> AbstractFriction:
     fits = isinstance(law, AbstractFriction)
     require_value(fits, "friction", "a law such as jb.Conti(...)", law)
     check_law(law)
-    has_kink(law)
+    _warn_of_kink(law)
     return law
 
 
