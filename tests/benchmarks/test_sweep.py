@@ -273,22 +273,18 @@ def test_w1_side_by_side(benchmark, tmp_path, monkeypatch):
         rows.append((f"by hand, {bits}-bit SIMD (C++)", n, *fastest(limit, n)))
     _, seconds, dataset = least(lambda: swept(n))
     rows.append(("sweep", n, seconds, float(np.abs(dataset.x1_end).sum())))
-    looped = numba_runs(64)
-    if looped is None:
-        print("numba: skipped, not installed")
-    else:
-        _, seconds, x1 = least(looped, 3)
-        rows.append(("numba event loop", 64, seconds, np.abs(x1).sum()))
-    taylor = heyoka_runs(32)
-    if taylor is None:
-        print("heyoka: skipped, not installed")
-    else:
-        _, seconds, x1 = least(taylor, 3)
-        rows.append(("heyoka (Taylor, LLVM)", 32, seconds, np.abs(x1).sum()))
-    _, seconds, x1 = least(vmapped(16), 3)
-    rows.append(("vmap of simulate", 16, seconds, np.abs(x1).sum()))
-    _, seconds, x1 = least(scipy_runs(3), 1)
-    rows.append(("SciPy, no events", 3, seconds, np.abs(x1).sum()))
+    for name, size, runs, repeat in (
+        ("numba event loop", 64, numba_runs, 3),
+        ("heyoka (Taylor, LLVM)", 32, heyoka_runs, 3),
+        ("vmap of simulate", 16, vmapped, 3),
+        ("SciPy, no events", 3, scipy_runs, 1),
+    ):
+        call = runs(size)
+        if call is None:
+            print(f"{name}: skipped, not installed")
+            continue
+        _, seconds, x1 = least(call, repeat)
+        rows.append((name, size, seconds, np.abs(x1).sum()))
     base = n * n / rows[0][2]
     print()
     for name, size, seconds, total in rows:
