@@ -283,7 +283,7 @@ class Returns:
                 found.append(cycle)
             elif divisions > 1 and tops.size > 2:
                 found += self._solved_between(Bracket(float(a), float(b)), divisions - 1)
-            elif after > before and (behind := self._cycle_behind(float(b))) is not None:
+            elif after > before and (behind := self._cycle_behind(float(a), float(b))) is not None:
                 found.append(behind)
             elif not abs(after - before) > JUMP:
                 self.gaps.append((float(a), float(b)))
@@ -294,10 +294,13 @@ class Returns:
         _, (loops,) = self._after(self.osc, np.array([[top, 0.0]]))
         return _if_at_home(solved(self.osc, pick(loops, 0)), top, high - low)
 
-    def _cycle_behind(self, top: float) -> Cycle | None:
-        """The cycle with its top there, as it is backwards, or None: then the map jumps there."""
+    def _cycle_behind(self, low: float, top: float) -> Cycle | None:
+        """The cycle with its top there, as it is backwards, or None: then the map jumps between low
+        and there, or, where no top comes backwards, that is not told."""
         behind = reversed_in_time(self.osc)
         (before,), (loops,) = self._after(behind, np.array([[top, 0.0]]))
+        if np.isnan(before):
+            self.gaps.append((low, top))
         if not abs(before - top) < MAP_ERROR * (1 + abs(top)):
             return None
         cycle = _if_at_home(solved(behind, pick(loops, 0)), top, 0.0)
