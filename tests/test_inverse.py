@@ -196,7 +196,7 @@ def test_what_is_told_in_combination_only_is_named():
     assert _undetermined(names, apart, _sizes(estimates)) == (("a",), ("c",))
 
 
-@pytest.mark.slow(first=True)
+@pytest.mark.slow
 def test_a_motion_that_touches_no_boundary_tells_only_a_combination():
     """Near rest it tells how fast it settles and where: two numbers, and not these four."""
     osc = jb.presets.class_b(0.45, 0.35)

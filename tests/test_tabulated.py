@@ -9,6 +9,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
+from jaxbelt.model import friction
 from jaxbelt.model.friction import _kink_of
 from jaxbelt.sweeps.question import Question
 
@@ -102,10 +103,17 @@ def test_kinks_are_found_where_they_are_and_nowhere_else():
     assert _kink_of(jb.Tabulated(SPEEDS, MEASURED)) is None
 
 
-def test_a_law_of_straight_lines_is_told_of():
+def test_a_law_of_straight_lines_is_told_of_once():
+    friction._asked_of_kinks.discard(Lines)
     with pytest.warns(UserWarning, match=r"mu of Lines has a kink at the speed 0\.1, .*Tabulated"):
-        belt = jb.Belt(0.3, Lines(0.6))
-    osc = jb.Oscillator(0.03, (belt,))  # and no second time
+        jb.Belt(0.3, Lines(0.6))
+    jb.Belt(0.3, Lines(0.6))  # warnings are errors here
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:mu of Lines has a kink")
+def test_a_cycle_with_straight_lines_is_not_found_and_the_text_says_what_to_do():
+    osc = jb.Oscillator(0.03, (jb.Belt(0.3, Lines(0.6)),))
     cycle = jb.find_cycle(osc, (3.0, 0.0))
     assert cycle.status == Status.NO_CONVERGENCE and "smooth" in repr(cycle)
 
