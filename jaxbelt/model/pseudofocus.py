@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .modes import (
+    ABOVE,
+    BELOW,
     Mode,
     force_rounding,
     mode_acceleration,
@@ -74,9 +76,11 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
 
     The leading term of a loop must outweigh the next one by ten (see `EdgeFocus`), and no boundary
-    may be near. With a belt at rest, or with a fixed point on the edge, the loops shrink to
-    rounding.
+    may be near, and no other edge; edges that are one up to rounding are passed together. With a
+    belt at rest, or with a fixed point on the edge, the loops shrink to rounding.
     """
+    left = _past_all(osc, left, edge, x2)
+    right = _past_all(osc, right, edge, x2, rightward=True)
     on_left, on_right = (field_at_rest(osc, mode, edge) for mode in (left, right))
     focus = _edge_focus(on_left, on_right)
     size = jnp.abs(x2)
@@ -90,6 +94,7 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
         & (10 * size**2 * focus.bend < -focus.rate)
         & (size < FOCUS_RADIUS)
         & (2 * osc.omega * size < nearest)
+        & _is_alone(osc, edge, size**2 / on_left[0], size**2 / -on_right[0])
     )
     (a_left, trace_left, *_), (a_right, trace_right, *_) = on_left, on_right
     rounding = force_rounding(edge)
@@ -97,3 +102,33 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     shrinks = trace_right * jnp.maximum(a_left, 0) - trace_left * jnp.minimum(a_right, 0) < 0
     captured = captured | pushed & (shrinks | (nearest == 0)) & (size < FOCUS_ROUNDING)
     return captured & ~left.any_stuck & ~right.any_stuck
+
+
+def _past_all(
+    osc: Oscillator, mode: Mode, edge: Array, x2: Array, *, rightward: bool = False
+) -> Mode:
+    """A slow mode beside an edge on the outer side of all edges that are one with it up to
+    rounding."""
+    rounding, codes = force_rounding(edge), []
+    for belt, code in zip(osc.belts, mode.codes, strict=True):
+        at_lower, at_upper = (jnp.abs(x - edge) <= rounding for x in (belt.lower, belt.upper))
+        outside, touches = (at_upper, at_lower) if rightward else (at_lower, at_upper)
+        sign = jnp.sign(jnp.where(belt.velocity == 0, -x2, belt.velocity))
+        code = jnp.where(touches & (jnp.abs(code) > 1), sign, code)
+        codes.append(jnp.where(outside, ABOVE if rightward else BELOW, code))
+    return Mode(tuple(codes))
+
+
+def _is_alone(osc: Oscillator, edge: Array, to_left: Array, to_right: Array) -> Array:
+    """Whether no other edge of a belt with a load is so near to one: what attracts where an orbit
+    passes one edge may repel where it passes both.
+
+    A loop reaches half as far as size^2 over the push towards the edge.
+    """
+    alone = jnp.asarray(True)
+    for belt in osc.belts:
+        for other in (belt.lower, belt.upper):
+            away, rounding = other - edge, force_rounding(edge)
+            near = (-to_left < away) & (away < to_right) & (jnp.abs(away) > rounding)
+            alone = alone & ~(near & (belt.load != 0))
+    return alone
