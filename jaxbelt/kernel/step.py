@@ -6,7 +6,7 @@ leaves the interval in which the mode holds, at the end or at an extremum on the
 made again, shorter, so that it ends on the first root; what is then left of the way, less than
 `LANDING * sqrt(tolerance)`, is bridged by one Taylor step. So the states at events are as good as
 the integration, not as its interpolant, and excursions within one step are found. Where a contact
-edge may be met (or extrema are wanted), steps also end where x2 = 0: x1 is then monotone on each.
+edge lies ahead (or extrema are wanted), steps also end where x2 = 0: x1 has no extremum beyond it.
 
 The Runge-Kutta stages are written for x1' = x2 (Nystroem's form: the accelerations alone are kept),
 and each acceleration is one quotient, with the division last. That is for XLA on the CPU, which
@@ -93,12 +93,14 @@ _E_LINEAR = 0.25 * float(np.abs(_E @ np.linalg.matrix_power(_A, 7) @ np.ones(_E.
 class _Window(eqx.Module):
     """Bounds of the modes, arrays [lanes].
 
-    x1, x2: (lower, upper); x1 is None where there are no edges. extrema: lanes whose extrema are
-    wanted. signs, pulls: constants of the mode's field, one a belt. active: lanes that slip.
+    x1, x2: (lower, upper); x1 is None where there are no edges. turns: lanes whose steps end at
+    (minima, maxima) of x1; None: no lanes. extrema: lanes whose extrema are wanted. signs, pulls:
+    constants of the mode's field, one a belt. active: lanes that slip.
     """
 
     x1: tuple[Array, Array] | None
     x2: tuple[Array, Array]
+    turns: tuple[Array, Array] | None
     extrema: Array | None
     signs: tuple[Array, ...]
     pulls: tuple[Array, ...]
@@ -106,7 +108,7 @@ class _Window(eqx.Module):
 
 
 def window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None) -> _Window:
-    """The bounds of the current modes. Where x1 has to be monotone, x2 = 0 is a bound, too."""
+    """The bounds of the current modes."""
     mode, inf = lanes.mode, jnp.full_like(lanes.t, jnp.inf)
 
     def innermost(pick, flags, bounds, none):
@@ -118,24 +120,33 @@ def window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None) -> _Windo
     boundaries = [belt.velocity / osc.omega for belt in osc.belts]
     low = innermost(jnp.maximum, [code == -1 for code in mode.codes], boundaries, -inf)
     high = innermost(jnp.minimum, [code == 1 for code in mode.codes], boundaries, inf)
-    x1, split = None, jnp.zeros_like(lanes.done) if extrema is None else extrema
+    x1, turns = None, None if extrema is None else (extrema, extrema)
     if has_edges(osc):
         left = innermost(jnp.maximum, bounds_leftward(mode), edge_positions(osc), -inf)
         right = innermost(jnp.minimum, bounds_rightward(mode), edge_positions(osc), inf)
         x1 = left, right
-        # Far from the edges, as measured by the motion, x1 need not be monotone. Steps that ended
-        # at every x2 = 0 would become as small as rounding where a lane comes to rest.
+        # An extremum far from the edge, as measured by the motion, is not beyond it. Steps that
+        # ended at every x2 = 0 would become as small as rounding where a lane comes to rest.
         reach = 4 * (jnp.abs(lanes.x2) + jnp.abs(lanes.a))
-        split = split | (jnp.minimum(lanes.x1 - left, right - lanes.x1) <= reach)
-    if has_edges(osc) or extrema is not None:
-        up = split & ((lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0)))
-        down = split & ((lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0)))
-        # Of the boundary of a belt at rest the derivatives stay.
-        low = jnp.where(up & (low < 0), 0.0, low)
-        high = jnp.where(down & (high > 0), 0.0, high)
+        turns = lanes.x1 - left <= reach, right - lanes.x1 <= reach
+        if extrema is not None:
+            turns = turns[0] | extrema, turns[1] | extrema
     signs = mode.signs
     pulls = tuple(belt.load * sign for belt, sign in zip(osc.belts, signs, strict=True))
-    return _Window(x1, (low, high), extrema, signs, pulls, ~lanes.done & ~mode.any_stuck)
+    return _Window(x1, (low, high), turns, extrema, signs, pulls, ~lanes.done & ~mode.any_stuck)
+
+
+def _bounds_of_x2(window: _Window, lanes: Lanes) -> tuple[Array, Array]:
+    """The bounds of x2 for the next step; 0 is one where that is to end at an extremum of x1."""
+    low, high = window.x2
+    if window.turns is not None:
+        at_minimum, at_maximum = window.turns
+        rises = (lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0))
+        falls = (lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0))
+        # Of the boundary of a belt at rest the derivatives stay.
+        low = jnp.where(at_maximum & rises & (low < 0), 0.0, low)
+        high = jnp.where(at_minimum & falls & (high > 0), 0.0, high)
+    return low, high
 
 
 def _quotient(osc: Oscillator, window: _Window, ones: Array, x1: Array, x2: Array) -> Array:
@@ -264,7 +275,7 @@ class _Landing(eqx.Module):
 def _landing(
     window: _Window, ones, lanes: Lanes, new: _Attempt, path: _Interpolant, rtol
 ) -> _Landing:
-    low, high = window.x2
+    low, high = (materialise(bound, ones) for bound in _bounds_of_x2(window, lanes))
     beyond_extremum = path.has_extremum & ((path.x2_extremum > high) | (path.x2_extremum < low))
     peak = jnp.where(beyond_extremum, path.x2_extremum, new.x2)
     reach = LANDING * jnp.sqrt(rtol)
@@ -294,7 +305,7 @@ def _landing(
         blocked = blocked | beyond
     until = jnp.where(beyond_extremum, path.extremum, 1.0)
     theta = _root_in_step(poly, start - target, until, end - target)
-    grazes = _grazes(window, lanes, new, path, reach) & ~beyond_extremum
+    grazes = _grazes(window, (low, high), lanes, new, path, reach) & ~beyond_extremum
     return _Landing(
         reached=reached,
         delta=delta,
@@ -323,7 +334,8 @@ def _way_to_edge(x1: tuple[Array, Array], new: _Attempt, reach) -> tuple[Array, 
 def _beyond_edge(x1: tuple[Array, Array], lanes: Lanes, new: _Attempt, near: Array, k):
     """x1 over the step as a polynomial, whether it ends beyond an edge, and that edge.
 
-    x1 is the integral of x2, which keeps its sign here, so x1 is monotone.
+    x1 is the integral of x2. On the way to an edge it has no extremum; if the step begins with an
+    extremum, that is far from the edge beyond it, see `_grazes` and `window_of`.
     """
     left, right = x1
     h = new.h
@@ -332,18 +344,23 @@ def _beyond_edge(x1: tuple[Array, Array], lanes: Lanes, new: _Attempt, near: Arr
     return integral, beyond, jnp.where(new.x1 > right, right, left)
 
 
-def _grazes(window: _Window, lanes: Lanes, new: _Attempt, path: _Interpolant, reach) -> Array:
+def _grazes(
+    window: _Window, x2: tuple[Array, Array], lanes: Lanes, new: _Attempt, path: _Interpolant, reach
+) -> Array:
     """Whether x2 has an extremum in the step at which the step should be split.
 
-    That is, one so close to a bound that the interpolant cannot tell on which side it is, or one
-    that the observer wants. The terms that the interpolant leaves out are far smaller than its last
+    That is, one so close to a bound that the interpolant cannot tell on which side it is, one
+    between two extrema of x1, or one that the observer wants. The terms that the interpolant leaves out are far smaller than its last
     ones, and near the ends of a step it is exact to the second order.
     """
-    low, high = window.x2
+    low, high = x2
     doubt = jnp.abs(path.k[3]) + 0.1 * jnp.abs(path.k[2])
     inside = jnp.minimum(path.extremum, 1 - path.extremum)
     grazes = (path.x2_extremum > high - doubt) | (path.x2_extremum < low + doubt)
     grazes = grazes & (inside * new.h > reach)
+    if window.x1 is not None:
+        back_and_forth = (path.x2_extremum * lanes.x2 < 0) & (path.x2_extremum * new.x2 < 0)
+        grazes = grazes | back_and_forth
     if window.extrema is not None:
         further = (path.x2_extremum > lanes.upper) | (path.x2_extremum < lanes.lower)
         grazes = grazes | (window.extrema & further & (inside > 1e-3))
