@@ -40,7 +40,8 @@ class _LoopSoFar(eqx.Module):
     x1_min, x1_max: extrema; sticks: time stuck to each belt; word: the events, see
     `events.word_events`. tops: maxima of x1 since the last stick phase; previous: x1 at the last
     one, change: how far that was from the one before. kind, period, transient, loop_events (how
-    many in one loop) are set when the attractor is found.
+    many in one loop) are set when the attractor is found. previous_t: time of the last maximum;
+    wake: time before which nobody asks for maxima.
     """
 
     mark: Mark
@@ -50,7 +51,9 @@ class _LoopSoFar(eqx.Module):
     word: Array
     tops: Array
     previous: Array
+    previous_t: Array
     change: Array
+    wake: Array
     kind: Array
     period: Array
     transient: Array
@@ -110,11 +113,16 @@ class Attractor(Observer):
     #: Time before which steps do not end at extrema, unless a stick phase has ended: about two
     #: loops, which are transient in nearly every run.
     SETTLING: ClassVar[float] = 12.0
+    #: Tops move slowly where each moves by so many times what the last one did, and by that part of
+    #: the amplitude; they need four times as many loops as these to settle, in which none is asked for.
+    SLOW: ClassVar[tuple[float, float]] = (0.8, 1.25)
+    FAR: ClassVar[float] = 1e-3
+    ASLEEP: ClassVar[int] = 16
     #: Tops without a stick phase after which a run is taken to stick no more.
     SMOOTH: ClassVar[int] = 2
 
     def extrema(self, lanes):
-        return ~jnp.isnan(lanes.memory.mark.x1) | (lanes.t > self.SETTLING)
+        return ~jnp.isnan(lanes.memory.mark.x1) | (lanes.t > lanes.memory.wake)
 
     def start(self, osc, lanes):
         zero = jnp.zeros_like(lanes.t)
@@ -129,7 +137,9 @@ class Attractor(Observer):
             word=zero + 1,
             tops=count,
             previous=nothing,
+            previous_t=nothing,
             change=nothing,
+            wake=zero + self.SETTLING,
             kind=count + jnp.where(rests, EQUILIBRIUM, UNDECIDED).astype(count.dtype),
             period=nothing,
             transient=jnp.where(rests, 0.0, nothing),
@@ -152,12 +162,15 @@ class Attractor(Observer):
         resting = found & (kind != CYCLE)
         cycle = found & ~resting
         mark = loop.mark
+        slow = self._is_slow(loop, change, seen)
+        sleeps = materialise(top & (tops > self.SMOOTH) & ~found & slow, ones)
         # Where it comes back and has not settled, the next loop is compared with this one.
         renewed, new = mark.renewed(lanes, section & ~found, lanes.events, ones, met)
         # An attractor at rest is a point; a new mark begins a new loop.
         fresh = new | resting
+        asleep = self.ASLEEP * (lanes.t - loop.previous_t)
         memory = _LoopSoFar(
-            mark=renewed,
+            mark=select(sleeps, Mark.none(lanes.t), renewed),
             x1_min=jnp.where(fresh, lanes.x1, seen.x1_min),
             x1_max=jnp.where(fresh, lanes.x1, seen.x1_max),
             sticks=tuple(
@@ -165,9 +178,11 @@ class Attractor(Observer):
                 for total, stuck in zip(seen.sticks, passage.mode.stuck, strict=True)
             ),
             word=jnp.where(fresh, 1.0, seen.word),
-            tops=tops,
-            previous=jnp.where(top, lanes.x1, loop.previous),
+            tops=jnp.where(sleeps, 0, tops),
+            previous=jnp.where(top, jnp.where(sleeps, jnp.nan, lanes.x1), loop.previous),
+            previous_t=jnp.where(top, lanes.t, loop.previous_t),
             change=jnp.where(top, change, loop.change),
+            wake=jnp.where(sleeps, lanes.t + asleep, loop.wake),
             kind=jnp.where(found, kind, loop.kind),
             period=jnp.where(cycle, lanes.t - mark.t, loop.period),
             transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), loop.transient),
@@ -182,6 +197,12 @@ class Attractor(Observer):
             done=lanes.done | (memory.kind != UNDECIDED),
             memory=memory,
         )
+
+    def _is_slow(self, loop: _LoopSoFar, change, seen: _LoopSoFar) -> Array:
+        """Whether tops move as in a slow spiral, so that they cannot settle soon."""
+        way, before, (least, most) = jnp.abs(change), jnp.abs(loop.change), self.SLOW
+        alike = (change * loop.change > 0) & (way > least * before) & (way < most * before)
+        return alike & (way > self.FAR * (seen.x1_max - seen.x1_min))
 
     def _kind(
         self, loop: _LoopSoFar, lanes, passage, section, released, change, tol
