@@ -350,8 +350,9 @@ def _grazes(
     """Whether x2 has an extremum in the step at which the step should be split.
 
     That is, one so close to a bound that the interpolant cannot tell on which side it is, one
-    between two extrema of x1, or one that the observer wants. The terms that the interpolant leaves out are far smaller than its last
-    ones, and near the ends of a step it is exact to the second order.
+    between two extrema of x1, or one that the observer wants. The terms that the interpolant leaves
+    out are far smaller than its last ones, and near the ends of a step it is exact to the second
+    order.
     """
     low, high = x2
     doubt = jnp.abs(path.k[3]) + 0.1 * jnp.abs(path.k[2])

@@ -113,10 +113,11 @@ class Attractor(Observer):
     #: Time before which steps do not end at extrema, unless a stick phase has ended: about two
     #: loops, which are transient in nearly every run.
     SETTLING: ClassVar[float] = 12.0
-    #: Tops move slowly where each moves by so many times what the last one did, and by that part of
-    #: the amplitude; they need four times as many loops as these to settle, in which none is asked for.
+    #: Tops spiral slowly where each moves by about what the last one did, by a factor of these, and
+    #: by more than that part of the amplitude: 40 more are needed until they repeat.
     SLOW: ClassVar[tuple[float, float]] = (0.8, 1.25)
     FAR: ClassVar[float] = 1e-3
+    #: Loops of a slow spiral in which steps do not end at tops.
     ASLEEP: ClassVar[int] = 16
     #: Tops without a stick phase after which a run is taken to stick no more.
     SMOOTH: ClassVar[int] = 2
