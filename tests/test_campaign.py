@@ -14,8 +14,10 @@ import numpy as np
 import oracle
 import pytest
 
+import jaxbelt as jb
+from jaxbelt.cycles.attractors import itinerary
 from tests.campaign import __main__ as command
-from tests.campaign import cases, compare, derivatives, engine, package
+from tests.campaign import cases, compare, derivatives, engine, package, paths
 from tests.campaign.engine import CROSS, EDGE, SLIP, STICK, Belt, Oscillator
 from tests.campaign.outcome import Outcome
 
@@ -189,6 +191,18 @@ def test_a_corner_has_the_answers_of_its_neighbours():
     assert compare.judge(case, told_by(before), 1e-8)[0] in compare.GOOD
     stuck = told_by(run, x1=0.9, x2=0.4, status=engine.OK)
     assert compare.judge(case, stuck, 1e-8)[0].startswith("corner: ")
+
+
+@pytest.mark.parametrize("velocity", [0.4, 0.41, 0.5])
+def test_a_mode_that_does_not_last_is_none(velocity):
+    """Slip onset, needed = capacity at x1 = 0.3 + 0.1 * 0.175 - 2 * 0.5, lies on the edge."""
+    left = coulomb(velocity, 0.5, 0.3, upper=-0.25)
+    right = coulomb(-0.35, 0.5, 0.3, load=2.0, lower=-0.6825)
+    osc = Oscillator(0.1, (left, right), omega=2.0)
+    (cycle,) = paths.label_of(osc, [(3.0, 0.0)]).cycles
+    found = jb.find_cycle(package.oscillator(osc), (3.0, 0.0))
+    assert cycle.modes == itinerary(found.oscillator, found.chain)
+    assert cycle.modes == ((0, -1), (2, -1), (2, 0), (1, 0), (1, -2), (1, -1))
 
 
 def test_derivatives_are_those_of_differences():

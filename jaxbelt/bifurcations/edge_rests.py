@@ -235,6 +235,9 @@ class BoundaryEquilibrium(_EdgeCondition):
 class PseudoHopf(_EdgeCondition):
     """The pseudo-focus at a contact edge of a belt changes its stability."""
 
+    #: Loops around it neither grow nor shrink, and those of a cycle beside it are lost in rounding.
+    slow: ClassVar[bool] = True
+
     caption: ClassVar[str] = "pseudo-Hopf, belt {belt}"
     line: ClassVar[Line] = Line("pseudo-Hopf", "#D55E00", (0, (5, 1.5)))
 

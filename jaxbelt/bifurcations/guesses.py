@@ -19,6 +19,7 @@ from ..model.equilibria import Equilibria, candidates
 from ..model.modes import STUCK, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
+from ..motion.integrators import STRIDE
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .systems import velocity_of
@@ -52,7 +53,7 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
     return jnp.concatenate([*ends, *others])
 
 
-def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
+def approach(osc: Oscillator, rests: Equilibria, start: Array, stride: float | Array) -> Orbit:
     """The orbit from a start until it settles, with the status OK where that is on a cycle.
 
     If it has not settled, it is followed on, from what it approaches where that can be told: the
@@ -65,7 +66,7 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
 
     def attempt(state):
         number, start, *_ = state
-        orbit = follow(osc, start, FOLLOWED)
+        orbit = follow(osc, start, FOLLOWED, stride)
         rows = jnp.arange(orbit.tops.size)
         last = jnp.sort(jnp.where(jnp.isnan(orbit.tops), -1, rows))[-3:]
         tops = orbit.tops[last]
@@ -101,11 +102,13 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array) -> Orbit:
 
 
 @jit
-def settled_loops(osc: Oscillator, rests: Equilibria, size: int) -> tuple[Loop, Array]:
+def settled_loops(
+    osc: Oscillator, rests: Equilibria, size: int, stride: float | Array = STRIDE
+) -> tuple[Loop, Array]:
     """The loops that the orbits from `starts` repeat, in `size` arcs each, and their status."""
 
     def run(start):
-        orbit = approach(osc, rests, start)
+        orbit = approach(osc, rests, start, stride)
         _, count = last_loop(orbit)
         fits = (orbit.status != Status.OK) | (count <= size)
         status = jnp.where(fits, orbit.status, Status.TOO_MANY_ARCS.value)

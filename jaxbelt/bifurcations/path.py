@@ -22,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike
 
 from ..checks import is_concrete, require
 from ..cycles.attractors import (
@@ -35,12 +36,14 @@ from ..cycles.attractors import (
 )
 from ..cycles.chains import SIZES, Loop, cut
 from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
+from ..cycles.orbits import FINE_STRIDE
 from ..cycles.settling import AT_REST
 from ..model.equilibria import candidates
 from ..model.far_out import is_bounded
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import as_span, varied
+from ..motion.integrators import STRIDE
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .base import AbstractCondition, check_conditions
@@ -54,8 +57,12 @@ BATCH = 32
 ROOM = SIZES[1]
 #: Nothing closer than this, and this fraction of the span, is told apart.
 CLOSE = 1e-6
-#: The fraction of a step along the path by which the derivative of a cycle is taken.
+#: The fraction of a step along the path by which the derivative of a cycle is taken; but no less
+#: than CLOSE: one that hardly attracts is known to 1e-5 of its size only.
 DIFFERENCE = 1e-3
+#: A solution known to this part of its size is a cycle: where it is on its way to the equilibrium,
+#: which is a double root, half of the size is left.
+TOLD_APART = 0.1
 #: A cycle is where it is expected if it is no further from there, relative to its size, or than
 #: a third of the way that it is expected to go. Nearer to a square root, intervals get smaller.
 EXPECTED = 1e-3
@@ -94,6 +101,8 @@ class ParameterPath:
         # From which value to which other one, from which cycle to which, of those that do not
         # stick; None where there is none.
         self._goes_on: dict[tuple[float, float], dict[int, int | None]] = {}
+        # Between which values labels are found by fine orbits.
+        self._fine: list[tuple[float, float]] = []
         self._coincidences = self.variation.coincidences(self.first, self.last)
         self._meetings = self.variation.meetings(self.first, self.last)
         self.breaks = sorted(self._coincidences.keys() | self._meetings.keys())
@@ -140,15 +149,42 @@ class ParameterPath:
 
     def look(self, values: Sequence[float] | np.ndarray) -> None:
         """Find the labels there, in batches."""
-        new = np.array(sorted({float(v) for v in values} - self.labels.keys()))
-        for batch in (new[i : i + BATCH] for i in range(0, new.size, BATCH)):
-            filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
-            oscs = self.variation.oscillators(filled[:, None])
-            seen = jax.tree.map(np.asarray, _motions(oscs))
-            courses = courses_of(oscs) if self.basins and self.edged else [()] * BATCH
-            for lane, value in enumerate(batch.tolist()):
-                self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen), courses[lane])
+        new = sorted({float(v) for v in values} - self.labels.keys())
+        for stride in (STRIDE, FINE_STRIDE):
+            own = np.array([v for v in new if self._is_fine(v) == (stride == FINE_STRIDE)])
+            for batch in (own[i : i + BATCH] for i in range(0, own.size, BATCH)):
+                self._look_at(batch, stride)
         self._share()
+
+    def look_finely(self, value: float, away: float) -> None:
+        """Find all labels no farther away from a value anew, by orbits that are good to 1e-12, as
+        they are found there from then on.
+
+        Where two events of a cycle come close together the error of the others, some 1e-8, decides
+        which is first.
+        """
+        self._fine.append((value - away, value + away))
+        again = [v for v in self.labels if abs(v - value) <= away]
+        for v in again:
+            del self.labels[v], self.cycles[v]
+        known = self._goes_on.items()
+        self._goes_on = {pair: to for pair, to in known if not set(pair) & set(again)}
+        self.look(again)
+
+    def _is_fine(self, value: float) -> bool:
+        return any(low <= value <= high for low, high in self._fine)
+
+    def is_fine(self, a: float, b: float) -> bool:
+        """Whether labels are found by fine orbits at two values."""
+        return self._is_fine(a) and self._is_fine(b)
+
+    def _look_at(self, batch: np.ndarray, stride: float) -> None:
+        filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
+        oscs = self.variation.oscillators(filled[:, None])
+        seen = jax.tree.map(np.asarray, _motions(oscs, np.asarray(stride)))
+        courses = courses_of(oscs) if self.basins and self.edged else [()] * BATCH
+        for lane, value in enumerate(batch.tolist()):
+            self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen), courses[lane])
 
     def changes(self, settled: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
         """The intervals between values looked at that differ, but for those that are settled."""
@@ -202,8 +238,7 @@ class ParameterPath:
         ways = (lambda: polish(osc, cut([loop])[0], ok), lambda: find_cycle(osc, loop.entries[0]))
         for cycle in (way() for way in ways[0 if closes else 1 :]):
             if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
-                # Not the equilibrium, to which a cycle may shrink.
-                if np.ptp(np.asarray(cycle.unknowns)[:, 0]) > AT_REST:
+                if _is_off_rest(cycle):
                     loop = jax.tree.map(np.asarray, as_loop(cycle, ROOM))
                     return AttractingCycle(itinerary(osc, loop), loop)
         return None
@@ -239,11 +274,12 @@ class ParameterPath:
         """
         path, loop = self.cycles[known][number]
         step = value - known
-        nearby = self._settled(known + DIFFERENCE * step, loop)
+        part = max(DIFFERENCE, CLOSE * (self.unit + self.length) / abs(step))
+        nearby = self._settled(known + part * step, loop)
         expected = loop
         if nearby is not None and nearby.path == path and _fits(nearby.loop, loop):
             parts = ((t.entries, t.durations) for t in (loop, nearby.loop))
-            moved = [a + (b - a) / DIFFERENCE for a, b in zip(*parts, strict=True)]
+            moved = [a + (b - a) / part for a, b in zip(*parts, strict=True)]
             expected = eqx.tree_at(lambda t: (t.entries, t.durations), loop, tuple(moved))
         found = self._settled(value, expected)
         if found is None or found.path != path:
@@ -297,6 +333,17 @@ class ParameterPath:
         return self.labels[float(value)]
 
 
+def _is_off_rest(cycle: Cycle) -> bool:
+    """Whether a solution is a cycle and not the equilibrium, which solves the equations, too.
+
+    A cycle may shrink to that. Around a pseudo-focus its width is like its velocity squared: the
+    larger of them is its size. It is known to the error of its equations over their slope, 1 - m.
+    """
+    size = float(np.max(np.ptp(np.asarray(cycle.unknowns)[:, :2], axis=0)))
+    away = float(cycle.residual) / abs(1 - float(cycle.multiplier))
+    return size > AT_REST and away < TOLD_APART * size
+
+
 def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> int | None:
     """The number of a cycle among others, or None."""
     for number, other in enumerate(among):
@@ -322,11 +369,10 @@ class _Motions(NamedTuple):
 
 
 @jit
-def _motions(oscs: Oscillator) -> _Motions:
-    return each(_motions_at)(oscs)
+def _motions(oscs: Oscillator, stride: ArrayLike) -> _Motions:
+    def at(osc: Oscillator) -> _Motions:
+        rests = candidates(osc)
+        loop, status = settled_loops(osc, rests, ROOM, stride)
+        return _Motions(rests.kind, rests.stable, rests.modes, status, loop)
 
-
-def _motions_at(osc: Oscillator) -> _Motions:
-    rests = candidates(osc)
-    loop, status = settled_loops(osc, rests, ROOM)
-    return _Motions(rests.kind, rests.stable, rests.modes, status, loop)
+    return each(at)(oscs)

@@ -6,7 +6,8 @@ There is no cycle at these points, and few equations: in x1 of the state of rest
 - `SuddenSliding`: nu_k = 0, with the mass at rest on the belt, x2' = x2 = 0: an equilibrium lies on
   the boundary. No cycle can be an unknown here: as nu_k goes to zero the stick phase lasts ever
   longer, the slip arc takes ever longer to leave the equilibrium, and in the limit there is none.
-- `BeltAtRest`: the same, if no cycle sticks to the belt: an equilibrium jumps.
+- `BeltAtRest`: the same, if no cycle sticks to the belt: an equilibrium jumps, or a pseudo-focus on
+  an edge becomes another one.
 
 Hopf's points are eqs. (27), (28) of the paper, and sudden sliding is its name. What happens on
 contact edges is in `edge_rests`.
@@ -26,9 +27,19 @@ from jaxtyping import Array, ArrayLike
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
-from ..model.modes import boundary_guards, capacity, edge_guards, mode_acceleration, mode_of
+from ..model.modes import (
+    STUCK,
+    boundary_guards,
+    capacity,
+    edge_guards,
+    edges,
+    mode_acceleration,
+    mode_of,
+)
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
+from ..model.pseudofocus import edge_focus
+from ..model.transitions import contact
 from ..model.variations import Family, Variation
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
@@ -252,13 +263,15 @@ class RestingBelt(RestSystem):
     """A belt comes to rest, and the mass rests on it in the mode of `codes`; the unknown is x1.
 
     side: of the direction in which the belts at rest hold all they can, 0 where they hold nothing;
-    sticks: whether that is what was meant.
+    sticks: whether that is what was meant; edge: the number of that on which the mass rests as a
+    pseudo-focus, -1 where it does not.
     """
 
     belt: int | Array
     codes: Array
     side: Array
     sticks: Array
+    edge: Array
 
     @property
     def otherwise(self):
@@ -268,7 +281,9 @@ class RestingBelt(RestSystem):
         mode = mode_of(self.codes)
         limit = self.side * capacity(osc, mode)
         needed = mode_acceleration(osc, mode, x[0], jnp.zeros(()))
-        return jnp.stack([needed + limit, velocity_of(osc, self.belt)])
+        away = x[0] - jnp.stack(edges(osc))[self.edge]
+        rests = jnp.where(self.edge < 0, needed + limit, away)
+        return jnp.stack([rests, velocity_of(osc, self.belt)])
 
     def exists(self, osc, x):
         return self.sticks
@@ -332,7 +347,7 @@ class SuddenSliding(_RestingBeltCondition):
         sticks = (orbit.status == Status.OK) & jnp.any(loop & (orbit.codes[:, self.belt] == 0))
         # The contacts at slip onset are those at the equilibrium that it meets.
         side = jnp.sign(velocity_of(moving, self.belt))
-        system = RestingBelt(self.belt, orbit.codes[0], side, sticks)
+        system = RestingBelt(self.belt, orbit.codes[0], side, sticks, jnp.asarray(-1))
         return system, start[:1], jnp.asarray(Status.OK.value)
 
     def values(self, a, b):
@@ -342,7 +357,9 @@ class SuddenSliding(_RestingBeltCondition):
 class BeltAtRest(_RestingBeltCondition):
     """A belt comes to rest where the mass is at rest on it, too, and no cycle sticks to it.
 
-    On the other side its friction pulls the other way: the equilibrium jumps, or there is none.
+    On the other side its friction pulls the other way: the equilibrium jumps, or there is none. A
+    pseudo-focus on an edge stays, but one of another stability: it repels on one side at least, and
+    attracts where the belt is at rest, so a cycle around it shrinks to it; or there is none.
     """
 
     def guess(self, osc, size):
@@ -350,10 +367,37 @@ class BeltAtRest(_RestingBeltCondition):
 
     def system(self, osc, guess: Equilibria):
         rests = lax.stop_gradient(guess)
-        touches = (rests.kind > 0) & (jnp.abs(rests.modes[:, self.belt]) < 2)
-        row, load = jnp.argmax(touches), jnp.stack([one.load for one in osc.belts])[self.belt]
-        exists = touches[row] & (load > 0)
+        on_edge = rests.kind == EquilibriumKind.PSEUDO_FOCUS
+        touches = (rests.kind > 0) & ~on_edge & (jnp.abs(rests.modes[:, self.belt]) < 2)
+        changes = on_edge & jax.vmap(lambda x1: _focus_changes(osc, self.belt, x1))(rests.x1)
+        row = jnp.where(jnp.any(touches), jnp.argmax(touches), jnp.argmax(changes))
+        load = jnp.stack([one.load for one in osc.belts])[self.belt]
+        found = touches[row] | changes[row]
+        exists = found & (load > 0)
         codes, nothing = rests.modes[row].astype(float), jnp.zeros(())
-        system = RestingBelt(self.belt, codes, nothing, exists)
+        nearest = jnp.argmin(jnp.abs(jnp.stack(edges(osc)) - rests.x1[row]))
+        edge = jnp.where(touches[row], -1, nearest)
+        system = RestingBelt(self.belt, codes, nothing, exists, edge)
         status = jnp.where(exists, Status.OK.value, Status.NOT_TOUCHED.value)
-        return system, jnp.where(touches[row], rests.x1[row], jnp.nan)[None], status
+        return system, jnp.where(found, rests.x1[row], jnp.nan)[None], status
+
+
+def _focus_changes(osc: Oscillator, belt: int | Array, edge: Array) -> Array:
+    """Whether the pseudo-focus on an edge that a belt touches is another one, or none, beside the
+    point at which that belt is at rest.
+
+    Where it attracts on both sides nothing changes; nor where another belt at rest brakes there.
+    """
+    beside = [contact(osc, edge, jnp.zeros(()), rightward=right) for right in (False, True)]
+    sides = [jnp.stack(mode.codes) for mode in beside]
+    loads, others = jnp.stack([one.load for one in osc.belts]), jnp.arange(len(osc.belts)) != belt
+    touched, braked, attracts = (jnp.asarray(flag) for flag in (False, False, True))
+    for codes in sides:
+        touched = touched | (jnp.abs(codes[belt]) < 2)
+        braked = braked | jnp.any(others & (codes == STUCK) & (loads > 0))
+    for sign in (1.0, -1.0):
+        turned = [jnp.where(jnp.abs(codes[belt]) < 2, sign, codes[belt]) for codes in sides]
+        left, right = (mode_of(c.at[belt].set(t)) for c, t in zip(sides, turned, strict=True))
+        focus = edge_focus(osc, left, right, edge)
+        attracts = attracts & focus.exists & (focus.rate < 0)
+    return touched & ~braked & ~attracts

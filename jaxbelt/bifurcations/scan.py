@@ -112,6 +112,7 @@ def search(
     while intervals := path.changes(settled):
         tell(f"{len(path.labels)} values seen, {len(points)} points found")
         values: list[float] = []
+        again: list[float] = []
         for a, b in intervals:
             is_narrow = b - a <= NEAR * path.length
             point = _explained(path, a, b) if b - a <= near * path.length else None
@@ -125,12 +126,16 @@ def search(
                 values += [max(a, before), min(b, after)]
             elif b - a <= near * path.length and _is_degenerate(path, a, b, points):
                 settled.append((a, b))
+            elif b - a <= 1e-9 * path.length and not path.is_fine(a, b):
+                again.append(0.5 * (a + b))
             elif b - a <= 1e-9 * path.length:
                 points.append(_told_point(path, 0.5 * (a + b), b - a))
                 settled.append((a, b))
             else:
                 values += np.linspace(a, b, 3 if is_narrow else 9).tolist()
         path.look(values)
+        for value in again:
+            path.look_finely(value, NEAR * path.length)
     return by_value(points)
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..model.equilibria import repelling_foci
 from ..model.modes import (
     STUCK,
     Mode,
@@ -35,7 +36,7 @@ from .settling import AT_REST, has_repeated
 
 #: Arcs that an orbit is followed for before it is given up: some 100 loops.
 MOST_ARCS = 1024
-#: The stride of `Graded` with which every arc is good to 1e-12.
+#: The stride of `Graded` with which every arc is good to 1e-12; with STRIDE it is to some 1e-8.
 FINE_STRIDE = 0.05
 #: The speed down to which a fine orbit is followed that creeps.
 CREEPING_SPEED = 1e-6
@@ -49,7 +50,8 @@ class Orbit(eqx.Module):
     tops: x1 where an arc ended in a maximum of x1, else NaN. repeats: row of the top that the last
     one repeats, else -1. y, code, signs: where it stands now. top: that of the last arc;
     top_before: the last one, NaN where there was none. low, low_before: the smallest x1 since then,
-    and between that and the one before. sticks: whether it has stuck since.
+    and between that and the one before. sticks: whether it has stuck since. repellers: x1 of the
+    pseudo-foci to which no loop shrinks.
     """
 
     entries: Array
@@ -66,12 +68,13 @@ class Orbit(eqx.Module):
     low: Array
     low_before: Array
     sticks: Array
+    repellers: Array
     repeats: Array
     status: Array
     done: Array
 
 
-def _arc(osc: Oscillator, orbit: Orbit, stride: float) -> ArcEnd:
+def _arc(osc: Oscillator, orbit: Orbit, stride: float | Array) -> ArcEnd:
     """The next arc of an orbit, to an extremum at most."""
     mode, y = mode_of(orbit.code), (orbit.y[0], orbit.y[1])
 
@@ -88,7 +91,9 @@ def _graded_slip_arc(osc: Oscillator, mode: Mode, signs: Signs, y, stride: Array
     return slip_arc(osc, mode, signs, y, integrator, every_extremum=True)
 
 
-def _next_arc(osc: Oscillator, orbit: Orbit, stride: float) -> tuple[dict[str, Array], Orbit]:
+def _next_arc(
+    osc: Oscillator, orbit: Orbit, stride: float | Array
+) -> tuple[dict[str, Array], Orbit]:
     """The next arc, a row of the columns by name; and the orbit after it, without that row."""
     codes = orbit.code
     stuck = mode_of(codes).any_stuck
@@ -102,7 +107,7 @@ def _next_arc(osc: Oscillator, orbit: Orbit, stride: float) -> tuple[dict[str, A
     amplitude = top - orbit.low
 
     def repeated():
-        same = has_repeated(orbit.tops - top, amplitude)
+        same = has_repeated(orbit.tops - top, amplitude, top)
         same = same & jnp.all(orbit.codes == codes[None], axis=-1)
         return jnp.max(jnp.where(same, jnp.arange(orbit.tops.size), -1))
 
@@ -112,7 +117,9 @@ def _next_arc(osc: Oscillator, orbit: Orbit, stride: float) -> tuple[dict[str, A
     # Two arcs that both end at one top are no loop.
     loops = amplitude > force_rounding(y_end[0])
     # An orbit that sticks is on a cycle, however small: it repeats exactly.
-    resting = is_top & ~orbit.sticks & loops & shrinks & (amplitude < AT_REST)
+    # Around a pseudo-focus a loop is as wide as its velocity squared.
+    repelled = jnp.any((orbit.low <= orbit.repellers) & (orbit.repellers <= y_end[0]))
+    resting = is_top & ~orbit.sticks & loops & shrinks & (amplitude < AT_REST) & ~repelled
     resting = (resting | settles(osc, end.mode, *end.y)) & ~end.forever
 
     status = jnp.where(end.forever, Status.STUCK_FOREVER.value, Status.OK.value)
@@ -139,7 +146,7 @@ def _next_arc(osc: Oscillator, orbit: Orbit, stride: float) -> tuple[dict[str, A
 
 
 def _followed_while(
-    going: Callable[[Orbit], Array], osc: Oscillator, start: Orbit, stride: float = STRIDE
+    going: Callable[[Orbit], Array], osc: Oscillator, start: Orbit, stride: float | Array = STRIDE
 ) -> Orbit:
     """Arc after arc, from no arcs, as long as there is room and `going` says so."""
 
@@ -168,8 +175,8 @@ def _followed_while(
 
 
 @one_kernel_alone
-def _follow_from(osc: Oscillator, start: Orbit) -> Orbit:
-    return _followed_while(lambda orbit: ~orbit.done, osc, start)
+def _follow_from(osc: Oscillator, start: Orbit, stride: Array) -> Orbit:
+    return _followed_while(lambda orbit: ~orbit.done, osc, start, stride)
 
 
 @one_kernel_alone
@@ -194,17 +201,18 @@ def _finely_from(osc: Oscillator, start: Orbit, reach: Array) -> Orbit:
     return _followed_while(going, osc, start, FINE_STRIDE)
 
 
-def follow(osc: Oscillator, y0: Array, budget: int) -> Orbit:
+def follow(osc: Oscillator, y0: Array, budget: int, stride: float | Array = STRIDE) -> Orbit:
     """The orbit from y0 until a loop repeats, it comes to rest, or the budget is used up."""
     osc, y0 = lax.stop_gradient((osc, y0))
     start = _beginning(osc, y0, budget, has_possible_numbers(osc))
-    return _settled_or_not(_follow_from(osc, start))
+    return _settled_or_not(_follow_from(osc, start, jnp.asarray(stride)))
 
 
 def follow_from(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: int) -> Orbit:
     """The orbit that leaves y0 in a mode, as in `follow`; none where the status is not OK."""
     osc, mode, y0 = lax.stop_gradient((osc, mode, y0))
-    return _settled_or_not(_follow_from(osc, _standing(osc, mode, y0, status, budget)))
+    start = _standing(osc, mode, y0, status, budget)
+    return _settled_or_not(_follow_from(osc, start, jnp.asarray(STRIDE)))
 
 
 def follow_to_top(osc: Oscillator, y0: Array, budget: int) -> tuple[Orbit, Array]:
@@ -270,6 +278,7 @@ def _standing(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: int
         low=y0[0],
         low_before=jnp.full_like(y0[0], jnp.inf),
         sticks=jnp.asarray(False),
+        repellers=repelling_foci(osc),
         repeats=jnp.asarray(-1),
         status=status,
         done=status != Status.OK,

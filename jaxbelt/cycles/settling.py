@@ -18,14 +18,19 @@ from jaxtyping import Array
 
 #: A loop that repeats to this fraction of its amplitude has repeated.
 REPEATED = 1e-7
+#: Tops that differ by this part of themselves may be one.
+TOP_ROUNDING = 1e-15
 #: Loops of this amplitude that shrink come to rest: Newton's method does not tell a smaller cycle
 #: from an equilibrium, as its equations hold to 1e-9 and the multiplier of both is near 1.
 AT_REST = 1e-5
 
 
-def has_repeated(change: Array, amplitude: Array) -> Array:
-    """Whether a top that is away from an earlier one by `change` repeats it."""
-    return jnp.abs(change) < REPEATED * amplitude
+def has_repeated(change: Array, amplitude: Array, top: Array) -> Array:
+    """Whether a top that is away from an earlier one by `change` repeats it.
+
+    Tops that differ by their rounding are one.
+    """
+    return jnp.abs(change) < jnp.maximum(REPEATED * amplitude, TOP_ROUNDING * jnp.abs(top))
 
 
 def way_left(change: Array, before: Array) -> Array:

@@ -304,6 +304,12 @@ def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equil
     )
 
 
+def repelling_foci(osc: Oscillator) -> Array:
+    """x1 of the pseudo-foci that repel, a row an edge, NaN where there is none."""
+    found = _at_edges(osc, jnp.sort(jnp.stack(edges(osc))), with_saddles=False)
+    return jnp.where((found.rate > 0) & ~found.neutral, found.x1, jnp.nan)
+
+
 # --- the Hopf point -----------------------------------------------------------------------------
 
 

@@ -40,6 +40,9 @@ NARROW = 1e-4
 #: Extrema and periods of one cycle differ by less: the engine's repeat to 2e-11, and what slowly
 #: approaches a limit may be a thousand times as far from it.
 SAME = 1e-6
+#: Events at places that differ by less, relative to their size, happen at once: either may come
+#: first, by rounding.
+ONE_PLACE = 1e-14
 #: Smaller cycles than this one around a pseudo-focus are not told from it.
 TINY = 1e-3
 #: Events at the end of a run that passes too many, some loops.
@@ -214,9 +217,19 @@ def _cycle(osc: engine.Oscillator, found: engine.Attractor) -> Cycle:
     inside = (
         (run.t > 0.3 * found.period) & (run.t <= 1.3 * found.period) & (run.kind <= engine.EDGE)
     )
-    modes = run.codes[inside].tolist() or [run.mode_end]
+    modes = run.codes[inside & _lasts(run)].tolist() or [run.mode_end]
     place = np.array([*found.x1, *found.x2, found.period])
     return Cycle(_loop([_told(osc, mode) for mode in modes]), place, top)
+
+
+def _lasts(run) -> np.ndarray:
+    """Whether the mode after each event lasts: one that the next event, at one place but for
+    rounding, ends at once is none, as where slip onset lies on an edge."""
+    events = np.flatnonzero(run.kind <= engine.EDGE)
+    lasts = np.ones(len(run.t), bool)
+    here, ahead = run.y[events[:-1]], run.y[events[1:]]
+    lasts[events[:-1]] = np.any(np.abs(ahead - here) > ONE_PLACE * (1 + np.abs(here)), axis=1)
+    return lasts
 
 
 def _told(osc: engine.Oscillator, codes) -> tuple:
