@@ -391,3 +391,22 @@ def test_a_curve_turns_where_a_slip_onset_comes_to_an_edge():
     for p, q in curve.values[1:-1:4].tolist():
         again = jb.refine(jb.CornerCollision(1), lambda v, p=p: class_d(p, v), at=q + 1e-3)
         assert again.value == pytest.approx(q, abs=1e-12)
+
+
+def test_a_curve_of_corners_ends_where_its_cycle_shrinks_with_a_belt_to_a_pseudo_focus():
+    """Class (c), sigma = -1/2, at (0, -1/2): a_L = 1/2 + mu(0), tr_L = 4 - zeta there, and a_R =
+    1/2 - mu(1/2), tr_R = 4/36 - zeta, so that tr_L/a_L = 7/3 = -tr_R/|a_R|: the rate is zero."""
+
+    def make(p, q):
+        return jb.presets.class_c(p, q, sigma=-0.5)
+
+    point = jb.refine(jb.CornerCollision(0), lambda p: make(p, -0.4), at=0.0112)
+    curve = jb.bifurcation_curve(point, make, ((-0.1, 0.02), (-0.6, -0.36)))
+    (rest,) = curve.special
+    assert (rest.kind, rest.belts) == ("BeltAtRest", (0,)) and rest.residual < 1e-14
+    # The slopes of the two equations are of size one.
+    assert rest.values == pytest.approx((0.0, -0.5), abs=1e-14)
+    assert set(curve.ends) == {Stop.STOPPED, Stop.LEFT_SPAN}
+    # Its rows from nu0 = 0.013 to 0.006 lead there; polynomials of degrees 3 and 4 differ by 6e-4.
+    p, q = curve.values[np.argsort(curve.values[:, 0])[:9]].T
+    assert np.polyval(np.polyfit(p, q, 4), 0.0) == pytest.approx(-0.5, abs=6e-4)

@@ -556,7 +556,7 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
     """
     belts = range(len(osc.belts))
 
-    def one(codes, end, unknown, exit_, after):
+    def one(codes, end, unknown, exit_, after, lasts):
         mode, following = mode_of(codes), mode_of(after)
         fine = unknown[2] >= -HOLDS
         for y in (unknown, exit_):
@@ -567,7 +567,7 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
             fine = fine & jnp.all(inside >= -HOLDS) & holds & jnp.all(together <= HOLDS)
         # At the point of a corner what follows the edge has no duration.
         on_boundary = jnp.abs(velocities - osc.omega * exit_[1]) <= HOLDS
-        goes_on = on_boundary & (jnp.abs(after) == 1) & (exit_[2] > LASTS)
+        goes_on = on_boundary & (jnp.abs(after) == 1) & lasts
         hit = [(end == belt) | goes_on[belt] for belt in belts]
         held, x2 = held_at_boundary(osc, following, hit)
         needed = mode_acceleration(osc, held, exit_[0], x2)
@@ -575,8 +575,8 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
         return fine & ~(any_of(hit) & ~following.any_stuck & would_stick)
 
     velocities = jnp.stack([belt.velocity for belt in osc.belts])
-    exits = jnp.roll(z, -1, axis=0)
+    exits, durations = jnp.roll(z[:, :2], -1, axis=0), jnp.roll(z[:, 2], -1)
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
-    exits = jnp.where(last[:, None], z[0], exits)
-    each = jax.vmap(one)(chain.codes, chain.ends, z, exits, following_codes(chain))
+    lasts = jnp.where(last, z[0, 2], durations) > LASTS
+    each = jax.vmap(one)(chain.codes, chain.ends, z, exits, following_codes(chain), lasts)
     return jnp.all(each | ~chain.used)
