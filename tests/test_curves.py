@@ -342,10 +342,11 @@ def test_a_curve_ends_where_its_cycle_shrinks_to_a_point():
         (lambda nu: nu - 0.3, [0.3]),
         (lambda nu: np.cbrt(nu - 0.3), [0.3]),
         (lambda nu: 1.0 if nu > 0.3 else -1.0, []),
+        (lambda nu: 1e-16 * (nu - 0.3), []),
     ],
-    ids=["smooth", "steep", "jump"],
+    ids=["smooth", "steep", "jump", "rounding"],
 )
-def test_what_jumps_over_zero_does_not_vanish(watched, values):
+def test_what_jumps_over_zero_or_is_zero_all_along_is_no_special_point(watched, values):
     class Straight(Track):
         def corrected(self, u, tangent, length):
             return Corrected(np.asarray(u) + length * np.asarray(tangent), tangent, 1, 1.0, True)

@@ -9,6 +9,7 @@ from compilations import compilations
 
 import jaxbelt as jb
 from jaxbelt.model.variations import varied
+from jaxbelt.sweeps import fractions
 from jaxbelt.sweeps.attractor import CYCLE, EQUILIBRIUM, STUCK_FOR_EVER
 from jaxbelt.sweeps.basins import starts_in
 from jaxbelt.sweeps.fractions import _matched, _Met
@@ -112,6 +113,31 @@ def test_at_a_hopf_point_the_equilibrium_attracts_nothing():
     assert found.attractors == ("cycle 0", "equilibrium 0")
     assert found.fractions[0].tolist() == [1 - found.undecided[0], 0.0]
     assert found.fractions[1, 1] > 0
+
+
+class Rayleigh(jb.AbstractFriction):
+    """mu(1 - v) = 1 + 0.3 (0.98 v - 8/3 v^3): without damping a cycle of amplitude 0.7 attracts."""
+
+    static: jax.Array
+
+    def mu(self, speed):
+        v = 1.0 - speed
+        return 1.0 + 0.3 * (0.98 * v - 8 / 3 * v**3)
+
+
+def test_an_attracting_cycle_is_found_beside_a_continuum_of_closed_orbits(monkeypatch):
+    """The belt touches from 0.2 on; orbits that do not reach that are circles around 0. Few are
+    looked into, and none of the first runs leads to the cycle."""
+    monkeypatch.setattr(fractions, "MOST_CYCLES", 3)
+    osc = jb.Oscillator(0.0, (jb.Belt(1.0, Rayleigh(jnp.asarray(3.0)), lower=0.2),))
+    box, n = ((-0.15, 0.22), (-0.13, 0.13)), 100
+    found = jb.basin_fractions(osc, nu0, (0.999, 1.0), rows=2, box=box, n=n, key=KEY)
+    x1, x2 = starts_in(np.array(box), n, jax.random.fold_in(KEY, 1))
+    circles = np.hypot(x1, x2) < 0.2
+    assert np.all(circles[:3]) and 0 < np.sum(~circles) < 20
+    assert found.attractors == ("cycle 0",) and found.x2_max[1, 0] < 1
+    assert found.fractions[1, 0] == pytest.approx(np.mean(~circles))
+    assert found.undecided[1] == pytest.approx(np.mean(circles))
 
 
 def test_without_damping_all_starts_are_undecided():
