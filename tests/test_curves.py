@@ -342,10 +342,11 @@ def test_a_curve_ends_where_its_cycle_shrinks_to_a_point():
         (lambda nu: nu - 0.3, [0.3]),
         (lambda nu: np.cbrt(nu - 0.3), [0.3]),
         (lambda nu: 1.0 if nu > 0.3 else -1.0, []),
+        (lambda nu: 1e-16 * (nu - 0.3), []),
     ],
-    ids=["smooth", "steep", "jump"],
+    ids=["smooth", "steep", "jump", "rounding"],
 )
-def test_what_jumps_over_zero_does_not_vanish(watched, values):
+def test_what_jumps_over_zero_or_is_zero_all_along_is_no_special_point(watched, values):
     class Straight(Track):
         def corrected(self, u, tangent, length):
             return Corrected(np.asarray(u) + length * np.asarray(tangent), tangent, 1, 1.0, True)
@@ -362,3 +363,51 @@ def test_what_jumps_over_zero_does_not_vanish(watched, values):
     limits = np.array([[-1.0, 1.0], [-1.0, 1.0]])
     found = special_between(track, limits, *ends)
     assert [point.values[0] for point in found] == pytest.approx(values, abs=1e-12)
+
+
+def class_d(p, q):
+    return jb.presets.class_d(p, q, sigma0=0.2, sigma1=0.9)
+
+
+def test_belts_of_two_velocities_do_not_hold_the_mass_together():
+    """From a guess where they are equal: there is no corner on nu1 = 0.2, where the onset on belt 1
+    alone is on the edge, as the mass sticks to the slower belt 0."""
+    point = jb.refine(jb.CornerCollision(0), lambda q: class_d(0.195, q), at=0.195)
+    assert abs(float(point.value) - 0.2) > 1e-3
+    cycle = jb.find_cycle(class_d(0.195, 0.2), (3.0, 0.0))
+    assert cycle.x2_max == 0.195 and float(cycle.stick_durations[1]) == 0
+
+
+def test_a_curve_turns_where_a_slip_onset_comes_to_an_edge():
+    """The edge tears the mass off belt 0. Where it would still hold, the cycle is another one."""
+    point = jb.refine(jb.CornerCollision(1), lambda q: class_d(0.3798, q), at=-0.4225)
+    curve = jb.bifurcation_curve(point, class_d, ((0.25, 0.4), (-0.5, -0.3)), step=0.02)
+    # x1 + zeta nu0 + mu(nu0 - nu1) = 1 at the edge x1 = 0.2.
+    excess = [0.5 * p + 0.4 / (1 + 10 * (p - q)) - 0.2 for p, q in curve.values]
+    assert min(excess) > -1e-13
+    (turn,) = (special for special in curve.special if special.kind == "EdgeTouch")
+    p, q = turn.values
+    assert 0.5 * p + 0.4 / (1 + 10 * (p - q)) == pytest.approx(0.2, abs=1e-13)
+    assert curve.ends == (Stop.LEFT_SPAN, Stop.LEFT_SPAN)
+    for p, q in curve.values[1:-1:4].tolist():
+        again = jb.refine(jb.CornerCollision(1), lambda v, p=p: class_d(p, v), at=q + 1e-3)
+        assert again.value == pytest.approx(q, abs=1e-12)
+
+
+def test_a_curve_of_corners_ends_where_its_cycle_shrinks_with_a_belt_to_a_pseudo_focus():
+    """Class (c), sigma = -1/2, at (0, -1/2): a_L = 1/2 + mu(0), tr_L = 4 - zeta there, and a_R =
+    1/2 - mu(1/2), tr_R = 4/36 - zeta, so that tr_L/a_L = 7/3 = -tr_R/|a_R|: the rate is zero."""
+
+    def make(p, q):
+        return jb.presets.class_c(p, q, sigma=-0.5)
+
+    point = jb.refine(jb.CornerCollision(0), lambda p: make(p, -0.4), at=0.0112)
+    curve = jb.bifurcation_curve(point, make, ((-0.1, 0.02), (-0.6, -0.36)))
+    (rest,) = curve.special
+    assert (rest.kind, rest.belts) == ("BeltAtRest", (0,)) and rest.residual < 1e-14
+    # The slopes of the two equations are of size one.
+    assert rest.values == pytest.approx((0.0, -0.5), abs=1e-14)
+    assert set(curve.ends) == {Stop.STOPPED, Stop.LEFT_SPAN}
+    # Its rows from nu0 = 0.013 to 0.006 lead there; polynomials of degrees 3 and 4 differ by 6e-4.
+    p, q = curve.values[np.argsort(curve.values[:, 0])[:9]].T
+    assert np.polyval(np.polyfit(p, q, 4), 0.0) == pytest.approx(-0.5, abs=6e-4)

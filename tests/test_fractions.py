@@ -8,7 +8,9 @@ import pytest
 from compilations import compilations
 
 import jaxbelt as jb
+from jaxbelt.cycles.attractors import Runs
 from jaxbelt.model.variations import varied
+from jaxbelt.sweeps import fractions
 from jaxbelt.sweeps.attractor import CYCLE, EQUILIBRIUM, STUCK_FOR_EVER
 from jaxbelt.sweeps.basins import starts_in
 from jaxbelt.sweeps.fractions import _matched, _Met
@@ -112,6 +114,28 @@ def test_at_a_hopf_point_the_equilibrium_attracts_nothing():
     assert found.attractors == ("cycle 0", "equilibrium 0")
     assert found.fractions[0].tolist() == [1 - found.undecided[0], 0.0]
     assert found.fractions[1, 1] > 0
+
+
+class Rayleigh(jb.AbstractFriction):
+    """mu(1 - v) = 1 + 0.3 (0.98 v - 8/3 v^3): without damping a cycle of amplitude 0.7 attracts."""
+
+    static: jax.Array
+
+    def mu(self, speed):
+        v = 1.0 - speed
+        return 1.0 + 0.3 * (0.98 * v - 8 / 3 * v**3)
+
+
+def test_of_many_cycles_that_to_which_most_runs_lead_is_looked_into(monkeypatch):
+    """What is left beyond the limit is undecided; a continuum of closed orbits may come first."""
+    monkeypatch.setattr(fractions, "MOST_CYCLES", 3)
+    osc = jb.Oscillator(0.0, (jb.Belt(1.0, Rayleigh(jnp.asarray(3.0))),))
+    radii = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.7, 0.7])
+    places = np.column_stack([1 - radii, 1 + radii, -radii, radii, np.full(8, 2 * np.pi)])
+    runs = Runs(places, np.full(8, ""), 1e-6)
+    left = fractions._closed_only(osc, np.full(8, True), runs)
+    # From within the cycle all orbits lead to it.
+    assert left.tolist() == [False] * 2 + [True] * 3 + [False] * 3
 
 
 def test_without_damping_all_starts_are_undecided():

@@ -36,7 +36,11 @@ from ..results import Status
 from .base import Line
 from .rests import NOTHING, AbstractRestCondition, criticality
 from .special import SpecialPoint, Trail
-from .systems import RestSystem, Tests, small_newton
+from .systems import RestSystem, Tests, small_newton, velocity_of
+
+#: A cycle around a pseudo-focus is as large as a velocity if its x2 goes over so many times that,
+#: from minus to plus.
+AS_LARGE = 3.0
 
 
 class _EdgeSystem(RestSystem):
@@ -158,10 +162,8 @@ class EdgeBalance(_EdgeSystem):
 def pseudo_hopf_limit(trail: Trail) -> SpecialPoint | None:
     """Where the cycle of a curve has shrunk to a pseudo-focus at which the rate and the coefficient
     are zero, if that is near: its own equations are singular there."""
-    chain, x1 = trail.system.chain, trail.x[:, 0]
-    n, ends = chain.codes.shape[-1], np.asarray(chain.ends)
-    passed = ends[(ends >= n) & (ends < 3 * n)] - n
-    if np.ptp(x1) > 5 * trail.step or not passed.size:
+    passed = _edges_passed(trail)
+    if np.ptp(trail.x[:, 0]) > 5 * trail.step or not passed.size:
         return None
     edge = jnp.asarray(passed[0])
 
@@ -189,6 +191,60 @@ def _degenerate_focus(family: Family, edge: Array, guess: Array) -> tuple[Array,
 
     found, _, residual, _ = small_newton(equations, family, guess)
     return found, residual
+
+
+def slow_focus_limit(trail: Trail, belt: int) -> SpecialPoint | None:
+    """Where a belt comes to rest, and a cycle around an edge that is as large as its velocity has
+    shrunk to a pseudo-focus, of the rate zero, if that is near.
+
+    The equations of the cycle lose their digits on the way, like a third power of the velocity. In
+    the limit its growth is that of the pseudo-focus, as beside a pseudo-Hopf point.
+    """
+    if len(trail.values) < 3:
+        return None
+    oscs = [trail.variation.oscillator(row) for row in trail.values]
+    v = np.array([float(osc.belts[belt].velocity) for osc in oscs])
+    falls = 0 < abs(v[2]) < abs(v[1]) < abs(v[0])
+    passed = _edges_passed(trail)
+    if not falls or np.ptp(trail.x[:, 1]) > AS_LARGE * abs(v[2]) or not passed.size:
+        return None
+    edge, number = jnp.asarray(passed[0]), jnp.asarray(belt)
+    sides = _beside_edge(oscs[-1], jnp.stack(edges(oscs[-1]))[edge])
+
+    def attempt(family, unknowns):
+        guess = jnp.asarray(unknowns[0])
+        found, residual = _slow_focus(family, EdgeBalance(edge, *sides), number, guess)
+        return (found, residual), (found,)
+
+    (found, residual), settled = trail.variation.settle(attempt, (trail.values[-1],))
+    values = np.asarray(found)
+    ahead = [np.polyval(np.polyfit(v, column, 2), 0.0) for column in trail.values.T]
+    near = np.linalg.norm(values - ahead) < 3 * trail.step
+    if not (settled and residual < HOLDS and near):
+        return None
+    return SpecialPoint(
+        "BeltAtRest", (belt,), (float(values[0]), float(values[1])), float(residual)
+    )
+
+
+@jit
+def _slow_focus(family: Family, system: EdgeBalance, belt: Array, guess: Array):
+    """Both parameters where the belt is at rest and the rate of a pseudo-focus zero, its contacts
+    those of a belt that moves, and the error."""
+
+    def equations(family, p):
+        osc = family.at(p)
+        return jnp.stack([system.balance(osc), velocity_of(osc, belt)])
+
+    found, _, residual, _ = small_newton(equations, family, guess)
+    return found, residual
+
+
+def _edges_passed(trail: Trail) -> np.ndarray:
+    """The numbers of the edges that the cycle of a curve passes."""
+    chain = trail.system.chain
+    n, ends = chain.codes.shape[-1], np.asarray(chain.ends)
+    return ends[(ends >= n) & (ends < 3 * n)] - n
 
 
 class _EdgeCondition(AbstractRestCondition):

@@ -35,7 +35,7 @@ from ..results import Status
 from .base import Line
 from .conditions import AbstractCycleCondition
 from .crossings import arrival_tests
-from .edge_rests import check_edge
+from .edge_rests import check_edge, slow_focus_limit
 from .guesses import nearest, without_arcs
 from .rests import hopf_limit
 from .systems import CycleSystem, nearest_edge
@@ -213,6 +213,14 @@ class CornerCollision(AbstractEdgeTouch):
     @property
     def wanted(self):
         return -1.0
+
+    def limit(self, trail):
+        """Where the cycle shrinks to a pseudo-focus with the velocity of the boundary's belt."""
+        system = trail.system
+        belt = min(int(system.end), int(system.chain.ends[system.row]))
+        if trail.end is Stop.POINT_COUNT or belt >= system.chain.codes.shape[-1]:
+            return None
+        return slow_focus_limit(trail, belt)
 
 
 def _guard_at_rest(osc: Oscillator, codes: Array, x1: Array, end: Array) -> Array:

@@ -20,10 +20,10 @@ from jax import lax
 from jaxtyping import Array
 
 from ..cycles.attractors import extent
-from ..cycles.chains import Chain, Loop
+from ..cycles.chains import Chain, Loop, following_codes
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import jacobian, meshed, residual, residual_and_blocks
-from ..model.modes import edge_guards, mode_of
+from ..model.modes import capacity, edge_guards, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
@@ -266,19 +266,26 @@ def contact_tests(name: str, nearest: Array, watched: Array) -> Tests:
 def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: int | Array = -1) -> Array:
     """How near a cycle is to passing a contact edge otherwise, NaN where there is none: the least
     distance of an extremum of x1, of a place where it is tangent to a boundary, or of a slip onset,
-    from an edge of its mode. without: an arc whose end is not asked."""
-    kinds = Ends(chain.codes.shape[-1])
+    from an edge of its mode; or by how much the force exceeds what would hold the mass where an
+    edge tears it off. without: an arc whose end is not asked."""
+    n = chain.codes.shape[-1]
+    kinds = Ends(n)
     following = jnp.roll(z, -1, axis=0)
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
     following = jnp.where(last[:, None], z[0], following)
 
-    def distance(codes, x1):
-        return jnp.min(jnp.stack(edge_guards(osc, mode_of(codes), x1)))
+    def distance(codes, end, after, y):
+        gap = jnp.min(jnp.stack(edge_guards(osc, mode_of(codes), y[0])))
+        told = (end == kinds.extremum_x1) | (end == kinds.onset) | (end >= kinds.tangent)
+        torn = (codes == 0) & (jnp.abs(after) == 1) & (end >= n) & (end < 3 * n)
+        held = mode_of(jnp.where(torn, 0.0, after))
+        excess = jnp.abs(mode_acceleration(osc, held, y[0], y[1])) - capacity(osc, held)
+        tears = jnp.any(torn) & jnp.all(after != 0)
+        return jnp.where(told, gap, jnp.where(tears, excess, jnp.inf))
 
-    told = (chain.ends == kinds.extremum_x1) | (chain.ends == kinds.onset)
-    told = chain.used & (told | (chain.ends >= kinds.tangent))
-    told = told & (jnp.arange(chain.ends.size) != without)
-    nearest = jnp.min(jnp.where(told, jax.vmap(distance)(chain.codes, following[:, 0]), jnp.inf))
+    columns = chain.codes, chain.ends, following_codes(chain), following
+    asked = chain.used & (jnp.arange(chain.ends.size) != without)
+    nearest = jnp.min(jnp.where(asked, jax.vmap(distance)(*columns), jnp.inf))
     return jnp.where(jnp.isfinite(nearest), nearest, jnp.nan)
 
 

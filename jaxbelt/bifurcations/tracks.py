@@ -26,6 +26,8 @@ SHRINKS = 8
 #: A watched function that is larger than this fraction of its values before and after where it
 #: changes its sign jumps there, and does not vanish. Zeros of square roots leave 1e-7.
 JUMPS = 1e-3
+#: One that is smaller at both ends of a step is zero all along it, to rounding.
+ALONG = 1e-12
 
 
 class Track(NamedTuple):
@@ -123,7 +125,7 @@ def special_between(
     found = []
     for name, start in seen_a.tests.items():
         end = seen_b.tests.get(name, np.nan)
-        if start * end >= 0 or np.isnan(start * end):
+        if start * end >= 0 or np.isnan(start * end) or max(abs(start), abs(end)) < ALONG:
             continue
 
         def probe(part, name=name):

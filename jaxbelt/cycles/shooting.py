@@ -31,6 +31,7 @@ from jaxtyping import Array
 
 from ..model.modes import (
     Mode,
+    any_of,
     boundary_guards,
     capacity,
     edge_guards,
@@ -51,6 +52,8 @@ from .chains import Chain, Loop, following_codes
 
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 ARC_STEPS = 8
+#: An arc of a shorter duration may have none: it is the square root of rounding.
+LASTS = 1e-6
 #: An arc magnifies, if its end moves so much faster than its entry.
 MAGNIFIED = 1e4
 
@@ -548,24 +551,32 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
     """Whether the oscillator moves like that, as far as equations hold.
 
     Every arc has a duration >= 0 and stays inside its mode: both ends are looked at; between them
-    x1, x2 and the needed force are monotone. None crosses a boundary where the mass would stick.
+    x1, x2 and the needed force are monotone. All belts to which the mass sticks have its velocity.
+    None crosses a boundary, or goes on from one beyond an edge, where the mass would stick.
     """
     belts = range(len(osc.belts))
 
-    def one(codes, end, unknown, exit_, after):
-        mode = mode_of(codes)
+    def one(codes, end, unknown, exit_, after, lasts):
+        mode, following = mode_of(codes), mode_of(after)
         fine = unknown[2] >= -HOLDS
         for y in (unknown, exit_):
             inside = jnp.stack([*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])])
             needed = mode_acceleration(osc, mode, y[0], y[1])
             holds = ~mode.any_stuck | (jnp.abs(needed) <= capacity(osc, mode) + HOLDS)
-            fine = fine & jnp.all(inside >= -HOLDS) & holds
-        held, x2 = held_at_boundary(osc, mode, [end == belt for belt in belts])
+            together = jnp.where(codes == 0, jnp.abs(velocities - osc.omega * y[1]), 0.0)
+            fine = fine & jnp.all(inside >= -HOLDS) & holds & jnp.all(together <= HOLDS)
+        # At the point of a corner what follows the edge has no duration.
+        on_boundary = jnp.abs(velocities - osc.omega * exit_[1]) <= HOLDS
+        goes_on = on_boundary & (jnp.abs(after) == 1) & lasts
+        hit = [(end == belt) | goes_on[belt] for belt in belts]
+        held, x2 = held_at_boundary(osc, following, hit)
         needed = mode_acceleration(osc, held, exit_[0], x2)
         would_stick = jnp.abs(needed) < capacity(osc, held) - HOLDS
-        crosses = (end < len(belts)) & ~mode_of(after).any_stuck
-        return fine & ~(crosses & would_stick)
+        return fine & ~(any_of(hit) & ~following.any_stuck & would_stick)
 
-    exits = jnp.roll(z, -1, axis=0)
-    each = jax.vmap(one)(chain.codes, chain.ends, z, exits, following_codes(chain))
+    velocities = jnp.stack([belt.velocity for belt in osc.belts])
+    exits, durations = jnp.roll(z[:, :2], -1, axis=0), jnp.roll(z[:, 2], -1)
+    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
+    lasts = jnp.where(last, z[0, 2], durations) > LASTS
+    each = jax.vmap(one)(chain.codes, chain.ends, z, exits, following_codes(chain), lasts)
     return jnp.all(each | ~chain.used)

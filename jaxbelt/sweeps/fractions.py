@@ -44,7 +44,8 @@ MOST_AT_ONCE = 2**20
 MOVES = 0.25
 #: A cycle attracts if its multiplier is below 1 by more than this, which is beyond rounding.
 ATTRACTS = 1e-9
-#: Of more cycles at one value that do not stick none is looked into: they are a continuum.
+#: Of the cycles at one value that do not stick so many are looked into, those first to which most
+#: runs lead: what is left after that is a continuum, with a run or two on each.
 MOST_CYCLES = 50
 #: An attractor that moves too far from value to value is followed by parts of the way down to this.
 SMALLEST_PART = 1 / 64
@@ -164,7 +165,9 @@ def basin_fractions(
 
     The attractors are those that starts lead to: one with a basin that no start is in is not seen.
     Starts on closed orbits that do not attract, such as those around a centre, are undecided, and
-    so are those that go to infinity, where the damping is negative.
+    so are those that go to infinity, where the damping is negative. Of cycles that do not stick the
+    50 to which most starts lead are looked into at a value; where there are more, starts that lead
+    to others are undecided, too.
     `ValueError` names an impossible argument.
     """
     if isinstance(osc, Oscillator):
@@ -261,12 +264,15 @@ def _attractors_met(
 
 def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
     """Which of the runs end on a closed orbit that does not attract; smooth: those that end on a
-    cycle that does not stick (one that does, attracts)."""
+    cycle that does not stick (one that does, attracts), or on one that was not looked into."""
     closed, untold = np.zeros_like(smooth), smooth.copy()
+    tops, reach = runs.places[:, 1], runs.error * np.ptp(runs.places[:, :4], axis=1)
+    others = np.sort(tops[smooth])
+    beside = np.searchsorted(others, tops + reach) - np.searchsorted(others, tops - reach)
     for _ in range(MOST_CYCLES):
         if not np.any(untold):
             return closed
-        first = int(np.argmax(untold))
+        first = int(np.argmax(np.where(untold, beside, -1)))
         same = untold & runs.same(runs.at(first))[0]
         same[first] = True
         cycle = find_cycle(osc, (float(runs.places[first, 1]), 0.0))

@@ -28,6 +28,8 @@ CELLS = 64, 65
 ROWS, BESIDE = 7, 2e-3
 #: Residuals of rows, and how far an image may be from a point that is refined there.
 SMALL, SAME = 1e-8, 1e-9
+#: How far from a row, at most, its image is looked for.
+ASIDE = 1e-4
 
 NU, SIGMA = (-0.7, 0.7), (-1.0, 1.0)
 
@@ -121,19 +123,38 @@ def _not_mirrored(plane: Plane, curve: jb.BifurcationCurve, counts: Counter) -> 
     for row in _some_rows(curve)[1::3]:
         condition = _for_mirror(curve.classes[row], curve.condition)
         chord = np.abs(curve.values[min(row + 1, len(curve) - 1)] - curve.values[max(row - 1, 0)])
-        free = int(np.argmin(chord))
-        held, at = float(curve.values[row, 1 - free]), float(curve.values[row, free])
-
-        def make(value, held=held, free=free):
-            return plane.mirrored(*((value, held) if free == 0 else (held, value)))
-
         counts["mirrored"] += 1
-        # A cycle may be there on one side only.
-        found = [jb.refine(condition, make, at=at + side) for side in (1e-4, -1e-4)]
-        away = [abs(float(one.value) - at) for one in found if int(one.status) == jb.Status.OK]
-        if min(away, default=np.inf) > SAME:
-            wrong.append(f"not mirrored: {curve} at {curve.values[row]}: {found}")
+        # Along the other parameter, too: beside a belt at rest rounding may hide it along one.
+        said = []
+        for free in np.argsort(chord).tolist():
+            said += _images(plane, condition, curve.values[row], free)
+            if any(away <= SAME for away, _ in said):
+                break
+        else:
+            wrong.append(f"not mirrored: {curve} at {curve.values[row]}: {said}")
     return wrong
+
+
+def _images(plane: Plane, condition, values: np.ndarray, free: int):
+    """What is found beside the mirror image of a row along a parameter, and how far from it."""
+    held, at = float(values[1 - free]), float(values[free])
+
+    def make(value):
+        return plane.mirrored(*((value, held) if free == 0 else (held, value)))
+
+    # A cycle may be there on one side only.
+    for side in (1, -1):
+        point = jb.refine(condition, make, at=at + side * _aside(plane, *values))
+        is_found = int(point.status) == jb.Status.OK
+        yield abs(float(point.value) - at) if is_found else np.inf, point
+
+
+def _aside(plane: Plane, p: float, q: float) -> float:
+    """How far from a row guesses are: no belt comes to rest, or to another one's velocity, on the
+    way there."""
+    nu0, nu1, *_ = plane.numbers(p, q)
+    gaps = np.abs([nu0, nu1, nu0 - nu1])
+    return min(ASIDE, 0.5 * float(np.min(gaps, initial=np.inf, where=gaps > SAME)))
 
 
 def _for_mirror(kind: type, condition):
