@@ -6,7 +6,8 @@ leaves the interval in which the mode holds, at the end or at an extremum on the
 made again, shorter, so that it ends on the first root; what is then left of the way, less than
 `LANDING * sqrt(tolerance)`, is bridged by one Taylor step. So the states at events are as good as
 the integration, not as its interpolant, and excursions within one step are found. Where a contact
-edge lies ahead (or extrema are wanted), steps also end where x2 = 0: x1 has no extremum beyond it.
+edge lies ahead (or extrema are wanted), steps also end where x2 = 0: no extremum of x1 within one
+is beyond the edge.
 
 The Runge-Kutta stages are written for x1' = x2 (Nystroem's form: the accelerations alone are kept),
 and each acceleration is one quotient, with the division last. That is for XLA on the CPU, which
@@ -93,14 +94,14 @@ _E_LINEAR = 0.25 * float(np.abs(_E @ np.linalg.matrix_power(_A, 7) @ np.ones(_E.
 class _Window(eqx.Module):
     """Bounds of the modes, arrays [lanes].
 
-    x1, x2: (lower, upper); x1 is None where there are no edges. turns: lanes whose steps end at
+    x1, x2: (lower, upper); x1 is None where there are no edges. stops_at: lanes whose steps end at
     (minima, maxima) of x1; None: no lanes. extrema: lanes whose extrema are wanted. signs, pulls:
     constants of the mode's field, one a belt. active: lanes that slip.
     """
 
     x1: tuple[Array, Array] | None
     x2: tuple[Array, Array]
-    turns: tuple[Array, Array] | None
+    stops_at: tuple[Array, Array] | None
     extrema: Array | None
     signs: tuple[Array, ...]
     pulls: tuple[Array, ...]
@@ -120,7 +121,7 @@ def window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None) -> _Windo
     boundaries = [belt.velocity / osc.omega for belt in osc.belts]
     low = innermost(jnp.maximum, [code == -1 for code in mode.codes], boundaries, -inf)
     high = innermost(jnp.minimum, [code == 1 for code in mode.codes], boundaries, inf)
-    x1, turns = None, None if extrema is None else (extrema, extrema)
+    x1, stops_at = None, None if extrema is None else (extrema, extrema)
     if has_edges(osc):
         left = innermost(jnp.maximum, bounds_leftward(mode), edge_positions(osc), -inf)
         right = innermost(jnp.minimum, bounds_rightward(mode), edge_positions(osc), inf)
@@ -128,25 +129,27 @@ def window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None) -> _Windo
         # An extremum far from the edge, as measured by the motion, is not beyond it. Steps that
         # ended at every x2 = 0 would become as small as rounding where a lane comes to rest.
         reach = 4 * (jnp.abs(lanes.x2) + jnp.abs(lanes.a))
-        turns = lanes.x1 - left <= reach, right - lanes.x1 <= reach
+        stops_at = lanes.x1 - left <= reach, right - lanes.x1 <= reach
         if extrema is not None:
-            turns = turns[0] | extrema, turns[1] | extrema
+            stops_at = stops_at[0] | extrema, stops_at[1] | extrema
     signs = mode.signs
     pulls = tuple(belt.load * sign for belt, sign in zip(osc.belts, signs, strict=True))
-    return _Window(x1, (low, high), turns, extrema, signs, pulls, ~lanes.done & ~mode.any_stuck)
+    active = ~lanes.done & ~mode.any_stuck
+    return _Window(x1, (low, high), stops_at, extrema, signs, pulls, active)
 
 
-def _bounds_of_x2(window: _Window, lanes: Lanes) -> tuple[Array, Array]:
+def _bounds_of_x2(window: _Window, ones: Array, lanes: Lanes) -> tuple[Array, Array]:
     """The bounds of x2 for the next step; 0 is one where that is to end at an extremum of x1."""
     low, high = window.x2
-    if window.turns is not None:
-        at_minimum, at_maximum = window.turns
-        rises = (lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0))
-        falls = (lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0))
-        # Of the boundary of a belt at rest the derivatives stay.
-        low = jnp.where(at_maximum & rises & (low < 0), 0.0, low)
-        high = jnp.where(at_minimum & falls & (high > 0), 0.0, high)
-    return low, high
+    if window.stops_at is None:
+        return low, high
+    at_minimum, at_maximum = window.stops_at
+    rises = (lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0))
+    falls = (lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0))
+    # Of the boundary of a belt at rest the derivatives stay.
+    low = jnp.where(at_maximum & rises & (low < 0), 0.0, low)
+    high = jnp.where(at_minimum & falls & (high > 0), 0.0, high)
+    return materialise(low, ones), materialise(high, ones)
 
 
 def _quotient(osc: Oscillator, window: _Window, ones: Array, x1: Array, x2: Array) -> Array:
@@ -275,7 +278,7 @@ class _Landing(eqx.Module):
 def _landing(
     window: _Window, ones, lanes: Lanes, new: _Attempt, path: _Interpolant, rtol
 ) -> _Landing:
-    low, high = (materialise(bound, ones) for bound in _bounds_of_x2(window, lanes))
+    low, high = _bounds_of_x2(window, ones, lanes)
     beyond_extremum = path.has_extremum & ((path.x2_extremum > high) | (path.x2_extremum < low))
     peak = jnp.where(beyond_extremum, path.x2_extremum, new.x2)
     reach = LANDING * jnp.sqrt(rtol)
@@ -334,8 +337,8 @@ def _way_to_edge(x1: tuple[Array, Array], new: _Attempt, reach) -> tuple[Array, 
 def _beyond_edge(x1: tuple[Array, Array], lanes: Lanes, new: _Attempt, near: Array, k):
     """x1 over the step as a polynomial, whether it ends beyond an edge, and that edge.
 
-    x1 is the integral of x2. On the way to an edge it has no extremum; if the step begins with an
-    extremum, that is far from the edge beyond it, see `_grazes` and `window_of`.
+    x1 is the integral of x2. It has one extremum in the step at most, and none on the side of an
+    edge that is near (see `window_of`): what passes an edge in the step ends beyond it.
     """
     left, right = x1
     h = new.h
