@@ -34,7 +34,7 @@ from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status
 from .base import Line
-from .rests import NOTHING, AbstractRestCondition, criticality
+from .rests import NOTHING, AbstractRestCondition, criticality, limit_near
 from .special import SpecialPoint, Trail
 from .systems import RestSystem, Tests, small_newton, velocity_of
 
@@ -171,13 +171,8 @@ def pseudo_hopf_limit(trail: Trail) -> SpecialPoint | None:
         found, residual = _degenerate_focus(family, edge, jnp.asarray(unknowns[0]))
         return (found, residual), (found,)
 
-    (found, residual), settled = trail.variation.settle(attempt, (trail.values[-1],))
-    values = np.asarray(found)
-    near = np.linalg.norm(values - trail.values[-1]) < 2 * trail.step
-    if not (settled and residual < HOLDS and near):
-        return None
-    values = float(values[0]), float(values[1])
-    return SpecialPoint("DegeneratePseudoHopf", (), values, float(residual))
+    last = trail.values[-1]
+    return limit_near(trail, attempt, (last,), last, 2 * trail.step, "DegeneratePseudoHopf")
 
 
 @jit
@@ -216,15 +211,9 @@ def slow_focus_limit(trail: Trail, belt: int) -> SpecialPoint | None:
         found, residual = _slow_focus(family, EdgeBalance(edge, *sides), number, guess)
         return (found, residual), (found,)
 
-    (found, residual), settled = trail.variation.settle(attempt, (trail.values[-1],))
-    values = np.asarray(found)
     ahead = [np.polyval(np.polyfit(v, column, 2), 0.0) for column in trail.values.T]
-    near = np.linalg.norm(values - ahead) < 3 * trail.step
-    if not (settled and residual < HOLDS and near):
-        return None
-    return SpecialPoint(
-        "BeltAtRest", (belt,), (float(values[0]), float(values[1])), float(residual)
-    )
+    guess = (trail.values[-1],)
+    return limit_near(trail, attempt, guess, ahead, 3 * trail.step, "BeltAtRest", belt)
 
 
 @jit

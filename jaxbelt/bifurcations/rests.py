@@ -235,12 +235,23 @@ def hopf_limit(kind: str, trail: Trail, vanishes: Callable, *args: Array) -> Spe
         found, residual = _special_hopf(family, codes, start, vanishes, *args)
         return (found, residual), (found[:1], found[1:])
 
-    (found, residual), settled = trail.variation.settle(attempt, (x1[:1], trail.values[-1]))
-    values = np.asarray(found[1:])
-    near = np.linalg.norm(values - trail.values[-1]) < 2 * trail.step
-    if not (settled and residual < HOLDS and near):
+    guess = x1[:1], trail.values[-1]
+    return limit_near(trail, attempt, guess, trail.values[-1], 2 * trail.step, kind)
+
+
+def limit_near(
+    trail: Trail, attempt: Callable, guess: tuple, ahead, away: float, kind: str, *belts: int
+) -> SpecialPoint | None:
+    """What a curve leads to, if that is found and no farther than `away` from `ahead`.
+
+    attempt: see `Variation.settle`; it gives the unknowns, of which both parameters are the last,
+    and the error.
+    """
+    (found, residual), settled = trail.variation.settle(attempt, guess)
+    values = np.asarray(found)[-2:]
+    if not (settled and residual < HOLDS and np.linalg.norm(values - ahead) < away):
         return None
-    return SpecialPoint(kind, (), (float(values[0]), float(values[1])), float(residual))
+    return SpecialPoint(kind, belts, (float(values[0]), float(values[1])), float(residual))
 
 
 @jit
