@@ -468,6 +468,27 @@ def test_what_holds_all_along_is_no_point():
     assert [b for _, b, _ in diagram.regions] == [pytest.approx(float(hopf.value)), 0.24]
 
 
+@pytest.mark.parametrize("distance", [0.0, 1e-15, -1e-15])
+def test_a_fixed_point_on_an_edge_all_along_has_a_hopf_point(distance):
+    """Its trace is that of the second belt, 0.4 / 0.5 exp(-0.8 / 0.5) - damping, and the edge of
+    the first one lies on it: on the other side that belt's force is missing, and pushes back."""
+    stribeck, held = jb.Stribeck(1.0, 0.6, 0.5), 0.4 * np.exp(-1.6) + 0.6
+    for turned in (False, True):
+        edge = (0.75 - held - distance) if turned else (held - 0.75 + distance)
+        own = jb.Coulomb(0.75, 0.75)
+        ends = dict(upper=edge) if turned else dict(lower=edge)
+        sign = -1.0 if turned else 1.0
+        belts = jb.Belt(-sign * 0.3, own, **ends), jb.Belt(sign * 0.8, stribeck)
+        osc = jb.Oscillator(0.2, belts)
+        points = jb.scan(osc, lambda osc: osc.damping, span=(0.0, 0.4), resolution=8)
+        kind = "PseudoHopf" if distance > 0 else "Hopf"
+        assert {point.kind for point in points} == {kind, "CornerCollision", "NonsmoothFold"}
+        (hopf,) = [point for point in points if point.kind == kind]
+        assert hopf.value == pytest.approx(0.8 * np.exp(-1.6), abs=1e-13)
+        if kind == "Hopf":
+            assert hopf.type == "degenerate" and np.isnan(hopf.coefficient)
+
+
 def test_edges_that_are_one_all_along_do_not_meet():
     conti = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
 

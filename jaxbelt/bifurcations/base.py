@@ -335,7 +335,8 @@ class BifurcationPoint(eqx.Module):
         """Which sort of its kind it is, "" where the kind has but one or no point was found.
 
         "supercritical" or "subcritical" of `Hopf` and `PseudoHopf`: the cycle that is born attracts
-        or repels ("degenerate": the coefficient is zero). "persistence" or "annihilation" of
+        or repels ("degenerate": the coefficient is zero, or the fixed point lies on a contact
+        edge, where there is none). "persistence" or "annihilation" of
         `BoundaryEquilibrium`: there is an equilibrium on both sides of the point, or two meet and
         vanish ("degenerate": another one lies there, too). "crossing" or "buckling" of
         `CrossingSliding`: a stick phase ceases to be there, or the boundary is crossed once more
@@ -347,7 +348,8 @@ class BifurcationPoint(eqx.Module):
 
     @property
     def coefficient(self) -> Array:
-        """The coefficient a of `Hopf` and `PseudoHopf`, else NaN; with derivatives by parameters.
+        """The coefficient a of `Hopf` and `PseudoHopf`, else NaN, as at a fixed point on a contact
+        edge; with derivatives by parameters.
 
         The amplitude r of small oscillations, of x1 around a fixed point, of x2 at the edge around
         a pseudo-focus, obeys r' = rate r + a r^3, with the `rate` of `Equilibria`. So near the

@@ -270,6 +270,14 @@ class BoundaryEquilibrium(_EdgeCondition):
     def _system_at_edge(self, osc):
         return _edge_rest(osc, self.belt)
 
+    @classmethod
+    def between(cls, before, after, edged):
+        # What passes an edge changes its kind or its contacts.
+        there, then = (
+            [(kind, modes) for kind, _, modes in label.equilibria] for label in (before, after)
+        )
+        return super().between(before, after, edged) if there != then else []
+
     def type_of(self, point):
         push, persists = _across_edge(point.oscillator, self.belt)
         if not persists and abs(push) < HOLDS:

@@ -53,6 +53,8 @@ from .systems import RestSystem, judged_by, small_newton, velocity_of
 NOTHING = np.zeros(0)
 #: Coefficients smaller than this part of their terms are zero: points are good to some 1e-12.
 DEGENERATE = 1e-9
+#: Nearer to a contact edge than this, relative to their size, a fixed point lies on it.
+ON_EDGE = 1e-14
 #: Where sudden sliding is looked for, relative to where the belt is at rest: orbits that settle
 #: soon first; other points may be nearer than where they do.
 BESIDE = (1e-2, -1e-2, 1e-4, -1e-4)
@@ -116,12 +118,20 @@ class HopfSystem(RestSystem):
         return jnp.append(needed[None], trace_of(osc, mode, x[0], rest))
 
     def exists(self, osc, x):
-        mode = mode_of(self.codes)
-        inside = [*boundary_guards(osc, mode, jnp.zeros(())), *edge_guards(osc, mode, x[0])]
-        return jnp.all(jnp.stack(inside) > 0)
+        # On an edge, too, where the fixed point may lie all along a path: the part of a loop on its
+        # side grows on one side of the point and shrinks on the other.
+        slips = jnp.stack(boundary_guards(osc, mode_of(self.codes), jnp.zeros(()))) > 0
+        return jnp.all(slips) & (self._nearest_edge(osc, x) >= -_on_edge(x[0]))
+
+    def _nearest_edge(self, osc, x):
+        return jnp.min(jnp.stack(edge_guards(osc, mode_of(self.codes), x[0])))
+
+    def is_on_edge(self, osc: Oscillator, x: Array) -> Array:
+        """Whether the fixed point lies on a contact edge, to rounding."""
+        return self._nearest_edge(osc, x) <= _on_edge(x[0])
 
     def tests(self, osc, x):
-        nearest = jnp.min(jnp.stack(edge_guards(osc, mode_of(self.codes), x[0])))
+        nearest = self._nearest_edge(osc, x)
         return {
             ("DegenerateHopf", ()): third_derivative(osc, self.codes, x[0]),
             ("BoundaryHopf", ()): jnp.where(jnp.isfinite(nearest), nearest, jnp.nan),
@@ -129,6 +139,10 @@ class HopfSystem(RestSystem):
 
     def place(self, x):
         return np.array([x[0], x[0], 0.0, 0.0, 0.0])
+
+
+def _on_edge(x1: Array) -> Array:
+    return ON_EDGE * (1 + jnp.abs(x1))
 
 
 class Hopf(AbstractRestCondition):
@@ -197,14 +211,19 @@ def criticality(coefficient: Array, size: Array) -> str:
 
 @jit
 def _hopf_growth(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
-    """The first Lyapunov coefficient at the Hopf point at x1, and the size of its terms."""
+    """The first Lyapunov coefficient at the Hopf point at x1, and the size of its terms.
+
+    NaN on a contact edge: no loop is on one side of it, however small.
+    """
     system, x1, _ = Hopf().system(osc, _rest_at(osc, x1))
     sizes = []
     for belt, code in zip(osc.belts, system.codes, strict=True):
         alone = eqx.tree_at(lambda o: o.belts, osc, (belt,))
         third = third_derivative(alone, code[None], x1[0])
         sizes.append(jnp.where(jnp.abs(code) == 1, jnp.abs(third), 0.0))
-    return third_derivative(osc, system.codes, x1[0]) / 16, jnp.sum(jnp.stack(sizes)) / 16
+    third = third_derivative(osc, system.codes, x1[0])
+    known = jnp.where(system.is_on_edge(osc, x1), jnp.nan, third / 16)
+    return known, jnp.sum(jnp.stack(sizes)) / 16
 
 
 def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
