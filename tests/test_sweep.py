@@ -373,7 +373,7 @@ def test_more_runs_than_are_counted_are_refused_at_once():
     ).program
     settings = dict(t1=1.0, rtol=1e-8, atol=1e-8, derivatives=2)
     with pytest.raises(ValueError, match=r"axes must be .* or fewer .*, got 2147483648"):
-        threads.run(program, [], np.zeros, 2**30, print, **settings)
+        threads.run(program, [], np.zeros, 2**31, print, **settings)
 
 
 @pytest.mark.slow(first=True)

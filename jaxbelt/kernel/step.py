@@ -13,7 +13,7 @@ The Runge-Kutta stages are written for x1' = x2 (Nystroem's form: the accelerati
 and each acceleration is one quotient, with the division last. That is for XLA on the CPU, which
 computes everything that it deems cheap again in each place where it is used; a division it keeps.
 
-Derivatives are forward mode (`jax.jvp` through the loop): step sizes carry none, the landing's
+Derivatives are forward mode (see `derivatives.in_directions`): step sizes carry none, the landing's
 Taylor step gives event times and states their exact ones, and so does the last step, t1 - t. The
 error of a step says nothing of theirs where the motion is small: near rest, any step will do for
 the state. So where derivatives are wanted, a step also has to keep the tolerance for a motion of
@@ -31,8 +31,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
+from ..model.friction import AbstractFriction
 from ..model.modes import (
     ULPS,
     bounds_leftward,
@@ -154,25 +156,59 @@ def _bounds_of_x2(window: _Window, ones: Array, lanes: Lanes) -> tuple[Array, Ar
 
 def _quotient(osc: Oscillator, window: _Window, ones: Array, x1: Array, x2: Array) -> Array:
     """`oscillator.acceleration` as a single quotient; ones: see `lanes.materialise`."""
-    numerator, denominator = -x1 - osc.damping * x2, ones
-    for belt, sign, pull in zip(osc.belts, window.signs, window.pulls, strict=True):
-        top, bottom = belt.friction.fraction(sign * (belt.velocity - osc.omega * x2))
-        numerator = numerator * bottom + pull * top * denominator
-        denominator = denominator * bottom
-    return _ratio(numerator, denominator)
+    return _acceleration(osc, window.signs, window.pulls, ones, x1, x2)
 
 
 @jax.custom_jvp
-def _ratio(numerator: Array, denominator: Array) -> Array:
-    """The quotient; its derivative ends with a division, too, so that XLA keeps it as well."""
+def _acceleration(osc: Oscillator, signs, pulls, ones: Array, x1: Array, x2: Array) -> Array:
+    numerator, denominator = -x1 - osc.damping * x2, ones
+    for belt, sign, pull in zip(osc.belts, signs, pulls, strict=True):
+        top, bottom = belt.friction.fraction(sign * (belt.velocity - osc.omega * x2))
+        numerator = numerator * bottom + pull * top * denominator
+        denominator = denominator * bottom
     return numerator / denominator
 
 
-@_ratio.defjvp
+@functools.partial(_acceleration.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
-    (_, denominator), (d_numerator, d_denominator) = primals, tangents
-    ratio = _ratio(*primals)
-    return ratio, (d_numerator - ratio * d_denominator) / denominator
+    """The slope of each belt's force has a division, so it is computed once for all directions. One
+    more division keeps their sum."""
+    osc, signs, pulls, ones, _, x2 = primals
+    d_osc, _, d_pulls, _, d_x1, d_x2 = tangents
+    total = _weighted((-1.0, d_x1), (-osc.damping, d_x2), (-x2, d_osc.damping))
+    forces = zip(osc.belts, d_osc.belts, signs, pulls, d_pulls, strict=True)
+    for belt, d_belt, sign, pull, d_pull in forces:
+        law, speed = belt.friction, sign * (belt.velocity - osc.omega * x2)
+        (top, bottom), (d_top, d_bottom) = jax.jvp(law.fraction, (speed,), (jnp.ones_like(speed),))
+        square = bottom * bottom * ones
+        slope = sign * pull * (d_top * bottom - top * d_bottom) / square
+        relative = ((1.0, d_belt.velocity), (-osc.omega, d_x2), (-x2, d_osc.omega))
+        total = total + slope * _weighted(*relative)
+        total = total + _weighted((top * bottom / square, d_pull))
+        total = total + pull * _change_of_law(law, d_belt.friction, speed, square)
+    return _acceleration(*primals), materialise(total, ones)
+
+
+def _weighted(*pairs: tuple[Any, Any]) -> Any:
+    """The sum of changes by their weights, of those that are not known to be zero."""
+    known = [weight * change for weight, change in pairs if not isinstance(change, SymbolicZero)]
+    return functools.reduce(jnp.add, known) if known else 0.0
+
+
+def _change_of_law(law: AbstractFriction, change: Any, speed: Array, square: Array) -> Any:
+    """How mu at a speed changes with the parameters of a law; square: of its denominator."""
+    leaves, structure = jax.tree.flatten(law)
+    changes = jax.tree.leaves(change)
+    if all(isinstance(one, SymbolicZero) for one in changes):
+        return 0.0
+    pairs = zip(leaves, changes, strict=True)
+    full = [jnp.zeros_like(x) if isinstance(dx, SymbolicZero) else dx for x, dx in pairs]
+
+    def fraction(leaves):
+        return jax.tree.unflatten(structure, leaves).fraction(speed)
+
+    (top, bottom), (d_top, d_bottom) = jax.jvp(fraction, (leaves,), (full,))
+    return (d_top * bottom - top * d_bottom) / square
 
 
 def _combine(weights: np.ndarray, arrays: Sequence[Array]) -> Array:

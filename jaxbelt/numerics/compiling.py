@@ -313,11 +313,11 @@ NOT_MARKED = {"xla_cpu_small_call": "false", "inlineable": "true"}
 POSSIBLE = frozenset(
     """abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh broadcast_in_dim
     cbrt ceil clamp concatenate cond convert_element_type copy cos cosh cumsum custom_jvp_call
-    div dynamic_slice dynamic_update_slice eq exp exp2 expm1 floor gather ge gt integer_pow iota
-    is_finite jit le le_to log log1p logistic lt max min mul ne neg nextafter nonbatchable not
-    or pow reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem remat2 reshape
-    rev round rsqrt scan select_if_vmap select_n sign sin sinh slice sqrt square squeeze stack
-    stop_gradient sub tan tanh transpose unvmap_any while xor""".split()
+    empty2 div dynamic_slice dynamic_update_slice eq exp exp2 expm1 floor gather ge gt
+    integer_pow iota is_finite jit le le_to log log1p logistic lt max min mul ne neg nextafter
+    nonbatchable not or pow reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum
+    rem remat2 reshape rev round rsqrt scan select_if_vmap select_n sign sin sinh slice sqrt
+    square squeeze stack stop_gradient sub tan tanh transpose unvmap_any while xor""".split()
 )
 #: Largest array there. XLA computes large loops on several threads, which fails inside one piece
 #: (seen at 4,096 numbers, not at 3,000).

@@ -1,6 +1,7 @@
-"""Derivatives of integrations: forward Jacobians that reverse mode can use too."""
+"""Derivatives of integrations: forward Jacobians that reverse mode can use too, and derivatives in
+several directions beside a value."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -43,3 +44,34 @@ def forward_jacobian(fn: Callable[..., Any]) -> Callable[..., Any]:
         return out, eqx.combine(tangent_out, nothing)
 
     return wrapped
+
+
+def in_directions(
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
+    slopes: Sequence[tuple[Any, ...]],
+    differentiable: Callable[[Any], Any],
+) -> tuple[Any, list[Any]]:
+    """The value of a function, and its derivative in each of some directions.
+
+    args: its arguments, trees; slopes: for each direction the change of each, with None in place of
+    what does not change. differentiable(value): the value with None in place of what does not
+    change; so are the derivatives. The value is computed once for all directions. Of `jax.jvp` by
+    itself, in a batch or one after another, XLA computes it again for each: it moves the constants
+    of each copy out of the loop, and no longer sees that two copies are one.
+    """
+    if not slopes:
+        return function(*args), []
+    moving, fixed = eqx.partition(args, _is_there(slopes[0]))
+
+    def of_moving(moving):
+        value = function(*eqx.combine(moving, fixed))
+        return eqx.partition(value, _is_there(differentiable(value)))
+
+    changing, linear, others = jax.linearize(of_moving, moving, has_aux=True)
+    return eqx.combine(changing, others), [linear(slope) for slope in slopes]
+
+
+def _is_there(tree: Any) -> Any:
+    """True in place of what is there, False in place of None."""
+    return jax.tree.map(lambda leaf: leaf is not None, tree, is_leaf=lambda leaf: leaf is None)

@@ -6,11 +6,14 @@ A pass of the loop is
 - *events*: lanes that stand on a guard of their mode go on by the rules of `modes`, and stick
   phases are passed in closed form;
 - *steps*: a few Runge-Kutta steps of the lanes that slip.
+
+Derivatives in some directions go through the same loops beside the values: each refill, look at
+the events and step is made once, with all of them, see `derivatives.in_directions`.
 """
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,6 +32,7 @@ from ..model.modes import without_edges
 from ..model.oscillator import Oscillator
 from ..model.rest import start_at_focus
 from ..numerics.compiling import one_kernel
+from ..numerics.derivatives import in_directions
 from ..results import Status
 
 #: Looks at the events between two refills: a refill costs about as much as a step, and a lane that
@@ -84,12 +88,21 @@ def idle(program: Program, shared, width: int, columns: int) -> Stream:
 
 def differentiable(stream: Stream) -> Stream:
     """The numbers of a stream that may have derivatives; None in place of all others."""
-
-    def constants(stream):
-        return [stream.ones, stream.lanes.h, stream.lanes.pace, *stream.lanes.mode.codes]
-
     floats = eqx.filter(stream, eqx.is_inexact_array)
-    return eqx.tree_at(constants, floats, replace_fn=lambda _: None)
+    pairs = (_floats_of_lanes(stream.lanes), None)
+    return eqx.tree_at(lambda s: (s.lanes, s.ones), floats, pairs)
+
+
+def _floats_of_lanes(lanes: Lanes) -> Lanes:
+    floats = eqx.filter(lanes, eqx.is_inexact_array)
+    return eqx.tree_at(lambda n: [n.h, n.pace, *n.mode.codes], floats, replace_fn=lambda _: None)
+
+
+def _floats_of_round(begun):
+    lanes, window = begun
+    floats = eqx.filter(window, eqx.is_inexact_array)
+    floats = eqx.tree_at(lambda w: w.signs, floats, (None,) * len(window.signs))
+    return _floats_of_lanes(lanes), floats
 
 
 def _ordered(values: dict[str, Any]) -> list[str]:
@@ -149,12 +162,10 @@ class _Desk(eqx.Module):
     columns: list[Array]
 
 
-def _floats_of(desk: _Desk) -> tuple[_Desk, _Desk]:
-    """The numbers of a desk that may have derivatives, and all others, each with None elsewhere."""
+def _floats_of(desk: _Desk) -> _Desk:
+    """The numbers of a desk that may have derivatives; None in place of all others."""
     floats = eqx.filter(desk, eqx.is_inexact_array)
-    floats = eqx.tree_at(lambda d: d.stream, floats, differentiable(desk.stream))
-    kept = jax.tree.map(lambda leaf: leaf is not None, floats, is_leaf=lambda leaf: leaf is None)
-    return eqx.partition(desk, kept)
+    return eqx.tree_at(lambda d: d.stream, floats, differentiable(desk.stream))
 
 
 def _refill(program: Program, common: Common, block: _Block, desk: _Desk) -> _Desk:
@@ -193,45 +204,74 @@ def _refill(program: Program, common: Common, block: _Block, desk: _Desk) -> _De
     )
 
 
-def _work(program: Program, common: Common, stream: Stream) -> Stream:
-    """The stream after ROUNDS_PER_PASS times some steps, each time past the events at first."""
-    osc, observer = _oscillators(program, common.shared, stream.rows), program.observer
-    t1, rtol, atol, ones = common.t1, common.rtol, common.atol, stream.ones
+def _work(program: Program, common: Common, stream: Stream, slopes: Sequence[Stream]):
+    """The stream after ROUNDS_PER_PASS times some steps, each time past the events at first, and
+    its derivatives, one for each direction."""
+    observer, ones = program.observer, stream.ones
+    t1, rtol, atol = common.t1, common.rtol, common.atol
     forward = functools.partial(take_step, derivatives=program.derivatives)
     rules = dict(captures=program.captures, derivatives=program.derivatives)
 
-    def round_(_, lanes):
+    def begin(rows, lanes):
+        osc = _oscillators(program, common.shared, rows)
         lanes, passage = pass_events(osc, lanes, t1, rtol, **rules)
         lanes = observer.watch(osc, lanes, passage, ones, t1, rtol)
-        window = window_of(osc, lanes, extrema=observer.extrema(lanes))
+        return lanes, window_of(osc, lanes, extrema=observer.extrema(lanes))
 
-        def step(_, lanes):
-            return observer.follow(forward, osc, window, ones, lanes, t1, rtol, atol)
+    def step(rows, lanes, window):
+        osc = _oscillators(program, common.shared, rows)
+        return observer.follow(forward, osc, window, ones, lanes, t1, rtol, atol)
 
-        return lax.fori_loop(0, STEPS_PER_ROUND, step, lanes)
+    rows, rows_slopes = stream.rows, [one.rows for one in slopes]
 
-    return replace(stream, lanes=lax.fori_loop(0, ROUNDS_PER_PASS, round_, stream.lanes))
+    def round_(_, state):
+        lanes, slopes = state
+        begun = list(zip(rows_slopes, slopes, strict=True))
+        (lanes, window), slopes = in_directions(begin, (rows, lanes), begun, _floats_of_round)
+
+        def go_on(_, state):
+            lanes, own = state
+            begun = [(r, one, w) for r, one, (_, w) in zip(rows_slopes, own, slopes, strict=True)]
+            return in_directions(step, (rows, lanes, window), begun, _floats_of_lanes)
+
+        return lax.fori_loop(0, STEPS_PER_ROUND, go_on, (lanes, [one for one, _ in slopes]))
+
+    begun = stream.lanes, [one.lanes for one in slopes]
+    lanes, own = lax.fori_loop(0, ROUNDS_PER_PASS, round_, begun)
+    pairs = zip(slopes, own, strict=True)
+    slopes = [eqx.tree_at(lambda s: s.lanes, one, lanes) for one, lanes in pairs]
+    return replace(stream, lanes=lanes), slopes
 
 
 def _at_work(stream: Stream) -> Array:
     return jnp.any((stream.lanes.run >= 0) | ~stream.lanes.done)
 
 
-def _fill(program: Program, common: Common, block: _Block, desk: _Desk) -> _Desk:
+def _fill(program: Program, common: Common, block: _Block, desk: _Desk, slopes):
     """The inner loop: works until the block of runs is taken, the desk is full, or the last pass.
 
-    It closes over no array, so that it can be one piece of machine code.
+    slopes: of the block's rows and of the desk, (rows, desk) for each direction. Returns the desk
+    and its derivatives. It closes over no array, so that it can be one piece of machine code.
     """
 
-    def unfinished(desk):
+    def unfinished(state):
+        desk, _ = state
         more = (desk.taken < block.available) | (block.drain & _at_work(desk.stream))
         return more & (desk.filled < desk.numbers.size) & (desk.stream.passes - block.until < 0)
 
-    def go_on(desk):
-        desk = _refill(program, common, block, desk)
-        return replace(desk, stream=_work(program, common, desk.stream))
+    def refill(rows, desk):
+        return _refill(program, common, replace(block, rows=rows), desk)
 
-    return lax.while_loop(unfinished, go_on, desk)
+    def go_on(state):
+        desk, own = state
+        begun = [(rows, one) for (rows, _), one in zip(slopes, own, strict=True)]
+        desk, own = in_directions(refill, (block.rows, desk), begun, _floats_of)
+        stream, streams = _work(program, common, desk.stream, [one.stream for one in own])
+        pairs = zip(own, streams, strict=True)
+        own = [eqx.tree_at(lambda d: d.stream, one, stream) for one, stream in pairs]
+        return replace(desk, stream=stream), own
+
+    return lax.while_loop(unfinished, go_on, (desk, [one for _, one in slopes]))
 
 
 class Call(eqx.Module):
@@ -249,65 +289,25 @@ class Call(eqx.Module):
     drain: Any
 
 
-def advance(program: Program, common: Common, queue, call: Call, stream: Stream):
+def advance(program: Program, common: Common, queue, call: Call, streams):
     """Work through the queue, or as far as the call's passes go.
 
-    queue: columns [runs + lanes], the starts and the parameters that differ. Returns the stream,
-    the number of runs taken, whether there is more to do, and, in order of completion, numbers of
-    runs (-1 where there is none) and results [columns, runs + 3 lanes].
-    """
-    one_piece = one_kernel(functools.partial(_fill, program))
-
-    def fill(block, desk, rows_slopes, slopes):
-        return one_piece(common, block, desk), None
-
-    (stream, _), *rest, results, _ = _worked_off(
-        program, common.shared, fill, call, (queue, None), (stream, None)
-    )
-    return stream, *rest, jnp.stack(results)
-
-
-def advance_with_derivatives(program: Program, common: Common, queue, call: Call, stream):
-    """`advance`, with the derivatives in the direction queue[1] of the rows queue[0].
-
-    stream: a stream and the derivatives of its floats. Results [2, columns, runs + 3 lanes]: the
-    values and their derivatives.
-    """
-    program = replace(program, derivatives=True)
-
-    @one_kernel
-    def one_piece(common, block, desk, rows_slopes, slopes):
-        floats, others = _floats_of(desk)
-
-        def of_floats(rows, floats):
-            filled = _fill(program, common, replace(block, rows=rows), eqx.combine(floats, others))
-            return _floats_of(filled)
-
-        primals, tangents = (block.rows, floats), (rows_slopes, slopes)
-        floats, slopes, others = jax.jvp(of_floats, primals, tangents, has_aux=True)
-        return eqx.combine(floats, others), slopes
-
-    fill = functools.partial(one_piece, common)
-    queues = tuple(queue[0]), tuple(queue[1])
-    stream, *rest, results, slopes = _worked_off(program, common.shared, fill, call, queues, stream)
-    return stream, *rest, jnp.stack([jnp.stack(results), jnp.stack(slopes)])
-
-
-def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, streams):
-    """What `advance` does, by a function for the inner loop; of derivatives, too.
-
-    queues: the columns, and their derivatives; streams: the stream, and the derivatives of its
-    floats; None where there are none.
+    queue: [1 + directions, columns, runs + lanes], the starts and the parameters that differ, and
+    their derivatives; streams: the stream, and its derivatives, see `differentiable`, in each
+    direction. Returns the streams, the number of runs taken, whether there is more to do, and, in
+    order of completion, numbers of runs (-1 where there is none) and results [1 + directions,
+    columns, runs + 3 lanes].
 
     Two loops, because on the CPU only loops on small arrays can be one kernel. The inner loop sees
     small ones only: as many new runs, and as many results, as there are lanes.
     """
-    queue, queue_slopes = queues
-    stream, slopes = streams
-    width, columns = stream.ones.size, _columns_of(program, shared)
-    size = queue[0].size + 2 * width
+    program = replace(program, derivatives=len(queue) > 1)
+    width, columns = streams[0].ones.size, _columns_of(program, common.shared)
+    size = queue.shape[-1] + 2 * width
+    one_piece = one_kernel(functools.partial(_fill, program))
+    columns_of_queue = [tuple(own) for own in queue]
     # Differences of pass numbers stay right where they overflow.
-    until = stream.passes + call.passes
+    until = streams[0].passes + call.passes
 
     def rows_at(taken, columns):
         return tuple(lax.dynamic_slice_in_dim(column, taken, width, axis=-1) for column in columns)
@@ -317,28 +317,21 @@ def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, st
         return [lax.dynamic_update_slice_in_dim(a, b, written, axis=-1) for a, b in pairs]
 
     def outer(state):
-        (stream, slopes), taken, written, numbers, results, result_slopes = state
+        (stream, slopes), taken, written, numbers, results = state
         zero, none = jnp.zeros_like(taken), jnp.full(width, -1, dtype=jnp.int32)
         available = jnp.minimum(call.count - taken, width)
         drain = call.drain & (taken + available >= call.count)
-        rows = rows_at(taken, queue)
+        rows, *rows_slopes = (rows_at(taken, own) for own in columns_of_queue)
         block = _Block(rows, call.first + taken, available, until, drain)
-        desk = _Desk(stream, zero, zero, none, [jnp.zeros(width)] * columns)
-        rows_slopes, desk_slopes = None, None
-        if queue_slopes is not None:
-            rows_slopes = rows_at(taken, queue_slopes)
-            parts = slopes, [jnp.zeros(width)] * columns
-            desk_slopes = eqx.tree_at(lambda d: (d.stream, d.columns), _floats_of(desk)[0], parts)
-        desk, desk_slopes = fill(block, desk, rows_slopes, desk_slopes)
+        blank = [jnp.zeros(width)] * columns
+        desk = _Desk(stream, zero, zero, none, blank)
+        desks = [eqx.tree_at(lambda d: d.stream, _floats_of(desk), one) for one in slopes]
+        desk, desks = one_piece(common, block, desk, list(zip(rows_slopes, desks, strict=True)))
         numbers = lax.dynamic_update_slice(numbers, desk.numbers, (written,))
-        results = put(results, desk.columns, written)
-        if desk_slopes is not None:
-            slopes, result_slopes = (
-                desk_slopes.stream,
-                put(result_slopes, desk_slopes.columns, written),
-            )
+        pairs = zip(results, [desk, *desks], strict=True)
+        results = [put(wholes, one.columns, written) for wholes, one in pairs]
         taken, written = taken + desk.taken, written + desk.filled
-        return (desk.stream, slopes), taken, written, numbers, results, result_slopes
+        return (desk.stream, [one.stream for one in desks]), taken, written, numbers, results
 
     def more(stream, taken):
         return (taken < call.count) | (call.drain & _at_work(stream))
@@ -348,11 +341,11 @@ def _worked_off(program: Program, shared, fill: Callable, call: Call, queues, st
         return more(stream, taken) & (stream.passes - until < 0)
 
     numbers = jnp.full(size, -1, dtype=jnp.int32)
-    results = [jnp.full(size, jnp.nan) for _ in range(columns)]
-    result_slopes = results if queue_slopes is not None else []
-    start = streams, call.taken, jnp.zeros((), jnp.int32), numbers, results, result_slopes
-    streams, taken, _, numbers, results, slopes = lax.while_loop(unfinished, outer, start)
-    return streams, taken, more(streams[0], taken), numbers, results, slopes
+    results = [[jnp.full(size, jnp.nan) for _ in range(columns)] for _ in queue]
+    start = streams, call.taken, jnp.zeros((), jnp.int32), numbers, results
+    streams, taken, _, numbers, results = lax.while_loop(unfinished, outer, start)
+    results = jnp.stack([jnp.stack(own) for own in results])
+    return streams, taken, more(streams[0], taken), numbers, results
 
 
 def _columns_of(program: Program, shared) -> int:

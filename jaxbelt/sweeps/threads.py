@@ -27,7 +27,6 @@ from .queue import (
     Call,
     Common,
     advance,
-    advance_with_derivatives,
     differentiable,
     idle,
 )
@@ -49,10 +48,10 @@ FIRST_PASSES = {"cpu": 2000}
 
 
 @functools.lru_cache(maxsize=32)
-def compiled(program: Program, derivatives: bool) -> Callable:
-    """The kernel of a program, one for all threads and all sweeps, compiled when first called."""
-    function = advance_with_derivatives if derivatives else advance
-    return wide(functools.partial(function, program))
+def compiled(program: Program) -> Callable:
+    """The kernel of a program, one for all threads and all sweeps, compiled when first called with
+    so many derivatives."""
+    return wide(functools.partial(advance, program))
 
 
 def workers() -> int:
@@ -91,22 +90,21 @@ def run(
     """
     if not runs:
         return
-    most, work = np.iinfo(np.int32).max, runs * max(1, derivatives)
-    require(work <= most, "axes", f"{most} runs, times derivatives, or fewer in one call", work)
+    most = np.iinfo(np.int32).max
+    require(runs <= most, "axes", f"{most} runs or fewer in one call", runs)
     limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
     limit = min(limit, most)
     threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
-    kernel = compiled(program, derivatives > 0)
     team = _Team(
-        functools.partial(kernel, Common(shared, t1, rtol, atol, np.int32(limit))),
-        functools.partial(_first_stream, program, shared, columns, derivatives > 0),
+        functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit))),
+        functools.partial(_first_streams, program, shared, columns, derivatives),
         rows_of,
         put,
         columns,
         derivatives,
-        _Chunks(runs, threads, CHUNK // max(1, derivatives)),
-        FIRST_PASSES.get(jax.default_backend(), 100) // (2 if derivatives else 1),
+        _Chunks(runs, threads, CHUNK),
+        FIRST_PASSES.get(jax.default_backend(), 100) // (1 + derivatives),
     )
     devices = jax.local_devices()
     # Compiled once, before the threads that would each do it again, and like all else not on the
@@ -120,13 +118,10 @@ def run(
         wait(at_work, timeout=10 * PATIENCE)
 
 
-def _first_stream(program: Program, shared, columns: int, derivatives: bool) -> Any:
-    """The stream that a kernel starts from."""
+def _first_streams(program: Program, shared, columns: int, derivatives: int) -> Any:
+    """The stream that a kernel starts from, and its derivatives, all zero."""
     stream = idle(program, shared, WIDTH.get(jax.default_backend(), 2**17), columns)
-    if not derivatives:
-        return stream
-    floats = differentiable(stream)
-    return stream, jax.tree.map(jnp.zeros_like, floats)
+    return stream, [jax.tree.map(jnp.zeros_like, differentiable(stream))] * derivatives
 
 
 class _Chunks:
@@ -143,37 +138,6 @@ class _Chunks:
     def take(self) -> tuple[int, int] | None:
         with self.lock:
             return next(self.spans, None)
-
-
-class _Directions:
-    """Runs with several derivatives: a run goes through the kernel once for each of them.
-
-    XLA computes the values again for each direction of a batch of them, and takes longer for that.
-    """
-
-    def __init__(self, count: int):
-        self.count = count
-        self.waiting: list[tuple[np.ndarray, np.ndarray]] = []
-
-    def rows(self, rows: np.ndarray) -> np.ndarray:
-        """Rows [1 + directions, columns, runs], as [2, columns, runs x directions]."""
-        slopes = np.moveaxis(rows[1:], 0, -1).reshape(rows.shape[1], -1)
-        return np.stack([np.repeat(rows[0], self.count, axis=-1), slopes])
-
-    def whole(self, numbers: np.ndarray, results: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The runs whose results are now known in every direction, [1 + directions, columns, runs].
-
-        Those of the others wait.
-        """
-        parts = zip(*self.waiting, (numbers, results), strict=True)
-        numbers, results = (np.concatenate(some, axis=-1) for some in parts)
-        order = np.argsort(numbers)
-        runs, counts = np.unique(numbers // self.count, return_counts=True)
-        known = np.repeat(counts == self.count, counts)
-        rest, done = order[~known], order[known].reshape(-1, self.count)
-        self.waiting = [(numbers[rest], results[:, :, rest])]
-        values, slopes = results[:1][:, :, done[:, 0]], np.moveaxis(results[1][:, done], -1, 0)
-        return runs[counts == self.count], np.concatenate([values, slopes])
 
 
 @dataclass
@@ -201,44 +165,35 @@ class _Team:
         """Take chunks until there are no more, or until the team is stopped."""
         with _settings(device):
             passes = self.first_passes
-            stream, todo = self.idle(), self.chunks.take()
-            several = _Directions(self.derivatives) if self.derivatives > 1 else None
+            streams, todo = self.idle(), self.chunks.take()
             while todo is not None and not self.stop.is_set():
                 (first, last), todo = todo, self.chunks.take()
-                rows, queue = self.rows_of(first, last), self._queue()
-                if several:
-                    rows = several.rows(np.reshape(rows, (1 + several.count, self.columns, -1)))
-                    first, last = several.count * first, several.count * last
-                queue[..., : last - first] = np.reshape(rows, (*queue.shape[:-1], -1))
-                drain = todo is None
-                stream, passes = self._chunk(queue, first, last, drain, stream, passes, several)
+                queue, drain = self._queue(), todo is None
+                queue[..., : last - first] = self.rows_of(first, last)
+                streams, passes = self._chunk(queue, first, last, drain, streams, passes)
 
     def _queue(self) -> np.ndarray:
         """Room for a chunk: of one size, for one compiled kernel."""
         width = WIDTH.get(jax.default_backend(), 2**17)
-        return np.zeros((*((2,) if self.derivatives else ()), self.columns, CHUNK + width))
+        return np.zeros((1 + self.derivatives, self.columns, CHUNK + width))
 
-    def _chunk(self, queue, first: int, last: int, drain: bool, stream, passes: int, several):
+    def _chunk(self, queue, first: int, last: int, drain: bool, streams, passes: int):
         """Call the kernel until a chunk is taken (with `drain`: done); calls take half of PATIENCE
-        or so. Returns the stream, and how many passes a call may make."""
+        or so. Returns the streams, and how many passes a call may make."""
         taken, more = np.int32(0), True
         while more and not self.stop.is_set():
             began = time.monotonic()
             span = np.int32(first), np.int32(last - first)
             call = Call(*span, taken, np.int32(passes), np.bool_(drain))
-            stream, taken, more, numbers, results = self.kernel(queue, call, stream)
+            streams, taken, more, numbers, results = self.kernel(queue, call, streams)
             numbers, more = np.asarray(numbers), bool(more)
             seconds = time.monotonic() - began
             if more:  # it made all of its passes
                 passes = int(np.clip(passes * 0.5 * PATIENCE / seconds, 1, 4 * passes))
             done = np.flatnonzero(numbers >= 0)
-            results = np.asarray(results).reshape(-1, *np.shape(results)[-2:])
-            numbers, results = numbers[done], results[:, :, done]
-            if several and numbers.size:
-                numbers, results = several.whole(numbers, results)
-            if numbers.size:
-                self.put(numbers, results)
-        return stream, passes
+            if done.size:
+                self.put(numbers[done], np.asarray(results)[:, :, done])
+        return streams, passes
 
 
 @contextmanager
