@@ -138,6 +138,33 @@ def test_a_start_at_a_pseudo_focus_moves_with_its_edge(by, mud):
     np.testing.assert_array_equal(found, [[0, 0, 0, 1], [0, 0, 0, 0]])
 
 
+def captured_on_an_edge(velocity, mud, edge):
+    """Spirals into a pseudo-focus where two belts end, of which one exerts no force."""
+    law = jb.Stribeck(0.5, 0.25, 0.1)
+    idle = jb.Belt(-0.5, law, 0.0, lower=-0.35)
+    belts = jb.Belt(velocity, law, upper=edge), idle, jb.Belt(-0.9, jb.Coulomb(1.2, mud), 0.5)
+    return jb.Oscillator(1.0, belts)
+
+
+@pytest.mark.parametrize("by", ["simulate", "sweep"])
+def test_a_run_that_a_pseudo_focus_captures_moves_with_its_edge(by):
+    """Nothing else moves it, however late it is captured."""
+    at, start = {"velocity": 0.9, "mud": 1.2, "edge": -0.35}, (-0.35, -0.5)
+    if by == "simulate":
+
+        def end(row):
+            osc = captured_on_an_edge(*row)
+            return jb.simulate(osc, start, 50.0, ts=jnp.array([50.0])).ys[-1]
+
+        found = jax.jit(jax.jacfwd(end))(jnp.array([*at.values()]))
+    else:
+        axes = {name: [value] for name, value in at.items()}
+        swept = jb.sweep(captured_on_an_edge, axes, y0=start, t1=50.0, derivatives=tuple(at))
+        assert swept.status.item() == jb.Status.PSEUDO_FOCUS
+        found = [[swept[f"d_{i}_end_d_{j}"].item() for j in at] for i in ("x1", "x2")]
+    np.testing.assert_array_equal(found, [[0, 0, 1], [0, 0, 0]])
+
+
 @pytest.mark.slow(first=True)
 @pytest.mark.parametrize("by", ["simulate", "sweep"])
 def test_a_run_that_comes_to_rest_on_an_edge_moves_with_its_equilibrium(by):

@@ -60,7 +60,7 @@ def pass_events(
     t = jnp.where(stuck & ~released | rests, t1, lanes.t + hold.duration)
     if derivatives:
         a = mode_acceleration(osc, mode, new_x1, x2)
-        creeps = (landed | released) & ~mode.any_stuck & is_slow(x2, a)
+        creeps = (landed | released) & ~mode.any_stuck & ~captured & is_slow(x2, a)
         t, new_x1, x2 = _at_fixed_time(creeps, t, new_x1, x2, a)
     a, h = _set_off(osc, lanes, mode, new_x1, x2, fired, released, rtol)
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
