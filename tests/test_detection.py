@@ -3,7 +3,6 @@
 from collections import Counter
 from itertools import pairwise
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -487,6 +486,20 @@ def test_a_fixed_point_on_an_edge_all_along_has_a_hopf_point(distance):
         assert hopf.value == pytest.approx(0.8 * np.exp(-1.6), abs=1e-13)
         if kind == "Hopf":
             assert hopf.type == "degenerate" and np.isnan(hopf.coefficient)
+
+
+@pytest.mark.slow(first=True)
+def test_nothing_happens_where_a_belt_reverses_at_a_pseudo_focus_that_attracts():
+    """It pushes to the right with 0.5 +- 0.125 there, and the other one back with 0.3."""
+
+    def make(v):
+        own = jb.Belt(v, jb.Coulomb(1, 0.5), 0.25, upper=-0.5)
+        return jb.Oscillator(1.0, (own, jb.Belt(-1.0, jb.Coulomb(1, 0.8), lower=-0.5)))
+
+    for v in (-0.1, 0.1):
+        (row,) = jb.equilibria(make(v))
+        assert row.kind == jb.EquilibriumKind.PSEUDO_FOCUS and row.stable
+    assert jb.scan(make, span=(-0.3, 0.4), resolution=14) == ()
 
 
 def test_edges_that_are_one_all_along_do_not_meet():

@@ -38,7 +38,7 @@ from ..cycles.chains import SIZES, Loop, cut
 from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
 from ..cycles.orbits import FINE_STRIDE
 from ..cycles.settling import AT_REST
-from ..model.equilibria import candidates
+from ..model.equilibria import EquilibriumKind, candidates
 from ..model.far_out import is_bounded
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
@@ -198,7 +198,11 @@ class ParameterPath:
     def _take(self, value: float, seen: "_Motions", courses: tuple[SaddleCourse, ...]) -> None:
         """Label a value by what was seen there."""
         exists = seen.kind > 0
-        modes = map(tuple, without_idle(self.at(value), seen.modes[exists]).tolist())
+        codes = without_idle(self.at(value), seen.modes[exists])
+        # Which way the belts rub at a pseudo-focus makes no difference to what it is.
+        is_focus = seen.kind[exists, None] == EquilibriumKind.PSEUDO_FOCUS
+        codes = np.where(is_focus & (codes == -1), 1, codes)
+        modes = map(tuple, codes.tolist())
         rests = tuple(
             zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), modes, strict=True)
         )
@@ -345,11 +349,16 @@ def _is_off_rest(cycle: Cycle) -> bool:
 
 
 def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> int | None:
-    """The number of a cycle among others, or None."""
+    """The number of a cycle among others, or None.
+
+    One is another one also if it is at the same place: just before a corner, say, the one that
+    passes it without a stick phase solves the equations as well as they can be solved.
+    """
     for number, other in enumerate(among):
-        if other.path == cycle.path:
-            if sticks(cycle.path) or apart(place_of(cycle.loop), place_of(other.loop)) < SOLVED:
-                return number
+        if other.path == cycle.path and sticks(cycle.path):
+            return number
+        if apart(place_of(cycle.loop), place_of(other.loop)) < SOLVED:
+            return number
     return None
 
 

@@ -295,8 +295,8 @@ def _rest_on_edge(osc, table, edge, left, right):
     (a, b), capacity = (pull - edge, other[1] - edge), max(held, other[2])
     if not a > held or not -b > other[2]:
         return None
-    signs = [1 if code == 0 else code for code in codes]  # rightwards, before the edge, r < 0
-    signs = [-1 if code == 0 else sign for code, sign in zip(codes, signs, strict=True)]
+    # Which way belts rub there makes no difference.
+    signs = [code if abs(code) == 2 else 1 for code in codes]
     stable = True if capacity + rubs + other[3] > 0 else trace / a + other[4] / -b < 0
     return edge, 3, stable, tuple(signs)
 
