@@ -244,8 +244,9 @@ def _from_edge(osc: Oscillator, codes: Array, x1: Array, edge: Array) -> Array:
 
 @jit
 def _with_mesh(osc: Oscillator, loop: Loop, leaves: Array, arrives: Array, status: Array):
-    chain, z = meshed(lax.stop_gradient(osc), loop)
-    return Connection(chain, leaves, arrives), z, status
+    osc = lax.stop_gradient(osc)
+    chain, z = meshed(osc, loop)
+    return Connection(chain, leaves, arrives).refined(osc, z), z, status
 
 
 @jit

@@ -212,8 +212,8 @@ def _settled_by(
     """Around a point the values between which nothing else is told; it explains what differs
     between a and b.
 
-    A slow one may lie just outside of these two. Then the half of the interval beside it is settled,
-    or all of that, if it is narrow: labels so near to it are not to be relied on.
+    A slow one may lie just outside of these two. Then the half of the interval beside it is
+    settled, or all of that, if it is narrow: labels so near to it are not to be relied on.
     """
     value = float(point.value)
     before, after = path.beside(value, slow=point.condition.slow)
