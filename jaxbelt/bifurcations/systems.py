@@ -254,25 +254,37 @@ def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
     return phase
 
 
-def nearest_contacts(osc: Oscillator, chain: Chain, z: Array, sticks: Array) -> tuple[Array, Array]:
+def nearest_contacts(
+    osc: Oscillator, chain: Chain, z: Array, sticks: Array, without: int | Array = -1
+) -> tuple[Array, Array]:
     """How near a cycle is to another signature at each belt, and whether it sticks there, [belts].
 
     The shortest of its stick phases, among the arcs `sticks`; where there is none, the distance of
-    its nearest extremum of x2 from the boundary. inf where there is neither.
+    its nearest extremum of x2 from the boundary. Or, if less, that of x2 from the boundary where
+    the cycle passes a contact edge slipping, as it meets both at once then. inf where there is
+    nothing of these. without: an arc whose end is not asked.
     """
+    n = len(osc.belts)
     following = jnp.roll(z, -1, axis=0)
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
     following = jnp.where(last[:, None], z[0], following)
-    extrema = chain.used & (chain.ends == Ends(len(osc.belts)).extremum_x2)
+    extrema = chain.used & (chain.ends == Ends(n).extremum_x2)
+    passes = (chain.ends >= n) & (chain.ends < 3 * n) & (jnp.arange(chain.ends.size) != without)
+    after = following_codes(chain)
     nearest, stuck = [], []
     for belt, one in enumerate(osc.belts):
         own = sticks & (chain.codes[:, belt] == 0)
         shortest = jnp.min(jnp.where(own, z[:, 2], jnp.inf))
         r = one.velocity - osc.omega * following[:, 1]
-        slips = extrema & (jnp.abs(chain.codes[:, belt]) == 1)
-        gap = jnp.min(jnp.where(slips, chain.codes[:, belt] * r, jnp.inf))
+        signs, signs_after = chain.codes[:, belt], after[:, belt]
+        slips = jnp.abs(signs) == 1
+        gap = jnp.min(jnp.where(extrema & slips, signs * r, jnp.inf))
+        # Where it sticks before or after the edge it is on the boundary anyway.
+        sign = jnp.where(slips, signs, signs_after)
+        moves = passes & (signs != 0) & (signs_after != 0) & (jnp.abs(sign) == 1)
+        at_edge = jnp.min(jnp.where(moves, sign * r, jnp.inf))
         stuck.append(jnp.any(own))
-        nearest.append(jnp.where(stuck[-1], shortest, gap))
+        nearest.append(jnp.minimum(jnp.where(stuck[-1], shortest, gap), at_edge))
     return jnp.stack(nearest), jnp.stack(stuck)
 
 
