@@ -325,8 +325,8 @@ def test_grazing_beside_a_belt_that_hardly_moves(steepness, damping, offset):
 
 @pytest.mark.slow(first=True)
 def test_the_nearest_point_and_not_one_to_which_another_within_reach_leads():
-    """Beside the guess an equilibrium comes to the edge; Newton's method for an edge that is touched
-    leads from there, as from the guess, to another point, 0.43 farther off."""
+    """Beside the guess an equilibrium comes to the edge. From there, as from the guess, Newton's
+    method leads to where a cycle touches the edge 0.43 farther off."""
     laws = jb.Conti(1.0, 0.5225, 5.697), jb.Conti(1.0666, 0.6, 8.479)
 
     def make(edge):

@@ -41,7 +41,7 @@ DETERMINED = 1e-3
 #: The integration steps of an arc are cut into so many parts if they leave a larger error in its
 #: equations, relative to the motion: beside a slow belt and under a steep law 1e-8 was seen, which
 #: moved the point by 1e-6, and 1e-15 with the parts.
-PARTS, EXACT = 4, 1e-13
+PARTS, EXACT = 8, 1e-13
 #: The place of nothing.
 NOWHERE = np.full(5, np.nan)
 #: Functions by what it means that one vanishes: the name of a special point, the belts concerned.
