@@ -7,6 +7,7 @@ import oracle
 import oracle_cycles
 import pytest
 from laws import BELL, bell
+from scipy.optimize import brentq
 
 import jaxbelt as jb
 from jaxbelt import Status
@@ -296,3 +297,44 @@ def test_the_nearer_of_two_to_which_a_cycle_grazes():
     assert near.kind == far.kind == "GrazingSliding" and far.value - near.value > 8e-3
     for guess in (0.9969278, 0.9985):
         assert jb.refine(near.condition, make, at=guess).value == pytest.approx(float(near.value))
+
+
+@pytest.mark.parametrize("offset", [-0.03, -1e-3, 1e-3, 0.03])
+@pytest.mark.parametrize(("steepness", "damping"), [(30.0, 0.5), (100.0, 0.3), (100.0, 0.5)])
+def test_grazing_beside_a_belt_that_hardly_moves(steepness, damping, offset):
+    """Under a steep law eight steps an arc left 1e-8 in the equations, and the point off by 1e-6;
+    from 0.03 away none was found."""
+    law, slow = jb.Conti(1.0, 0.6, steepness), 1e-4
+
+    def make(nu):
+        return jb.Oscillator(damping, (jb.Belt(slow, law), jb.Belt(nu, law, load=0.8)))
+
+    def gap(nu):
+        mu, static = oracle.conti(1.0, 0.6, steepness)
+        belts = oracle.Belt(slow, mu, static, 1.0), oracle.Belt(nu, mu, static, 0.8)
+        osc = oracle.Oscillator(damping, belts, 1.0)
+        # Not so far beyond the boundary as the pole of the law is.
+        return oracle_cycles.gap(osc, 0, 1, slack=0.2 / steepness)
+
+    expected = brentq(gap, -0.365, -0.315, xtol=1e-15)
+    point = jb.refine(jb.GrazingSliding(1), make, at=expected + offset)
+    assert point.status == Status.OK and point.error < 1e-11
+    # The oracle's orbit is good to 1e-13; on the way from the belt errors grow some tenfold.
+    assert abs(point.value - expected) <= point.error + 1e-12
+
+
+@pytest.mark.slow(first=True)
+def test_the_nearest_point_and_not_one_to_which_another_within_reach_leads():
+    """Beside the guess an equilibrium comes to the edge. From there, as from the guess, Newton's
+    method leads to where a cycle touches the edge 0.43 farther off."""
+    laws = jb.Conti(1.0, 0.5225, 5.697), jb.Conti(1.0666, 0.6, 8.479)
+
+    def make(edge):
+        belts = jb.Belt(-3.75e-4, laws[0], 0.7885, upper=edge), jb.Belt(5.62e-3, laws[1], 0.9203)
+        return jb.Oscillator(0.3879, belts)
+
+    near, far = (one for one in jb.scan(make, span=(0.1, 0.7)) if one.kind == "GrazingEdge")
+    guess = float(near.value) - 0.03
+    assert far.value - guess > 0.4
+    point = jb.refine(jb.GrazingEdge(0), make, at=guess)
+    assert point.value == pytest.approx(float(near.value), abs=1e-10)

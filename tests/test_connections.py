@@ -245,3 +245,42 @@ def test_an_orbit_that_slowly_circles_a_pseudo_focus_stays_between_saddles():
         return jb.Oscillator(0.14666389569371077, belts, 1.2720166147779866)
 
     assert jb.scan(at, span=(0.0032336, 0.0032348), resolution=4) == ()
+
+
+@pytest.mark.slow(first=True)
+def test_belts_that_share_an_edge_may_be_named_by_either_also_where_a_point_is_searched_for():
+    """In class (c) both belts have the edge; an edge is touched from the side where no cycle is."""
+    value, grazing = -0.263755321469, jb.GrazingEdge
+    for offset in (1e-3, -0.03):
+        for condition in (jb.SaddleConnection(0, to=1), jb.SaddleConnection(1, to=1)):
+            point = jb.refine(condition, beside, at=value + offset)
+            assert point.value == pytest.approx(value, abs=1e-11)
+            assert point.condition == condition
+    for nu0 in (-0.25, -0.05):
+        make = functools.partial(jb.presets.class_c, nu0, 0.3)
+        (touched,) = (one for one in jb.scan(make, span=(-0.7, -0.45)) if one.kind == "GrazingEdge")
+        points = [jb.refine(grazing(k), make, at=float(touched.value) - 1e-3) for k in (0, 1)]
+        for point in points:
+            assert point.value == pytest.approx(float(touched.value), abs=1e-11)
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("away", [-0.03, -0.01, -1e-3, 1e-3, 0.01, 0.03])
+def test_mirror_images_answer_alike(away):
+    """(nu0, nu1, sigma) -> (-nu1, -nu0, -sigma): the belts change places."""
+
+    def image(nu0):
+        return jb.presets.class_c(-0.3, -nu0, 0.5)
+
+    for value, conditions in (
+        (-0.263755321469, (jb.SaddleConnection(0, to=0), jb.SaddleConnection(1, to=1))),
+        (-0.252465134234, (jb.GrazingEdge(0), jb.GrazingEdge(1))),
+    ):
+        points = [
+            jb.refine(condition, make, at=value + away)
+            for make, condition in zip((beside, image), conditions, strict=True)
+        ]
+        assert [int(point.status) for point in points] == [Status.OK] * 2
+        # Of the connections the other one may be nearer.
+        assert points[0].value == pytest.approx(float(points[1].value), abs=1e-11)
+        assert abs(points[0].value - (value + away)) <= abs(away) + 1e-9

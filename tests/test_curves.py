@@ -1,5 +1,6 @@
 """Curves in two parameters: against refined points, closed forms, the oracle and symmetry."""
 
+import functools
 from typing import Any
 
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from jaxbelt.bifurcations.tracks import Track, special_between
 from jaxbelt.model.parameters import leaf_index
 from jaxbelt.model.variations import Variation
 from jaxbelt.numerics.continuation import Corrected, CurvePoint, Stop
+from tests.campaign import engine
 
 
 def nu0(osc):
@@ -411,3 +413,29 @@ def test_a_curve_of_corners_ends_where_its_cycle_shrinks_with_a_belt_to_a_pseudo
     # Its rows from nu0 = 0.013 to 0.006 lead there; polynomials of degrees 3 and 4 differ by 6e-4.
     p, q = curve.values[np.argsort(curve.values[:, 0])[:9]].T
     assert np.polyval(np.polyfit(p, q, 4), 0.0) == pytest.approx(-0.5, abs=6e-4)
+
+
+@pytest.mark.slow(first=True)
+def test_a_point_where_the_cycle_passes_an_edge_in_two_corners_is_told_along_all_curves_there():
+    """Of class (c): on the way to the right it passes the edge with the velocity of belt 0, on the
+    way back with that of belt 1. Four curves of corners meet; on one of them the cycle sticks to
+    both belts beside the point, on two to one, on one to none."""
+
+    def make(nu0, nu1):
+        return jb.presets.class_c(nu0, nu1, -0.5)
+
+    found = []
+    for nu1, guess in ((-0.2343, 0.255), (-0.2383, 0.235), (-0.2322, 0.23), (-0.2291, 0.23)):
+        point = jb.refine(jb.CornerCollision(0), functools.partial(make, nu1=nu1), at=guess)
+        curve = jb.bifurcation_curve(point, make, ((0.225, 0.26), (-0.25, -0.22)))
+        (double,) = curve.special
+        assert double.kind == "DoubleSliding" and double.residual < 1e-12
+        found.append(double.values)
+    assert np.max(np.ptp(found, axis=0)) < 1e-11
+    # An orbit of the engine passes both corners in turn; errors do not grow on a loop.
+    law, values = ("conti", 1.0, 0.6, 10.0), found[0]
+    belts = engine.Belt(values[0], law, upper=-0.5), engine.Belt(values[1], law, lower=-0.5)
+    run = engine.simulate(engine.Oscillator(0.5, belts), (-0.5, values[0]), 4.0)
+    passed = run.y[run.kind == engine.EDGE]
+    np.testing.assert_allclose(passed[:3, 1], [values[1], values[0], values[1]], atol=1e-10)
+    assert np.all(passed[:, 0] == -0.5)

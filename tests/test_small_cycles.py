@@ -109,3 +109,24 @@ def test_a_cycle_that_hardly_attracts_shrinks_to_its_pseudo_hopf_point():
 
     (point,) = jb.scan(make, span=(0.175, 0.182), resolution=6)
     assert point.condition == jb.PseudoHopf(0) and point.type == "supercritical"
+
+
+@pytest.mark.slow(first=True)
+def test_a_scan_ends_where_a_fold_of_cycles_explains_what_differs_beside_it():
+    """Just before they meet, two small cycles around close edges are told from none no more."""
+    laws = (
+        jb.Stribeck(1.2680291173892104, 0.7289566527855321, 0.2836081013111068),
+        jb.Conti(0.5337176820507991, 0.32950903749697996, 7.564122878061967, 0.10724645908958609),
+    )
+
+    def make(nu):
+        belts = (
+            jb.Belt(0.35119653416169805, laws[0], 0.5711931783868905, upper=-0.019601275688333697),
+            jb.Belt(nu, laws[1], 1.6626790276232228, lower=-0.023343609120135778),
+        )
+        return jb.Oscillator(0.49616067385904467, belts)
+
+    points = jb.scan(make, span=(-0.3396733297118405, 0.262960281920367))
+    assert all(point.status == Status.OK for point in points)
+    (fold,) = (point for point in points if point.kind == "FoldOfCycles")
+    assert fold.value == pytest.approx(-0.159462417136, abs=1e-9)

@@ -122,9 +122,12 @@ class AbstractCondition(eqx.Module):
         """What a point that was sought is."""
         return self
 
-    def covers(self, other: "AbstractCondition") -> bool:
-        """Whether a point of the other condition is one of this one."""
-        return self == other
+    def covers(self, point: "BifurcationPoint") -> bool:
+        """Whether a point that has a name is one of this condition."""
+        other = point.condition
+        is_pair = type(self) is type(other) and len(self.belts_concerned) == 2
+        same_pair = is_pair and set(self.belts_concerned) == set(other.belts_concerned)
+        return self == other or same_pair
 
     def check(self, osc: Oscillator) -> None:
         """`ValueError` where the oscillator cannot meet it."""

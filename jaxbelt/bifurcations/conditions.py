@@ -66,7 +66,9 @@ class AbstractCycleCondition(AbstractCondition):
 
 @jit
 def _prepared(condition: AbstractCycleCondition, osc: Oscillator, loop: Loop, status: Array):
-    return condition.system(lax.stop_gradient(osc), loop, status)
+    osc = lax.stop_gradient(osc)
+    system, x, status = condition.system(osc, loop, status)
+    return system.refined(osc, x), x, status
 
 
 @jit

@@ -164,13 +164,21 @@ class SaddleConnection(AbstractCondition):
         return SaddleConnection(self.belt)
 
     def named(self, point):
-        system, _ = self.followed(point)
-        positions = np.asarray(jnp.stack(edges(point.oscillator))).reshape(2, -1)
-        at = positions.reshape(-1)[int(system.arrives)]
-        return SaddleConnection(self.belt, int(np.argmax(np.any(positions == at, axis=0))))
+        belts = self._belts_reached(point)
+        return SaddleConnection(self.belt, self.belt if self.belt in belts else belts[0])
 
-    def covers(self, other):
-        return self == other or self == other.sought
+    def covers(self, point):
+        other = point.condition
+        if not isinstance(other, SaddleConnection) or self.belt != other.belt:
+            return False
+        return self.to is None or self.to in other._belts_reached(point)
+
+    def _belts_reached(self, point) -> list[int]:
+        """The belts of which the edge is one where the connection at a point ends."""
+        system, _ = self.followed(point)
+        positions = np.asarray(jnp.stack(edges(point.oscillator)))
+        is_there = (positions == positions[int(system.arrives)]).reshape(2, -1)
+        return np.flatnonzero(np.any(is_there, axis=0)).tolist()
 
     def check(self, osc):
         n = len(osc.belts)
@@ -236,8 +244,9 @@ def _from_edge(osc: Oscillator, codes: Array, x1: Array, edge: Array) -> Array:
 
 @jit
 def _with_mesh(osc: Oscillator, loop: Loop, leaves: Array, arrives: Array, status: Array):
-    chain, z = meshed(lax.stop_gradient(osc), loop)
-    return Connection(chain, leaves, arrives), z, status
+    osc = lax.stop_gradient(osc)
+    chain, z = meshed(osc, loop)
+    return Connection(chain, leaves, arrives).refined(osc, z), z, status
 
 
 @jit

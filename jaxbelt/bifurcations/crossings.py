@@ -67,7 +67,7 @@ def arrival_tests(osc: Oscillator, chain: Chain, z: Array, row: Array):
     """
     others = chain.used & ~stick_phase_from(osc, chain, (row + 1) % jnp.sum(chain.used))
     others = others & (jnp.arange(others.size) != row) & jnp.any(chain.codes == 0, axis=-1)
-    nearest, _ = nearest_contacts(osc, chain, z, others)
+    nearest, _ = nearest_contacts(osc, chain, z, others, row)
     return contact_tests("DoubleSliding", nearest, jnp.ones(nearest.shape, bool))
 
 

@@ -128,10 +128,14 @@ class ParameterPath:
 
     @property
     def edged(self) -> list[int]:
-        """Belts with a finite contact edge; one for each place if they share their edges."""
+        """Belts with a finite contact edge; one for each place if they share their edges, that of
+        one's own conditions if it is among them."""
+        own_first = [belt for one in self.conditions for belt in one.belts_concerned]
         belts: list[int] = []
         known: set[float] = set()
-        for number, belt in enumerate(self.at(0.5 * (self.first + self.last)).belts):
+        all_belts = self.at(0.5 * (self.first + self.last)).belts
+        for number in dict.fromkeys([*own_first, *range(len(all_belts))]):
+            belt = all_belts[number]
             own = {float(edge) for edge in (belt.lower, belt.upper) if np.isfinite(edge)}
             if own - known:
                 belts.append(number)

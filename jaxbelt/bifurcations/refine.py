@@ -5,6 +5,7 @@ By Newton's method from the guess. Where that fails, or ends far away, the point
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -101,10 +102,12 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
             # What attracts may tell a point as one of another kind, too.
             also = (condition.found_from(variation, float(one.value)) for one in found)
             found += [one for one in also if one is not None]
-        of_kind = [one for one in found if condition.covers(one.condition)]
+        # Any of these may have led to one that is farther away than others beyond the reach.
+        of_kind = [one for one in found if condition.covers(one) and _away(one, guess) <= reach]
         if of_kind:
             nearest = min(of_kind, key=lambda one: _away(one, guess))
-            return nearest if _away(nearest, guess) < away - unit * SAME_POINT else point
+            is_nearer = _away(nearest, guess) < away - unit * SAME_POINT
+            return replace(nearest, condition=condition) if is_nearer else point
         if away <= reach:
             break
     return point

@@ -121,7 +121,7 @@ def search(
                 for one in (point, *_beside_it(path, a, b, point)):
                     if not any(_is_same_point(one, other) for other in points):
                         points.append(one)
-                before, after = path.beside(float(point.value), slow=point.condition.slow)
+                before, after = _settled_by(path, a, b, point)
                 settled.append((before, after))
                 values += [max(a, before), min(b, after)]
             elif b - a <= near * path.length and _is_degenerate(path, a, b, points):
@@ -204,6 +204,25 @@ def edges_touched(
 
 
 # --- what makes the difference between two values -------------------------------------------------
+
+
+def _settled_by(
+    path: ParameterPath, a: float, b: float, point: BifurcationPoint
+) -> tuple[float, float]:
+    """Around a point the values between which nothing else is told; it explains what differs
+    between a and b.
+
+    A slow one may lie just outside of these two. Then the half of the interval beside it is
+    settled, or all of that, if it is narrow: labels so near to it are not to be relied on.
+    """
+    value = float(point.value)
+    before, after = path.beside(value, slow=point.condition.slow)
+    is_narrow, middle = b - a <= after - before, 0.5 * (a + b)
+    if value > b:
+        before = min(before, a if is_narrow else middle)
+    elif value < a:
+        after = max(after, b if is_narrow else middle)
+    return before, after
 
 
 def _explained(path: ParameterPath, a: float, b: float) -> BifurcationPoint | None:

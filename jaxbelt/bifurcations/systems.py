@@ -38,6 +38,10 @@ WEIGHT = 0.1
 #: A point is determined where its error, in units of the parameter, is smaller: at a double root it
 #: is some 1e-7, and where the equations hold all along the parameter 1 and more.
 DETERMINED = 1e-3
+#: The integration steps of an arc are cut into so many parts if they leave a larger error in its
+#: equations, relative to the motion: beside a slow belt and under a steep law 1e-8 was seen, which
+#: moved the point by 1e-6, and 1e-15 with the parts.
+PARTS, EXACT = 8, 1e-13
 #: The place of nothing.
 NOWHERE = np.full(5, np.nan)
 #: Functions by what it means that one vanishes: the name of a special point, the belts concerned.
@@ -221,7 +225,22 @@ class CycleSystem(AbstractSystem):
 
     def remeshed(self, osc, x):
         loop = Loop(self.chain.codes, self.chain.ends, x[:, :2], x[:, 2])
-        return eqx.tree_at(lambda system: system.chain, self, meshed(osc, loop)[0])
+        return eqx.tree_at(lambda system: system.chain, self, meshed(osc, loop)[0]).refined(osc, x)
+
+    def refined(self, osc: Oscillator, x: Array) -> "CycleSystem":
+        """The same with shorter integration steps on arcs that need them, by the error that their
+        steps leave in the equations at x; steps of length zero pad the others."""
+        chain = self.chain
+        values, misses = _on_both_meshes(self, lambda one: residual(osc, one.chain, x))
+        error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
+        is_tangent = chain.ends >= Ends(chain.codes.shape[-1]).tangent
+        error = jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
+        mesh, others = chain.mesh, (PARTS - 1) * chain.mesh.shape[-1]
+        fine = jnp.repeat(mesh / PARTS, PARTS, axis=-1)
+        coarse = jnp.pad(mesh, [(0, 0), (0, others)])
+        is_exact = error < EXACT * (1 + jnp.max(jnp.abs(x[:, :2])))
+        mesh = jnp.where(is_exact[:, None], coarse, fine)
+        return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
 
 
 def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
@@ -235,25 +254,37 @@ def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
     return phase
 
 
-def nearest_contacts(osc: Oscillator, chain: Chain, z: Array, sticks: Array) -> tuple[Array, Array]:
+def nearest_contacts(
+    osc: Oscillator, chain: Chain, z: Array, sticks: Array, without: int | Array = -1
+) -> tuple[Array, Array]:
     """How near a cycle is to another signature at each belt, and whether it sticks there, [belts].
 
     The shortest of its stick phases, among the arcs `sticks`; where there is none, the distance of
-    its nearest extremum of x2 from the boundary. inf where there is neither.
+    its nearest extremum of x2 from the boundary. Or, if less, that of x2 from the boundary where
+    the cycle passes a contact edge slipping, as it meets both at once then. inf where there is
+    nothing of these. without: an arc whose end is not asked.
     """
+    n = len(osc.belts)
     following = jnp.roll(z, -1, axis=0)
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
     following = jnp.where(last[:, None], z[0], following)
-    extrema = chain.used & (chain.ends == Ends(len(osc.belts)).extremum_x2)
+    extrema = chain.used & (chain.ends == Ends(n).extremum_x2)
+    passes = (chain.ends >= n) & (chain.ends < 3 * n) & (jnp.arange(chain.ends.size) != without)
+    after = following_codes(chain)
     nearest, stuck = [], []
     for belt, one in enumerate(osc.belts):
         own = sticks & (chain.codes[:, belt] == 0)
         shortest = jnp.min(jnp.where(own, z[:, 2], jnp.inf))
         r = one.velocity - osc.omega * following[:, 1]
-        slips = extrema & (jnp.abs(chain.codes[:, belt]) == 1)
-        gap = jnp.min(jnp.where(slips, chain.codes[:, belt] * r, jnp.inf))
+        signs, signs_after = chain.codes[:, belt], after[:, belt]
+        slips = jnp.abs(signs) == 1
+        gap = jnp.min(jnp.where(extrema & slips, signs * r, jnp.inf))
+        # Where it sticks before or after the edge it is on the boundary anyway.
+        sign = jnp.where(slips, signs, signs_after)
+        moves = passes & (signs != 0) & (signs_after != 0) & (jnp.abs(sign) == 1)
+        at_edge = jnp.min(jnp.where(moves, sign * r, jnp.inf))
         stuck.append(jnp.any(own))
-        nearest.append(jnp.where(stuck[-1], shortest, gap))
+        nearest.append(jnp.minimum(jnp.where(stuck[-1], shortest, gap), at_edge))
     return jnp.stack(nearest), jnp.stack(stuck)
 
 
@@ -342,19 +373,21 @@ def solve_system(family: Family, system: CycleSystem, z0, p0, status: Array) -> 
 def _accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
     """The residual, and a bound on the error of p, in its units: what the residual with halved
     steps and rounding do to it."""
+    values = _on_both_meshes(system, lambda one: one.residual(osc, z))
+    weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
+    # Of states; what rounding does to a duration, however long, the velocity undoes.
+    rounding = 1e-15 * (1 + jnp.max(jnp.abs(z[:, :2]))) * jnp.sum(jnp.abs(weights))
+    return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
+
+
+def _on_both_meshes(system: CycleSystem, value: Callable[[CycleSystem], Any]) -> Any:
+    """A value of the system with its integration steps as they are, and with all of them halved."""
     mesh = system.chain.mesh
-    # The steps as they are, and halved; padded by steps of length zero to one shape.
+    # Padded by steps of length zero to one shape.
     meshes = jnp.stack(
         [jnp.concatenate([mesh, jnp.zeros_like(mesh)], axis=1), jnp.repeat(0.5 * mesh, 2, axis=1)]
     )
-
-    def value(mesh):
-        return eqx.tree_at(lambda s: s.chain.mesh, system, mesh).residual(osc, z)
-
-    values = lax.map(value, meshes)
-    weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
-    rounding = 1e-15 * (1 + jnp.max(jnp.abs(z))) * jnp.sum(jnp.abs(weights))
-    return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
+    return lax.map(lambda m: value(eqx.tree_at(lambda s: s.chain.mesh, system, m)), meshes)
 
 
 def judged_by(error: Array, family: Family, status: Array) -> Array:

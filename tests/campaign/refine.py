@@ -5,9 +5,13 @@ several distances, `refine` is asked for its condition, as a user would. It is r
 the point, or another one of that kind that is no farther from the guess: one between the two, or
 one that is nearer on the other side of the guess. Whether something happens there `scan` has to
 say, too, on a short path across it.
+
+The mirror image of the oscillator is asked the same: x1 and x2 with other signs, and the belts in
+reverse order. It has to answer alike.
 """
 
 import time
+from dataclasses import fields, replace
 
 import jaxbelt as jb
 from jaxbelt.results import Status
@@ -38,12 +42,14 @@ def outcome(options, number: int) -> Outcome:
     middle = package.oscillator(case.at(0.5 * sum(case.span)))
     known = [p for p in jb.scan(middle, case.where, case.span) if p.status == Status.OK]
     one = Outcome(f"{case.parameter}, {len(known)} points")
+    image = mirror_image(case)
     for point in known:
         for guess in _guesses(case, float(point.value)):
             osc = package.oscillator(case.at(guess))
             begun = time.perf_counter()
             found = jb.refine(point.condition, osc, where=case.where)
             seconds = time.perf_counter() - begun
+            one.wrong += _unlike(case, image, point.condition, guess, found)
             verdict = _verdict(case, point, guess, found)
             one.counts[f"{verdict} from {abs(guess - float(point.value)):.3f}"] += 1
             one.counts["calls"] += 1
@@ -84,3 +90,54 @@ def _verdict(case: paths.Case, point, guess: float, found) -> str:
     if not any(p.status == Status.OK and abs(p.value - value) < SAME for p in beside):
         return "wrong"
     return "between" if (value - guess) * (at - guess) > 0 else "nearer"
+
+
+# --- mirror images --------------------------------------------------------------------------------
+
+#: Numbers that have another sign in the mirror image.
+_TURNED = ("velocity", "lower", "upper")
+
+
+def mirror_image(case: paths.Case) -> paths.Case:
+    """The path of which the motions are those of another one with -x1 and -x2, and the belts in
+    reverse order. A velocity or an edge is minus that of the path."""
+    belts = [
+        replace(belt, velocity=-belt.velocity, lower=-belt.upper, upper=-belt.lower)
+        for belt in reversed(case.oscillator.belts)
+    ]
+    number, name = case.parameter
+    osc = replace(case.oscillator, belts=tuple(belts))
+    other = {"lower": "upper", "upper": "lower"}.get(name, name)
+    first, last = (_mirrored_value(case, end) for end in case.span)
+    parameter = (-1 if number < 0 else len(belts) - 1 - number, other)
+    return replace(case, oscillator=osc, parameter=parameter, span=tuple(sorted((first, last))))
+
+
+def _mirrored_value(case: paths.Case, value: float) -> float:
+    return -value if case.parameter[1] in _TURNED else value
+
+
+def mirrored_condition(condition, count: int):
+    """The condition on the mirror image of an oscillator with so many belts."""
+
+    def turned(value):
+        if isinstance(value, tuple):
+            return tuple(sorted(count - 1 - one for one in value))
+        return count - 1 - value if type(value) is int else value
+
+    own = {one.name: getattr(condition, one.name) for one in fields(condition)}
+    return type(condition)(**{name: turned(value) for name, value in own.items()})
+
+
+def _unlike(case: paths.Case, image: paths.Case, condition, guess: float, found) -> list[str]:
+    """What the mirror image answers, if that is something else."""
+    value = _mirrored_value(case, guess)
+    osc = package.oscillator(image.at(value))
+    condition = mirrored_condition(condition, len(osc.belts))
+    other = jb.refine(condition, osc, where=image.where)
+    if found.status == other.status:
+        away = abs(_mirrored_value(case, float(other.value)) - float(found.value))
+        if found.status != Status.OK or away <= SAME + float(found.error) + float(other.error):
+            return []
+    told = f"not as its mirror image: from {guess!r}: {found!r}"
+    return [told, f"    {condition} from {value!r}: {other!r}\n    {osc!r}"]
