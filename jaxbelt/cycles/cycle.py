@@ -26,7 +26,7 @@ from ..checks import (
     require,
     require_value,
 )
-from ..model.equilibria import Equilibria, EquilibriumKind, candidates
+from ..model.equilibria import Equilibria, EquilibriumKind, candidates, most_equilibria
 from ..model.events import Signature, signature_name
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
@@ -430,8 +430,14 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
     between it and its neighbour the search is repeated, and Newton's method does the rest.
     """
     check_oscillator(osc)
-    whole = isinstance(around, int) and around >= 0
-    require_value(whole, "around", "the number of an equilibrium, 0 or more", around)
+    last = most_equilibria(osc) - 1
+    is_number = isinstance(around, int | np.integer) and not isinstance(around, bool)
+    among = (
+        "0, the number of the equilibrium"
+        if last == 0
+        else f"the number of an equilibrium, 0 to {last}"
+    )
+    require_value(is_number and 0 <= around <= last, "around", among, around)
     room = SIZES[0] if max_arcs is None else as_whole(max_arcs, "max_arcs")
     loop, status, distance = separating_loop(osc, room, around)
     return _if_meant(exactly(osc, loop, status), loop, distance)

@@ -173,6 +173,14 @@ def _existing(rows, found: Equilibria):
     return pick(rows, slice(int(np.sum(np.asarray(found.kind) > 0))))
 
 
+def most_equilibria(osc: Oscillator) -> int:
+    """How many equilibria there may be: one a zone and one an edge, as far as edges are known."""
+    places = edges(osc)
+    if is_concrete(places):
+        places = [place for place in set(map(float, places)) if np.isfinite(place)]
+    return 2 * len(places) + 1
+
+
 @jit
 def candidates(osc: Oscillator) -> Equilibria:
     """Where the mass can rest, all but saddles: one row a zone and one an edge, sorted; those
