@@ -76,6 +76,13 @@ def in_words(value: Any) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
+def shape_in_words(tree: Any) -> str:
+    """What a function returned where it was tried on shapes."""
+    if isinstance(tree, jax.ShapeDtypeStruct):
+        return f"an array of {tree.dtype} of shape {tree.shape}"
+    return f"a {type(tree).__name__} of {len(jax.tree.leaves(tree))} arrays"
+
+
 def _array_in_words(value: Any) -> str:
     if np.size(value) > 8 or jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         ends = f", from {value[0]:.6g} to {value[-1]:.6g}" if _is_row(value) else ""

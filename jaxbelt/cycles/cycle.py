@@ -195,6 +195,19 @@ class Cycle(eqx.Module):
         )
 
 
+def shapes_of_cycle(osc: Oscillator) -> Cycle:
+    """The shapes of a cycle of that oscillator, on which functions of cycles can be tried."""
+    arcs, number, whole = SIZES[0], jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), int)
+
+    def numbers(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct((arcs, *shape), float)
+
+    ends: Any = jax.ShapeDtypeStruct((arcs,), int)
+    chain = Chain(numbers(len(osc.belts)), ends, numbers(FINE_STEPS))
+    known: Any = (number, number, whole, whole)
+    return Cycle(jax.eval_shape(lambda: osc), chain, numbers(3), *known)
+
+
 def as_loop(cycle: Cycle, size: int) -> Loop:
     """The loop that a cycle is, padded to `size` arcs."""
     chain, z = cycle.chain, cycle.unknowns

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ..checks import require
+from ..checks import require, shape_in_words
 from ..model.oscillator import Oscillator
 from .along import Motion
 from .moments import AtSection, checked
@@ -33,12 +33,12 @@ def check_reducer(reducer: Any, osc: Oscillator) -> None:
     event = jax.eval_shape(RunEvent, *place, code, code, moment, integrals)
     new = _tried("update", "(state, event)", reducer.update, state, event)
     same = jax.tree.map(jnp.shape, new) == jax.tree.map(jnp.shape, state)
-    came = f"{_shapes(new)} where init returns {_shapes(state)}"
+    came = f"{shape_in_words(new)} where init returns {shape_in_words(state)}"
     require(same, "observe.update", "a method that returns a state such as init does", came)
     end = jax.eval_shape(RunEnd, *place, code, integrals)
     results = _tried("finish", "(state, end)", reducer.finish, state, end)
     expected = "a method that returns a dictionary of results"
-    require(isinstance(results, Mapping), "observe.finish", expected, _shapes(results))
+    require(isinstance(results, Mapping), "observe.finish", expected, shape_in_words(results))
     strange = [name for name in results if not isinstance(name, str)]
     require(not strange, "observe.finish", f"{expected} by their names", strange)
 
@@ -53,7 +53,7 @@ def check_sections(moments: Sequence[Any], osc: Oscillator) -> None:
             value = _shape_of(field, kind, function, number, number)
             fits = isinstance(value, jax.ShapeDtypeStruct) and value.shape == ()
             fits = fits and jnp.issubdtype(value.dtype, jnp.floating)
-            require(fits, field, f"{kind} that returns one number", _shapes(value))
+            require(fits, field, f"{kind} that returns one number", shape_in_words(value))
 
 
 def _tried(name: str, arguments: str, method: Callable, *args: Any) -> Any:
@@ -71,10 +71,3 @@ def _shape_of(field: str, kind: str, function: Callable, *args: Any) -> Any:
             f"{field} must be {kind} made of what JAX can trace "
             f"(jnp.where, say, not if), got {type(error).__name__}: {came}"
         ) from error
-
-
-def _shapes(tree: Any) -> str:
-    """What came, in words."""
-    if isinstance(tree, jax.ShapeDtypeStruct):
-        return f"an array of {tree.dtype} of shape {tree.shape}"
-    return f"a {type(tree).__name__} of {len(jax.tree.leaves(tree))} arrays"
