@@ -1,4 +1,4 @@
-"""How long a call may leave somebody in front of a terminal, or of a notebook, without a sign of life.
+"""How long a call may leave somebody at a terminal, or at a notebook, without a sign of life.
 
 `python -m tests.silence` calls what may take long, each function in a process of its own, in which
 nothing was compiled before, and then once more; names choose among them, and `--notebook` asks a
@@ -8,6 +8,7 @@ time between two changes, its beginning and its end among them.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import pty
@@ -51,6 +52,8 @@ CALLS = {
     "plot_vector_field": "jb.plot_vector_field(osc)",
     "attractors": "jb.attractors(dataset)",
     "in_si": "jb.in_si(cycle, machine)",
+    "plot": "cycle.plot()",
+    "explore": "jb.explore(osc)",
     "explain": "jb.explain(jb.presets.class_b, square(1024), t1=100.0)",
     "jax.jacfwd": "jax.block_until_ready(jax.jacfwd(end)(0.45))",
     "jax.vmap": "jax.block_until_ready(jax.vmap(end)(0.45 + 0.001 * np.arange(256)))",
@@ -70,10 +73,13 @@ end = lambda nu: jb.simulate(jb.presets.class_b(nu, 0.35), (3.0, 0.0), 30.0).ys[
 NEEDED = {
     "finite_time_stability": "basins = jb.basins(osc, x1=row, x2=row)",
     **dict.fromkeys(
-        ("energy_dissipated", "plot_phase_portrait", "sample"),
+        ("energy_dissipated", "plot", "plot_phase_portrait", "sample"),
         "cycle = jb.find_cycle(osc, (3.0, 0.0))",
     ),
-    "attractors": 'dataset = jb.sweep(jb.presets.class_b, square(128), observe="attractor")',
+    "attractors": """
+axes = {"nu0": np.linspace(-0.7, 0.7, 64), "x1": np.linspace(-2.0, 2.0, 64)}
+dataset = jb.sweep(jb.presets.class_a, axes, observe="attractor")
+""",
     "in_si": """
 law = jb.Conti(1.0, 0.6, 10.0)
 machine = jb.Machine(1.0, 1.0, 0.5, (jb.PhysicalBelt(0.45, law, 1.0),))
@@ -96,7 +102,7 @@ def longest(times: Iterable[float]) -> tuple[float, float]:
 
 
 def told(name: str, turn: str, times: list[float]) -> str:
-    """A line of the table; times: of the beginning, of each change on the screen, and of the end."""
+    """A line of the table; times: of the beginning, each change on the screen, and the end."""
     gap, at = longest(times)
     return f"{name:20} {turn:6} {times[-1] - times[0]:8.2f} {gap:8.2f} {at:8.2f} {len(times) - 2:8}"
 
@@ -169,13 +175,17 @@ def in_notebook(name: str) -> list[str]:
     manager, client = start_new_kernel(env=environment)
     arrived: queue.Queue = queue.Queue()
 
-    def listen() -> None:
-        while True:
-            message = client.get_iopub_msg(timeout=None)
-            arrived.put((time.monotonic(), message))
+    ended = threading.Event()
 
+    def listen() -> None:
+        while not ended.is_set():
+            with contextlib.suppress(queue.Empty):
+                message = client.get_iopub_msg(timeout=0.5)
+                arrived.put((time.monotonic(), message))
+
+    listener = threading.Thread(target=listen)
+    listener.start()
     try:
-        threading.Thread(target=listen, daemon=True).start()
         stamps, changes = [], []
         for code in (BEFORE + NEEDED.get(name, ""), *[f"_ = {CALLS[name]}"] * 2):
             began, sent = time.monotonic(), client.execute(code)
@@ -196,6 +206,8 @@ def in_notebook(name: str) -> list[str]:
             stamps += [began, at]
         return _lines(name, stamps[2:], changes)
     finally:
+        ended.set()
+        listener.join()
         client.stop_channels()
         manager.shutdown_kernel(now=True)
 

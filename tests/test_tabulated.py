@@ -10,7 +10,7 @@ import pytest
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.model import friction
-from jaxbelt.model.friction import _kink_of
+from jaxbelt.model.friction import kink_of
 from jaxbelt.sweeps.question import Question
 
 SPEEDS = np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0])
@@ -96,11 +96,11 @@ class Smooth(jb.AbstractFriction):
 
 
 def test_kinks_are_found_where_they_are_and_nowhere_else():
-    speed, before, after = _kink_of(Corner(0.6))
+    speed, before, after = kink_of(Corner(0.6))
     assert (speed, before, after) == (pytest.approx(0.2, rel=1e-6), -0.5, 0.0)
-    assert _kink_of(Lines(0.6))[0] == pytest.approx(0.1, rel=1e-6)
-    assert _kink_of(Smooth(0.6)) is None
-    assert _kink_of(jb.Tabulated(SPEEDS, MEASURED)) is None
+    assert kink_of(Lines(0.6))[0] == pytest.approx(0.1, rel=1e-6)
+    assert kink_of(Smooth(0.6)) is None
+    assert kink_of(jb.Tabulated(SPEEDS, MEASURED)) is None
 
 
 def test_a_law_of_straight_lines_is_told_of_once():

@@ -28,6 +28,7 @@ from ..checks import (
 )
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, most_equilibria
 from ..model.events import Signature, signature_name
+from ..model.friction import kink_of
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.rest import is_neutral
@@ -36,7 +37,7 @@ from ..numerics.compiling import any_lane, each, in_groups, jit
 from ..numerics.newton import HOLDS
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
-from .chains import SIZES, Chain, Loop, loop_events, room_of
+from .chains import SIZES, Chain, Loop, loop_events, modes_of, room_of
 from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
 from .shooting import (
     ARC_STEPS,
@@ -315,15 +316,36 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
     for steps in (FINE_STEPS, *FINER_STEPS):
         if int(status) != Status.OK or not _is_inexact(cycle, error):
             break
-        fails = int(cycle.status) == Status.NO_CONVERGENCE
-        if fails and _mesh_error(osc, loop, coarser) < EXACT:
-            break  # not for its steps
+        if int(cycle.status) == Status.NO_CONVERGENCE:
+            change = float(_mesh_error(osc, loop, coarser))
+            # With the order two that is left across a kink.
+            finest = change * (coarser / FINER_STEPS[-1]) ** 2
+            if change < EXACT or (finest > HOLDS and _slips_across_kink(osc, loop)):
+                break  # not for its steps, or more of them do not help
         coarser = steps
         finer, remaining = _polished(osc, loop, status, steps)
         if int(cycle.status) == Status.OK and remaining > 0.1 * error:
             break  # the rest is rounding
         cycle, error = finer, remaining
     return cycle
+
+
+def _slips_across_kink(osc: Oscillator, loop: Loop) -> bool:
+    """Whether the mass slips, on a known loop, at the speed at which a law of one's own has its
+    largest kink."""
+    modes = modes_of(loop)
+    begin = np.asarray(loop.entries)[: len(modes), 1]
+    x2 = np.stack([begin, np.roll(begin, -1)])
+    for belt, codes in zip(osc.belts, modes.T, strict=True):
+        slips = np.abs(codes) == 1
+        kink = kink_of(belt.friction) if np.any(slips) else None
+        if kink is not None:
+            # Between its ends an arc's speed rises or falls throughout.
+            speeds = np.abs(float(belt.velocity) - float(osc.omega) * x2[:, slips])
+            inside = (np.min(speeds, axis=0) < kink[0]) & (kink[0] < np.max(speeds, axis=0))
+            if np.any(inside):
+                return True
+    return False
 
 
 def _is_inexact(cycle: Cycle, error: Array) -> Array:

@@ -6,6 +6,7 @@ from jaxtyping import Array
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon, Rectangle
 
+from ..activity import announced
 from ..checks import as_positive, require_value
 from ..model.friction import AbstractFriction
 from ..numerics.compiling import jit
@@ -17,6 +18,7 @@ def _coefficient(friction: AbstractFriction, speed: Array) -> Array:
     return friction.mu(speed)
 
 
+@announced("plot_friction_law")
 def plot_friction_law(
     friction: AbstractFriction, ax: Axes | None = None, *, speed: float = 1.0, unit: str = ""
 ) -> Axes:

@@ -23,6 +23,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from ..activity import announced
 from ..checks import as_interval, require_one_of, require_value
 from ..cycles.cycle import Cycle
 from ..cycles.portrait import Portrait
@@ -176,6 +177,7 @@ def path_around(cycle: ClosedOrbit) -> np.ndarray:
 # --- phase portraits ----------------------------------------------------------------------------
 
 
+@announced("plot_phase_portrait")
 def plot_phase_portrait(
     osc: Oscillator,
     trajectories: Trajectory | Sequence[Trajectory] = (),
@@ -460,6 +462,7 @@ def _draw_arrowheads(ax: Axes, path: np.ndarray, colour: str, indices: Sequence[
 # --- vector field -------------------------------------------------------------------------------
 
 
+@announced("plot_vector_field")
 def plot_vector_field(
     osc: Oscillator,
     *,

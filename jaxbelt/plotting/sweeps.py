@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
+from ..activity import announced
 from ..checks import require, require_one_of, require_value
 from ..sweeps.basins import Basins, BasinStability, standard_error
 from ..sweeps.fractions import BasinFractions
@@ -114,6 +115,7 @@ def _with_unit(words: str, told: dict[str, Any]) -> str:
     return f"{words} ({in_fractions(told['units'])})" if "units" in told else words
 
 
+@announced("plot_basins")
 def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     """Which start leads where, with the cycles, and the unstable one between the basins dashed.
 

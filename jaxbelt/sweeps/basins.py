@@ -109,6 +109,7 @@ class Basins(eqx.Module):
         boundary = float(np.mean(entropy[mixed])) if np.any(mixed) else float("nan")
         return BasinEntropy(float(np.mean(entropy)), boundary)
 
+    @announced("finite_time_stability")
     def finite_time_stability(self, t: ArrayLike, within: ArrayLike) -> np.ndarray:
         """The finite-time basin stability of each attractor, [attractors]: the fraction of all
         starts that lead to it and are near to it at time t.
