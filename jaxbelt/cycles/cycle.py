@@ -467,12 +467,9 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
     check_oscillator(osc)
     last = most_equilibria(osc) - 1
     is_number = isinstance(around, int | np.integer) and not isinstance(around, bool)
-    among = (
-        "0, the number of the equilibrium"
-        if last == 0
-        else f"the number of an equilibrium, 0 to {last}"
-    )
-    require_value(is_number and 0 <= around <= last, "around", among, around)
+    among = f"0 to {last}" if last else "0"
+    expected = f"the number of an equilibrium, {among}"
+    require_value(is_number and 0 <= around <= last, "around", expected, around)
     room = SIZES[0] if max_arcs is None else as_whole(max_arcs, "max_arcs")
     loop, status, distance = separating_loop(osc, room, around)
     return _if_meant(exactly(osc, loop, status), loop, distance)

@@ -148,10 +148,10 @@ def design(
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     functionals, intervals = _checked_targets(targets)
-    tell = told_to(report)
-    selection, u = selection_of(oscillator, where, bounds)
     for functional in functionals:
         _check_functional(functional, oscillator)
+    tell = told_to(report)
+    selection, u = selection_of(oscillator, where, bounds)
 
     def evaluate(u):
         u = jnp.asarray(u)
