@@ -10,6 +10,7 @@ import pytest
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.model import friction
+from jaxbelt.cycles.shooting import ARC_STEPS
 from jaxbelt.model.friction import kink_of
 from jaxbelt.sweeps.question import Question
 
@@ -116,6 +117,8 @@ def test_a_cycle_with_straight_lines_is_not_found_and_the_text_says_what_to_do()
     osc = jb.Oscillator(0.03, (jb.Belt(0.3, Lines(0.6)),))
     cycle = jb.find_cycle(osc, (3.0, 0.0))
     assert cycle.status == Status.NO_CONVERGENCE and "smooth" in repr(cycle)
+    # Finer steps are not tried: each number of steps is compiled, and none is enough.
+    assert cycle.chain.mesh.shape[-1] == ARC_STEPS
 
 
 def test_a_table_is_no_parameter_and_static_is_one():

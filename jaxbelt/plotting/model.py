@@ -10,7 +10,7 @@ from ..activity import announced
 from ..checks import as_positive, require_value
 from ..model.friction import AbstractFriction
 from ..numerics.compiling import jit
-from .style import belt_colour, check_axes, new_axes
+from .style import belt_colour, new_axes, require_axes
 
 
 @jit
@@ -32,7 +32,7 @@ def plot_friction_law(
     require_value(isinstance(friction, AbstractFriction), "friction", law, friction)
     speed = as_positive(speed, "speed")
     require_value(isinstance(unit, str), "unit", 'a text such as "m/s"', unit)
-    check_axes(ax)
+    require_axes(ax)
     ax = new_axes() if ax is None else ax
     r = jnp.linspace(0.0, speed, 401)
     mu, static = np.asarray(_coefficient(friction, r)), float(friction.static)

@@ -38,12 +38,12 @@ from ..numerics.compiling import jit
 from .style import (
     add_key,
     belt_colour,
-    check_axes,
     figure_of,
     journal_figure,
     key_entries,
     new_axes,
     new_figure,
+    require_axes,
     spread,
 )
 
@@ -207,7 +207,7 @@ def plot_phase_portrait(
     known = equilibria is None or isinstance(equilibria, Equilibria)
     require_value(known, "equilibria", "what jb.equilibria returns, or None", equilibria)
     _check_window(xlim, ylim)
-    check_axes(ax)
+    require_axes(ax)
     is_new, ax = ax is None, new_axes() if ax is None else ax
     paths = [path_of(trajectory)[1] for trajectory in trajectories]
     loops = [path_around(cycle) for cycle in cycles]
@@ -480,7 +480,7 @@ def plot_vector_field(
     check_oscillator(osc)
     require_one_of(kind, ("streamlines", "arrows"), "kind")
     _check_window(xlim, ylim)
-    check_axes(ax)
+    require_axes(ax)
     ax = new_axes() if ax is None else ax
     (left, right), (bottom, top) = _window(osc, [], None, xlim, ylim)
     ax.set(xlim=(left, right), ylim=(bottom, top))

@@ -204,7 +204,7 @@ def spread(wanted: np.ndarray, gap: float) -> np.ndarray:
     return at
 
 
-def check_axes(ax: Any) -> None:
+def require_axes(ax: Any) -> None:
     """Raise unless `ax` is axes to draw into, or None: new ones."""
     expected = "axes of matplotlib, such as plt.subplots()[1], or None"
     require_value(ax is None or isinstance(ax, Axes), "ax", expected, ax)

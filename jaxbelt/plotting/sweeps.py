@@ -22,13 +22,13 @@ from .phase import plot_phase_portrait
 from .style import (
     add_key,
     belt_colour,
-    check_axes,
     draw_key,
     figure_of,
     in_fractions,
     journal_figure,
     new_axes,
     parameter_label,
+    require_axes,
 )
 
 #: Axes of datasets that are no parameters.
@@ -50,7 +50,7 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     known = isinstance(dataset, xr.Dataset)
     require_value(known, "dataset", "an xarray.Dataset, such as sweep(...) returns", dataset)
     require_one_of(variable, map(str, dataset.data_vars), "variable")
-    check_axes(ax)
+    require_axes(ax)
     told = dataset[variable].attrs
     is_category = variable == "kind" or "flag_meanings" in told
     # Signatures get their numbers when all are known.
@@ -123,7 +123,7 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     orange, undecided starts white. Returns the axes.
     """
     require_value(isinstance(basins, Basins), "basins", "what jb.basins returns", basins)
-    check_axes(ax)
+    require_axes(ax)
     ax = new_axes() if ax is None else ax
     labels = np.asarray(basins.label)
     x1, x2 = np.asarray(basins.dataset["x1"]), np.asarray(basins.dataset["x2"])
