@@ -9,8 +9,8 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.model import friction
 from jaxbelt.cycles.shooting import ARC_STEPS
+from jaxbelt.model import friction
 from jaxbelt.model.friction import kink_of
 from jaxbelt.sweeps.question import Question
 

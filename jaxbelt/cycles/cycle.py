@@ -196,17 +196,12 @@ class Cycle(eqx.Module):
         )
 
 
-def shapes_of_cycle(osc: Oscillator) -> Cycle:
-    """The shapes of a cycle of that oscillator, on which functions of cycles can be tried."""
-    arcs, number, whole = SIZES[0], jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), int)
-
-    def numbers(*shape: int) -> Any:
-        return jax.ShapeDtypeStruct((arcs, *shape), float)
-
-    ends: Any = jax.ShapeDtypeStruct((arcs,), int)
-    chain = Chain(numbers(len(osc.belts)), ends, numbers(FINE_STEPS))
-    known: Any = (number, number, whole, whole)
-    return Cycle(jax.eval_shape(lambda: osc), chain, numbers(3), *known)
+def cycle_of_zeros(osc: Oscillator) -> Cycle:
+    """What has the shapes of a cycle of that oscillator, on which functions of cycles are tried."""
+    arcs, number, whole = SIZES[0], jnp.zeros(()), jnp.zeros((), int)
+    codes, mesh = jnp.zeros((arcs, len(osc.belts))), jnp.zeros((arcs, FINE_STEPS))
+    chain = Chain(codes, jnp.zeros(arcs, int), mesh)
+    return Cycle(osc, chain, jnp.zeros((arcs, 3)), number, number, whole, whole)
 
 
 def as_loop(cycle: Cycle, size: int) -> Loop:

@@ -27,7 +27,7 @@ from ..checks import (
     shape_in_words,
     traceable,
 )
-from ..cycles.cycle import Cycle, find_cycle, shapes_of_cycle
+from ..cycles.cycle import Cycle, cycle_of_zeros, find_cycle
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
@@ -223,8 +223,11 @@ def _check_functional(functional: Callable[[Cycle], Any], osc: Oscillator) -> No
     if isinstance(functional, BasinMargin):
         return
     field, expected = "functional of targets", "a function of a cycle that returns one number"
-    shapes = shapes_of_cycle(osc)
-    value = traceable(lambda: jax.eval_shape(functional, shapes), field, expected)
+
+    def tried(osc: Oscillator) -> Any:
+        return functional(cycle_of_zeros(osc))
+
+    value = traceable(lambda: jax.eval_shape(tried, osc), field, expected)
     fits = isinstance(value, jax.ShapeDtypeStruct) and value.shape == ()
     require(fits, field, expected, f"one that returns {shape_in_words(value)}")
 
