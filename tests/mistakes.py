@@ -571,7 +571,7 @@ MISTAKES = [
     ("jaxbelt sweep nu0=0:1:9 --out p.zarr --blocks 4", "blocks must be FROM:TO, .*, got '4'"),
     ("jaxbelt sweep nu0=nan", "an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got 'nu0=nan'"),
     ("jaxbelt sweep nu0=0:inf:5", "an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got"),
-    ("jaxbelt sweep --nuo 0.3", r"No such option:? '?--nuo'?.*nu0=\.\.\., nu1=\.\.\."),
+    ("jaxbelt sweep --nuo 0.3", r"No such option:? '?--nuo'?.*nu0=\.\.\.'?, '?nu1=\.\.\."),
     ("jaxbelt diagram --nuo 0.3", r"No such option:? '?--nuo'?[^-]*--nu0'?, '?--nu1"),
     ("jaxbelt simulate -nu0 0.3", r"No such option:? '?-n'?.*--nu0"),
     ("jaxbelt basins --zeta 0.3", "No such option:? '?--zeta'?.*--damping"),
