@@ -6,8 +6,10 @@ pages of public names say comes from the docstrings, see `reference`; notebooks 
 outputs stored in them.
 """
 
+import base64
 import json
 import shutil
+import struct
 import sys
 from pathlib import Path
 
@@ -66,7 +68,8 @@ copybutton_prompt_is_regexp = True
 
 
 def take_notebooks() -> None:
-    """Copies the notebooks to where Sphinx looks for pages, without the views of progress bars."""
+    """Copies the notebooks to where Sphinx looks for pages, without the views of progress bars;
+    pictures that a phone would make too small to read are marked as wide, see site.css."""
     pages = HERE / "notebooks"
     shutil.rmtree(pages, ignore_errors=True)
     pages.mkdir()
@@ -78,11 +81,23 @@ def take_notebooks() -> None:
             cell["source"] = "".join(cell["source"]).replace("](../docs/", "](../")
             if cell["cell_type"] == "code":
                 cell["outputs"] = [one for one in cell["outputs"] if not _is_widget(one)]
+                if any(_width(one) > WIDE for one in cell["outputs"]):
+                    cell["metadata"]["mystnb"] = {"image": {"classes": "wide"}}
         (pages / path.name).write_text(json.dumps(notebook), encoding="utf-8")
 
 
 def _is_widget(output: dict) -> bool:
     return any("widget" in kind for kind in output.get("data", {}))
+
+
+#: Pictures with more columns of pixels than this are wide.
+WIDE = 700
+
+
+def _width(output: dict) -> int:
+    """The columns of pixels of an output's picture, from the header of the PNG; 0: it has none."""
+    text = "".join(output.get("data", {}).get("image/png", ""))
+    return struct.unpack(">I", base64.b64decode(text[:32])[16:20])[0] if text else 0
 
 
 take_notebooks()

@@ -228,7 +228,11 @@ def measured(question: Question) -> str:
 
 def main(names: list[str]) -> None:
     """Prints the table; writes it if it is whole."""
-    lines = ["| function | answer | first call | again | each |", "|---|---|---|---|---|"]
+    lines = [
+        "{.costs}",
+        "| function | answer | first call | again | each |",
+        "|---|---|---|---|---|",
+    ]
     print("\n".join(lines), flush=True)
     for question in QUESTIONS:
         if not names or question.name in names:

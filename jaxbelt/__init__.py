@@ -82,9 +82,12 @@ def __dir__() -> list[str]:
 
 
 def _with_matplotlib(result: Any, ax: Any, **options: Any) -> Any:
-    from .plotting.draw import draw_result
+    from .activity import Activity
 
-    return draw_result(result, ax, **options)
+    with Activity("plot"):  # the first time, Matplotlib is imported
+        from .plotting.draw import draw_result
+
+        return draw_result(result, ax, **options)
 
 
 draw_with(_with_matplotlib)

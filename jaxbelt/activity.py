@@ -1,4 +1,4 @@
-"""What takes long says what it does, on a terminal or in a notebook, after two seconds.
+"""What takes long says what it does, on a terminal or in a notebook, after a second.
 
 Functions that may take long are `announced`; inside of them `tell` says how far they are. Of those
 that call one another the outermost one has the line. Elsewhere, in scripts and pipes, nothing is
@@ -15,8 +15,9 @@ from typing import Any, ClassVar
 from rich.console import Console
 from rich.progress import Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-#: Seconds before anything is shown that nobody asked for.
-SHOWN_AFTER = 2.0
+#: Seconds before anything is shown that nobody asked for. A busy machine may take another one, and
+#: nobody is to see nothing for more than two.
+SHOWN_AFTER = 1.0
 
 logger = logging.getLogger("jaxbelt")
 logger.addHandler(logging.NullHandler())

@@ -64,6 +64,8 @@ def in_words(value: Any) -> str:
         return _array_in_words(value)
     if inspect.isclass(value):
         return f"the class {value.__name__}, not an object of it"
+    if hasattr(type(value), "plot") and hasattr(type(value), "table"):
+        return f"a {type(value).__name__}"  # a result, which has many numbers
     if inspect.isroutine(value):
         return f"the function {getattr(value, '__qualname__', value)}"
     if isinstance(value, tuple | list) and type(value) in (tuple, list) and len(value) <= 6:
@@ -72,6 +74,13 @@ def in_words(value: Any) -> str:
     else:
         text = " ".join(repr(value).split())
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def shape_in_words(tree: Any) -> str:
+    """What a function returned where it was tried on shapes."""
+    if isinstance(tree, jax.ShapeDtypeStruct):
+        return f"an array of {tree.dtype} of shape {tree.shape}"
+    return f"a {type(tree).__name__} of {len(jax.tree.leaves(tree))} arrays"
 
 
 def _array_in_words(value: Any) -> str:
@@ -83,9 +92,9 @@ def _array_in_words(value: Any) -> str:
 
 def _is_row(value: Any) -> bool:
     return (
-        value.ndim == 1
+        isinstance(value, np.ndarray)
+        and value.ndim == 1
         and np.issubdtype(value.dtype, np.floating)
-        and isinstance(value, np.ndarray)
     )
 
 
@@ -107,6 +116,12 @@ def require_callable(value: Any, field: str, expected: str) -> None:
     require_value(callable(value), field, expected, value)
 
 
+def require_wish(value: Any, field: str) -> None:
+    """Raise unless `value` is True, False or None, which leaves it open."""
+    is_wish = value is None or isinstance(value, bool)
+    require_value(is_wish, field, "True, False or None", value)
+
+
 def as_whole(value: Any, field: str, least: int = 1) -> int:
     """`value` as an integer that is `least` or more, or a `ValueError`."""
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= least
@@ -126,6 +141,15 @@ def as_interval(value: Any, field: str) -> tuple[float, float]:
     first, last = ends.tolist()
     require(first < last, field, expected, f"({first:.12g}, {last:.12g})")
     return first, last
+
+
+def refuse_interval(values: Any, field: str) -> None:
+    """Raise where an interval came, (first, last), and all values are wanted: they would be two."""
+    if isinstance(values, tuple) and len(values) == 2:
+        first, last = map(in_words, values)
+        expected = f"all values, such as np.linspace({first}, {last}, 201)"
+        came = f"{in_words(values)}; for two values write {list(values)}"
+        require(False, field, expected, came)
 
 
 def as_path(value: Any, field: str) -> Path:

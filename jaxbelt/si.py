@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .activity import announced
 from .bifurcations.diagrams import BifurcationDiagram
 from .checks import outside_of_traces, require
 from .cycles.cycle import Cycle
@@ -64,6 +65,7 @@ AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
 SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
 
 
+@announced("in_si")
 @outside_of_traces
 def in_si(
     result: Union[

@@ -10,6 +10,7 @@ import shlex
 import sys
 import time
 import warnings
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,7 @@ CYCLE = r"cycle must be a Cycle, such as jb.find_cycle\(...\), got "
 WHOLE = "must be a positive integer, got "
 POINT = r"point must be a BifurcationPoint, such as jb.refine\(...\), got "
 TARGETS = r"targets must be a list of pairs \(functional, value\), such as .* got "
+AXES_OF = r"ax must be axes of matplotlib, such as plt.subplots\(\)\[1\], or None, got "
 OBSERVE = '"final", "attractor" or an object with init, update, finish, got '
 TRACED = r" must be known: \w+ is not for jit, vmap or derivatives, got a traced one"
 
@@ -74,6 +76,20 @@ MISTAKES = [
     ("jb.Oscillator(0.5, (belt,), omega=0)", r"omega must be > 0, got 0\.0"),
     ("jb.Oscillator(dampng=0.5, belts=(belt,))", "unexpected keyword argument 'dampng'"),
     ("jb.plot_sweep(dataset, 'knd')", "variable must be \"kind\", got 'knd'"),
+    (
+        "jb.Belt(0.3, OwnLaw(lambda r: jnp.ones(3)))",
+        r"mu of OwnLaw must .* one float64 a speed, got ",
+    ),
+    ("jb.Belt(0.3, OwnLaw(lambda r: None))", "mu of OwnLaw must .* one float64 a speed, got None"),
+    (
+        "jb.Belt(0.3, OwnLaw(lambda: 0.5))",
+        "mu of OwnLaw must be a function of the speed, .*argument",
+    ),
+    ("jb.Conti(1.0, math.nan, 10.0)", "residual of Conti must be finite, got nan"),
+    ("jb.Belt(0.3, law, load='1')", "load must be a number, got '1'"),
+    ("jb.Belt(0.3, law, lower=1.0, upper=1.0)", r"lower of belt must be < 1\.0, got 1\.0"),
+    ("jb.Oscillator(0.5, (belt, None))", r"belts\[1\] must be a Belt, got None"),
+    ("jb.Oscillator(0.5, (physical,))", r"belts\[0\] must be a Belt, got PhysicalBelt\("),
     # --- machines
     ("jb.Machine(0.0, 1.0, 0.1, (physical,))", r"mass must be > 0, got 0\.0"),
     ("jb.Machine(m=1.0, k=1.0, c=0.1, belts=(physical,))", "stiffness, not k, damping, not c"),
@@ -145,6 +161,13 @@ MISTAKES = [
     ("jb.energy_fed(osc)", CYCLE + r"Oscillator\("),
     ("jb.energy_dissipated(cycle.chain)", CYCLE + "None"),
     ("jb.describe(99)", "status must be a Status, or its number, got 99"),
+    ("jb.unstable_cycle(osc, around=99)", "around must be the number of an equil.*, 0, got 99"),
+    ("jb.unstable_cycle(osc, around=True)", "around must be the number of an .*, 0, got True"),
+    ("jb.unstable_cycle(edged, around=3)", "around must be the number of an .*, 0 to 2, got 3"),
+    ("jb.minimal_fatal_shock(osc, cycle)", "y0 must be numbers, got a Cycle"),
+    ("jb.find_cycle(osc, (math.inf, 0.0))", r"y0 must be finite, got \[inf  ?0\.\]"),
+    ("jb.stick_duration([cycle], belt=0)", CYCLE),
+    ("jb.simulate(osc, cycle, 10.0)", "y0 must be numbers, got a Cycle"),
     # --- bifurcations
     ("jb.refine(jb.Hopf, osc, where=nu0)", "condition must be such as .*, got the class Hopf"),
     ("jb.refine(osc, jb.Hopf(), where=nu0)", r"condition must be such as .*, got Oscillator\("),
@@ -237,6 +260,33 @@ MISTAKES = [
     ),
     ("jb.region_map(jb.presets.class_b, AXES, starts=(3.0, 0.0))", r"starts must .*got \(3\.0, 0"),
     ("jb.region_map(jb.presets.class_b, AXES, lines=-1)", "lines must be an integer >= 0, got -1"),
+    ("jb.refine(jb.NonsmoothFold(True), osc, where=nu0)", "belt must be 0 to 1, got True"),
+    (
+        "jb.refine(jb.GrazingEdge(0, 'middle'), edged, where=nu0)",
+        "unstable must be True or False, got 'middle'",
+    ),
+    ("jb.refine(jb.Hopf(), osc, where=(nu0, nu1))", SELECTS),
+    ("jb.refine(jb.Hopf(), osc, where=lambda o: o.nothing)", SELECTS + ".*'nothing'"),
+    ("jb.scan(osc, nu0, (0.3, 0.3))", "span " + PAIR + r"\(0\.3, 0\.3\)"),
+    ("jb.scan(osc, nu0, (0.1, 0.7), conditions=[jb.Hopf])", "conditions must be .*the class Hopf"),
+    ("jb.scan(lambda nu: None, span=(0.1, 0.7))", "osc must be .* got one that returns NoneType"),
+    (
+        "jb.orbit_diagram(osc, nu0, (0.1, 0.7), at=jb.AtSection(lambda o: 1.0))",
+        r"function of AtSection must be a function of \(osc, x1, x2\) .*got TypeError",
+    ),
+    (
+        "jb.orbit_diagram(osc, nu0, (0.1, 0.7), at=jb.AtSection(lambda o, a, b: (a, b)))",
+        "function of AtSection must be .* returns one number, got a tuple of 2 arrays",
+    ),
+    (
+        "jb.orbit_diagram(osc, nu0, (0.1, 0.7), at=jb.AtSection(lambda o, a, b: math.sqrt(a)))",
+        "function of AtSection must be .* made of what JAX can trace",
+    ),
+    (
+        "jb.region_map(jb.presets.class_b, {'nu0': (0, 1), 'nu1': row})",
+        r"nu0 must be all values, such as np.linspace\(0, 1, 201\), got \(0, 1\)",
+    ),
+    ("jb.region_map(jb.presets.class_b, {'nu0': row, 'nu1': [0.3]})", "nu1 must be two values or"),
     # --- sweeps and basins
     (
         "jb.sweep(jb.presets.class_b, {'nu0': row})",
@@ -339,6 +389,20 @@ MISTAKES = [
         r"omega must be > 0, got -1\.0",
     ),
     ("jb.basin_stability(osc, box=BOX, key=key, n=1e4)", f"n {WHOLE}10000.0"),
+    (
+        "jb.sweep(jb.presets.class_b, AXES, t1=9.0, observe=Numbered())",
+        r"observe.finish must be .* by their names, got \[1\]",
+    ),
+    (
+        "jb.sweep(jb.presets.class_b, AXES, t1=9.0, observe=Sectioned())",
+        "function of AtSection must be .* returns one number, got an array of bool",
+    ),
+    ("jb.verify('nowhere.zarr', repair='yes')", "repair must be True or False, got 'yes'"),
+    ("jb.basins(osc, x1=row, x2=row, progress='yes')", "progress must be True, .*got 'yes'"),
+    (
+        "jb.basin_stability(osc, box=BOX, key=keys)",
+        r"key must be one key, .*got an array of key<fry> of shape \(3,\)",
+    ),
     # --- from data to parameters
     ("jb.fit(osc, row, row)", "missing 1 required keyword-only argument: 'where'"),
     ("jb.fit(row, row, osc, where=nu0)", "oscillator must be an Oscillator, .* got an array"),
@@ -382,6 +446,22 @@ MISTAKES = [
     ),
     ("jb.distance_to(jb.Hopf, where=nu0)", "conditions must be a tuple .*, got the class Hopf"),
     ("jb.distance_to(jb.Hopf(), where='nu0')", "where must be a function .*, got 'nu0'"),
+    (
+        "jb.design(osc, [(lambda c: 'a', 1.0)], where=nu0)",
+        "functional of targets must be .*TypeErr",
+    ),
+    (
+        "jb.design(osc, [(lambda c: c.nothing, 1.0)], where=nu0)",
+        "functional of targets must be .*'nothing'",
+    ),
+    (
+        "jb.design(osc, [(lambda c: c.stick_durations, 1.0)], where=nu0)",
+        "functional of targets must be .* one number, got .* of shape .2,.",
+    ),
+    (
+        "jb.design(osc, [(lambda c: math.sqrt(c.period), 1.0)], where=nu0)",
+        "functional of targets must be .* made of what JAX can trace",
+    ),
     # --- in jit, vmap or derivatives
     ("jax.jit(lambda osc: jb.scan(osc, nu0, (0.1, 0.7)))(osc)", "osc" + TRACED),
     ("jax.vmap(lambda end: jb.scan(osc, nu0, (0.1, end)))(row)", "span" + TRACED),
@@ -424,6 +504,23 @@ MISTAKES = [
     ("jb.plot_sweep('sweep.nc', 'kind')", "dataset must be an xarray.Dataset, .*got 'sweep.nc'"),
     ("jb.plot_basins(osc)", r"basins must be what jb.basins returns, got Oscillator\("),
     ("jb.show_progress('yes')", "wanted must be True, False or None, got 'yes'"),
+    ("cycle.plot('here')", AXES_OF + "'here'"),
+    ("point.plot(ax=3)", AXES_OF + "3"),
+    ("jb.plot_friction_law(law, 'here')", AXES_OF + "'here'"),
+    ("jb.plot_friction_law(law, speed='fast')", "speed must be a number, got 'fast'"),
+    ("jb.plot_phase_portrait(osc, ax='here')", AXES_OF + "'here'"),
+    ("jb.plot_phase_portrait(osc, equilibria='none')", "equilibria must be what .*got 'none'"),
+    ("jb.plot_phase_portrait(osc, cycles=cycle)", "cycles must be a list of cyc.*, got a Cycle"),
+    ("jb.plot_vector_field(osc, ax='here')", AXES_OF + "'here'"),
+    ("jb.plot_vector_field(osc, ylim=3)", "ylim " + PAIR + "3"),
+    ("jb.plot_sweep(dataset, 'kind', 'here')", AXES_OF + "'here'"),
+    ("jb.plot_in_si(cycle, machine, ax='here')", AXES_OF + "'here'"),
+    ("jb.plot_time_history([cycle])", r"trajectory must be a Trajectory, .*, got \[a Cycle\]"),
+    ("jb.plot_time_history(run, 'here')", "ax must be two axes of matplotlib, .*, got 'here'"),
+    (
+        "jb.plot_time_history(run, ('upper', 'lower'))",
+        "ax must be two axes of matplotlib, .*'upper",
+    ),
     # --- the command line
     ("jaxbelt simulat", "No such command 'simulat'"),
     ("jaxbelt simulate --class q", "class must be a, b, c or d, got q"),
@@ -474,7 +571,7 @@ MISTAKES = [
     ("jaxbelt sweep nu0=0:1:9 --out p.zarr --blocks 4", "blocks must be FROM:TO, .*, got '4'"),
     ("jaxbelt sweep nu0=nan", "an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got 'nu0=nan'"),
     ("jaxbelt sweep nu0=0:inf:5", "an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got"),
-    ("jaxbelt sweep --nuo 0.3", r"No such option:? '?--nuo'?.*nu0=\.\.\., nu1=\.\.\."),
+    ("jaxbelt sweep --nuo 0.3", r"No such option:? '?--nuo'?.*nu0=\.\.\.'?, '?nu1=\.\.\."),
     ("jaxbelt diagram --nuo 0.3", r"No such option:? '?--nuo'?[^-]*--nu0'?, '?--nu1"),
     ("jaxbelt simulate -nu0 0.3", r"No such option:? '?-n'?.*--nu0"),
     ("jaxbelt basins --zeta 0.3", "No such option:? '?--zeta'?.*--damping"),
@@ -500,6 +597,15 @@ class BranchingLaw(jb.AbstractFriction):
         return 1.0 if speed < 0.1 else 0.5
 
 
+class OwnLaw(jb.AbstractFriction):
+    function: Callable
+    static: float = 1.0
+
+    @property
+    def mu(self):
+        return self.function
+
+
 class Foreign:
     """Such as a column of words of another library."""
 
@@ -518,6 +624,15 @@ class Reducer:
 
     def finish(self, state, end):
         return state
+
+
+class Numbered(Reducer):
+    def finish(self, state, end):
+        return {1: state}
+
+
+class Sectioned(Reducer):
+    at = (jb.AtSection(lambda osc, x1, x2: x1 > 0),)
 
 
 class Growing(Reducer):
@@ -569,9 +684,12 @@ def names() -> dict:
         "TARGET": [(jb.amplitude, 1.0)],
         "belt": jb.Belt(0.3, law),
         "cycle": cycle,
+        "run": jb.Trajectory(*[None] * 5, jnp.asarray(0)),
+        "edged": jb.presets.class_c(0.1, 0.3, 0.2),
         "dataset": xr.Dataset({"kind": ("nu0", [0])}),
         "failed": failed,
         "key": jax.random.key(0),
+        "keys": jax.random.split(jax.random.key(0), 3),
         "law": law,
         "machine": jb.Machine(1.0, 1.0, 0.1, (physical,)),
         "physical": physical,

@@ -308,3 +308,16 @@ def test_design_says_so_when_a_target_is_out_of_reach():
 def test_impossible_targets_are_named(targets, message):
     with pytest.raises(ValueError, match=message):
         jb.design(jb.presets.class_b(0.45, 0.35), targets, where=nu0)
+
+
+@pytest.mark.slow(first=True)
+def test_a_record_of_a_mass_that_sticks_throughout_tells_the_velocity_of_the_belt():
+    """Its one velocity gives the search no scale of velocities."""
+    ts = np.linspace(0.0, 2.0, 100)
+    guess = jb.Oscillator(0.5, (jb.Belt(0.3, jb.Conti(1.0, 0.6, 10.0)),))
+    found = jb.fit(
+        guess, ts, -0.6 + 0.35 * ts, where=lambda o: o.belts[0].velocity, noise=1e-3, starts=2
+    )
+    assert found.status == Status.OK
+    # The record is exact.
+    np.testing.assert_allclose(found.estimates, [0.35], rtol=1e-9)

@@ -9,8 +9,9 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
+from jaxbelt.cycles.shooting import ARC_STEPS
 from jaxbelt.model import friction
-from jaxbelt.model.friction import _kink_of
+from jaxbelt.model.friction import kink_of
 from jaxbelt.sweeps.question import Question
 
 SPEEDS = np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0])
@@ -96,11 +97,11 @@ class Smooth(jb.AbstractFriction):
 
 
 def test_kinks_are_found_where_they_are_and_nowhere_else():
-    speed, before, after = _kink_of(Corner(0.6))
+    speed, before, after = kink_of(Corner(0.6))
     assert (speed, before, after) == (pytest.approx(0.2, rel=1e-6), -0.5, 0.0)
-    assert _kink_of(Lines(0.6))[0] == pytest.approx(0.1, rel=1e-6)
-    assert _kink_of(Smooth(0.6)) is None
-    assert _kink_of(jb.Tabulated(SPEEDS, MEASURED)) is None
+    assert kink_of(Lines(0.6))[0] == pytest.approx(0.1, rel=1e-6)
+    assert kink_of(Smooth(0.6)) is None
+    assert kink_of(jb.Tabulated(SPEEDS, MEASURED)) is None
 
 
 def test_a_law_of_straight_lines_is_told_of_once():
@@ -116,6 +117,8 @@ def test_a_cycle_with_straight_lines_is_not_found_and_the_text_says_what_to_do()
     osc = jb.Oscillator(0.03, (jb.Belt(0.3, Lines(0.6)),))
     cycle = jb.find_cycle(osc, (3.0, 0.0))
     assert cycle.status == Status.NO_CONVERGENCE and "smooth" in repr(cycle)
+    # Finer steps are not tried: each number of steps is compiled, and none is enough.
+    assert cycle.chain.mesh.shape[-1] == ARC_STEPS
 
 
 def test_a_table_is_no_parameter_and_static_is_one():

@@ -135,7 +135,7 @@ class AbstractCondition(eqx.Module):
         # Of a field `belt` that is None, too.
         belts = [vars(self)["belt"]] if "belt" in vars(self) else self.belts_concerned
         for belt in belts:
-            there = isinstance(belt, int) and 0 <= belt < n
+            there = isinstance(belt, int) and not isinstance(belt, bool) and 0 <= belt < n
             require_value(there, "belt", f"0 to {n - 1}", belt)
         plain = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(self))
         require(plain, "condition", "made of plain numbers", self)

@@ -169,7 +169,8 @@ def bifurcation_curve(
         "a BifurcationPoint, such as jb.refine(...)",
         point,
     )
-    require_value(int(point.status) == Status.OK, "point", "one with status OK", point)
+    if int(point.status) != Status.OK:
+        require(False, "point", "one with status OK", repr(point))
     two = isinstance(span, tuple | list | np.ndarray) and len(span) == 2 and np.ndim(span[0]) > 0
     require_value(two, "span", "((first, last), (first, last)), one pair a parameter", span)
     limits = np.array([as_interval(ends, f"span[{i}]") for i, ends in enumerate(span)])

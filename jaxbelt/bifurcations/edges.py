@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..checks import require_value
 from ..cycles.chains import SIZES, Chain, Loop, following_codes
 from ..cycles.cycle import separating_loop
 from ..cycles.settling import AT_REST
@@ -108,6 +109,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
     def check(self, osc):
         super().check(osc)
+        require_value(isinstance(self.repels, bool), "unstable", "True or False", self.repels)
         check_edge(osc, self.belt)
 
     def as_data(self):

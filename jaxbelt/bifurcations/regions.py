@@ -22,6 +22,7 @@ from ..checks import (
     check_arguments,
     check_finite,
     outside_of_traces,
+    refuse_interval,
     require_one_of,
     require_value,
 )
@@ -195,6 +196,8 @@ def region_map(
     require_value(isinstance(axes, Mapping) and len(axes) == 2, "axes", expected, axes)
     names = tuple(axes)
     check_arguments(make, names, "make")
+    for name in names:
+        refuse_interval(axes[name], name)
     values = [np.asarray(as_array(axes[name], name, (None,))) for name in names]
     for name, along in zip(names, values, strict=True):
         increases = along.size > 1 and np.all(np.diff(along) > 0)

@@ -26,8 +26,9 @@ from ..checks import (
     require,
     require_value,
 )
-from ..model.equilibria import Equilibria, EquilibriumKind, candidates
+from ..model.equilibria import Equilibria, EquilibriumKind, candidates, most_equilibria
 from ..model.events import Signature, signature_name
+from ..model.friction import kink_of
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.rest import is_neutral
@@ -36,7 +37,7 @@ from ..numerics.compiling import any_lane, each, in_groups, jit
 from ..numerics.newton import HOLDS
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
-from .chains import SIZES, Chain, Loop, loop_events, room_of
+from .chains import SIZES, Chain, Loop, loop_events, modes_of, room_of
 from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
 from .shooting import (
     ARC_STEPS,
@@ -195,6 +196,14 @@ class Cycle(eqx.Module):
         )
 
 
+def cycle_of_zeros(osc: Oscillator) -> Cycle:
+    """What has the shapes of a cycle of that oscillator, on which functions of cycles are tried."""
+    arcs, number, whole = SIZES[0], jnp.zeros(()), jnp.zeros((), int)
+    codes, mesh = jnp.zeros((arcs, len(osc.belts))), jnp.zeros((arcs, FINE_STEPS))
+    chain = Chain(codes, jnp.zeros(arcs, int), mesh)
+    return Cycle(osc, chain, jnp.zeros((arcs, 3)), number, number, whole, whole)
+
+
 def as_loop(cycle: Cycle, size: int) -> Loop:
     """The loop that a cycle is, padded to `size` arcs."""
     chain, z = cycle.chain, cycle.unknowns
@@ -302,15 +311,36 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
     for steps in (FINE_STEPS, *FINER_STEPS):
         if int(status) != Status.OK or not _is_inexact(cycle, error):
             break
-        fails = int(cycle.status) == Status.NO_CONVERGENCE
-        if fails and _mesh_error(osc, loop, coarser) < EXACT:
-            break  # not for its steps
+        if int(cycle.status) == Status.NO_CONVERGENCE:
+            change = float(_mesh_error(osc, loop, coarser))
+            # With the order two that is left across a kink.
+            finest = change * (coarser / FINER_STEPS[-1]) ** 2
+            if change < EXACT or (finest > HOLDS and _slips_across_kink(osc, loop)):
+                break  # not for its steps, or more of them do not help
         coarser = steps
         finer, remaining = _polished(osc, loop, status, steps)
         if int(cycle.status) == Status.OK and remaining > 0.1 * error:
             break  # the rest is rounding
         cycle, error = finer, remaining
     return cycle
+
+
+def _slips_across_kink(osc: Oscillator, loop: Loop) -> bool:
+    """Whether the mass slips, on a known loop, at the speed at which a law of one's own has its
+    largest kink."""
+    modes = modes_of(loop)
+    begin = np.asarray(loop.entries)[: len(modes), 1]
+    x2 = np.stack([begin, np.roll(begin, -1)])
+    for belt, codes in zip(osc.belts, modes.T, strict=True):
+        slips = np.abs(codes) == 1
+        kink = kink_of(belt.friction) if np.any(slips) else None
+        if kink is not None:
+            # Between its ends an arc's speed rises or falls throughout.
+            speeds = np.abs(float(belt.velocity) - float(osc.omega) * x2[:, slips])
+            inside = (np.min(speeds, axis=0) < kink[0]) & (kink[0] < np.max(speeds, axis=0))
+            if np.any(inside):
+                return True
+    return False
 
 
 def _is_inexact(cycle: Cycle, error: Array) -> Array:
@@ -430,8 +460,11 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
     between it and its neighbour the search is repeated, and Newton's method does the rest.
     """
     check_oscillator(osc)
-    whole = isinstance(around, int) and around >= 0
-    require_value(whole, "around", "the number of an equilibrium, 0 or more", around)
+    last = most_equilibria(osc) - 1
+    is_number = isinstance(around, int | np.integer) and not isinstance(around, bool)
+    among = f"0 to {last}" if last else "0"
+    expected = f"the number of an equilibrium, {among}"
+    require_value(is_number and 0 <= around <= last, "around", expected, around)
     room = SIZES[0] if max_arcs is None else as_whole(max_arcs, "max_arcs")
     loop, status, distance = separating_loop(osc, room, around)
     return _if_meant(exactly(osc, loop, status), loop, distance)

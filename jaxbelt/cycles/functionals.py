@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..activity import announced
 from ..checks import require_one_of, require_value
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator
@@ -82,6 +83,7 @@ def gap(cycle: Cycle, belt: int) -> Array:
     return jnp.maximum(boundary - cycle.x2_max, cycle.x2_min - boundary)
 
 
+@announced("energy_fed")
 def energy_fed(cycle: Cycle) -> Array:
     """Work that the drives of the belts do in one loop: the sum of friction times belt velocity.
 
@@ -90,6 +92,7 @@ def energy_fed(cycle: Cycle) -> Array:
     return _energies(_checked_cycle(cycle))[0]
 
 
+@announced("energy_dissipated")
 def energy_dissipated(cycle: Cycle) -> Array:
     """Energy that damping and slipping contacts turn into heat in one loop."""
     return _energies(_checked_cycle(cycle))[1]

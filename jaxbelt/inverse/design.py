@@ -24,8 +24,10 @@ from ..checks import (
     require,
     require_callable,
     require_value,
+    shape_in_words,
+    traceable,
 )
-from ..cycles.cycle import Cycle, find_cycle
+from ..cycles.cycle import Cycle, cycle_of_zeros, find_cycle
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
@@ -146,6 +148,8 @@ def design(
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     functionals, intervals = _checked_targets(targets)
+    for functional in functionals:
+        _check_functional(functional, oscillator)
     tell = told_to(report)
     selection, u = selection_of(oscillator, where, bounds)
 
@@ -212,6 +216,20 @@ def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
 
     slopes, (values, cycle) = jax.jacfwd(achieved, has_aux=True)(u)
     return values, slopes, cycle
+
+
+def _check_functional(functional: Callable[[Cycle], Any], osc: Oscillator) -> None:
+    """Raise a `ValueError` unless a functional gives one number for a cycle."""
+    if isinstance(functional, BasinMargin):
+        return
+    field, expected = "functional of targets", "a function of a cycle that returns one number"
+
+    def tried(osc: Oscillator) -> Any:
+        return functional(cycle_of_zeros(osc))
+
+    value = traceable(lambda: jax.eval_shape(tried, osc), field, expected)
+    fits = isinstance(value, jax.ShapeDtypeStruct) and value.shape == ()
+    require(fits, field, expected, f"one that returns {shape_in_words(value)}")
 
 
 def _checked_targets(targets):

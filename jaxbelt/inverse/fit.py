@@ -132,7 +132,8 @@ def _first_guesses(selection, u, osc, record: Record, starts: int):
     """The ends of the search, best first, each with its window starts; near ones count once."""
     # The velocity over which tanh changes its sign. Steps of the scheme are stable up to 2.8 over
     # the slope of the friction there; two belts of one velocity double it.
-    eps = 0.1 * float(record.scale[1])
+    # A record of one velocity, of a mass that sticks throughout, gives none: its length has to do.
+    eps = 0.1 * max(float(record.scale[1]), 0.1 * float(record.scale[0]))
     slope = max(float(b.load * b.friction.static * osc.omega) for b in osc.belts) / eps
     steps = 16 * int(np.ceil(float(jnp.max(record.times)) * max(20.0, slope / 1.3) / 16))
     rng = np.random.default_rng(0)

@@ -27,6 +27,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from ..activity import announced
 from ..checks import is_concrete, number, pick
 from ..numerics.compiling import jit
 from ..results import draw
@@ -149,6 +150,7 @@ def stability(row: Equilibria) -> str:
     return "stable" if row.stable else "neutral" if row.neutral else "unstable"
 
 
+@announced("equilibria")
 def equilibria(osc: Oscillator) -> Equilibria:
     """All equilibria of the oscillator, saddles among them, sorted by x1: see `Equilibria` for what
     is known of each.
@@ -171,6 +173,14 @@ def _existing(rows, found: Equilibria):
     if not is_concrete((rows, found)):
         return rows
     return pick(rows, slice(int(np.sum(np.asarray(found.kind) > 0))))
+
+
+def most_equilibria(osc: Oscillator) -> int:
+    """How many equilibria there may be: one a zone and one an edge, as far as edges are known."""
+    places = edges(osc)
+    if is_concrete(places):
+        places = [place for place in set(map(float, places)) if np.isfinite(place)]
+    return 2 * len(places) + 1
 
 
 @jit
@@ -313,6 +323,7 @@ def repelling_foci(osc: Oscillator) -> Array:
 # --- the Hopf point -----------------------------------------------------------------------------
 
 
+@announced("lyapunov_coefficient")
 def lyapunov_coefficient(osc: Oscillator) -> Array:
     """First Lyapunov coefficient a of each fixed point; positive: the Hopf point is subcritical.
 

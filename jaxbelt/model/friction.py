@@ -123,7 +123,7 @@ def _warn_of_kink(law: AbstractFriction) -> None:
     if kind in _asked_of_kinks or kind.__module__ == __name__ or not is_concrete(law):
         return
     _asked_of_kinks.add(kind)
-    if kink := _kink_of(law):
+    if kink := kink_of(law):
         warnings.warn(
             "mu of {} has a kink at the speed {:.6g}, its slope goes from {:.3g} to {:.3g}: "
             "motions that slip at that speed are followed, but most of their cycles are not "
@@ -140,12 +140,17 @@ SEARCHED, HALVINGS = np.logspace(-5, 3, 2049), 30
 LEAST_KINK, LEAST_BEND = 1e-3, 1e-6
 
 
-def _kink_of(law: AbstractFriction) -> tuple[float, float, float] | None:
-    """Where the slope of mu jumps most, and the slopes before and after; None where it does not.
+def kink_of(law: AbstractFriction) -> tuple[float, float, float] | None:
+    """Where the slope of mu of a known law jumps most, and the slopes before and after; None where
+    it does not.
 
     Every interval between two of many speeds is halved again and again, and the half kept over
     which the slope changes more: without a kink it changes less and less.
     """
+
+    own = law.law if isinstance(law, LawInUnits) else law
+    if type(own).__module__ == __name__:
+        return None  # these are smooth
 
     @jax.jit
     def asked(speeds: Array) -> tuple[Array, Array]:
@@ -204,7 +209,10 @@ class LawInUnits(AbstractFriction):
         return self.law.mu(self.unit * speed)
 
     def in_units_of(self, speed: Array) -> AbstractFriction:
-        return LawInUnits(self.law, self.unit * speed)
+        unit = self.unit * speed
+        # There and back again it is the law itself, to rounding.
+        is_own = is_concrete(unit) and np.all(np.abs(np.asarray(unit) - 1.0) < 1e-15)
+        return self.law if is_own else LawInUnits(self.law, unit)
 
     def rules(self) -> list[Rule]:
         return type(self.law).rules(self.law)

@@ -30,7 +30,7 @@ from .orbits import plot_orbits
 from .phase import plot_portrait, plot_separatrix
 from .points import plot_cycle, plot_design, plot_equilibria, plot_point, plot_shock
 from .regions import plot_region_map
-from .style import add_key, figure_of
+from .style import add_key, figure_of, require_axes
 from .sweeps import plot_basins, plot_blocks, plot_explanation, plot_fractions, plot_stability
 
 
@@ -69,6 +69,7 @@ def draw_result(result: Any, ax: Axes | None, **options: Any) -> Axes:
     picture = PICTURES.get(type(result))
     if picture is None:
         raise TypeError(f"result must be one that has a picture, got {type(result).__name__}")
+    require_axes(ax)
     drawn = picture(result, ax, **options)
     # A figure of several axes has a key of its own.
     if ax is not None or not figure_of(drawn).legends:

@@ -7,8 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from ..activity import announced
 from ..checks import as_numbers, check_finite, check_positive
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import names_of
@@ -88,12 +91,13 @@ class Explorer:
         run = simulate(osc, start, self._t1)
         portrait, laws, upper, lower = self._axes
         for axes in self._axes:
-            axes.clear()
+            _empty(axes)
         plot_phase_portrait(osc, run, ax=portrait)
         _draw_laws(osc, laws)
         plot_time_history(run, (upper, lower))
         page = io.BytesIO()
-        self.figure.savefig(page, format="png")
+        # Drawn once; savefig draws twice.
+        FigureCanvasAgg(self.figure).print_png(page)
         # Laid out once: that takes as long as all the rest, and nothing should jump.
         self.figure.set_layout_engine("none")
         self._picture.value = page.getvalue()
@@ -108,6 +112,7 @@ class Explorer:
         display(self.widget)
 
 
+@announced("explore")
 def explore(
     osc: Oscillator, start: ArrayLike | tuple = (1.5, 0.0), *, t1: ArrayLike = 60.0
 ) -> Explorer:
@@ -124,6 +129,14 @@ def explore(
     check_finite(state, "start")
     check_positive(until, "t1")
     return Explorer(osc, (float(state[0]), float(state[1])), float(until))
+
+
+def _empty(ax: Axes) -> None:
+    """Remove what was drawn, and leave the axes themselves: to make new ones takes longer."""
+    legend = [ax.get_legend()] if ax.get_legend() is not None else []
+    for artist in [*ax.lines, *ax.patches, *ax.collections, *ax.texts, *legend]:
+        artist.remove()
+    ax.relim()
 
 
 def _slider(ipywidgets: Any, name: str, value: float) -> Any:

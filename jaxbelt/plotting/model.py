@@ -6,10 +6,11 @@ from jaxtyping import Array
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon, Rectangle
 
+from ..activity import announced
 from ..checks import as_positive, require_value
 from ..model.friction import AbstractFriction
 from ..numerics.compiling import jit
-from .style import belt_colour, new_axes
+from .style import belt_colour, new_axes, require_axes
 
 
 @jit
@@ -17,6 +18,7 @@ def _coefficient(friction: AbstractFriction, speed: Array) -> Array:
     return friction.mu(speed)
 
 
+@announced("plot_friction_law")
 def plot_friction_law(
     friction: AbstractFriction, ax: Axes | None = None, *, speed: float = 1.0, unit: str = ""
 ) -> Axes:
@@ -30,6 +32,7 @@ def plot_friction_law(
     require_value(isinstance(friction, AbstractFriction), "friction", law, friction)
     speed = as_positive(speed, "speed")
     require_value(isinstance(unit, str), "unit", 'a text such as "m/s"', unit)
+    require_axes(ax)
     ax = new_axes() if ax is None else ax
     r = jnp.linspace(0.0, speed, 401)
     mu, static = np.asarray(_coefficient(friction, r)), float(friction.static)

@@ -23,6 +23,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from ..activity import announced
 from ..checks import as_interval, require_one_of, require_value
 from ..cycles.cycle import Cycle
 from ..cycles.portrait import Portrait
@@ -42,6 +43,7 @@ from .style import (
     key_entries,
     new_axes,
     new_figure,
+    require_axes,
     spread,
 )
 
@@ -83,6 +85,8 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
     trajectory: from `simulate`. ax: two axes, for x1 and for x2. Returns the two.
     """
     _check_trajectory(trajectory, "trajectory")
+    pair = ax is None or (np.shape(ax) == (2,) and all(isinstance(one, Axes) for one in ax))
+    require_value(pair, "ax", "two axes of matplotlib, such as plt.subplots(2)[1], or None", ax)
     if ax is None:
         ax = tuple(new_figure().subplots(2, sharex=True))
     t, ys = path_of(trajectory)
@@ -173,6 +177,7 @@ def path_around(cycle: ClosedOrbit) -> np.ndarray:
 # --- phase portraits ----------------------------------------------------------------------------
 
 
+@announced("plot_phase_portrait")
 def plot_phase_portrait(
     osc: Oscillator,
     trajectories: Trajectory | Sequence[Trajectory] = (),
@@ -199,7 +204,10 @@ def plot_phase_portrait(
         _check_trajectory(trajectory, "trajectories")
     fits = isinstance(cycles, Sequence) and all(hasattr(cycle, "sample") for cycle in cycles)
     require_value(fits, "cycles", "a list of cycles, such as [jb.find_cycle(...)]", cycles)
+    known = equilibria is None or isinstance(equilibria, Equilibria)
+    require_value(known, "equilibria", "what jb.equilibria returns, or None", equilibria)
     _check_window(xlim, ylim)
+    require_axes(ax)
     is_new, ax = ax is None, new_axes() if ax is None else ax
     paths = [path_of(trajectory)[1] for trajectory in trajectories]
     loops = [path_around(cycle) for cycle in cycles]
@@ -454,6 +462,7 @@ def _draw_arrowheads(ax: Axes, path: np.ndarray, colour: str, indices: Sequence[
 # --- vector field -------------------------------------------------------------------------------
 
 
+@announced("plot_vector_field")
 def plot_vector_field(
     osc: Oscillator,
     *,
@@ -471,6 +480,7 @@ def plot_vector_field(
     check_oscillator(osc)
     require_one_of(kind, ("streamlines", "arrows"), "kind")
     _check_window(xlim, ylim)
+    require_axes(ax)
     ax = new_axes() if ax is None else ax
     (left, right), (bottom, top) = _window(osc, [], None, xlim, ylim)
     ax.set(xlim=(left, right), ylim=(bottom, top))

@@ -15,7 +15,7 @@ from ..checks import require
 from ..model.machine import Units
 from ..si import AlongParameter, check_machine, units_along, units_of
 from .draw import draw_result
-from .style import figure_of, in_fractions, parameter_label
+from .style import figure_of, in_fractions, parameter_label, require_axes
 
 #: By the beginning of its label, what an axis shows, and its label in SI units.
 LABELS = {
@@ -64,6 +64,7 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     no axis can be converted, as in the picture of a sweep (draw what `in_si` returns instead),
     where the units vary along the parameter, and for a wrong argument.
     """
+    require_axes(ax)
     units, parameter = _units_of_picture(result, machine)
     several = isinstance(result, Sequence) and all(isinstance(one, Axes) for one in result)
     is_drawn = isinstance(result, Axes) or several

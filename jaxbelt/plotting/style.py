@@ -14,6 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import ScaledTranslation
 
+from ..checks import require_value
+
 #: One colour a belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
 BELT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 #: What a phase portrait may hold, in the order of its key.
@@ -200,6 +202,12 @@ def spread(wanted: np.ndarray, gap: float) -> np.ndarray:
                 at[i - 1] -= lack / 2
                 at[i] += lack / 2
     return at
+
+
+def require_axes(ax: Any) -> None:
+    """Raise unless `ax` is axes to draw into, or None: new ones."""
+    expected = "axes of matplotlib, such as plt.subplots()[1], or None"
+    require_value(ax is None or isinstance(ax, Axes), "ax", expected, ax)
 
 
 def figure_of(ax: Axes) -> Figure:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
+from ..activity import announced
 from ..checks import require, require_one_of, require_value
 from ..sweeps.basins import Basins, BasinStability, standard_error
 from ..sweeps.fractions import BasinFractions
@@ -27,6 +28,7 @@ from .style import (
     journal_figure,
     new_axes,
     parameter_label,
+    require_axes,
 )
 
 #: Axes of datasets that are no parameters.
@@ -48,6 +50,7 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     known = isinstance(dataset, xr.Dataset)
     require_value(known, "dataset", "an xarray.Dataset, such as sweep(...) returns", dataset)
     require_one_of(variable, map(str, dataset.data_vars), "variable")
+    require_axes(ax)
     told = dataset[variable].attrs
     is_category = variable == "kind" or "flag_meanings" in told
     # Signatures get their numbers when all are known.
@@ -112,6 +115,7 @@ def _with_unit(words: str, told: dict[str, Any]) -> str:
     return f"{words} ({in_fractions(told['units'])})" if "units" in told else words
 
 
+@announced("plot_basins")
 def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     """Which start leads where, with the cycles, and the unstable one between the basins dashed.
 
@@ -119,6 +123,7 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     orange, undecided starts white. Returns the axes.
     """
     require_value(isinstance(basins, Basins), "basins", "what jb.basins returns", basins)
+    require_axes(ax)
     ax = new_axes() if ax is None else ax
     labels = np.asarray(basins.label)
     x1, x2 = np.asarray(basins.dataset["x1"]), np.asarray(basins.dataset["x2"])

@@ -25,10 +25,11 @@ from ..checks import (
     as_positive,
     as_whole,
     check_finite,
-    in_words,
     outside_of_traces,
+    refuse_interval,
     require,
     require_value,
+    require_wish,
 )
 from ..cycles.attractors import Runs, is_same
 from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
@@ -108,6 +109,7 @@ class Basins(eqx.Module):
         boundary = float(np.mean(entropy[mixed])) if np.any(mixed) else float("nan")
         return BasinEntropy(float(np.mean(entropy)), boundary)
 
+    @announced("finite_time_stability")
     def finite_time_stability(self, t: ArrayLike, within: ArrayLike) -> np.ndarray:
         """The finite-time basin stability of each attractor, [attractors]: the fraction of all
         starts that lead to it and are near to it at time t.
@@ -265,6 +267,7 @@ def basins(
     """
     check_oscillator(oscillator, "oscillator")
     axes = {name: _starts_along(values, name) for name, values in (("x1", x1), ("x2", x2))}
+    require_wish(progress, "progress")
     with Activity("basins", progress):
         dataset = sweep(
             lambda: oscillator,
@@ -292,11 +295,7 @@ def basins(
 
 def _starts_along(values: Any, name: str) -> np.ndarray:
     """The starts along one axis, or a `ValueError`."""
-    if isinstance(values, tuple) and len(values) == 2:
-        # Elsewhere such a tuple is an interval; taken as numbers it would be two starts.
-        from_, to = map(in_words, values)
-        expected = f"the values of all starts, such as np.linspace({from_}, {to}, 201)"
-        require(False, name, expected, f"{in_words(values)}; for two starts write {list(values)}")
+    refuse_interval(values, name)
     along = np.asarray(as_array(values, name, (None,)))
     check_finite(along, name)
     require(along.size > 0, name, "one value or more", "none")

@@ -39,6 +39,7 @@ from .attractor import CYCLE, KINDS, UNDECIDED, Attractor
 from .grid import Grid
 from .moments import AtEvents, AtExtrema, AtSection
 from .question import LONG_ENOUGH
+from .reducers import check_sections
 from .work import results_of
 
 if TYPE_CHECKING:
@@ -153,6 +154,7 @@ def orbit_diagram(
     numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_positive(atol, "atol")}
     variation = varied(osc, where, (first,))
     rows = as_whole(rows, "rows", 2)
+    check_sections((at,), variation.oscillator(np.array([first])))
     return Sampling(variation, at, starts, rows, numbers).diagram((first, last))
 
 

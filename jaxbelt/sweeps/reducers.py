@@ -1,14 +1,16 @@
 """Whether a reducer of the user's own is one: its methods are tried on shapes, before any run."""
 
-from collections.abc import Callable, Mapping
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from ..checks import require
+from ..checks import require, shape_in_words
 from ..model.oscillator import Oscillator
 from .along import Motion
+from .moments import AtSection, checked
 from .observers import RunEnd, RunEvent
 
 
@@ -18,6 +20,8 @@ def check_reducer(reducer: Any, osc: Oscillator) -> None:
     moment = integrals = None
     if hasattr(reducer, "at") or hasattr(reducer, "rates"):
         moment = code
+    if hasattr(reducer, "at"):
+        check_sections(checked(reducer.at), osc)
     if hasattr(reducer, "rates"):
         forces = jax.ShapeDtypeStruct((len(osc.belts),), jnp.float64)
         motion = jax.eval_shape(Motion, number, number, number, number, forces)
@@ -29,28 +33,41 @@ def check_reducer(reducer: Any, osc: Oscillator) -> None:
     event = jax.eval_shape(RunEvent, *place, code, code, moment, integrals)
     new = _tried("update", "(state, event)", reducer.update, state, event)
     same = jax.tree.map(jnp.shape, new) == jax.tree.map(jnp.shape, state)
-    came = f"{_shapes(new)} where init returns {_shapes(state)}"
+    came = f"{shape_in_words(new)} where init returns {shape_in_words(state)}"
     require(same, "observe.update", "a method that returns a state such as init does", came)
     end = jax.eval_shape(RunEnd, *place, code, integrals)
     results = _tried("finish", "(state, end)", reducer.finish, state, end)
     expected = "a method that returns a dictionary of results"
-    require(isinstance(results, Mapping), "observe.finish", expected, _shapes(results))
+    require(isinstance(results, Mapping), "observe.finish", expected, shape_in_words(results))
+    strange = [name for name in results if not isinstance(name, str)]
+    require(not strange, "observe.finish", f"{expected} by their names", strange)
+
+
+def check_sections(moments: Sequence[Any], osc: Oscillator) -> None:
+    """Raise a `ValueError` unless the function of each `AtSection` gives one number."""
+    number = jax.ShapeDtypeStruct((), jnp.float64)
+    for one in moments:
+        if isinstance(one, AtSection):
+            field, kind = "function of AtSection", "a function of (osc, x1, x2)"
+            function = functools.partial(one.function, osc)
+            value = _shape_of(field, kind, function, number, number)
+            fits = isinstance(value, jax.ShapeDtypeStruct) and value.shape == ()
+            fits = fits and jnp.issubdtype(value.dtype, jnp.floating)
+            require(fits, field, f"{kind} that returns one number", shape_in_words(value))
 
 
 def _tried(name: str, arguments: str, method: Callable, *args: Any) -> Any:
     """The shapes of what a method gives."""
+    return _shape_of(f"observe.{name}", f"a method of {arguments}", method, *args)
+
+
+def _shape_of(field: str, kind: str, function: Callable, *args: Any) -> Any:
+    """The shapes of what a function gives, or a `ValueError` on the field that it came from."""
     try:
-        return jax.eval_shape(method, *args)
+        return jax.eval_shape(function, *args)
     except Exception as error:
         came = str(error).partition("\n")[0]
         raise ValueError(
-            f"observe.{name} must be a method of {arguments} made of what JAX can trace "
+            f"{field} must be {kind} made of what JAX can trace "
             f"(jnp.where, say, not if), got {type(error).__name__}: {came}"
         ) from error
-
-
-def _shapes(tree: Any) -> str:
-    """What came, in words."""
-    if isinstance(tree, jax.ShapeDtypeStruct):
-        return f"an array of {tree.dtype} of shape {tree.shape}"
-    return f"a {type(tree).__name__} of {len(jax.tree.leaves(tree))} arrays"

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..checks import as_path, require
+from ..checks import as_path, require, require_value
 from ..results import draw
 from ..tables import table_of
 from .datasets import NUMBERED, renumber
@@ -454,6 +454,7 @@ def verify(path: str | Path, repair: bool = False) -> Verified:
     `OSError` if a sweep is writing it and `repair` is wanted.
     """
     path = as_path(path, "path")
+    require_value(isinstance(repair, bool), "repair", "True or False", repair)
     require(path.exists(), "path", "that of a store, a folder", f"{path}, which is not there")
     root = _open(path, "r")
     if not repair:

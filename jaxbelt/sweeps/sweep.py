@@ -17,7 +17,14 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from ..activity import announced
-from ..checks import as_array, as_path, outside_of_traces, require, require_value
+from ..checks import (
+    as_array,
+    as_path,
+    outside_of_traces,
+    require,
+    require_value,
+    require_wish,
+)
 from ..model.oscillator import Oscillator
 from ..results import draw
 from ..tables import table_of
@@ -115,8 +122,7 @@ def sweep(
             '0 but for observe="final" and "attractor"',
             audit,
         )
-        known_wish = progress is None or isinstance(progress, bool)
-        require_value(known_wish, "progress", "True, False or None", progress)
+        require_wish(progress, "progress")
         store = None if store is None else as_path(store, "store")
         _check_where(question, store, executor, blocks, audit)
         if store is not None:
