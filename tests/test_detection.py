@@ -3,6 +3,7 @@
 from collections import Counter
 from itertools import pairwise
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -41,7 +41,7 @@ DETERMINED = 1e-3
 #: The integration steps of an arc are cut into so many parts if they leave a larger error in its
 #: equations, relative to the motion: beside a slow belt and under a steep law 1e-8 was seen, which
 #: moved the point by 1e-6, and 1e-15 with the parts.
-PARTS, EXACT = 8, 1e-13
+PARTS_OF_ARC, EXACT_ARC = 8, 1e-13
 #: The place of nothing.
 NOWHERE = np.full(5, np.nan)
 #: Functions by what it means that one vanishes: the name of a special point, the belts concerned.
@@ -235,10 +235,10 @@ class CycleSystem(AbstractSystem):
         error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
         is_tangent = chain.ends >= Ends(chain.codes.shape[-1]).tangent
         error = jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
-        mesh, others = chain.mesh, (PARTS - 1) * chain.mesh.shape[-1]
-        fine = jnp.repeat(mesh / PARTS, PARTS, axis=-1)
+        mesh, others = chain.mesh, (PARTS_OF_ARC - 1) * chain.mesh.shape[-1]
+        fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
         coarse = jnp.pad(mesh, [(0, 0), (0, others)])
-        is_exact = error < EXACT * (1 + jnp.max(jnp.abs(x[:, :2])))
+        is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
         mesh = jnp.where(is_exact[:, None], coarse, fine)
         return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
 

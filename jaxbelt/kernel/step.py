@@ -156,11 +156,11 @@ def _bounds_of_x2(window: _Window, ones: Array, lanes: Lanes) -> tuple[Array, Ar
 
 def _quotient(osc: Oscillator, window: _Window, ones: Array, x1: Array, x2: Array) -> Array:
     """`oscillator.acceleration` as a single quotient; ones: see `lanes.materialise`."""
-    return _acceleration(osc, window.signs, window.pulls, ones, x1, x2)
+    return _as_quotient(osc, window.signs, window.pulls, ones, x1, x2)
 
 
 @jax.custom_jvp
-def _acceleration(osc: Oscillator, signs, pulls, ones: Array, x1: Array, x2: Array) -> Array:
+def _as_quotient(osc: Oscillator, signs, pulls, ones: Array, x1: Array, x2: Array) -> Array:
     numerator, denominator = -x1 - osc.damping * x2, ones
     for belt, sign, pull in zip(osc.belts, signs, pulls, strict=True):
         top, bottom = belt.friction.fraction(sign * (belt.velocity - osc.omega * x2))
@@ -169,13 +169,13 @@ def _acceleration(osc: Oscillator, signs, pulls, ones: Array, x1: Array, x2: Arr
     return numerator / denominator
 
 
-@functools.partial(_acceleration.defjvp, symbolic_zeros=True)
+@functools.partial(_as_quotient.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
     """The slope of each belt's force has a division, so it is computed once for all directions. One
     more division keeps their sum."""
     osc, signs, pulls, ones, _, x2 = primals
     d_osc, _, d_pulls, _, d_x1, d_x2 = tangents
-    total = _weighted((-1.0, d_x1), (-osc.damping, d_x2), (-x2, d_osc.damping))
+    total = _sum_of_changes((-1.0, d_x1), (-osc.damping, d_x2), (-x2, d_osc.damping))
     forces = zip(osc.belts, d_osc.belts, signs, pulls, d_pulls, strict=True)
     for belt, d_belt, sign, pull, d_pull in forces:
         law, speed = belt.friction, sign * (belt.velocity - osc.omega * x2)
@@ -183,13 +183,13 @@ def _(primals, tangents):
         square = bottom * bottom * ones
         slope = sign * pull * (d_top * bottom - top * d_bottom) / square
         relative = ((1.0, d_belt.velocity), (-osc.omega, d_x2), (-x2, d_osc.omega))
-        total = total + slope * _weighted(*relative)
-        total = total + _weighted((top * bottom / square, d_pull))
+        total = total + slope * _sum_of_changes(*relative)
+        total = total + _sum_of_changes((top * bottom / square, d_pull))
         total = total + pull * _change_of_law(law, d_belt.friction, speed, square)
-    return _acceleration(*primals), materialise(total, ones)
+    return _as_quotient(*primals), materialise(total, ones)
 
 
-def _weighted(*pairs: tuple[Any, Any]) -> Any:
+def _sum_of_changes(*pairs: tuple[Any, Any]) -> Any:
     """The sum of changes by their weights, of those that are not known to be zero."""
     known = [weight * change for weight, change in pairs if not isinstance(change, SymbolicZero)]
     return functools.reduce(jnp.add, known) if known else 0.0
