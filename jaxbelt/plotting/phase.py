@@ -85,7 +85,8 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
     trajectory: from `simulate`. ax: two axes, for x1 and for x2. Returns the two.
     """
     _check_trajectory(trajectory, "trajectory")
-    pair = ax is None or (np.shape(ax) == (2,) and all(isinstance(one, Axes) for one in ax))
+    is_pair = isinstance(ax, Sequence | np.ndarray) and len(ax) == 2
+    pair = ax is None or (is_pair and all(isinstance(one, Axes) for one in ax))
     require_value(pair, "ax", "two axes of matplotlib, such as plt.subplots(2)[1], or None", ax)
     if ax is None:
         ax = tuple(new_figure().subplots(2, sharex=True))
@@ -211,8 +212,8 @@ def plot_phase_portrait(
     is_new, ax = ax is None, new_axes() if ax is None else ax
     paths = [path_of(trajectory)[1] for trajectory in trajectories]
     loops = [path_around(cycle) for cycle in cycles]
-    equilibria = find_equilibria(osc) if equilibria is None else equilibria
-    window = _window(osc, [*paths, *loops], equilibria, xlim, ylim)
+    rests: Equilibria = find_equilibria(osc) if equilibria is None else equilibria
+    window = _window(osc, [*paths, *loops], rests, xlim, ylim)
     ax.set(xlim=window[0], ylim=window[1])
     plot_boundaries(osc, ax)
     for path in paths:
@@ -225,7 +226,7 @@ def plot_phase_portrait(
             style = {"linewidth": 1.0, "linestyle": (0, (4, 2.2)), "label": "unstable cycle"}
         ax.plot(*loop.T, color="black", solid_joinstyle="round", zorder=4, **style)
         _draw_arrowheads(ax, loop, "black", [int(np.argmin(loop[:, 1]))])
-    for equilibrium in equilibria:
+    for equilibrium in rests:
         draw_equilibrium(ax, equilibrium)
     ax.set_xlabel("displacement $x_1$")
     ax.set_ylabel("velocity $x_2$")

@@ -40,12 +40,12 @@ def plot_point(point: BifurcationPoint, ax: Axes | None = None) -> Axes:
     require_single(point, point.value, 0)
     _check_found(point, "point")
     cycles = [point.cycle] if int(point.cycle.status) == Status.OK else []
-    ax = plot_phase_portrait(point.oscillator, cycles=cycles, ax=ax)
+    drawn: Axes = plot_phase_portrait(point.oscillator, cycles=cycles, ax=ax)
     orbit = point.condition.orbit(point)
     if orbit is not None and not cycles:
-        draw_orbit(ax, orbit, point.condition.line.name)
-    ax.set_title(f"{point.condition.words} at {float(point.value):.6g}", fontsize="medium")
-    return ax
+        draw_orbit(drawn, orbit, point.condition.line.name)
+    drawn.set_title(f"{point.condition.words} at {float(point.value):.6g}", fontsize="medium")
+    return drawn
 
 
 def plot_shock(shock: FatalShock, ax: Axes | None = None) -> Axes:
