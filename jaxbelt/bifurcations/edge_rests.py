@@ -16,6 +16,7 @@ Kowalczyk, Piecewise-smooth Dynamical Systems, 2008.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -33,7 +34,7 @@ from ..model.variations import Family
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status
-from .base import Line
+from .base import AbstractCondition, Line
 from .rests import NOTHING, AbstractRestCondition, criticality, limit_near
 from .special import SpecialPoint, Trail
 from .systems import RestSystem, Tests, small_newton, velocity_of
@@ -257,7 +258,7 @@ class _EdgeCondition(AbstractRestCondition):
         return system, NOTHING, jnp.where(has_edge, Status.OK.value, Status.NOT_TOUCHED.value)
 
     @classmethod
-    def between(cls, before, after, edged):
+    def between(cls, before, after, edged) -> Sequence[AbstractCondition]:
         return [cls(belt) for belt in edged] if before.equilibria != after.equilibria else []
 
 
