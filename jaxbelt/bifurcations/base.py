@@ -88,7 +88,7 @@ class AbstractCondition(eqx.Module):
     family: ClassVar[str] = ""
     #: Whether orbits beside a point are slow to settle, so that it is seen from farther off only.
     slow: ClassVar[bool] = False
-    #: Whether one loop may be near to several such points, in different arcs.
+    #: Whether one guess may be near to several such points, in different arcs or of other cycles.
     has_several: ClassVar[bool] = False
     #: Whether branches of a diagram go on through a point.
     joins: ClassVar[bool] = True

@@ -77,6 +77,7 @@ class FoldOfCycles(AbstractCycleCondition):
     line: ClassVar[Line] = Line("fold of cycles", "#E69F00")
     #: Beyond a fold orbits pass the place of the cycles slowly, as if they were there.
     slow: ClassVar[bool] = True
+    has_several: ClassVar[bool] = True
     ends_at_contact: ClassVar[bool] = True
 
     def guess(self, osc, size):

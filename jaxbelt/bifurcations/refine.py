@@ -28,7 +28,8 @@ SAME_POINT = 1e-9
 #: Where Newton's method ends so near to the guess, there is no look for a nearer point, if its
 #: first step was no longer than that. Of three thousand guesses four led beyond the next point,
 #: to others 0.008, 0.018 and 0.029 away, after first steps of 0.4 and 0.5, and to a corner 0.004
-#: away beside another one. Of edges there may be several, and any is looked for.
+#: away beside another one. Of edges and of folds of cycles there may be several, and any is looked
+#: for: one fold of cycles was passed for another one 5e-4 farther off.
 QUITE_NEAR, SHORT_STEP = 0.05, 0.25
 #: The same after a longer step, and for conditions of which there may be several beside each other.
 BESIDE_OTHERS = 1e-4
@@ -63,8 +64,9 @@ def refine(
     the condition. So of points on coexisting cycles it need not find the nearest; `scan` finds all.
     Where it does not converge, what `scan` does is done around the guess, up to 0.2 to both sides,
     and the nearest point of that kind is taken, of any cycle; so it is where it ends further from
-    the guess than 0.05, or, after a first step of more than 0.25, or of what edges do, than 1e-4
-    (in units of the parameter). This takes some tenths of a second to two rather than milliseconds.
+    the guess than 0.05, or, after a first step of more than 0.25, or of folds of cycles and of what
+    edges do, than 1e-4 (in units of the parameter). This takes some tenths of a second to two
+    rather than milliseconds.
 
     Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`, without that
     second look; `value` and `cycle` are differentiable with respect to the other parameters. A

@@ -26,7 +26,8 @@ class SpecialPoint(NamedTuple):
     "DegeneratePseudoHopf" (the same at a pseudo-focus), "DoubleBoundaryEquilibrium" (both sides of
     the edge have their equilibrium on it: persistence turns into annihilation),
     "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
-    point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too),
+    point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too, or
+    met where the cycle passes an edge),
     "EdgeTouch" (on an edge a cycle turns back, is tangent to a boundary, or begins to slip),
     "BoundaryHopf" (a Hopf point on a contact edge: there the curves of boundary equilibria and of
     pseudo-Hopf points meet its own), "BoundaryEquilibrium" (a side of a saddle ceases to push away,

@@ -8,6 +8,7 @@ be watched along a curve.
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -270,6 +271,8 @@ def nearest_contacts(
     following = jnp.where(last[:, None], z[0], following)
     extrema = chain.used & (chain.ends == Ends(n).extremum_x2)
     passes = (chain.ends >= n) & (chain.ends < 3 * n) & (jnp.arange(chain.ends.size) != without)
+    # Beyond a point to which the cycle shrinks the equations go on, on the other side of the edge.
+    passes = passes & jax.vmap(functools.partial(_is_within, osc))(chain.codes, z[:, 0])
     after = following_codes(chain)
     nearest, stuck = [], []
     for belt, one in enumerate(osc.belts):
@@ -286,6 +289,11 @@ def nearest_contacts(
         stuck.append(jnp.any(own))
         nearest.append(jnp.minimum(jnp.where(stuck[-1], shortest, gap), at_edge))
     return jnp.stack(nearest), jnp.stack(stuck)
+
+
+def _is_within(osc: Oscillator, codes: Array, x1: Array) -> Array:
+    """Whether a place is within the contact edges of a mode, or on one."""
+    return jnp.min(jnp.stack(edge_guards(osc, mode_of(codes), x1))) >= -HOLDS
 
 
 def contact_tests(name: str, nearest: Array, watched: Array) -> Tests:
