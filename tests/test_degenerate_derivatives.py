@@ -146,6 +146,7 @@ def captured_on_an_edge(velocity, mud, edge):
     return jb.Oscillator(1.0, belts)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("by", ["simulate", "sweep"])
 def test_a_run_that_a_pseudo_focus_captures_moves_with_its_edge(by):
     """Nothing else moves it, however late it is captured."""

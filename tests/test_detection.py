@@ -468,6 +468,7 @@ def test_what_holds_all_along_is_no_point():
     assert [b for _, b, _ in diagram.regions] == [pytest.approx(float(hopf.value)), 0.24]
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("distance", [0.0, 1e-15, -1e-15])
 def test_a_fixed_point_on_an_edge_all_along_has_a_hopf_point(distance):
     """Its trace is that of the second belt, 0.4 / 0.5 exp(-0.8 / 0.5) - damping, and the edge of
