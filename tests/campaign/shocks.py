@@ -32,6 +32,9 @@ LEAST = 1e-3
 PHASES, ANGLES = 12, 8
 #: Runs repeat to this: nearer to an unstable cycle one is not told from it.
 REPEATS = 1e-11
+#: Loops of the slowest cycle after which one is told: half of the latest piece of a run, which is
+#: doubled, repeats.
+LOOPS = 50
 #: Changes of parameters for the differences: the first with which nothing else becomes the nearest
 #: and the two differences that are extrapolated are as near to one another.
 STEPS, ALIKE = (3e-4, 3e-5, 3e-6), 1e-4
@@ -43,7 +46,10 @@ INFINITY, UNKNOWN = 1000, -1
 
 def label(osc: engine.Oscillator, told: jb.Portrait, y0) -> int:
     """Where the engine's run from a start leads: a number among the attractors of the portrait."""
-    seen = engine.attractor(osc, tuple(map(float, y0)), t_max=PATIENCE, same=REPEATS)
+    # A cycle that creeps for long has to repeat, too.
+    longest = max((float(cycle.period) for cycle in told.cycles), default=0.0)
+    patience = max(PATIENCE, LOOPS * longest)
+    seen = engine.attractor(osc, tuple(map(float, y0)), t_max=patience, same=REPEATS)
     if seen.kind == "undecided":
         return INFINITY if seen.status == engine.NOT_FINITE and told.escapes else UNKNOWN
     return _number_of(seen, told)
