@@ -355,13 +355,14 @@ def _is_off_rest(cycle: Cycle) -> bool:
 def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> int | None:
     """The number of a cycle among others, or None.
 
-    One is another one also if it is at the same place: just before a corner, say, the one that
-    passes it without a stick phase solves the equations as well as they can be solved.
+    Two at the same place are one, whatever their modes: just before a corner that a cycle passes
+    with a short stick phase, a loop without it solves the equations to their accuracy, too.
     """
+    place = place_of(cycle.loop)
     for number, other in enumerate(among):
         if other.path == cycle.path and sticks(cycle.path):
             return number
-        if apart(place_of(cycle.loop), place_of(other.loop)) < SOLVED:
+        if apart(place, place_of(other.loop)) < SOLVED:
             return number
     return None
 

@@ -22,14 +22,7 @@ from ..checks import require
 from ..kernel.lanes import Program
 from ..kernel.rounds import STEPS_PER_ROUND
 from ..numerics.compiling import wide
-from .queue import (
-    ROUNDS_PER_PASS,
-    Call,
-    Common,
-    advance,
-    differentiable,
-    idle,
-)
+from .queue import ROUNDS_PER_PASS, Call, Common, advance, differentiable, idle
 
 #: Steps that a run may take for each 100 units of time before it is given up. On its way to a
 #: pseudo-focus beside a slow belt it may pass ten thousand events in that time.
