@@ -98,6 +98,8 @@ MISTAKES = [
     ("jb.PhysicalBelt(0.1, law, -1.0)", r"normal_force must be >= 0, got -1\.0"),
     ("jb.PhysicalBelt(0.1, 0.4, 1.0)", f"friction must be {LAW}.*, got 0.4"),
     ("jb.Units(1.0)", "missing 4 required positional arguments"),
+    ("jb.Units(1.0, '2', 3.0, 4.0, 5.0)", "length must be a number, got '2'"),
+    ("jb.Units(1.0, -2.0, 3.0, 4.0, 5.0)", r"length must be > 0, got -2\.0"),
     ("machine.start('3 mm', 0.0)", "displacement must be a number, got '3 mm'"),
     ("jb.in_si(3.0, machine)", "result must be a Trajectory, .* a Fit, .*, got float"),
     ("jb.in_si(cycle, osc)", r"machine must be a Machine, got Oscillator\("),

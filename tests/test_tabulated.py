@@ -105,10 +105,42 @@ def test_kinks_are_found_where_they_are_and_nowhere_else():
 
 
 def test_a_law_of_straight_lines_is_told_of_once():
-    friction._asked_of_kinks.discard(Lines)
+    friction._warned_of.discard(Lines)
     with pytest.warns(UserWarning, match=r"mu of Lines has a kink at the speed 0\.1, .*Tabulated"):
         jb.Belt(0.3, Lines(0.6))
     jb.Belt(0.3, Lines(0.6))  # warnings are errors here
+
+
+class Pushing(jb.AbstractFriction):
+    static: float
+
+    def mu(self, speed):
+        return 0.4 - 0.2 * speed
+
+
+class PushingAtRest(jb.AbstractFriction):
+    static: float
+
+    def mu(self, speed):
+        return 0.2 * speed - 0.1
+
+
+def test_a_law_that_pushes_is_told_of_and_one_that_pushes_at_rest_is_refused():
+    with pytest.warns(UserWarning, match=r"mu of Pushing is negative at the speed 2\.\d*: "):
+        jb.Belt(0.3, Pushing(0.6))
+    jb.Belt(0.3, Pushing(0.6))
+    with pytest.raises(ValueError, match=r"mu\(0\) of friction of belt must be >= 0, got -0\.1"):
+        jb.Belt(0.3, PushingAtRest(0.6))
+
+
+def test_a_curve_that_leaves_its_table_is_told_of():
+    told = r"goes to mu = -0\.165 at the speed 0\.269, .* have 0\.05 and 0\.05"
+    with pytest.warns(UserWarning, match=told):
+        jb.Tabulated((0.0, 0.1, 1.0), (0.5, 0.05, 0.05))
+    with pytest.warns(UserWarning, match="at the speed 0.9, .* have 0.01 and 0.01"):
+        jb.Tabulated((0.0, 0.1, 0.2, 0.3), (0.5, 0.01, 0.3, 0.01))
+    # Decades between the points, and falling: as measured laws are.
+    jb.Tabulated((0.0, 1e-3, 1e-2, 0.1, 1.0), (0.5, 0.48, 0.4, 0.3, 0.25))
 
 
 @pytest.mark.slow

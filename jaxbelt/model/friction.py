@@ -8,6 +8,7 @@ continues smoothly a little beyond its boundary. A law of your own is a subclass
 """
 
 import abc
+import itertools
 import operator
 import warnings
 from collections.abc import Callable, Sequence
@@ -51,8 +52,8 @@ class AbstractFriction(eqx.Module):
     def mu(self, speed: Array) -> Array:
         """Kinetic friction coefficient at sliding speed |nu_R| (dimensionless, any shape).
 
-        Must be smooth for speed >= 0 and stay finite and smooth slightly below 0; mu(0) <= static,
-        and the two are equal for a law without a jump.
+        Must be smooth for speed >= 0 and stay finite and smooth slightly below 0; 0 <= mu(0) <=
+        static, and the latter two are equal for a law without a jump.
         """
 
     def fraction(self, speed: Array) -> tuple[Array, Array]:
@@ -84,16 +85,18 @@ def _of_static(static: ArrayLike, begins: ArrayLike) -> list[Rule]:
     """The rules of a law whose mu(0) is that."""
     most = static + MU_ROUNDING * (1 + static)
     bound = Rule("mu(0)", (begins, static, most), _is_at_most, "<= static = {1}")
-    return [*be_nonnegative("static", static), bound]
+    # A coefficient < 0 pushes: a belt that does holds the mass and lets it go at once.
+    least = Rule("mu(0)", (begins, -MU_ROUNDING), operator.ge, ">= 0")
+    return [*be_nonnegative("static", static), least, bound]
 
 
 def _is_at_most(value: Any, _: Any, most: Any) -> Any:
     return value <= most
 
 
-#: Laws of one's own whose `mu` was traced, and those that were searched for kinks.
+#: Laws of one's own whose `mu` was traced, and those that were asked what to warn of.
 _traced: set[type] = set()
-_asked_of_kinks: set[type] = set()
+_warned_of: set[type] = set()
 
 
 def check_law(law: AbstractFriction) -> None:
@@ -117,12 +120,22 @@ def check_law(law: AbstractFriction) -> None:
     _traced.add(kind)
 
 
-def _warn_of_kink(law: AbstractFriction) -> None:
-    """Warn where a known law of one's own has a kink, once for each class."""
+def _warn_of_own(law: AbstractFriction) -> None:
+    """Warn where a known law of one's own pushes or has a kink, once for each class."""
     kind = type(law)
-    if kind in _asked_of_kinks or kind.__module__ == __name__ or not is_concrete(law):
+    if kind in _warned_of or kind.__module__ == __name__ or not is_concrete(law):
         return
-    _asked_of_kinks.add(kind)
+    if not all(np.all(rule.holds()) for rule in law.rules()):
+        return  # the belt refuses it
+    _warned_of.add(kind)
+    with jax.ensure_compile_time_eval():
+        least = np.asarray(jax.jit(jax.vmap(law.mu))(jnp.asarray(SEARCHED)))
+    if np.min(least) < 0:
+        warnings.warn(
+            f"mu of {kind.__name__} is negative at the speed {SEARCHED[np.argmax(least < 0)]:.3g}: "
+            "friction that pushes is followed, too, but no machine has it",
+            stacklevel=2,
+        )
     if kink := kink_of(law):
         warnings.warn(
             "mu of {} has a kink at the speed {:.6g}, its slope goes from {:.3g} to {:.3g}: "
@@ -183,7 +196,7 @@ def as_friction(law: Any) -> AbstractFriction:
     fits = isinstance(law, AbstractFriction)
     require_value(fits, "friction", "a law such as jb.Conti(...)", law)
     check_law(law)
-    _warn_of_kink(law)
+    _warn_of_own(law)
     return law
 
 
@@ -319,13 +332,18 @@ def _of_static_and_kinetic(static: ArrayLike, kinetic: ArrayLike) -> list[Rule]:
     return [*rules, Rule("kinetic", (kinetic, static), operator.le, "<= static = {1}")]
 
 
+#: By how much of the largest coefficient the curve of a table may leave what its points span. That
+#: of a law that falls and levels out does so by 0.02 at most, which a picture hardly shows.
+MOST_ASTRAY = 0.03
+
+
 class Tabulated(AbstractFriction):
     """A law from a table of measured coefficients: a smooth curve through all of its points.
 
     mu(r) = level + sum of w_i sqrt((r - r_i)^2 + h_i^2) over the points (r_i, mu_i), Hardy's
     multiquadrics: h_i is the way from r_i to the nearer of its neighbours, and the w_i, whose sum
     is zero, are such that mu(r_i) = mu_i. It has all derivatives, keeps close to straight lines
-    between the points, and levels out beyond the last one.
+    between the points, and levels out beyond the last one; a warning says where it does not.
 
     Arguments: speeds (increasing, >= 0, two or more) and coefficients (>= 0, as many), known
     numbers, which are no parameters; static, a scalar (None: mu(0), what the curve has there).
@@ -361,6 +379,26 @@ class Tabulated(AbstractFriction):
 
     def __check_init__(self):
         self.check("Tabulated")
+        self._warn_if_astray()
+
+    def _warn_if_astray(self) -> None:
+        """Warn where the curve leaves what its points span: where gaps of the table differ much."""
+        speeds, mus = np.array(self.speeds), np.array(self.coefficients)
+        ends = np.append(speeds, 3.0 * speeds[-1])
+        at = np.concatenate([np.linspace(*gap, 65) for gap in itertools.pairwise(ends)])
+        # Beyond the last point, the last coefficient.
+        around = np.repeat(np.stack([mus, np.append(mus[1:], mus[-1])]), 65, axis=1)
+        curve = self._known(at)
+        off = np.maximum(around.min(axis=0) - curve, curve - around.max(axis=0))
+        worst = np.argmax(off)
+        if off[worst] > MOST_ASTRAY * np.max(mus):
+            warnings.warn(
+                "the curve through the table goes to mu = {:.3g} at the speed {:.3g}, where the "
+                "points beside it have {:.3g} and {:.3g}: more points there hold it".format(
+                    curve[worst], at[worst], *around[:, worst]
+                ),
+                stacklevel=4,
+            )
 
     def mu(self, speed: Array) -> Array:
         """Kinetic friction coefficient mu(r) at speed r >= 0 (the table's unit), any shape."""
@@ -368,11 +406,14 @@ class Tabulated(AbstractFriction):
         weights = np.reshape(self.weights, (1,) * jnp.ndim(speed) + (-1,))
         return self.level + jnp.sum(weights * terms, axis=-1)
 
+    def _known(self, speed: Any) -> Any:
+        """`mu` in NumPy, which compiles nothing."""
+        terms = _multiquadrics(np, np.asarray(speed), np.array(self.speeds))
+        return self.level + np.sum(np.asarray(self.weights) * terms, axis=-1)
+
     @property
     def _begins(self) -> float:
-        """mu(0), known."""
-        terms = _multiquadrics(np, 0.0, np.array(self.speeds))
-        return self.level + float(np.sum(self.weights * terms))
+        return float(self._known(0.0))
 
     def rules(self) -> list[Rule]:
         known = is_concrete(self.static)

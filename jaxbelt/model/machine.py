@@ -32,14 +32,19 @@ from .oscillator import Belt, Oscillator, as_belts, as_edge, check_oscillator, s
 class Units(eqx.Module):
     """How much one of a dimensionless quantity of a `Machine` is.
 
-    time in s, length in m, velocity in m/s, force in N, energy in J.
+    Scalars: time in s, length in m, velocity in m/s, force in N, energy in J. `ValueError` for one
+    that is not > 0.
     """
 
-    time: Array
-    length: Array
-    velocity: Array
-    force: Array
-    energy: Array
+    time: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "time"))
+    length: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "length"))
+    velocity: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "velocity"))
+    force: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "force"))
+    energy: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "energy"))
+
+    def __check_init__(self):
+        for name, value in vars(self).items():
+            check_positive(value, name)
 
     def __repr__(self) -> str:
         symbols = {"time": "s", "length": "m", "velocity": "m/s", "force": "N", "energy": "J"}
