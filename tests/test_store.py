@@ -290,6 +290,9 @@ def test_places_that_cannot_hold_a_store_are_told_before_the_computing(tmp_path,
             again(tmp_path / name)
     with pytest.raises(OSError, match="store cannot be written"):
         again(tmp_path / "file" / "a.zarr")
+    if Path("/proc/self").exists():  # where nobody may write, not even root
+        with pytest.raises(OSError, match="store cannot be written"):
+            again(Path("/proc/a.zarr"))
     assert (tmp_path / "full" / "thesis.tex").read_text() == "mine"
 
 

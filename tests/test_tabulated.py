@@ -173,3 +173,20 @@ def test_a_branch_does_not_end_where_the_law_wants_more_steps():
     assert cycles.value.min() == pytest.approx(0.03) and cycles.value.max() == pytest.approx(0.2)
     # As many as there are fixed points, one for each value and each end.
     assert len(cycles) == np.sum(table.kind == "equilibrium")
+
+
+@pytest.mark.slow(first=True)
+def test_a_cycle_that_a_fold_ends_just_beside_its_hopf_point_is_seen():
+    """The cycle attracts so weakly that orbits hardly come to it; the values that are looked at
+    first have one in the interval of 1.8e-4 where it is, of 0.145."""
+    table = jb.Tabulated(
+        (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2), (0.42, 0.36, 0.33, 0.30, 0.28, 0.275, 0.28)
+    )
+
+    def make(velocity):
+        return jb.Machine(1.2, 15e3, 4.0, (jb.PhysicalBelt(velocity, table, 40.0),)).oscillator
+
+    fold, hopf = jb.scan(make, span=(0.005, 0.15))
+    assert (fold.kind, hopf.kind) == ("FoldOfCycles", "Hopf")
+    assert float(fold.value) == pytest.approx(0.0747890104994, abs=1e-11)
+    assert float(hopf.value) == pytest.approx(0.0749666018134, abs=1e-11)

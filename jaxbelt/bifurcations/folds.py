@@ -25,8 +25,8 @@ from ..results import Status
 from .base import Line
 from .conditions import AbstractCycleCondition
 from .edge_rests import pseudo_hopf_limit
-from .rests import hopf_limit, third_derivative
-from .systems import CycleSystem, contact_tests, nearest_contacts
+from .rests import hopf_limit
+from .systems import CycleSystem, contact_tests, nearest_contacts, third_derivative
 
 #: Starts of which the first loops are compared. From 12 to 96 find the same folds of a smooth law,
 #: down to cycles of amplitude 0.03, in 11 to 32 ms.

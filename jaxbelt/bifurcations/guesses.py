@@ -15,14 +15,14 @@ from jaxtyping import Array
 
 from ..cycles.chains import Loop, following_codes
 from ..cycles.orbits import Orbit, before_stick_ends, follow, last_loop, loop_of
-from ..model.equilibria import Equilibria, candidates
+from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.modes import STUCK, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..motion.integrators import STRIDE
 from ..numerics.compiling import each, jit
 from ..results import Status
-from .systems import velocity_of
+from .systems import third_derivative, velocity_of
 
 #: Arcs for which the orbit from slip onset is followed in search of the signature. Of 665 such
 #: orbits (300 oscillators, half of them of round numbers) 84% had settled by then, 87% after 96.
@@ -47,10 +47,24 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
     row = jnp.where(jnp.any(repels), jnp.argmax(repels), jnp.maximum(jnp.sum(exists) - 1, 0))
     centre = jnp.where(jnp.any(exists), rests.x1[row], 0.0)
     ends = [before_stick_ends(osc, belt) for belt in range(len(osc.belts))]
-    innermost = jnp.where(jnp.any(repels), INNERMOST, jnp.nan)
+    innermost = jnp.where(jnp.any(repels), _innermost(osc, rests, row), jnp.nan)
     distances = (innermost, *DISTANCES)
     others = [jnp.stack([centre + distance, jnp.zeros(())])[None] for distance in distances]
     return jnp.concatenate([*ends, *others])
+
+
+def _innermost(osc: Oscillator, rests: Equilibria, row: Array) -> Array:
+    """How far from an equilibrium that repels the innermost start is.
+
+    Beside a supercritical Hopf point the cycle is there, to third order: its damping over a loop,
+    rate A^2 + y A^4 / 16 with the third derivative y of x2' by x2, is zero. Orbits would hardly
+    come to so weak a cycle, and it may end in a fold before they do.
+    """
+    codes = rests.modes[row].astype(float)
+    third = third_derivative(osc, codes, rests.x1[row])
+    amplitude = jnp.sqrt(-16 * rests.rate[row] / jnp.where(third < 0, third, -jnp.inf))
+    is_weak = (rests.kind[row] == EquilibriumKind.FIXED_POINT) & (third < 0)
+    return jnp.where(is_weak & (amplitude < DISTANCES[1]), amplitude, INNERMOST)
 
 
 def approach(osc: Oscillator, rests: Equilibria, start: Array, stride: float | Array) -> Orbit:

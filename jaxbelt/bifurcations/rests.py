@@ -47,7 +47,7 @@ from ..results import Status
 from .base import AbstractCondition, Line, point_without_cycle
 from .guesses import HINT_BUDGET, orbit_after_stick
 from .special import SpecialPoint, Trail
-from .systems import RestSystem, judged_by, small_newton, velocity_of
+from .systems import RestSystem, judged_by, small_newton, third_derivative, velocity_of
 
 #: The unknowns of a state of rest of which all is known.
 NOTHING = np.zeros(0)
@@ -224,18 +224,6 @@ def _hopf_growth(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
     third = third_derivative(osc, system.codes, x1[0])
     known = jnp.where(system.is_on_edge(osc, x1), jnp.nan, third / 16)
     return known, jnp.sum(jnp.stack(sizes)) / 16
-
-
-def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
-    """That of x2' by x2 at a fixed point: 16 times the first Lyapunov coefficient."""
-
-    def derivative(fn):
-        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
-
-    def acceleration(x2):
-        return mode_acceleration(osc, mode_of(codes), x1, x2)
-
-    return derivative(derivative(derivative(acceleration)))(jnp.zeros(()))
 
 
 def hopf_limit(kind: str, trail: Trail, vanishes: Callable, *args: Array) -> SpecialPoint | None:

@@ -157,6 +157,18 @@ class RestSystem(AbstractSystem):
 # --- systems of a cycle ---------------------------------------------------------------------------
 
 
+def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
+    """That of x2' by x2 at a fixed point: 16 times the first Lyapunov coefficient."""
+
+    def derivative(fn):
+        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
+
+    def acceleration(x2):
+        return mode_acceleration(osc, mode_of(codes), x1, x2)
+
+    return derivative(derivative(derivative(acceleration)))(jnp.zeros(()))
+
+
 class CycleSystem(AbstractSystem):
     """A fixed signature and a condition; the unknowns are those of the cycle, [N, 3]."""
 

@@ -22,7 +22,7 @@ import time
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,12 +83,13 @@ class Store:
 
         def prepare():
             if not (path / "zarr.json").exists():
-                with _writes(path):
-                    _create(path, question)
+                _create(path, question)
             if part is None:
                 _sweep_out(path)
 
-        with locked(path, *(part or ()), prepare=prepare):
+        with ExitStack() as stack:
+            with _writes(path):
+                stack.enter_context(locked(path, *(part or ()), prepare=prepare))
             yield cls(path, question, part)
 
     @classmethod
@@ -290,6 +291,8 @@ def _writes(path: Path) -> Iterator[None]:
     """Let an error of the system say that it was the store that could not be written."""
     try:
         yield
+    except BlockingIOError:
+        raise  # another process writes
     except OSError as error:
         message = f"store cannot be written: {error.strerror}"
         raise OSError(error.errno, message, str(path)) from None
