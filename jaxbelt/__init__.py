@@ -61,7 +61,11 @@ def __getattr__(name: str) -> Any:
 
     if name in api.__all__ and (name.startswith("plot_") or name == "explore"):
         # Matplotlib is imported when something is drawn, not before.
-        from .plotting import explorer, model, phase, si, sweeps
+        from .activity import Activity
+
+        with Activity("matplotlib") as activity:
+            activity.say("imported")
+            from .plotting import explorer, model, phase, si, sweeps
 
         modules = explorer, model, phase, si, sweeps
         return next(getattr(m, name) for m in modules if hasattr(m, name))
