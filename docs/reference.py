@@ -93,7 +93,7 @@ def page_of(name: str) -> str:
 def first_sentence(name: str) -> str:
     """Of a docstring: its first sentence, or its first clause if that is long."""
     paragraph = " ".join((inspect.getdoc(found(name)) or "").partition("\n\n")[0].split())
-    return re.split(r"(?<=[a-z)`])[.;] ", paragraph)[0].rstrip(".") + "."
+    return re.split(r"(?<=[a-z)`])(?<!eqs)(?<!eq)[.;] ", paragraph)[0].rstrip(".") + "."
 
 
 def described(name: str) -> Iterator[str]:

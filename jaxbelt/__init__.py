@@ -68,7 +68,8 @@ def __getattr__(name: str) -> Any:
             from .plotting import explorer, model, phase, si, sweeps
 
         modules = explorer, model, phase, si, sweeps
-        return next(getattr(m, name) for m in modules if hasattr(m, name))
+        globals()[name] = value = next(getattr(m, name) for m in modules if hasattr(m, name))
+        return value
     if name == "__all__" or name in api.__all__:
         globals()[name] = value = getattr(api, name)
         return value
