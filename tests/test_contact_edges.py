@@ -225,7 +225,7 @@ def test_a_corner_in_which_the_cycle_ends():
 def test_the_passage_of_an_edge_becomes_tangent():
     """The edge pushes away to both sides, and the cycle that passes it ends there."""
     points = jb.scan(jb.presets.class_c(0.31, 0.25, 0.7), nu1, (0.16, 0.2))
-    kinds = [jb.FoldOfCycles(), jb.Hopf(), jb.GrazingEdge(0)]
+    kinds = [jb.FoldOfCycles(), jb.Hopf(), jb.SaddleConnection(0), jb.GrazingEdge(0)]
     assert [point.condition for point in points] == kinds
 
     def miss(nu):
@@ -245,8 +245,8 @@ def test_the_passage_of_an_edge_becomes_tangent():
         return loops[1] - 0.7
 
     expected = brentq(miss, 0.1846, 0.18475, xtol=1e-14)
-    assert points[2].value == pytest.approx(expected, abs=1e-11)
-    assert points[2].residual < 1e-12 and points[2].error < 1e-11
+    assert points[3].value == pytest.approx(expected, abs=1e-11)
+    assert points[3].residual < 1e-12 and points[3].error < 1e-11
 
 
 def test_a_belt_at_rest_that_no_cycle_sticks_to():

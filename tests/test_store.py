@@ -239,7 +239,7 @@ def test_a_law_and_a_reducer_count_by_type_numbers_and_source(tmp_path):
 
     class Other(Constant):
         def mu(self, speed):
-            return self.static - 0.1 * speed
+            return self.static / (1.0 + speed)
 
     class Twice(Count):
         def update(self, state, event):

@@ -138,9 +138,11 @@ class Bounds:
             if point.status == Status.OK and not any(
                 _lies_on(point, pair, curve, self.step) for curve in self.curves
             ):
-                limits, step = self.limits, self.step
-                curve = follow_point(self.variation, point, pair, limits, step=step)
-                self.curves.append(_without_known(curve, pair, self.curves, step))
+                # As `step`, in the units in which curves are followed.
+                sides = np.ptp(self.limits, axis=1)
+                step = self.step * np.max(sides / self.variation.family(pair).units) / np.max(sides)
+                curve = follow_point(self.variation, point, pair, self.limits, step=float(step))
+                self.curves.append(_without_known(curve, pair, self.curves, self.step))
 
     def away(self, rows: np.ndarray) -> np.ndarray:
         """How far from the way between the two cells the next curve passes, in cells, [pairs]."""

@@ -134,9 +134,10 @@ class BifurcationCurve(eqx.Module):
     def __repr__(self) -> str:
         first, last = (f"({p:.6g}, {q:.6g})" for p, q in self.values[[0, -1]])
         special = ", ".join(point.kind for point in self.special) or "none"
+        cut_off = ", cut off at max_points" if Stop.POINT_COUNT in self.ends else ""
         return (
             f"BifurcationCurve({self.condition!r}, {len(self)} rows, {first} to {last}, "
-            f"special: {special})"
+            f"special: {special}{cut_off})"
         )
 
 
@@ -156,8 +157,10 @@ def bifurcation_curve(
 
     point: from `refine` or `scan`, with status OK; where: selects the two parameters, or is a
     function of both that returns the oscillator, `make(p, q)`; span: first and last value of each;
-    at: see below; step: length between neighbours; max_points: on each side. `ValueError` names an
-    impossible argument.
+    at: see below; step: the longest way between neighbours, both parameters measured such that a
+    change by one changes some number of the dimensionless oscillator by one, and none by more;
+    max_points: on each side; `ends` says where the curve is cut off for that. `ValueError` names
+    an impossible argument.
 
     With `make` the curve begins where make(p, q) is the oscillator of the point, however that was
     found: with `make` at a fixed q, or in any other way. So (p, q) need not be told; where one
@@ -212,8 +215,14 @@ def follow_point(
     step: float,
     max_points: int = 1000,
 ) -> BifurcationCurve:
-    """The curve of a point at `start`, [2], in what is varied, between limits, [2, 2]."""
-    problem = _Problem(point.condition, variation, limits, step, max_points)
+    """The curve of a point at `start`, [2], in what is varied, between limits, [2, 2].
+
+    step: with both parameters in units by which they make the same difference.
+    """
+    units = np.asarray(variation.family(start).units)
+    measured, ends = variation.measured_in(units), limits / units[:, None]
+    problem = _Problem(point.condition, measured, ends, step, max_points)
+    start = start / units
     ahead = _side(problem, point, start, 1.0)
     closed = ahead.end is Stop.CLOSED
     behind = (
@@ -222,12 +231,15 @@ def follow_point(
     rows = [*reversed(behind.rows[1:]), *ahead.rows]
     return BifurcationCurve(
         condition=point.condition,
-        values=np.array([row.values for row in rows]),
+        values=units * np.array([row.values for row in rows]),
         classes=tuple(row.kind for row in rows),
         multiplier=np.array([row.multiplier for row in rows]),
         residual=np.array([row.residual for row in rows]),
         places=np.array([row.place for row in rows]),
-        special=(*reversed(behind.special), *ahead.special),
+        special=tuple(
+            one._replace(values=(one.values[0] * float(units[0]), one.values[1] * float(units[1])))
+            for one in (*reversed(behind.special), *ahead.special)
+        ),
         ends=(behind.end, ahead.end),
         names=(variation.names[0], variation.names[1]),
     )

@@ -9,6 +9,7 @@ is tangent to it at a guess is solved for again in the one that is tangent at th
 both are one oscillator there (`Variation.settle`). That is Newton's method once more.
 """
 
+import functools
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -37,6 +38,9 @@ PASSES, TRACED_PASSES = 12, 5
 #: Values between which zeros of velocities, and gaps between edges, are looked for, and how near
 #: two are taken for one.
 VALUES_SEEN, MERGED = 257, 1e-7
+#: A function whose tangent was asked for more often is compiled, which takes a few tenths of a
+#: second; uncompiled that of a machine in SI units takes some 20 ms.
+OFTEN = 128
 #: Guesses along each side of a plane for where an oscillator lies in it.
 GUESSES = 9
 
@@ -70,13 +74,20 @@ class Family(eqx.Module):
         return jax.tree.unflatten(structure, leaves)
 
     @property
-    def unit(self) -> Any:
-        """By how much the last parameter changes where that number of the oscillator which changes
-        most does so by one: what the parameter is measured in makes no difference to who asks."""
-        slopes = [slope[-1] for slope in lax.stop_gradient(self.slopes) if slope is not None]
+    def units(self) -> Any:
+        """By how much each parameter changes where that number of the oscillator which changes
+        most does so by one, [k]: what parameters are measured in makes no difference to who asks.
+        """
+        slopes = [slope for slope in lax.stop_gradient(self.slopes) if slope is not None]
         one: Any = np if is_concrete(slopes) else jnp
-        rate = one.max(one.stack([one.max(one.abs(slope)) for slope in slopes]))
-        return one.where(rate > 0, 1 / one.where(rate > 0, rate, 1.0), 1.0)
+        rows = [one.abs(one.reshape(slope, (len(slope), -1))) for slope in slopes]
+        rates = one.max(one.concatenate(rows, axis=1), axis=1)
+        return one.where(rates > 0, 1 / one.where(rates > 0, rates, 1.0), 1.0)
+
+    @property
+    def unit(self) -> Any:
+        """That of the last parameter."""
+        return self.units[-1]
 
     def belt_slopes(self, belt: int, name: str) -> Any:
         """Those of a number of a belt, [k]."""
@@ -170,32 +181,47 @@ class Variation:
 
     def _tangent(self, values: Any) -> Family:
         """The oscillators that are tangent to the function there."""
-        structure, rest = None, []
-
-        def numbers(*p):
-            nonlocal structure, rest
-            leaves, structure = jax.tree.flatten(self.make(*p))
-            is_one = [is_real(leaf) for leaf in leaves]
-            rest = [None if one else leaf for leaf, one in zip(leaves, is_one, strict=True)]
-            pairs = zip(leaves, is_one, strict=True)
-            return [jnp.asarray(leaf, dtype=jnp.float64) for leaf, one in pairs if one]
-
         values = np.asarray(values) if is_concrete(values) else jnp.stack([*values])
         at = tuple(jnp.asarray(value) for value in values)
-        tangents, leaves = [], []
-        for place in range(len(at)):
-            along = tuple(jnp.asarray(np.float64(place == i)) for i in range(len(at)))
-            leaves, tangent = jax.jvp(numbers, at, along)
-            tangents.append(tangent)
+        is_often_asked = len(self.tangents) >= OFTEN
+        numbers = self._compiled if is_often_asked else self._numbers_and_slopes
+        leaves, tangents = numbers(*at)
         pack: Any = np if is_concrete(tangents) else jnp
         slopes = iter([pack.stack(rows) for rows in zip(*tangents, strict=True)])
         found = iter(leaves)
+        structure, rest = self._frame
         whole = [next(found) if other is None else other for other in rest]
         return Family(
             jax.tree.unflatten(structure, whole),
             tuple(next(slopes) if other is None else None for other in rest),
             values,
         )
+
+    def _numbers_and_slopes(self, *at):
+        """The numbers of the oscillator there, and of each parameter their derivatives by it."""
+
+        def numbers(*p):
+            leaves, structure = jax.tree.flatten(self.make(*p))
+            is_one = [is_real(leaf) for leaf in leaves]
+            pairs = list(zip(leaves, is_one, strict=True))
+            self._frame[:] = structure, [None if one else leaf for leaf, one in pairs]
+            return [jnp.asarray(leaf, dtype=jnp.float64) for leaf, one in pairs if one]
+
+        tangents, leaves = [], []
+        for place in range(len(at)):
+            along = tuple(jnp.asarray(np.float64(place == i)) for i in range(len(at)))
+            leaves, tangent = jax.jvp(numbers, at, along)
+            tangents.append(tangent)
+        return leaves, tangents
+
+    @functools.cached_property
+    def _compiled(self) -> Callable:
+        return jax.jit(self._numbers_and_slopes)
+
+    @functools.cached_property
+    def _frame(self) -> list[Any]:
+        """What of an oscillator is no number: the tree, and its leaves (None: a number)."""
+        return []
 
     def family(self, values: Any) -> Family:
         """Oscillators that are linear in the parameters, and those of the variation near `values`,
@@ -325,6 +351,20 @@ class Variation:
             return self.make(*(p if place == free else value for place in (0, 1)))
 
         return Variation(make, (self.names[free],), line)
+
+    def measured_in(self, units: np.ndarray) -> "Variation":
+        """The same with its parameters in these units, [k]."""
+        if np.all(units == 1.0):
+            return self
+        line = None
+        if self.line is not None:
+            slopes = [s if s is None else (s.T * units).T for s in self.line.slopes]
+            line = Family(self.line.oscillator, tuple(slopes), self.line.origin / units)
+
+        def make(*p):
+            return self.make(*(unit * one for unit, one in zip(units, p, strict=True)))
+
+        return Variation(make, self.names, line, varies_leaves=self.varies_leaves)
 
     def rest_of(self, belt: int, start: float) -> float:
         """The value, near `start`, of the one parameter, at which a belt is at rest."""
