@@ -111,6 +111,13 @@ def require_one_of(value: Any, names: Iterable[str], field: str, more: str = "")
         require(False, field, expected, in_words(value) + did_you_mean(value, names))
 
 
+def check_belt(value: Any, belts: int, field: str = "belt", more: str = "") -> None:
+    """Raise unless `value` is the number of one of so many belts; more: what else is allowed."""
+    there = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < belts
+    expected = f"0 to {belts - 1}{more}" if belts > 1 else f"0{more}: there is one belt"
+    require_value(there, field, expected, value)
+
+
 def require_callable(value: Any, field: str, expected: str) -> None:
     """Raise unless `value` can be called."""
     require_value(callable(value), field, expected, value)
