@@ -215,9 +215,10 @@ def traceable(function: Callable[[], Any], field: str, expected: str) -> Any:
         ) from error
 
 
-def outside_of_traces(function: Callable) -> Any:
+def outside_of_traces(function: Callable, instead: str = "") -> Any:
     """Makes an entry one that refuses to be called under `jit`, `vmap` or derivatives, by what is
-    traced: how much there is in its numbers decides what it computes."""
+    traced: how much there is in its numbers decides what it computes. instead: what else to do
+    there, the end of the message."""
     name, signature = function.__name__, inspect.signature(function)
 
     @functools.wraps(function)
@@ -227,9 +228,9 @@ def outside_of_traces(function: Callable) -> Any:
         if not _is_known((args, kwargs)):
             given = signature.bind_partial(*args, **kwargs).arguments
             field = next(field for field, one in given.items() if not _is_known(one))
-            require(False, field, f"known: {scope}", "a traced one")
+            require(False, field, f"known: {scope}", f"a traced one{instead}")
         if not is_outermost():
-            raise ValueError(f"{name} must be called outside of jax.jit: {scope}")
+            raise ValueError(f"{name} must be called outside of jax.jit: {scope}{instead}")
         return function(*args, **kwargs)
 
     return call

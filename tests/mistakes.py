@@ -4,6 +4,7 @@ By itself, `python tests/mistakes.py` prints what came of each as a line of JSON
 of the package are unchecked there, as they are for its users.
 """
 
+import dataclasses
 import json
 import math  # noqa: F401
 import shlex
@@ -31,6 +32,7 @@ POINT = r"point must be a BifurcationPoint, such as jb.refine\(...\), got "
 TARGETS = r"targets must be a list of pairs \(functional, value\), such as .* got "
 AXES_OF = r"ax must be axes of matplotlib, such as plt.subplots\(\)\[1\], or None, got "
 OBSERVE = '"final", "attractor" or an object with init, update, finish, got '
+UNITS = r"; multiply by machine\.units instead$"
 TRACED = r" must be known: \w+ is not for jit, vmap or derivatives, got a traced one"
 
 #: What is called, and a pattern of the message; what begins with "jaxbelt" is a command.
@@ -109,6 +111,12 @@ MISTAKES = [
     ("jb.in_si(3.0, machine)", "result must be a Trajectory, .* a Fit, .*, got float"),
     ("jb.in_si(cycle, osc)", r"machine must be a Machine, got Oscillator\("),
     ("jb.plot_in_si(cycle, osc)", r"machine must be a Machine, got Oscillator\("),
+    ("jb.in_si(cycle, lambda V: machine)", "got the function .*; a function is for .* a diagram"),
+    ("jb.plot_in_si(cycle, lambda V: machine)", "got the .*; a function is for .* fractions"),
+    ("jb.plot_in_si(curve, lambda V: machine)", "got the .*; a function is for .* of a sweep"),
+    ("jb.in_si(point, machine)", r"got BifurcationPoint; its value is .*\(point.cycle, machine\(p"),
+    ("jb.in_si(curve, machine)", "got BifurcationCurve; its values are in the units of the arg"),
+    ("jb.in_si(several, machine)", r"got Equilibria; write jb.in_si\(jb.portrait\(osc\), machine"),
     ("jb.explore((1.0, 0.0))", OSC + r"\(1\.0, 0\.0\)"),
     ("jb.explore(osc, (1.0, 0.0, 2.0))", r"start must be of shape \(2\), got shape \(3,\)"),
     ("jb.explore(osc, t1=0)", r"t1 must be > 0, got 0\.0"),
@@ -524,7 +532,11 @@ MISTAKES = [
         "jax.jit(lambda osc: jb.minimal_fatal_shock(osc, (3.0, 0.0)))(osc)",
         "osc must be known: shocks are not for jit or vmap, got a traced one",
     ),
-    ("jax.jit(lambda one: jb.in_si(cycle, one))(machine)", "machine" + TRACED),
+    ("jax.jit(lambda one: jb.in_si(cycle, one))(machine)", "machine" + TRACED + UNITS),
+    (
+        "jax.jit(lambda _: jb.in_si(cycle, machine))(0.1)",
+        "in_si must be called outside of jax.jit: .* derivatives" + UNITS,
+    ),
     # --- pictures
     ("jb.plot_friction_law(osc)", r"friction must be a law .*, got Oscillator\("),
     ("jb.plot_friction_law(law, unit=3)", 'unit must be a text such as "m/s", got 3'),
@@ -716,6 +728,8 @@ def names() -> dict:
         "TARGET": [(jb.amplitude, 1.0)],
         "belt": jb.Belt(0.3, law),
         "cycle": cycle,
+        "curve": jb.BifurcationCurve(*[None] * 9),
+        "several": jb.Equilibria(*[None] * len(dataclasses.fields(jb.Equilibria))),
         "one": one,
         "of_one": jb.Cycle(one, *[None] * 5, jnp.asarray(0)),
         "run": jb.Trajectory(*[None] * 5, jnp.asarray(0)),
