@@ -172,11 +172,11 @@ def in_si(
 
 def units_of(machine: Any) -> Units:
     """The units of a machine, or these themselves; `ValueError` for anything else."""
-    if not isinstance(machine, Machine | Units):
-        along = "what is along an argument of it: a diagram, fractions, the dataset of a sweep"
-        told = f"; a function is for {along}" if callable(machine) else ""
-        require(False, "machine", "a Machine", in_words(machine) + told)
-    return machine if isinstance(machine, Units) else machine.units
+    if isinstance(machine, Machine | Units):
+        return machine if isinstance(machine, Units) else machine.units
+    along = "what is along an argument of it: a diagram, fractions, the dataset of a sweep"
+    told = f"; a function is for {along}" if callable(machine) else ""
+    raise ValueError(f"machine must be a Machine, got {in_words(machine)}{told}")
 
 
 def check_machine(result: Any, machine: Any) -> None:
