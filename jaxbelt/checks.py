@@ -111,6 +111,13 @@ def require_one_of(value: Any, names: Iterable[str], field: str, more: str = "")
         require(False, field, expected, in_words(value) + did_you_mean(value, names))
 
 
+def check_belt(value: Any, belts: int, field: str = "belt", more: str = "") -> None:
+    """Raise unless `value` is the number of one of so many belts; more: what else is allowed."""
+    there = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < belts
+    expected = f"0 to {belts - 1}{more}" if belts > 1 else f"0{more}: there is one belt"
+    require_value(there, field, expected, value)
+
+
 def require_callable(value: Any, field: str, expected: str) -> None:
     """Raise unless `value` can be called."""
     require_value(callable(value), field, expected, value)
@@ -208,9 +215,10 @@ def traceable(function: Callable[[], Any], field: str, expected: str) -> Any:
         ) from error
 
 
-def outside_of_traces(function: Callable) -> Any:
+def outside_of_traces(function: Callable, instead: str = "") -> Any:
     """Makes an entry one that refuses to be called under `jit`, `vmap` or derivatives, by what is
-    traced: how much there is in its numbers decides what it computes."""
+    traced: how much there is in its numbers decides what it computes. instead: what else to do
+    there, the end of the message."""
     name, signature = function.__name__, inspect.signature(function)
 
     @functools.wraps(function)
@@ -220,9 +228,9 @@ def outside_of_traces(function: Callable) -> Any:
         if not _is_known((args, kwargs)):
             given = signature.bind_partial(*args, **kwargs).arguments
             field = next(field for field, one in given.items() if not _is_known(one))
-            require(False, field, f"known: {scope}", "a traced one")
+            require(False, field, f"known: {scope}", f"a traced one{instead}")
         if not is_outermost():
-            raise ValueError(f"{name} must be called outside of jax.jit: {scope}")
+            raise ValueError(f"{name} must be called outside of jax.jit: {scope}{instead}")
         return function(*args, **kwargs)
 
     return call

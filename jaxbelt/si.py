@@ -4,6 +4,7 @@ What a number is, is told by its name, as this package gives them. What has anot
 result of an observable of one's own, stays as it is.
 """
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Union
@@ -14,13 +15,16 @@ import numpy as np
 from jaxtyping import Array
 
 from .activity import announced
+from .bifurcations.base import BifurcationPoint
+from .bifurcations.curves import BifurcationCurve
 from .bifurcations.diagrams import BifurcationDiagram
-from .checks import outside_of_traces, require
+from .checks import in_words, outside_of_traces, require
 from .cycles.cycle import Cycle
 from .cycles.functionals import energy_dissipated
 from .cycles.portrait import Portrait
 from .cycles.shocks import FatalShock
 from .inverse.fit import Fit
+from .model.equilibria import Equilibria
 from .model.friction import Conti, Coulomb, Stribeck
 from .model.machine import Machine, Units
 from .model.modes import STUCK, mode_acceleration, mode_of
@@ -65,8 +69,19 @@ AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
 SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
 
 
+#: What else to do with a result that `in_si` does not take.
+INSTEAD = {
+    BifurcationPoint: "; its value is in the unit of the argument where a function was given in "
+    "place of an oscillator, else multiply it by machine.units.velocity, say; for its cycle write "
+    "jb.in_si(point.cycle, machine(point.value))",
+    BifurcationCurve: "; its values are in the units of the arguments where a function was given, "
+    "else multiply them by machine.units.velocity, say",
+    Equilibria: "; write jb.in_si(jb.portrait(osc), machine), which has them among its rows",
+}
+
+
 @announced("in_si")
-@outside_of_traces
+@functools.partial(outside_of_traces, instead="; multiply by machine.units instead")
 def in_si(
     result: Union[
         Trajectory,
@@ -113,8 +128,14 @@ def in_si(
     for the velocity of a belt, in N for a load (the normal force), in m for a contact edge, in N
     s/m for the damping, and that of a function's argument stays as the function takes it. Of a
     dataset: its own variables, with derivatives by starts and parameters where the units are the
-    same in all runs; results of an observable of one's own stay dimensionless. `TypeError` for
-    anything else.
+    same in all runs; results of an observable of one's own stay dimensionless, and so does the
+    attribute `start`. `TypeError` for anything else.
+
+    Where a function was given in place of an oscillator, the value of a `BifurcationPoint` and
+    those of a `BifurcationCurve` are in the units of its arguments already; the cycle at a point is
+    `in_si(point.cycle, machine(point.value))`. `Equilibria` are among the rows of
+    `in_si(portrait(osc), machine)`. Under `jit`, `vmap` and derivatives multiply by `machine.units`
+    instead.
     """
     import xarray
 
@@ -145,14 +166,17 @@ def in_si(
     raise TypeError(
         "result must be a Trajectory, a Cycle, a Portrait, a FatalShock, Basins, BasinStability, "
         "a Fit, a BifurcationDiagram, an OrbitDiagram, BasinFractions, or the dataset of a sweep, "
-        f"got {type(result).__name__}"
+        f"got {type(result).__name__}{INSTEAD.get(type(result), '')}"
     )
 
 
 def units_of(machine: Any) -> Units:
     """The units of a machine, or these themselves; `ValueError` for anything else."""
-    require(isinstance(machine, Machine | Units), "machine", "a Machine", repr(machine))
-    return machine if isinstance(machine, Units) else machine.units
+    if isinstance(machine, Machine | Units):
+        return machine if isinstance(machine, Units) else machine.units
+    along = "what is along an argument of it: a diagram, fractions, the dataset of a sweep"
+    told = f"; a function is for {along}" if callable(machine) else ""
+    raise ValueError(f"machine must be a Machine, got {in_words(machine)}{told}")
 
 
 def check_machine(result: Any, machine: Any) -> None:
@@ -446,6 +470,8 @@ def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
         changed[name] = (old.dims, values, old.attrs | told)
     coordinates = {name: changed.pop(name) for name in axes if name in changed}
     told = {"units": "SI where a variable says so; else dimensionless"}
+    if str(start := dataset.attrs.get("start", "")).startswith("x"):  # not along the axes
+        told["start"] = f"dimensionless: {start}"
     return dataset.assign(changed).assign_coords(coordinates).assign_attrs(told)
 
 

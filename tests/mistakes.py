@@ -4,6 +4,7 @@ By itself, `python tests/mistakes.py` prints what came of each as a line of JSON
 of the package are unchecked there, as they are for its users.
 """
 
+import dataclasses
 import json
 import math  # noqa: F401
 import shlex
@@ -31,6 +32,7 @@ POINT = r"point must be a BifurcationPoint, such as jb.refine\(...\), got "
 TARGETS = r"targets must be a list of pairs \(functional, value\), such as .* got "
 AXES_OF = r"ax must be axes of matplotlib, such as plt.subplots\(\)\[1\], or None, got "
 OBSERVE = '"final", "attractor" or an object with init, update, finish, got '
+UNITS = r"; multiply by machine\.units instead$"
 TRACED = r" must be known: \w+ is not for jit, vmap or derivatives, got a traced one"
 
 #: What is called, and a pattern of the message; what begins with "jaxbelt" is a command.
@@ -93,6 +95,11 @@ MISTAKES = [
     # --- machines
     ("jb.Machine(0.0, 1.0, 0.1, (physical,))", r"mass must be > 0, got 0\.0"),
     ("jb.Machine(m=1.0, k=1.0, c=0.1, belts=(physical,))", "stiffness, not k, damping, not c"),
+    ("jb.Machine(spring=2.0, dashpot=3.0)", "belts: stiffness, not spring, damping, not dashpot"),
+    ("jb.Machine(1.0, 1.0, 0.1, belt=physical)", "stiffness, damping and belts: belts, not belt"),
+    ("jb.Machine(1.0, stifness=1.0)", "stiffness, damping and belts: stiffness, not stifness"),
+    ("jb.Machine(1.0, omega=1.0)", "Machine.. takes mass, .* and belts: not omega"),
+    ("jb.PhysicalBelt(0.1, law, load=1.0)", "PhysicalBelt.. takes .*: normal_force, not load"),
     ("jb.Machine(1.0, 1.0, 0.1, physical)", r"belts must be a tuple of belts, .*got PhysicalBelt"),
     ("jb.Machine(1.0, 1.0, 0.1, (belt,))", r"belts\[0\] must be a PhysicalBelt, got Belt"),
     ("jb.PhysicalBelt(0.1, law, -1.0)", r"normal_force must be >= 0, got -1\.0"),
@@ -104,6 +111,12 @@ MISTAKES = [
     ("jb.in_si(3.0, machine)", "result must be a Trajectory, .* a Fit, .*, got float"),
     ("jb.in_si(cycle, osc)", r"machine must be a Machine, got Oscillator\("),
     ("jb.plot_in_si(cycle, osc)", r"machine must be a Machine, got Oscillator\("),
+    ("jb.in_si(cycle, lambda V: machine)", "got the function .*; a function is for .* a diagram"),
+    ("jb.plot_in_si(cycle, lambda V: machine)", "got the .*; a function is for .* fractions"),
+    ("jb.plot_in_si(curve, lambda V: machine)", "got the .*; a function is for .* of a sweep"),
+    ("jb.in_si(point, machine)", r"got BifurcationPoint; its value is .*\(point.cycle, machine\(p"),
+    ("jb.in_si(curve, machine)", "got BifurcationCurve; its values are in the units of the arg"),
+    ("jb.in_si(several, machine)", r"got Equilibria; write jb.in_si\(jb.portrait\(osc\), machine"),
     ("jb.explore((1.0, 0.0))", OSC + r"\(1\.0, 0\.0\)"),
     ("jb.explore(osc, (1.0, 0.0, 2.0))", r"start must be of shape \(2\), got shape \(3,\)"),
     ("jb.explore(osc, t1=0)", r"t1 must be > 0, got 0\.0"),
@@ -115,7 +128,23 @@ MISTAKES = [
     ("jb.simulate(jb.presets.class_b, (3.0, 0.0), 10.0)", OSC + "the function class_b"),
     ("jb.simulate(osc, (3.0, 0.0))", "missing 1 required positional argument: 't1'"),
     ("jb.simulate(osc, (3.0, 0.0, 1.0), 10.0)", r"y0 must be of shape \(2\), got shape \(3,\)"),
-    ("jb.simulate(machine, (3.0, 0.0), 10.0)", OSC + r"Machine\("),
+    (
+        "jb.simulate(machine, (3.0, 0.0), 10.0)",
+        OSC + r"Machine\(.*\.\.\.; give machine\.oscillator$",
+    ),
+    ("jb.portrait(cycle)", OSC + r"a Cycle; give cycle\.oscillator$"),
+    (
+        "jb.refine(jb.Hopf(), lambda v: machine, at=0.3)",
+        "osc must be .* got one that returns Machine; return machine.oscillator",
+    ),
+    (
+        "jb.sweep(lambda nu0: machine, {'nu0': row}, t1=9.0)",
+        "make must be .* got one that returns Machine; return machine.oscillator",
+    ),
+    (
+        "jb.region_map(lambda nu0, nu1: machine, AXES)",
+        "make must be .* got one that returns Machine; return machine.oscillator",
+    ),
     ("jb.simulate(osc, np.zeros(2, np.float32), 10.0)", "y0 must be float64, got float32"),
     ("jb.simulate(osc, (3.0, 1j), 10.0)", "y0 must be float64, got complex128"),
     ("jb.simulate(osc, (3.0, 0.0), 10.0, t0=20.0)", r"t1 must be > t0 = 20\.0, got 10\.0"),
@@ -154,6 +183,10 @@ MISTAKES = [
     ("jb.period(None)", CYCLE + "None"),
     ("jb.peak(cycle, 'x3')", 'coordinate must be "x1" or "x2", got \'x3\''),
     ("jb.stick_duration(cycle, belt=5)", "belt must be 0 to 1, got 5"),
+    ("jb.stick_duration(of_one, belt=1)", "belt must be 0: there is one belt, got 1"),
+    ("jb.refine(jb.NonsmoothFold(1), one, where=nu0)", "belt must be 0: there is one belt, got 1"),
+    ("jb.refine(jb.Hopf(), one, where=0)", "parameter of an oscillator with one belt, 0, unch"),
+    ("jb.refine(jb.SaddleConnection(0, 1), one, where=nu0)", "to must be 0, or None: there is one"),
     ("jb.stick_duration(cycle, belt=True)", "belt must be 0 to 1, got True"),
     ("cycle.sample(0)", f"n {WHOLE}0"),
     ("jb.describe('OK')", "status must be a Status, or its number, got 'OK'"),
@@ -190,7 +223,12 @@ MISTAKES = [
         "jb.refine(jb.Hopf(), jb.presets.class_b, at=0.3)",
         r"osc must be .*, got one of \(nu0, nu1\)",
     ),
-    ("jb.refine(jb.NonsmoothFold(), osc, where=nu0)", "missing .* argument: 'belt'"),
+    (
+        "jb.refine(jb.NonsmoothFold(), osc, where=nu0)",
+        r"NonsmoothFold\(\) takes belt \(the number of a .*, such as 0\): missing .*: 'belt'",
+    ),
+    ("jb.EdgeExchange()", r"takes belts \(the numbers of two belts, .*: missing .* 'belts'"),
+    ("jb.Hopf(0)", r"Hopf\(\) takes nothing: too many positional arguments"),
     ("jb.refine(jb.NonsmoothFold(2), osc, where=nu0)", "belt must be 0 to 1, got 2"),
     ("jb.refine(jb.GrazingSliding(1.0), osc, where=nu0)", r"belt must be 0 to 1, got 1\.0"),
     ("jb.refine(jb.CrossingSliding('1'), osc, where=nu0)", "belt must be 0 to 1, got '1'"),
@@ -494,7 +532,11 @@ MISTAKES = [
         "jax.jit(lambda osc: jb.minimal_fatal_shock(osc, (3.0, 0.0)))(osc)",
         "osc must be known: shocks are not for jit or vmap, got a traced one",
     ),
-    ("jax.jit(lambda one: jb.in_si(cycle, one))(machine)", "machine" + TRACED),
+    ("jax.jit(lambda one: jb.in_si(cycle, one))(machine)", "machine" + TRACED + UNITS),
+    (
+        "jax.jit(lambda _: jb.in_si(cycle, machine))(0.1)",
+        "in_si must be called outside of jax.jit: .* derivatives" + UNITS,
+    ),
     # --- pictures
     ("jb.plot_friction_law(osc)", r"friction must be a law .*, got Oscillator\("),
     ("jb.plot_friction_law(law, unit=3)", 'unit must be a text such as "m/s", got 3'),
@@ -669,7 +711,7 @@ def twice(osc):
 def names() -> dict:
     """What stands in the calls."""
     osc, row = jb.presets.class_b(0.45, 0.35), np.linspace(0.0, 20.0, 200)
-    law = jb.presets.paper_friction()
+    law, one = jb.presets.paper_friction(), jb.presets.class_a(0.3)
     physical = jb.PhysicalBelt(0.1, law, 1.0)
     # Results without what they would be computed from.
     cycle = jb.Cycle(osc, *[None] * 5, jnp.asarray(0))
@@ -686,6 +728,10 @@ def names() -> dict:
         "TARGET": [(jb.amplitude, 1.0)],
         "belt": jb.Belt(0.3, law),
         "cycle": cycle,
+        "curve": jb.BifurcationCurve(*[None] * 9),
+        "several": jb.Equilibria(*[None] * len(dataclasses.fields(jb.Equilibria))),
+        "one": one,
+        "of_one": jb.Cycle(one, *[None] * 5, jnp.asarray(0)),
         "run": jb.Trajectory(*[None] * 5, jnp.asarray(0)),
         "edged": jb.presets.class_c(0.1, 0.3, 0.2),
         "dataset": xr.Dataset({"kind": ("nu0", [0])}),

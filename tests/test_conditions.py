@@ -140,5 +140,5 @@ def test_every_kind_of_the_package_carries_its_words(kind: type[AbstractConditio
 def test_what_is_no_plain_number_is_named():
     with pytest.raises(ValueError, match="condition must be made of plain numbers"):
         jb.refine(PeriodIs(jnp.asarray(8.0)), jb.presets.class_a(0.2), where=nu0)
-    with pytest.raises(ValueError, match="belt must be 0 to 0, got 1"):
+    with pytest.raises(ValueError, match="belt must be 0: there is one belt, got 1"):
         jb.scan(jb.presets.class_a(0.2), nu0, (0.1, 0.2), conditions=[jb.GrazingSliding(1)])

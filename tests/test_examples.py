@@ -60,6 +60,12 @@ def test_the_page_on_scaling_runs():
     found = jb.in_si(given["fractions"], machine).to_dataframe()
     sticks = found[found.attractor.str.startswith("cycle")]
     np.testing.assert_allclose(sticks.x2_max, sticks.value, rtol=1e-9)
+    amplitude = given["amplitude"]
+    np.testing.assert_allclose(amplitude(0.02), jb.in_si(given["cycle"], m).amplitude, rtol=1e-9)
+    slope = (amplitude(0.0201) - amplitude(0.0199)) / 0.0002
+    np.testing.assert_allclose(given["slope"], slope, rtol=1e-3)  # a difference, of order two
+    # The second stiffness is that of m; the tolerance of the runs is 1e-10.
+    np.testing.assert_allclose(given["ends"][1], jb.in_si(given["run"], m).x1[-1], rtol=1e-7)
     # In one machine's units and in its own a machine does the same: at 8 N a cycle of one period.
     own, held = machine(N=8.0), given["pressed"](8.0)
     periods = (

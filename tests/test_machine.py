@@ -499,5 +499,6 @@ def test_what_is_in_si_units_is_not_scaled_again():
     machine = jb.Machine(mass=2.0, stiffness=800.0, damping=4.0, belts=(belt,))
     dataset = jb.sweep(lambda: machine.oscillator, {"x1": [1.0]}, t1=1.0)
     once = jb.in_si(dataset, machine)
+    assert once.start == "dimensionless: x2 = 0.0"
     with pytest.raises(ValueError, match="result must be dimensionless, got a dataset that is in"):
         jb.in_si(once, machine)

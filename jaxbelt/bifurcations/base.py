@@ -18,6 +18,7 @@ is static.
 """
 
 import abc
+import inspect
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -28,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..checks import is_concrete, number, require, require_value
+from ..checks import check_belt, is_concrete, number, require, require_value
 from ..cycles.attractors import place_of
 from ..cycles.chains import SIZES, Chain, Loop
 from ..cycles.cycle import Cycle
@@ -48,6 +49,13 @@ from .systems import (
 
 if TYPE_CHECKING:
     import pandas
+
+
+#: What the arguments of conditions are.
+ARGUMENTS = {
+    "belt": " (the number of a belt, such as 0)",
+    "belts": " (the numbers of two belts, such as (0, 1))",
+}
 
 
 class Line(NamedTuple):
@@ -97,6 +105,18 @@ class AbstractCondition(eqx.Module):
     #: Whether its curve bends sharply before its limit, so that rows are wanted close to that.
     bends: ClassVar[bool] = False
 
+    def __new__(cls, *args: Any, **given: Any):
+        signature = inspect.signature(cls)
+        try:
+            signature.bind(*args, **given)
+        except TypeError as error:
+            takes = " and ".join(name + ARGUMENTS.get(name, "") for name in signature.parameters)
+            raise TypeError(f"{cls.__name__}() takes {takes or 'nothing'}: {error}") from None
+        return super().__new__(cls)
+
+    def __reduce__(self):  # without arguments `__new__` would refuse
+        return object.__new__, (type(self),), vars(self)
+
     @property
     def belts_concerned(self) -> tuple[int, ...]:
         """The numbers of the belts that it is about: those in its field `belt`, or `belts`."""
@@ -131,12 +151,10 @@ class AbstractCondition(eqx.Module):
 
     def check(self, osc: Oscillator) -> None:
         """`ValueError` where the oscillator cannot meet it."""
-        n = len(osc.belts)
         # Of a field `belt` that is None, too.
         belts = [vars(self)["belt"]] if "belt" in vars(self) else self.belts_concerned
         for belt in belts:
-            there = isinstance(belt, int) and not isinstance(belt, bool) and 0 <= belt < n
-            require_value(there, "belt", f"0 to {n - 1}", belt)
+            check_belt(belt, len(osc.belts))
         plain = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(self))
         require(plain, "condition", "made of plain numbers", self)
 

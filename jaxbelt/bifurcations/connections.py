@@ -34,7 +34,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import is_concrete, require_value
+from ..checks import check_belt, is_concrete
 from ..cycles.attractors import extent
 from ..cycles.chains import SIZES, Chain, Loop, cut
 from ..cycles.cycle import cycle_of
@@ -181,9 +181,8 @@ class SaddleConnection(AbstractCondition):
         return np.flatnonzero(np.any(is_there, axis=0)).tolist()
 
     def check(self, osc):
-        n = len(osc.belts)
-        there = self.to is None or (isinstance(self.to, int) and 0 <= self.to < n)
-        require_value(there, "to", f"0 to {n - 1}, or None", self.to)
+        if self.to is not None:
+            check_belt(self.to, len(osc.belts), "to", ", or None")
         super().check(osc)
         check_edge(osc, self.belt)
         if self.to is not None:

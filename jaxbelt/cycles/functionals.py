@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..activity import announced
-from ..checks import require_one_of, require_value
+from ..checks import check_belt, require_one_of, require_value
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
@@ -109,9 +109,7 @@ def _is_stuck(cycle: Cycle) -> Array:
 
 
 def _belt_index(cycle: Cycle, belt: int) -> int:
-    n = len(_checked_cycle(cycle).oscillator.belts)
-    there = isinstance(belt, int) and not isinstance(belt, bool) and 0 <= belt < n
-    require_value(there, "belt", f"0 to {n - 1}", belt)
+    check_belt(belt, len(_checked_cycle(cycle).oscillator.belts))
     return belt
 
 

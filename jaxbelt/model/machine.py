@@ -7,6 +7,8 @@ normal force, max N_i / k; velocity, force and energy follow from these. So the 
 omega = 1, its largest load is 1, and its laws take speeds in the unit of velocity.
 """
 
+import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -25,6 +27,7 @@ from ..checks import (
     require,
     require_value,
 )
+from ..spelling import near
 from .friction import AbstractFriction, as_friction
 from .oscillator import Belt, Oscillator, as_belts, as_edge, check_oscillator, scaled_edge
 
@@ -52,6 +55,28 @@ class Units(eqx.Module):
         return f"Units({', '.join(parts)})"
 
 
+#: What the arguments of `PhysicalBelt` and `Machine` are sometimes called.
+OTHER_NAMES = {
+    **{"v": "velocity", "speed": "velocity", "law": "friction", "mu": "friction"},
+    **dict.fromkeys(("n", "normal", "force", "load"), "normal_force"),
+    **{"m": "mass", "k": "stiffness", "spring": "stiffness", "belt": "belts"},
+    **dict.fromkeys(("c", "dashpot", "damper"), "damping"),
+}
+
+
+def _check_names(of: Any, given: Iterable[str]) -> None:
+    """`TypeError` where an argument has another name than a field; it tells which was meant."""
+    names = [field.name for field in dataclasses.fields(of)]
+
+    def told(name):
+        meant = [OTHER_NAMES.get(name.lower(), ""), *near(name, names)]
+        return ", ".join([*[one for one in meant if one in names][:1], f"not {name}"])
+
+    if wrong := [name for name in given if name not in names]:
+        known = f"{', '.join(names[:-1])} and {names[-1]}"
+        raise TypeError(f"{of.__name__}() takes {known}: {', '.join(map(told, wrong))}")
+
+
 class PhysicalBelt(eqx.Module):
     """A belt of a `Machine`, in SI units; it touches the mass while lower < X < upper.
 
@@ -73,6 +98,10 @@ class PhysicalBelt(eqx.Module):
         converter=lambda value: as_edge(value, "upper"), default=float("inf")
     )
 
+    def __new__(cls, *_: Any, **given: Any):
+        _check_names(cls, given)
+        return super().__new__(cls)
+
     def __check_init__(self):
         check_finite(self.velocity, "velocity")
         check_nonnegative(self.normal_force, "normal_force")
@@ -87,10 +116,6 @@ class PhysicalBelt(eqx.Module):
             f"normal_force={number(self.normal_force)} N, lower={number(self.lower)} m, "
             f"upper={number(self.upper)} m)"
         )
-
-
-#: What the arguments of `Machine` are sometimes called.
-SHORT_NAMES = {"m": "mass", "k": "stiffness", "c": "damping", "belt": "belts"}
 
 
 class Machine(eqx.Module):
@@ -113,9 +138,7 @@ class Machine(eqx.Module):
     )
 
     def __new__(cls, *_: Any, **given: Any):
-        if short := [name for name in given if name in SHORT_NAMES]:
-            meant = ", ".join(f"{SHORT_NAMES[name]}, not {name}" for name in short)
-            raise TypeError(f"Machine() takes mass, stiffness, damping and belts: {meant}")
+        _check_names(cls, given)
         return super().__new__(cls)
 
     def __check_init__(self):

@@ -37,6 +37,7 @@ from ..checks import (
     be_finite,
     be_nonnegative,
     be_positive,
+    in_words,
     is_concrete,
     number,
     require,
@@ -192,14 +193,17 @@ def check_oscillator(osc: Any, field: str = "osc") -> None:
     The entries that take one ask this first; in a forked process they raise a `RuntimeError`.
     """
     require_own_threads()
-    require_value(
-        isinstance(osc, Oscillator),
-        field,
-        "an Oscillator, such as jb.presets.class_b(...)",
-        osc,
-    )
+    if not isinstance(osc, Oscillator):
+        expected = "an Oscillator, such as jb.presets.class_b(...)"
+        require(False, field, expected, in_words(osc) + its_oscillator(osc))
     check_scalars(osc)
     Oscillator.check(osc)
+
+
+def its_oscillator(value: Any, verb: str = "give") -> str:
+    """What else to give where what has an oscillator, such as a `Machine`, came in place of it."""
+    has = isinstance(value, eqx.Module) and "oscillator" in dir(value)
+    return f"; {verb} {type(value).__name__.lower()}.oscillator" if has else ""
 
 
 def check_scalars(osc: Oscillator) -> None:

@@ -106,7 +106,8 @@ def is_real(leaf: Any) -> bool:
 
 
 def _of(osc: Oscillator) -> str:
-    return f" of an oscillator with belts 0 to {len(osc.belts) - 1}"
+    last = len(osc.belts) - 1
+    return f" of an oscillator with {f'belts 0 to {last}' if last else 'one belt, 0'}"
 
 
 def _tuple(chosen: Any) -> tuple[Any, ...]:

@@ -25,7 +25,7 @@ from jax.core import Tracer
 
 from ..checks import as_interval, is_concrete, require, require_callable, require_value
 from ..numerics.compiling import depends, is_affine, is_outermost
-from .oscillator import Oscillator, check_oscillator, check_scalars
+from .oscillator import Oscillator, check_oscillator, check_scalars, its_oscillator
 from .parameters import is_number, is_real, leaf_index, names_of
 
 #: Numbers that differ by less, relative to their size beside 1, are the same but for rounding.
@@ -152,7 +152,7 @@ class Variation:
         def numbers(*p):
             osc = make(*p)
             kind = "a number" if isinstance(osc, Tracer) else type(osc).__name__
-            told = f"one that returns {kind}"
+            told = f"one that returns {kind}{its_oscillator(osc, 'return')}"
             require(isinstance(osc, Oscillator), argument, expected, told)
             check_scalars(osc)
             leaves = jax.tree.leaves(osc)

@@ -20,7 +20,7 @@ from ..checks import (
     traceable,
 )
 from ..kernel.lanes import Observer, Program
-from ..model.oscillator import Oscillator, check_scalars
+from ..model.oscillator import Oscillator, check_scalars, its_oscillator
 from .threads import CHUNK
 
 
@@ -55,7 +55,8 @@ class Grid:
         finite = {name: self.axes[name][np.isfinite(self.axes[name])] for name in self.names}
         first = {name: float(v[0]) if v.size else 0.0 for name, v in finite.items()}
         self.example = make(**first)
-        came = f"one that returns {type(self.example).__name__}"
+        kind = type(self.example).__name__
+        came = f"one that returns {kind}{its_oscillator(self.example, 'return')}"
         require(isinstance(self.example, Oscillator), "make", returns, came)
         known = "one of known numbers: sweeps are not for jit, vmap or derivatives"
         require(is_concrete(self.example), "make", known, "a traced one")
