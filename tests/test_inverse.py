@@ -226,6 +226,34 @@ def test_local_cubics_are_exact_for_cubics():
     assert noise < 1e-9
 
 
+@pytest.mark.slow(first=True)
+def test_a_record_in_seconds_and_metres_is_a_misfit():
+    """Sampled so coarsely, taken for dimensionless, the motion itself is taken for noise."""
+    speeds, mus = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4), (0.55, 0.48, 0.41, 0.36, 0.34, 0.35)
+
+    def machine(force):
+        belt = jb.PhysicalBelt(0.12, jb.Tabulated(speeds, mus), force)
+        return jb.Machine(2.0, 800.0, 3.0, (belt,))
+
+    true, guess, ts = machine(30.0), machine(25.0), np.linspace(0.0, 3.0, 301)
+    run = jb.simulate(true.oscillator, true.start(0.0, 0.0), true.tau(3.0), ts=true.tau(ts))
+    noise = 2e-4 * np.random.default_rng(5).standard_normal(ts.size)
+    record, length = np.asarray(run.ys[:, 0] * true.units.length) + noise, guess.units.length
+
+    def fit(ts, x1):
+        return jb.fit(guess.oscillator, ts, x1, where=lambda osc: osc.belts[0].load)
+
+    wrong = fit(ts, record)
+    assert wrong.status == Status.MISFIT and wrong.plausibility > 1e-3 and "units" in repr(wrong)
+    right = fit(guess.tau(ts), record / length)
+    assert (
+        right.status == Status.OK and abs(right.estimates[0] - 1.2) < 3 * right.standard_errors[0]
+    )
+    few = slice(None, None, 7)
+    coarse = fit(guess.tau(ts[few]), record[few] / length)
+    assert coarse.reduced_chi_squared < 0.2 and "estimated too large" in repr(coarse)
+
+
 @pytest.mark.parametrize("step", [0.2, 0.05])
 def test_the_noise_of_a_record_is_estimated(step):
     """Of cubics through 7 and through 15 data. The estimate from 20,000 data scatters by about

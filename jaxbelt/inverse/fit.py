@@ -54,6 +54,9 @@ SEARCH_STEPS, LEARNING_RATE = 60, 0.1
 HOPELESS = 6.0
 #: A fit as bad as this happens once in a million records, by noise.
 IMPLAUSIBLE = 1e-6
+#: Residuals with a larger autocorrelation, over 1/sqrt(data), are no noise; and of a reduced chi^2
+#: below that the noise was estimated too large.
+MOST_CORRELATED, OVERESTIMATED = 6.0, 0.2
 TOLERANCE = 1e-8
 #: Parameters nearer to zero than this may have errors of this size; and those whose error in a
 #: direction that is not told is this many of their sizes have a share in it.
@@ -271,9 +274,11 @@ class Fit(eqx.Module):
 
     candidates: how many starts were followed; evaluations: of the motion and its Jacobian; status:
     OK, NOT_IDENTIFIED (a standard error that is infinite, or larger than its parameter and than
-    0.1), MISFIT (plausibility below 1e-6), NO_CONVERGENCE or NOT_FINITE. Standard errors are those
-    of the linearised problem: right where the model is and the errors are small. With a MISFIT they
-    mean nothing, and `table` and the text leave them out.
+    0.1), MISFIT (plausibility below 1e-6, or, where the noise was estimated, residuals of its size
+    with an autocorrelation that noise has not), NO_CONVERGENCE or NOT_FINITE. Standard errors are
+    those of the linearised problem: right where the model is and the errors are small. With a
+    MISFIT they mean nothing, and `table` and the text leave them out. noise_was_estimated: whether
+    it was, of a column at least.
     """
 
     oscillator: Oscillator
@@ -293,6 +298,7 @@ class Fit(eqx.Module):
     candidates: int
     evaluations: int
     status: Array
+    noise_was_estimated: bool = eqx.field(static=True, default=False)
 
     @property
     def undetermined(self) -> tuple[tuple[str, ...], ...]:
@@ -344,6 +350,11 @@ class Fit(eqx.Module):
             f"autocorrelation {float(self.autocorrelation):+.3f}, {self.evaluations} evaluations)"
         )
         advice = [] if status == Status.OK else [f"  {describe(status)}"]
+        if self.noise_was_estimated and float(self.reduced_chi_squared) < OVERESTIMATED:
+            advice += [
+                "  The noise was estimated too large, and with it these errors: there is hardly "
+                "any, or the record is coarse against its motion. Give noise=."
+            ]
         advice += [
             f"  Not told: {group[0]}."
             if len(group) == 1
@@ -411,7 +422,8 @@ def fit(
         lambda o: (o.damping, (o.belts[0].friction.static, o.belts[1].friction.static))
 
     noise: standard deviation of the data, of x1 and x2 as a pair where both are given; None
-    estimates it from how far neighbouring data scatter about a smooth curve. bounds: for each
+    estimates it from how far neighbouring data scatter about a smooth curve, for which a loop needs
+    some tens of them. bounds: for each
     parameter (lower, upper) or None, which keeps positive what cannot be negative; a parameter
     stays inside by reparametrisation, so an estimate at a bound is one that wants to leave. starts:
     of the search, spread about the guess. report: is told of the progress, too, a line at a time,
@@ -450,9 +462,12 @@ def fit(
         whole = np.arange(len(record.starts)) == 0
         best = _fit_windows(linearized, np.asarray(u), np.asarray(record.starts), whole, 0.0)
         evaluations += best.evaluations
-    result = _result(
-        oscillator, selection, record, times, values, best, freedom, count, evaluations
+    counts = freedom, count, evaluations
+    estimated = any(
+        sigma is None and np.any(np.isfinite(column))
+        for sigma, column in zip(sigmas, values.T, strict=True)
     )
+    result = _result(oscillator, selection, record, times, values, best, counts, estimated)
     tell(repr(result).splitlines()[0])
     return result
 
@@ -513,8 +528,8 @@ def _plausibility(chi2, freedom: int) -> float:
     return float(jax.scipy.special.gammaincc(0.5 * freedom, 0.5 * chi2))
 
 
-def _result(oscillator, selection, record, ts, values, point: _Point, freedom, count, evaluations):
-    p = point.u.size
+def _result(oscillator, selection, record, ts, values, point: _Point, counts, estimated: bool):
+    p, (freedom, count, evaluations) = point.u.size, counts
     u = jnp.asarray(point.u)
     estimates = selection.values(u)
     slopes = np.append(np.diag(jax.jacfwd(selection.values)(u)), [1.0, 1.0])
@@ -523,8 +538,14 @@ def _result(oscillator, selection, record, ts, values, point: _Point, freedom, c
     ys = point.ys.reshape(-1, 2)[: len(values)]
     weights = np.asarray(record.weights).reshape(-1, 2)[: len(values)]
     off = values - ys
-    plausibility = _plausibility(point.chi2, freedom)
-    status = Status.OK if plausibility > IMPLAUSIBLE else Status.MISFIT
+    plausibility, autocorrelation = (
+        _plausibility(point.chi2, freedom),
+        _autocorrelation(off * weights),
+    )
+    # Noise that was taken from the record is no witness: it may be the motion's own.
+    is_shape = abs(autocorrelation) > MOST_CORRELATED / np.sqrt(np.sum(np.isfinite(values)))
+    is_shape &= estimated and point.chi2 > OVERESTIMATED * freedom
+    status = Status.OK if plausibility > IMPLAUSIBLE and not is_shape else Status.MISFIT
     # Of a misfit finite errors mean nothing.
     most = _sizes(estimates) if status == Status.OK else np.finfo(float).max
     status = status if np.all(errors[:p] <= most) else Status.NOT_IDENTIFIED
@@ -545,10 +566,11 @@ def _result(oscillator, selection, record, ts, values, point: _Point, freedom, c
         noise=jnp.asarray(np.where(np.isfinite(noise), noise, np.nan)),
         reduced_chi_squared=jnp.asarray(point.chi2 / freedom),
         plausibility=jnp.asarray(plausibility),
-        autocorrelation=jnp.asarray(_autocorrelation(off * weights)),
+        autocorrelation=jnp.asarray(autocorrelation),
         candidates=count,
         evaluations=evaluations,
         status=jnp.asarray(status.value),
+        noise_was_estimated=estimated,
     )
 
 
