@@ -190,3 +190,17 @@ def test_a_cycle_that_a_fold_ends_just_beside_its_hopf_point_is_seen():
     assert (fold.kind, hopf.kind) == ("FoldOfCycles", "Hopf")
     assert float(fold.value) == pytest.approx(0.0747890104994, abs=1e-11)
     assert float(hopf.value) == pytest.approx(0.0749666018134, abs=1e-11)
+
+
+def test_cycles_that_slip_faster_than_the_table_goes_are_told_of():
+    table = jb.Tabulated((0.0, 0.02, 0.05, 0.1, 0.2, 0.4), (0.55, 0.48, 0.41, 0.36, 0.34, 0.35))
+
+    def machine(velocity):
+        return jb.Machine(2.0, 800.0, 3.0, (jb.PhysicalBelt(velocity, table, 30.0),))
+
+    within, beyond = machine(0.12), machine(0.3)
+    jb.find_cycle(within.oscillator, within.start(0.0, 0.0))
+    with pytest.warns(UserWarning, match=r"slips on belt 0 at 1\.59 times the speed at which"):
+        cycle = jb.find_cycle(beyond.oscillator, beyond.start(0.0, 0.0))
+    slowest = jnp.min(cycle.sample(2000)[:, 1]) * beyond.units.velocity
+    assert (0.3 - slowest) / 0.4 == pytest.approx(1.59, abs=0.005)

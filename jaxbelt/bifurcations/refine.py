@@ -14,6 +14,7 @@ import numpy as np
 
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, require, require_value
+from ..cycles.cycle import warn_of_extrapolation
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
@@ -78,7 +79,11 @@ def refine(
     room = None if max_arcs is None else as_whole(max_arcs, "max_arcs")
     variation, near, value = _begun(condition, osc, where, at)
     point = condition.point(variation, near, value, room or condition.room)
-    return _bracketed(point, variation, value) if is_outermost(near, value, point) else point
+    if not is_outermost(near, value, point):
+        return point
+    point = _bracketed(point, variation, value)
+    warn_of_extrapolation([point.cycle])
+    return point
 
 
 def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> BifurcationPoint:

@@ -22,7 +22,7 @@ import numpy as np
 from ..activity import announced, tell
 from ..checks import as_whole, outside_of_traces
 from ..cycles.attractors import SOLVED, apart, is_same, itinerary, place_of
-from ..cycles.cycle import as_loop
+from ..cycles.cycle import as_loop, warn_of_extrapolation
 from ..model.oscillator import Oscillator
 from ..numerics.newton import NEWTON_STEPS
 from ..results import Status
@@ -90,7 +90,9 @@ def scan(
     argument.
     """
     resolution = as_whole(resolution, "resolution")
-    return search(ParameterPath(osc, where, span, conditions), resolution)
+    points = search(ParameterPath(osc, where, span, conditions), resolution)
+    warn_of_extrapolation(point.cycle for point in points)
+    return points
 
 
 def search(

@@ -5,6 +5,8 @@ guess from which `shooting` solves for the cycle.
 """
 
 import functools
+import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -328,19 +330,47 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
 def _slips_across_kink(osc: Oscillator, loop: Loop) -> bool:
     """Whether the mass slips, on a known loop, at the speed at which a law of one's own has its
     largest kink."""
-    modes = modes_of(loop)
-    begin = np.asarray(loop.entries)[: len(modes), 1]
-    x2 = np.stack([begin, np.roll(begin, -1)])
-    for belt, codes in zip(osc.belts, modes.T, strict=True):
-        slips = np.abs(codes) == 1
-        kink = kink_of(belt.friction) if np.any(slips) else None
+    slips = _slip_speeds(osc, modes_of(loop), np.asarray(loop.entries)[:, 1])
+    for belt, speeds in zip(osc.belts, slips, strict=True):
+        kink = kink_of(belt.friction) if speeds.size else None
         if kink is not None:
-            # Between its ends an arc's speed rises or falls throughout.
-            speeds = np.abs(float(belt.velocity) - float(osc.omega) * x2[:, slips])
             inside = (np.min(speeds, axis=0) < kink[0]) & (kink[0] < np.max(speeds, axis=0))
             if np.any(inside):
                 return True
     return False
+
+
+def _slip_speeds(osc: Oscillator, modes: np.ndarray, x2: np.ndarray) -> list[np.ndarray]:
+    """Of each belt the speeds at both ends of the arcs of a known loop that slip on it, [2, arcs];
+    between these an arc's speed rises or falls throughout."""
+    begin = x2[: len(modes)]
+    ends = np.stack([begin, np.roll(begin, -1)])
+    return [
+        np.abs(float(belt.velocity) - float(osc.omega) * ends[:, np.abs(codes) == 1])
+        for belt, codes in zip(osc.belts, modes.T, strict=True)
+    ]
+
+
+def warn_of_extrapolation(cycles: Iterable[Cycle]) -> None:
+    """Warn where known cycles slip faster than what was measured of a belt's friction."""
+    worst, belt = 1.0, 0
+    for cycle in cycles:
+        if not is_concrete(cycle) or int(cycle.status) != Status.OK:
+            continue
+        ends = [float(np.asarray(one.friction.measured_to)) for one in cycle.oscillator.belts]
+        if np.all(np.isinf(ends)):
+            continue
+        x2 = np.asarray(cycle.unknowns)[:, 1]
+        slips = _slip_speeds(cycle.oscillator, modes_of(cycle.chain), x2)
+        for index, (speeds, end) in enumerate(zip(slips, ends, strict=True)):
+            part = float(np.max(speeds, initial=0.0)) / end
+            worst, belt = (part, index) if part > worst else (worst, belt)
+    if worst > 1 + ROUNDED_SPEED:
+        warnings.warn(
+            f"the mass slips on belt {belt} at {worst:.3g} times the speed at which the table of "
+            "its friction ends: results rest on the extrapolation, measure up to there",
+            stacklevel=4,
+        )
 
 
 def _is_inexact(cycle: Cycle, error: Array) -> Array:
@@ -402,6 +432,8 @@ def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -
     return _polished(osc, loop, status, steps)[0]
 
 
+#: By this part of itself a speed is not above another one.
+ROUNDED_SPEED = 1e-9
 #: How often an orbit is followed on for MOST_ARCS where it has not settled: to a cycle with the
 #: multiplier 0.99, in loops of eight arcs, it has then come to 1e-7.
 MORE_BUDGETS = 15
@@ -437,7 +469,9 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
         loop = pick(loop, slice(room_of(needed)))
     elif max_arcs is None:
         loop, status = pick(loop, slice(SIZES[0])), _if_it_fits(status, count, SIZES[0])
-    return exactly(osc, loop, status)
+    cycle = exactly(osc, loop, status)
+    warn_of_extrapolation([cycle])
+    return cycle
 
 
 #: Loops that are compared in one batch, and how often the interval between two of them is refined:

@@ -60,6 +60,11 @@ class AbstractFriction(eqx.Module):
         """mu(speed) as (numerator, denominator), denominator > 0; kernels divide last."""
         return self.mu(speed), jnp.ones_like(speed)
 
+    @property
+    def measured_to(self) -> ArrayLike:
+        """The speed beyond which it is an extrapolation; inf: nowhere."""
+        return np.inf
+
     def in_units_of(self, speed: Array) -> "AbstractFriction":
         """The same law for speeds that are given in units of `speed`; see `Machine`."""
         return LawInUnits(self, speed)
@@ -213,6 +218,10 @@ class LawInUnits(AbstractFriction):
     @property
     def static(self) -> ArrayLike:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.law.static
+
+    @property
+    def measured_to(self) -> ArrayLike:
+        return self.law.measured_to / self.unit
 
     def fraction(self, speed: Array) -> tuple[Array, Array]:
         return self.law.fraction(self.unit * speed)
@@ -406,6 +415,10 @@ class Tabulated(AbstractFriction):
         terms = _multiquadrics(jnp, jnp.asarray(speed), np.array(self.speeds))
         weights = np.reshape(self.weights, (1,) * jnp.ndim(speed) + (-1,))
         return self.level + jnp.sum(weights * terms, axis=-1)
+
+    @property
+    def measured_to(self) -> ArrayLike:
+        return self.speeds[-1]
 
     def _known(self, speed: Any) -> Any:
         """`mu` in NumPy, which compiles nothing."""
