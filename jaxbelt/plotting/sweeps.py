@@ -34,7 +34,7 @@ from .style import (
 #: Axes of datasets that are no parameters.
 COUNTED = ("belt", "attractor")
 #: What is 0 of an attractor that is no cycle, though it has no loop.
-OF_CYCLES = ("stick_duration", "d_stick_duration")
+OF_LOOPS = ("stick_duration", "d_stick_duration")
 
 
 def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Axes:
@@ -94,7 +94,7 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
 def _numbers_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
     """A variable as floats, NaN where the run is yet to be done, or has no cycle to tell of."""
     values = dataset[variable].astype(float)
-    if variable.startswith(OF_CYCLES) and "kind" in dataset:
+    if variable.startswith(OF_LOOPS) and "kind" in dataset:
         values = values.where(decoded(dataset[["kind"]]).kind == "cycle")
     return values if "status" not in dataset else values.where(dataset.status >= 0)
 
