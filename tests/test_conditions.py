@@ -107,7 +107,8 @@ def test_its_curve_is_followed_and_drawn(points):
 def test_its_name_stands_in_diagrams(points):
     osc = jb.presets.class_a(0.2)
     diagram = jb.BifurcationDiagram(points, (), ((0.09, 0.4, "2"),), osc, "belts[0].velocity")
-    assert {"period", "Hopf", "fold, belt 0"} <= {text.get_text() for text in diagram.plot().texts}
+    texts = {text.get_text() for text in diagram.plot().texts}
+    assert {"period", "Hopf", "nonsmooth fold, belt 0"} <= texts
     plt.close("all")
 
 

@@ -115,7 +115,14 @@ def test_picture(diagram):
     for quantity in ("x2", "x1", "period", "amplitude", jb.stick_fraction):
         ax = diagram.plot(quantity=quantity)
         texts = {text.get_text() for text in ax.texts}
-        assert {"6", "4a", "2b", "fold, belt 1", "grazing, belt 0", "belt 0 at rest"} <= texts
+        assert {
+            "6",
+            "4a",
+            "2b",
+            "nonsmooth fold, belt 1",
+            "grazing, belt 0",
+            "belt 0 at rest",
+        } <= texts
         assert ax.get_xlabel() == r"belt velocity $\nu_0$"
     expected = "quantity must be one of amplitude, x1, x2, period, or a function of a cycle, got"
     with pytest.raises(ValueError, match=f"{expected} 'x3'"):

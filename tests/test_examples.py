@@ -3,6 +3,8 @@
 One page a test. The names that the index of the reference takes for granted are there.
 """
 
+import ast
+import builtins
 import doctest
 import re
 from pathlib import Path
@@ -73,6 +75,25 @@ def test_the_page_on_scaling_runs():
         for osc, one in ((own.oscillator, own), (held, m))
     )
     assert next(periods) == pytest.approx(next(periods), rel=1e-9)
+    plt.close("all")
+
+
+def test_the_code_of_the_gallery_runs_after_the_lines_that_it_shows():
+    page = (DOCS / "gallery.md").read_text("utf-8")
+    (begin,) = re.findall(r"^```python\n(.+?)^```$", page, re.M | re.S)
+    given: dict = {}
+    exec(compile(begin, "gallery.md", "exec"), given)
+    shown = re.findall(r":pyobject: (\w+)", page)
+    for one in ast.parse((DOCS / "draw.py").read_text("utf-8")).body:
+        if isinstance(one, ast.FunctionDef) and one.name in shown:
+            shown.remove(one.name)
+            exec(compile(ast.Module([one], []), "draw.py", "exec"), given)
+            used = {name.id for name in ast.walk(one) if isinstance(name, ast.Name)}
+            local = set(given[one.name].__code__.co_varnames)
+            local |= {argument.arg for argument in ast.walk(one) if isinstance(argument, ast.arg)}
+            assert used - local <= {*given, *dir(builtins)}, one.name
+    assert not shown
+    assert len(given["friction_laws"]().axes) == 3
     plt.close("all")
 
 

@@ -361,18 +361,89 @@ def test_basins_in_si():
 def test_pictures_in_si(run):
     m = machine()
     ax = jb.plot_phase_portrait(m.oscillator, run)
-    before = ax.get_xlim()
+    before = np.array([ax.get_xlim(), ax.get_ylim()])
     assert jb.plot_in_si(ax, m) is ax
     assert ax.get_xlabel() == "displacement $X$ (m)"
     assert ax.get_ylabel() == r"velocity $\dot X$ (m/s)"
-    assert ax.get_xlim() == before
-    ticks = ax.get_xticks()
-    shown = [
-        float(label.get_text().replace("\N{MINUS SIGN}", "-")) for label in ax.get_xticklabels()
+    sizes = np.array([[m.units.length], [m.units.velocity]])
+    assert np.allclose([ax.get_xlim(), ax.get_ylim()], before * sizes, rtol=1e-14)
+    (orbit,) = (line for line in ax.lines if line.get_label() == "orbit")
+    assert np.allclose(orbit.get_xydata()[0], (0.003, 0.0), rtol=1e-14)
+    ax.figure.canvas.draw()
+    texts = [label.get_text() for label in ax.get_xticklabels()]
+    shown = [float(text.replace("\N{MINUS SIGN}", "-")) for text in texts]
+    assert np.allclose(shown, ax.get_xticks(), rtol=1e-5)
+    # As many decimals in each, and no hyphen.
+    assert min(shown) < 0 and not any("-" in text for text in texts)
+    assert len({len(text.partition(".")[2]) for text in texts}) == 1
+    plt.close("all")
+
+
+def of_page(ax):
+    """What is drawn, as numbers [rows, columns, colours], without the axes' own numbers."""
+    figure = ax.figure
+    figure.set_layout_engine("none")
+    for one in figure.axes:
+        one.set_position((0.1, 0.1 + 0.5 * (one is not ax), 0.8, 0.3))
+        one.xaxis.set_visible(False)
+        one.yaxis.set_visible(False)
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].astype(int)
+
+
+def test_in_si_everything_stays_where_it_is(run):
+    m = machine()
+    osc, events = m.oscillator, run.events
+    pictures = [
+        lambda: jb.plot_phase_portrait(osc, run),
+        lambda: jb.plot_vector_field(osc),
+        lambda: jb.plot_vector_field(osc, kind="arrows"),
+        lambda: jb.plot_friction_law(osc.belts[0].friction),
+        *(run.plot, events.plot, run.arcs.plot, jb.equilibria(osc).plot),
+        lambda: jb.plot_time_history(run),
     ]
-    assert np.allclose(shown, ticks * float(m.units.length), rtol=1e-5)
-    axes = jb.plot_in_si(jb.plot_time_history(run), m)
-    assert axes[1].get_xlabel() == "time $t$ (s)"
+    for draw in pictures:
+        pages = []
+        for axes in (draw(), jb.plot_in_si(draw(), m)):
+            # As if somebody went on drawing: limits follow what is there.
+            ax = axes if isinstance(axes, plt.Axes) else axes[1]
+            ax.autoscale_view()
+            pages.append(of_page(ax))
+        differs = np.max(np.abs(pages[0] - pages[1]), axis=-1) > 60
+        # Rounding moves edges by a pixel.
+        assert np.mean(differs) < 2e-3, draw
+        assert np.mean(pages[0] < 250) > 1e-3
+    plt.close("all")
+
+
+def test_a_measurement_beside_a_picture_in_si(run):
+    m = machine()
+    t, X = np.linspace(0.0, 0.6, 4), np.array([0.003, 0.004, 0.0, 0.001])
+    _, axes = plt.subplots(2, sharex=True)
+    jb.plot_time_history(run, tuple(axes))
+    assert jb.plot_in_si(axes, m) is axes
+    axes[0].plot(t, X)
+    assert axes[1].get_xlim() == axes[0].get_xlim() == (0.0, 0.6)
+    assert axes[0].get_ylim()[1] == pytest.approx(0.00427, abs=1e-4)
+
+    # What is there already stays, and so do limits that somebody has set.
+    _, ax = plt.subplots()
+    (line,) = ax.plot(t, X)
+    run_alone = jb.plot_in_si(run, m, ax)
+    assert run_alone.get_xlim() == pytest.approx((0.0, 0.6))
+    assert np.array_equal(line.get_xydata(), np.stack([t, X], axis=1))
+    ax.set_xlim(0.1, 0.2)
+    assert jb.plot_in_si(run, m, ax).get_xlim() == (0.1, 0.2)
+    assert [one.get_xdata()[-1] for one in ax.lines[1:]] == pytest.approx([0.5] * 4)
+    # A call that fails leaves the limits alone.
+    with pytest.raises(TypeError):
+        jb.plot_in_si(run, m, ax, colour="red")
+    ax.autoscale()
+    assert ax.get_xlim() == pytest.approx((0.0, 0.6))
+    # And what was drawn without units is converted once.
+    ax = run.plot()
+    jb.plot_in_si(run, m, ax)
+    assert [one.get_xdata()[-1] for one in ax.lines] == pytest.approx([0.5] * 4)
     plt.close("all")
 
 
@@ -411,14 +482,16 @@ def test_results_along_a_parameter_in_si():
         assert ours[name].units == "m" and ours.period.units == "s"
         ax = jb.plot_in_si(one, m)
         assert ax.get_xlabel() == "belt velocity $V_0$ (m/s)"
-        shown = [float(label.get_text()) for label in ax.get_xticklabels()]
-        assert np.allclose(shown, ax.get_xticks() * length / time, rtol=1e-5)
+        assert np.allclose(ax.get_xlim(), np.array([0.5, 1.0]) * length / time, rtol=1e-14)
     diagram = along()[2]
     assert jb.in_si(diagram, m.units).identical(jb.in_si(diagram, m))
     with pytest.raises(ValueError, match="as the result keeps no oscillator, got its units"):
         jb.in_si(along()[0], m.units)
     assert jb.in_si(diagram, m).stick_duration_1.units == "s"
-    assert jb.plot_in_si(diagram, m, quantity="x1").get_ylabel() == "displacement $X$ (m)"
+    ax = jb.plot_in_si(diagram, m, quantity="x1")
+    assert ax.get_ylabel() == "displacement $X$ (m)"
+    ends = np.array([line.get_ydata()[[0, -1]] for line in ax.lines])
+    assert np.ptp(ends) == pytest.approx(2 * length, rel=1e-12)
     root = np.sqrt(STIFFNESS * MASS)
     sizes = {"belts[1].load": 5.0, "belts[0].upper": length, "belts[1].lower": length}
     sizes |= {"damping": root, "belts[1].friction.static": 1.0}
@@ -443,8 +516,8 @@ def test_a_parameter_of_a_function_stays_as_the_function_takes_it():
         with pytest.raises(ValueError, match=r"machine must be a function of N .* 'V'"):
             jb.in_si(one, lambda V: machine(V))
     shown = dataclasses.replace(along("V", True)[2], oscillator=machine(0.5).oscillator)
-    label = jb.plot_in_si(shown, machine).get_xlabel()
-    assert label == "parameter $V$"
+    ax = jb.plot_in_si(shown, machine)
+    assert ax.get_xlabel() == "parameter $V$" and ax.get_xlim() == (0.5, 1.0)
     plt.close("all")
 
 
@@ -460,6 +533,10 @@ def test_what_has_no_si_units_is_told():
         jb.plot_in_si(jb.plot_sweep(dataset, "x1_end"), m)
     with pytest.raises(ValueError, match=r"machine must be a function of V that .* 'speed'"):
         jb.in_si(dataset, lambda speed: machine(speed))
+    _, ax = plt.subplots()
+    ax.set_xlabel("time in hours")
+    with pytest.raises(ValueError, match="got axes of 'time in hours', ''"):
+        jb.plot_in_si(ax, m)
     drawn = jb.plot_sweep(jb.in_si(dataset, machine), "x1_end")
     assert drawn.get_ylabel() == "x1 (m)"
     plt.close("all")

@@ -1,5 +1,6 @@
 """Orbit diagrams against the independent integrator, and zooming by the events of a mouse."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
@@ -208,6 +209,21 @@ def test_new_limits_are_computed_once(zoomed):
     assert zoomed.asked[1:] == [(0.3, 0.7)] and zoomed.ax.get_ylim() == (0.4, 0.5)
     zoomed.canvas.draw()
     assert len(zoomed.asked) == 2
+
+
+def test_a_zoom_in_si():
+    """Of a machine whose unit of length is 0.25 m, and of velocity 0.5 m/s."""
+    machine = jb.Machine(1.0, 4.0, 0.1, [jb.PhysicalBelt(0.1, jb.Coulomb(0.4, 0.3), 1.0)])
+    sampling = MadeUp()
+    sampling.variation = SimpleNamespace(oscillator=lambda _: machine.oscillator)
+    diagram = dataclasses.replace(sampling.diagram((0.0, 1.0)), name="belts[0].velocity")
+    ax = jb.plot_in_si(diagram, machine, zoom=True)
+    assert sampling.asked == [(0.0, 1.0)] and ax.get_xlim() == (0.0, 0.5)
+    ax.set_xlim(0.125, 0.375)
+    assert sampling.asked[1:] == [(0.25, 0.75)]
+    np.testing.assert_allclose(drawn(ax), np.linspace(0.125, 0.375, 5), rtol=1e-14)
+    (cycle,) = (line for line in ax.lines if line.get_label() == "cycle")
+    np.testing.assert_allclose(cycle.get_ydata(), 0.5 * cycle.get_xdata(), rtol=1e-14)
 
 
 def test_nothing_is_computed_while_a_button_is_held(zoomed):

@@ -296,6 +296,12 @@ def test_what_is_not_done_is_left_white(dataset):
         jb.plot_sweep(half.assign(signature=status), "signature")
 
 
+def test_what_rests_has_no_stick_duration(dataset):
+    mesh = jb.plot_sweep(dataset.isel(belt=0), "stick_duration").collections[0]
+    drawn = np.ma.filled(mesh.get_array(), np.nan)
+    assert np.array_equal(np.isnan(drawn), (dataset.kind == 1).values.T)
+
+
 def test_signatures_have_a_key_of_the_most_frequent(dataset):
     names = ["none", *("-".join(["stick0", "slip0"] * n) for n in range(1, 12))]
     told = {"flag_values": np.arange(12), "flag_meanings": " ".join(names)}
@@ -309,6 +315,18 @@ def test_signatures_have_a_key_of_the_most_frequent(dataset):
     assert len(ax.figure.axes) == 1
     (line,) = jb.plot_sweep(many.isel(nu0=0), "signature").get_lines()
     assert np.array_equal(line.get_ydata(), values[0])
+
+
+def test_basins_have_one_key_that_leaves_room(results):
+    keys = []
+    for draw in (jb.plot_basins, draw_result):
+        figure, ax = plt.subplots(figsize=(5.2, 3.6))
+        draw(results[jb.Basins], ax)
+        keys.append([text.get_text() for text in ax.get_legend().get_texts()])
+        figure.canvas.draw()
+        # 0.47 with a column of six lines.
+        assert ax.get_position().height > 0.6
+    assert keys[0] == keys[1] and len(keys[0]) == 6
 
 
 def test_pictures_of_sweeps_tell_the_unit(dataset):

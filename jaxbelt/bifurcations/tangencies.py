@@ -195,7 +195,7 @@ class Tangency(AbstractTangency):
 class NonsmoothFold(AbstractTangency):
     """The stick phase on a belt shrinks to a point and the cycle vanishes with an unstable one."""
 
-    caption: ClassVar[str] = "fold, belt {belt}"
+    caption: ClassVar[str] = "nonsmooth fold, belt {belt}"
     line: ClassVar[Line] = Line("nonsmooth fold", "black")
 
     @property

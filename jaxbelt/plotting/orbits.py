@@ -37,7 +37,8 @@ def plot_orbits(
     ax = new_axes() if ax is None else ax
     lines = {kind: _line(ax, kind) for kind in DOTS}
     _put(lines, diagram, quantity)
-    ax.relim()
+    for kind, line in lines.items():
+        ax.update_datalim(line.get_xydata(), updatey=kind != "undecided")
     ax.autoscale_view()
     ax.set_xlim(diagram.values[0], diagram.values[-1])
     ax.set(xlabel=parameter_label(diagram.name), ylabel=QUANTITIES[quantity])
@@ -54,8 +55,13 @@ def _line(ax: Axes, kind: str) -> Line2D:
     return line
 
 
-def _put(lines: dict[str, Line2D], diagram: OrbitDiagram, quantity: str) -> None:
-    """Give each line the points of its kind; the key names those that have some."""
+def _put(
+    lines: dict[str, Line2D],
+    diagram: OrbitDiagram,
+    quantity: str,
+    sizes: tuple[float, float] = (1.0, 1.0),
+) -> None:
+    """Give each line the points of its kind, times the sizes; the key names those with points."""
     heights = diagram.x1 if quantity == "x1" else diagram.x2
     values = np.broadcast_to(diagram.values[:, None, None], heights.shape)
     for kind, line in lines.items():
@@ -65,7 +71,7 @@ def _put(lines: dict[str, Line2D], diagram: OrbitDiagram, quantity: str) -> None
             y = np.zeros_like(x)
         else:
             x, y = (one[of_kind & ~np.isnan(heights)] for one in (values, heights))
-        line.set_data(x, y)
+        line.set_data(x * sizes[0], y * sizes[1])
         line.set_label(DOTS[kind]["label"] if len(x) else "_none")
 
 
@@ -77,6 +83,8 @@ class _Zoom:
 
     def __init__(self, diagram: OrbitDiagram, ax: Axes, lines: dict[str, Line2D], quantity: str):
         self.diagram, self.ax, self.lines, self.quantity = diagram, ax, lines, quantity
+        # It stays at 1 and 1 where `plot_in_si` scales what is drawn.
+        self.one = ax.text(1.0, 1.0, "")
         self.shown, self.is_held = ax.get_xlim(), False
         self.told = ax.text(0.5, 0.5, "", transform=ax.transAxes, ha="center", wrap=True)
         canvas = figure_of(ax).canvas
@@ -92,8 +100,9 @@ class _Zoom:
 
     def follow(self) -> None:
         """Draw what belongs between the limits, unless it is there."""
-        limits = self.ax.get_xlim()
-        if self.is_held or limits == self.shown:
+        sizes = self.one.get_position()
+        limits = tuple(np.array(self.ax.get_xlim()) / sizes[0])
+        if self.is_held or np.allclose(limits, self.shown, rtol=1e-12, atol=0):
             return
         self.shown = limits
         try:
@@ -103,7 +112,7 @@ class _Zoom:
             self.told.set_text(str(error))
         else:
             self.told.set_text("")
-            _put(self.lines, diagram, self.quantity)
+            _put(self.lines, diagram, self.quantity, sizes)
             self.ax.relim()
             self.ax.autoscale_view(scalex=False)
             add_key(self.ax)

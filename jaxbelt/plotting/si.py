@@ -1,4 +1,4 @@
-"""Pictures in SI units: the axes of any picture of this package, relabelled."""
+"""Pictures in SI units: what any picture of this package shows, in s, m and m/s."""
 
 import re
 from collections.abc import Sequence
@@ -7,9 +7,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import AutoLocator, FuncFormatter
+from matplotlib.collections import Collection
+from matplotlib.lines import Line2D
+from matplotlib.text import Annotation, Text
+from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import Affine2D, Bbox, Transform
 
 from ..checks import require
 from ..model.machine import Units
@@ -17,14 +22,14 @@ from ..si import AlongParameter, check_machine, units_along, units_of
 from .draw import draw_result
 from .style import figure_of, in_fractions, parameter_label, require_axes
 
-#: By the beginning of its label, what an axis shows, and its label in SI units.
+#: By its label, what an axis shows, and its label in SI units.
 LABELS = {
-    "time": ("time", "time $t$ (s)"),
-    "period": ("time", "period (s)"),
+    r"time $\tau$": ("time", "time $t$ (s)"),
+    "period $T$": ("time", "period (s)"),
     "displacement $x_1$": ("length", "displacement $X$ (m)"),
-    "amplitude": ("length", "amplitude (m)"),
+    "amplitude of $x_1$": ("length", "amplitude (m)"),
     "velocity $x_2$": ("velocity", r"velocity $\dot X$ (m/s)"),
-    "relative velocity": ("velocity", r"relative velocity $R$ (m/s)"),
+    r"relative velocity $\nu_{\mathrm{R}}$": ("velocity", r"relative velocity $R$ (m/s)"),
 }
 #: Parameters of an oscillator that have another symbol in SI units, by the end of their path.
 SI_PARAMETERS = {
@@ -38,17 +43,6 @@ SI_PARAMETERS = {
 REST = re.compile(r"(?<=rest at )-?\d+\.\d+$")
 
 
-class _RoundInUnits(AutoLocator):
-    """Ticks where value times unit is a round number."""
-
-    def __init__(self, unit: float):
-        super().__init__()
-        self.unit = unit
-
-    def tick_values(self, vmin: float, vmax: float) -> Any:
-        return np.asarray(super().tick_values(vmin * self.unit, vmax * self.unit)) / self.unit
-
-
 def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any) -> Any:
     """A picture with times in s, displacements in m and velocities in m/s, also in its key.
 
@@ -58,28 +52,38 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     argument of a function, a function of that which returns it. options: of that `.plot()`. Returns
     the axes.
 
-    The parameter of a diagram or of fractions is in SI units, too: that of a function's argument as
-    the function takes it, whose unit only you know: `ax.set_xlabel("belt velocity $V$ (m/s)")`.
-    Other axes that show something else, or tell their unit, stay as they are. `ValueError` where
-    no axis can be converted, as in the picture of a sweep (draw what `in_si` returns instead),
-    where the units vary along the parameter, and for a wrong argument.
+    Limits and coordinates of these axes are in SI units, so that a measurement can be drawn over
+    it: `ax.plot(t_in_s, X_in_m)`; what was in `ax` before is taken to be in them. The parameter of
+    a diagram or of fractions is in SI units, too: that of a function's argument as the function
+    takes it, whose unit only you know: `ax.set_xlabel("belt velocity $V$ (m/s)")`. Other axes that
+    show something else, or tell their unit, stay as they are. `ValueError` where no axis can be
+    converted, as in the picture of a sweep (draw what `in_si` returns instead), where the units
+    vary along the parameter, and for a wrong argument.
     """
     require_axes(ax)
     units, parameter = _units_of_picture(result, machine)
-    several = isinstance(result, Sequence) and all(isinstance(one, Axes) for one in result)
+    is_list = isinstance(result, Sequence | np.ndarray)
+    several = is_list and all(isinstance(one, Axes) for one in result)
     is_drawn = isinstance(result, Axes) or several
-    axes: Any = result if is_drawn else draw_result(result, ax, **options)
-    every = [axes] if isinstance(axes, Axes) else list(axes)
-    done = [_relabel(axis, units) for one in every for axis in (one.xaxis, one.yaxis)]
-    if parameter is not None:
-        unit, label = parameter
-        _rescale(axes.xaxis, unit, label)
+    before = None
+    if ax is not None and not is_drawn:
+        _convert([ax], units, None)
+        before = _Before(ax)
+    try:
+        axes: Any = result if is_drawn else draw_result(result, ax, **options)
+        every = [axes] if isinstance(axes, Axes) else list(axes)
+        shown = [repr(axis.get_label_text()) for one in every for axis in (one.xaxis, one.yaxis)]
+        is_done = _convert(every, units, before)
+        if parameter is not None:
+            _scale(axes, 0, *parameter, before)
+    finally:
+        if before is not None:
+            before.join()
     expected = (
         "a picture with an axis of time, displacement, velocity, amplitude or period (that of a "
         "sweep is jb.plot_sweep(jb.in_si(dataset, machine), ...))"
     )
-    shown = [repr(axis.get_label_text()) for one in every for axis in (one.xaxis, one.yaxis)]
-    fits = any(done) or isinstance(result, AlongParameter)
+    fits = is_done or isinstance(result, AlongParameter)
     require(fits, "result", expected, f"axes of {', '.join(shown)}")
     for one in every:
         _relabel_key(one, units)
@@ -124,22 +128,99 @@ def _relabel_key(ax: Axes, units: Units) -> None:
             text.set_text(REST.sub(in_m, text.get_text()))
 
 
-def _relabel(axis: Axis, units: Units) -> bool:
-    """Put an axis in SI units, if it shows one quantity that has some; whether it does."""
-    text = axis.get_label_text()
-    if text.endswith(")"):  # it tells its unit
-        return False
-    shown = [
-        LABELS[begins] for part in text.split(", ") for begins in LABELS if part.startswith(begins)
-    ]
-    if len(shown) != 1:  # two quantities on one axis have no common unit
-        return False
-    ((quantity, label),) = shown
-    _rescale(axis, float(getattr(units, quantity)), label)
-    return True
+class _Before:
+    """What axes hold in SI units before a result is drawn into them."""
+
+    def __init__(self, ax: Axes):
+        self.artists = {*_artists(ax)}
+        self.limits = ax.get_xlim(), ax.get_ylim()
+        self.ax, self.held = ax, ax.dataLim.get_points().copy()
+        ax.dataLim.set_points(Bbox.null().get_points())
+
+    def join(self) -> None:
+        """Let limits that are not set hold all, what is new being in SI units now, too."""
+        lower, upper = zip(self.held, self.ax.dataLim.get_points(), strict=True)
+        self.ax.dataLim.set_points(np.array([np.min(lower, axis=0), np.max(upper, axis=0)]))
+        self.ax.autoscale_view()
 
 
-def _rescale(axis: Axis, unit: float, label: str) -> None:
-    axis.set_major_locator(_RoundInUnits(unit))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value * unit:.6g}"))
-    axis.set_label_text(label)
+def _convert(every: Sequence[Axes], units: Units, before: _Before | None) -> bool:
+    """Put axes in SI units that show one quantity that has some; whether there are any."""
+    is_any = False
+    for one in every:
+        for number in (0, 1):
+            found = _quantity_of(_axis(one, number).get_label_text())
+            if found is not None:
+                quantity, label = found
+                _scale(one, number, float(getattr(units, quantity)), label, before)
+                is_any = True
+    return is_any
+
+
+def _axis(ax: Axes, number: int) -> Axis:
+    return (ax.xaxis, ax.yaxis)[number]
+
+
+def _quantity_of(text: str) -> tuple[str, str] | None:
+    """What the label of an axis tells of it, and the label in SI units; None where it has none."""
+    shown = [LABELS[part] for part in text.split(", ") if part in LABELS]
+    # Two quantities on one axis have no common unit.
+    return shown[0] if len(shown) == 1 else None
+
+
+def _scale(ax: Axes, number: int, unit: float, label: str, before: _Before | None) -> None:
+    """Multiply what is drawn along the x (0) or y axis (1), and its limits, but what was before."""
+    sizes = np.where(np.arange(2) == number, unit, 1.0)
+    limits = (ax.get_xlim(), ax.get_ylim())[number]
+    shared = (ax.get_shared_x_axes, ax.get_shared_y_axes)[number]().get_siblings(ax)
+    for one in shared if before is None else [ax]:
+        one.dataLim.set_points(one.dataLim.get_points() * sizes)
+        for artist in _artists(one):
+            if before is None or artist not in before.artists:
+                _scale_artist(artist, one, sizes)
+        if _axis(one, number).get_label_text():
+            _axis(one, number).set_label_text(label)
+    if before is None or limits != before.limits[number]:
+        first, last = limits
+        (ax.set_xlim, ax.set_ylim)[number](first * unit, last * unit, auto=None)
+    if number == 0:
+        # Numbers such as 0.0015 want more room than Matplotlib leaves them side by side.
+        count = max(2, int(0.65 * ax.xaxis.get_tick_space()))
+        ax.xaxis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10]))
+
+
+def _artists(ax: Axes) -> list[Artist]:
+    return [*ax.lines, *ax.patches, *ax.collections, *ax.images, *ax.texts]
+
+
+def _scale_artist(artist: Artist, ax: Axes, sizes: np.ndarray) -> None:
+    """Multiply the coordinates of an artist that are data."""
+
+    def of_data(transform: Any) -> np.ndarray:
+        transform = ax.transData if transform == "data" else transform
+        known = isinstance(transform, Transform)
+        return np.where(known and transform.contains_branch_seperately(ax.transData), sizes, 1.0)
+
+    def scaled(place: Any, transform: Any) -> tuple[float, float]:
+        x, y = place * of_data(transform)
+        return float(x), float(y)
+
+    # Of a patch get_transform() has its own shape in it, too.
+    transform = Artist.get_transform(artist)
+    for edges, size in zip(artist.sticky_edges, of_data(transform), strict=True):
+        edges[:] = [edge * size for edge in edges]
+    match artist:
+        case Line2D():
+            x, y = np.transpose(artist.get_xydata())
+            by_x, by_y = of_data(transform)
+            artist.set_data(x * by_x, y * by_y)
+        case Annotation():
+            artist.xy = scaled(artist.xy, artist.xycoords)
+            artist.xyann = scaled(artist.xyann, artist.anncoords)
+        case Text():
+            artist.set_position(scaled(artist.get_position(), transform))
+        case _:
+            artist.set_transform(Affine2D().scale(*of_data(transform)) + transform)
+    if isinstance(artist, Collection):
+        offsets = artist.get_offset_transform()
+        artist.set_offset_transform(Affine2D().scale(*of_data(offsets)) + offsets)

@@ -99,17 +99,15 @@ def key_entries(axes: Sequence[Axes]) -> dict[str, Any]:
     return {label: found[label] for label in [*(x for x in found if x not in known), *known]}
 
 
-def draw_key(
-    figure: Figure, note: str = "", *, ncols: int | None = None, leave_out: Axes | None = None
-) -> None:
-    """Below the axes of a figure a note, and one key for all that they label, in so many columns
-    (None: as many as there is room for); leave_out: axes that have a key of their own."""
+def draw_key(figure: Figure, note: str = "", *, leave_out: Axes | None = None) -> None:
+    """Below the axes of a figure a note, and one key for all that they label, in as many columns as
+    there is room for; leave_out: axes that have a key of their own."""
     entries = key_entries([axes for axes in figure.axes if axes is not leave_out])
     figure.legend(
         entries.values(),
         entries.keys(),
         loc="outside lower center",
-        ncols=ncols or _key_columns(72 * figure.get_size_inches()[0], list(entries)),
+        ncols=_key_columns(72 * figure.get_size_inches()[0], list(entries)),
         frameon=False,
         handlelength=1.8,
         columnspacing=1.4,
@@ -134,7 +132,8 @@ def add_key(ax: Axes) -> None:
     # Below the numbers and the name of the axis, whatever the height of the axes.
     figure, size = figure_of(ax), matplotlib.rcParams["font.size"]
     below = ScaledTranslation(0, -(3.4 * size + 4) / 72, figure.dpi_scale_trans)
-    width = ax.get_window_extent().width * 72 / figure.dpi
+    width, grid = ax.get_window_extent().width * 72 / figure.dpi, ax.get_gridspec()
+    room = 72 * figure.get_size_inches()[0] / grid.ncols if grid else width
     ax.legend(
         entries.values(),
         entries.keys(),
@@ -142,20 +141,24 @@ def add_key(ax: Axes) -> None:
         bbox_to_anchor=(0.5, 0.0),
         bbox_transform=ax.transAxes + below,
         borderaxespad=0.0,
-        ncols=_key_columns(width, list(entries)),
+        ncols=_key_columns(width, list(entries), room),
         frameon=False,
         handlelength=2.2,
         columnspacing=1.4,
     )
 
 
-def _key_columns(width: float, labels: Sequence[str]) -> int:
-    """How many columns of a key there is room for in a width, in points; rows of one length."""
+def _key_columns(width: float, labels: Sequence[str], room: float = 0.0) -> int:
+    """How many columns of a key there is room for in a width, in points; rows of one length. Rather
+    than one two that need more, within what there is room for beside the axes, too."""
     size = matplotlib.rcParams["font.size"]
     letters = 0.48 * size * np.array([len(label.replace("$", "")) for label in labels])
     count = len(labels)
     while count > 1 and np.sum(np.sort(letters)[-count:]) + 4.0 * size * count > width:
         count -= 1
+    if count == 1 < len(labels):
+        halves = sum(np.max(half) for half in np.array_split(letters, 2))
+        return 2 if halves + 8.0 * size < room else 1
     rows = -(-len(labels) // count)
     return -(-len(labels) // rows)
 

@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from ..activity import announced
 from ..checks import require, require_one_of, require_value
 from ..sweeps.basins import Basins, BasinStability, standard_error
+from ..sweeps.datasets import decoded
 from ..sweeps.fractions import BasinFractions
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
@@ -22,7 +23,6 @@ from .phase import plot_phase_portrait
 from .style import (
     add_key,
     belt_colour,
-    draw_key,
     figure_of,
     in_fractions,
     journal_figure,
@@ -33,6 +33,8 @@ from .style import (
 
 #: Axes of datasets that are no parameters.
 COUNTED = ("belt", "attractor")
+#: What is 0 of an attractor that is no cycle, though it has no loop.
+OF_LOOPS = ("stick_duration", "d_stick_duration")
 
 
 def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Axes:
@@ -42,8 +44,9 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     it. "kind" shows equilibria, and cycles by the belts that they stick to, each kind in the same
     colour in every picture. Other categories, such as "signature", have a key of those that most
     runs have; the rest is "other" (along one axis, the numbers of the categories where their words
-    are long). Along one axis a variable of each belt, or of each attractor, is as many lines. Of a
-    store whose sweep is not finished, what is not done is left white. Returns the axes.
+    are long). Along one axis a variable of each belt, or of each attractor, is as many lines. What
+    is not done of a store whose sweep is not finished is left white, and in stick durations what is
+    no cycle. Returns the axes.
     `ValueError` if there is no such variable, or if its axes are not one or two: choose with
     `dataset.isel(belt=0)` and the like.
     """
@@ -89,8 +92,10 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
 
 
 def _numbers_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
-    """A variable as floats, NaN where the run is yet to be done."""
+    """A variable as floats, NaN where the run is yet to be done, or has no cycle to tell of."""
     values = dataset[variable].astype(float)
+    if variable.startswith(OF_LOOPS) and "kind" in dataset:
+        values = values.where(decoded(dataset[["kind"]]).kind == "cycle")
     return values if "status" not in dataset else values.where(dataset.status >= 0)
 
 
@@ -120,7 +125,7 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     """Which start leads where, with the cycles, and the unstable one between the basins dashed.
 
     basins: from `basins`. Basins of cycles are pale blue and green, those of equilibria pale
-    orange, undecided starts white. Returns the axes.
+    orange, undecided starts white. Below the axes is a key, as in `Basins.plot`. Returns the axes.
     """
     require_value(isinstance(basins, Basins), "basins", "what jb.basins returns", basins)
     require_axes(ax)
@@ -141,6 +146,7 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
         ylim=(x2[0], x2[-1]),
         ax=ax,
     )
+    add_key(ax)
     return ax
 
 
@@ -157,7 +163,6 @@ def draw_basins(basins: Basins) -> Figure:
     """Basins of attraction on a page, with a key."""
     figure = journal_figure(4.6, 4.4)
     plot_basins(basins, ax=figure.subplots())
-    draw_key(figure, ncols=2)
     return figure
 
 

@@ -170,7 +170,7 @@ class Basins(eqx.Module):
 
     def plot(self, ax: Any = None) -> Any:
         """Draw which start leads where, with the cycles, into the axes `ax` (None: new ones), which
-        are returned."""
+        are returned, and a key below them: the picture of `plot_basins`."""
         return draw(self, ax)
 
     def __repr__(self) -> str:
