@@ -134,13 +134,14 @@ def test_a_law_that_pushes_is_told_of_and_one_that_pushes_at_rest_is_refused():
 
 
 def test_a_curve_that_leaves_its_table_is_told_of():
-    told = r"goes to mu = -0\.165 at the speed 0\.269, .* have 0\.05 and 0\.05"
+    told = r"goes to mu = -0\.165 at the speed 0\.269, .* expects 0\.05 to 0\.05"
     with pytest.warns(UserWarning, match=told):
         jb.Tabulated((0.0, 0.1, 1.0), (0.5, 0.05, 0.05))
-    with pytest.warns(UserWarning, match="at the speed 0.9, .* have 0.01 and 0.01"):
+    with pytest.warns(UserWarning, match="at the speed 0.9, .* expects 0 to 0.01"):
         jb.Tabulated((0.0, 0.1, 0.2, 0.3), (0.5, 0.01, 0.3, 0.01))
     # Decades between the points, and falling: as measured laws are.
     jb.Tabulated((0.0, 1e-3, 1e-2, 0.1, 1.0), (0.5, 0.48, 0.4, 0.3, 0.25))
+    jb.Tabulated((0.0, 0.1), (0.5, 0.4))
 
 
 @pytest.mark.slow

@@ -394,17 +394,18 @@ class Tabulated(AbstractFriction):
     def _warn_if_astray(self) -> None:
         """Warn where the curve leaves what its points span: where gaps of the table differ much."""
         speeds, mus = np.array(self.speeds), np.array(self.coefficients)
-        ends = np.append(speeds, 3.0 * speeds[-1])
+        # Beyond the last point it may go on as far as over the last gap, but does not push.
+        beyond = max(0.0, 2.0 * mus[-1] - mus[-2])
+        ends, steps = np.append(speeds, 3.0 * speeds[-1]), np.append(mus, beyond)
         at = np.concatenate([np.linspace(*gap, 65) for gap in itertools.pairwise(ends)])
-        # Beyond the last point, the last coefficient.
-        around = np.repeat(np.stack([mus, np.append(mus[1:], mus[-1])]), 65, axis=1)
+        around = np.repeat(np.sort([steps[:-1], steps[1:]], axis=0), 65, axis=1)
         curve = self._known(at)
-        off = np.maximum(around.min(axis=0) - curve, curve - around.max(axis=0))
+        off = np.maximum(around[0] - curve, curve - around[1])
         worst = np.argmax(off)
         if off[worst] > MOST_ASTRAY * np.max(mus):
             warnings.warn(
-                "the curve through the table goes to mu = {:.3g} at the speed {:.3g}, where the "
-                "points beside it have {:.3g} and {:.3g}: more points there hold it".format(
+                "the curve through the table goes to mu = {:.3g} at the speed {:.3g}, where one "
+                "expects {:.3g} to {:.3g}: more points there hold it".format(
                     curve[worst], at[worst], *around[:, worst]
                 ),
                 stacklevel=4,
