@@ -328,3 +328,15 @@ def test_an_unstable_cycle_that_takes_fine_steps():
     assert told.status == jb.Status.OK and told.escapes
     # By bisection with the campaigns' engine: from there tops neither rise nor fall.
     assert outer.x1_max == pytest.approx(6.4667377846218, abs=1e-10)
+
+
+@pytest.mark.slow(first=True)
+def test_rounding_beside_an_equilibrium_on_an_edge_is_no_gap():
+    """The fixed point lies on the edge, which repels: so near to it rounding says whether loops
+    grow."""
+    strong, weak = jb.Conti(1.0, 0.6, 10.0), jb.Conti(0.5, 0.3, 10.0)
+    belts = jb.Belt(-0.35, strong, lower=-0.55), jb.Belt(-0.15, weak, load=2.0, lower=-0.76)
+    found = jb.portrait(jb.Oscillator(0.2, belts))
+    assert int(found.status) == jb.Status.OK and not len(found.gaps)
+    (cycle,) = found.cycles
+    assert not found.unstable and bool(cycle.x1_min < -0.76 < cycle.x1_max)

@@ -154,7 +154,8 @@ def portrait(osc: Oscillator) -> Portrait:
     """All equilibria, attracting and unstable cycles, and separatrices of an oscillator.
 
     osc: `Oscillator` with any friction laws, belts and contact intervals, of any damping. See
-    `Portrait` for what comes back. Cycles smaller than 1e-5 are not told from equilibria.
+    `Portrait` for what comes back. Cycles smaller than 1e-5, and those that go less than 1e-7 to
+    the right of a contact edge at which the mass can rest, are not told from equilibria.
 
     For one known oscillator, outside of `jax.jit`, `jax.vmap` and derivatives: how much there is
     decides what is computed. `ValueError` names an argument that is impossible, or traced.

@@ -52,7 +52,8 @@ PER_DECADE = 16
 SHORT, UNEVEN, SHORTEST = 1e-2, 0.05, 1e-5
 #: Distances from the tops that follow stick phases, and jumps, begin with this one.
 CLOSEST = 1e-10
-#: Cycles around a pseudo-focus are looked for down to this width; their height is larger.
+#: Cycles around a pseudo-focus are looked for down to this width; their height is larger. Of tops
+#: that are nearer to the edge than that rounding says whether loops grow: they leave no gap.
 AT_FOCUS = 1e-7
 #: Tops at most, in search of all cycles.
 MOST_TOPS = 20_000
@@ -141,6 +142,10 @@ class Returns:
         for low, high in self.intervals:
             self._search(low, high)
         self.cycles = self._solved()
+        at_edges = [low for low, _ in self.intervals if low in self._edges]
+        self.gaps = [
+            gap for gap in self.gaps if not any(0 <= gap[1] - low < AT_FOCUS for low in at_edges)
+        ]
         outermost = self.intervals[-1][1]
         grows, bounded = bool(self(np.array([outermost]))[0] > outermost), bool(is_bounded(osc))
         self.escapes = grows and not bounded
