@@ -439,3 +439,23 @@ def test_a_point_where_the_cycle_passes_an_edge_in_two_corners_is_told_along_all
     passed = run.y[run.kind == engine.EDGE]
     np.testing.assert_allclose(passed[:3, 1], [values[1], values[0], values[1]], atol=1e-10)
     assert np.all(passed[:, 0] == -0.5)
+
+
+@pytest.mark.slow(first=True)
+def test_a_curve_is_the_same_in_any_units():
+    """In thousandths and in thousands, as of velocities in mm/s and forces in kN."""
+
+    def curve(*units, most=200):
+        def make(p, q):
+            return jb.presets.class_b(p / units[0], q / units[1])
+
+        part = (0.1, 0.4), (0.2, 0.5)
+        at, span = 0.27 * units[0], [(a * u, b * u) for u, (a, b) in zip(units, part, strict=True)]
+        point = jb.refine(jb.Hopf(), lambda p: make(p, 0.35 * units[1]), at=at)
+        return jb.bifurcation_curve(point, make, tuple(span), max_points=most)
+
+    one, other = curve(1.0, 1.0), curve(1e3, 1e-3)
+    assert len(one) == len(other) > 30 and one.ends == other.ends
+    np.testing.assert_allclose(other.values / [1e3, 1e-3], one.values, rtol=1e-9)
+    assert "cut off" not in repr(one)
+    assert "cut off at max_points" in repr(curve(1.0, 1.0, most=5))
