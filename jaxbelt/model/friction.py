@@ -99,9 +99,9 @@ def _is_at_most(value: Any, _: Any, most: Any) -> Any:
     return value <= most
 
 
-#: Laws of one's own whose `mu` was traced, and those that were asked what to warn of.
+#: Laws of one's own whose `mu` was traced, and those that were searched for kinks.
 _traced: set[type] = set()
-_warned_of: set[type] = set()
+_asked_of_kinks: set[type] = set()
 
 
 def check_law(law: AbstractFriction) -> None:
@@ -125,22 +125,12 @@ def check_law(law: AbstractFriction) -> None:
     _traced.add(kind)
 
 
-def _warn_of_own(law: AbstractFriction) -> None:
-    """Warn where a known law of one's own pushes or has a kink, once for each class."""
+def _warn_of_kink(law: AbstractFriction) -> None:
+    """Warn where a known law of one's own has a kink, once for each class."""
     kind = type(law)
-    if kind in _warned_of or kind.__module__ == __name__ or not is_concrete(law):
+    if kind in _asked_of_kinks or kind.__module__ == __name__ or not is_concrete(law):
         return
-    if not all(np.all(rule.holds()) for rule in law.rules()):
-        return  # the belt refuses it
-    _warned_of.add(kind)
-    with jax.ensure_compile_time_eval():
-        least = np.asarray(jax.jit(jax.vmap(law.mu))(jnp.asarray(SEARCHED)))
-    if np.min(least) < 0:
-        warnings.warn(
-            f"mu of {kind.__name__} is negative at the speed {SEARCHED[np.argmax(least < 0)]:.3g}: "
-            "friction that pushes is followed, too, but no machine has it",
-            stacklevel=2,
-        )
+    _asked_of_kinks.add(kind)
     if kink := kink_of(law):
         warnings.warn(
             "mu of {} has a kink at the speed {:.6g}, its slope goes from {:.3g} to {:.3g}: "
@@ -201,7 +191,7 @@ def as_friction(law: Any) -> AbstractFriction:
     fits = isinstance(law, AbstractFriction)
     require_value(fits, "friction", "a law such as jb.Conti(...)", law)
     check_law(law)
-    _warn_of_own(law)
+    _warn_of_kink(law)
     return law
 
 
