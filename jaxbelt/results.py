@@ -138,12 +138,12 @@ ADVICE = {
         "belt, or slips at other speeds."
     ),
     Status.MISFIT: (
-        "The best fit leaves more than the given noise. Where the autocorrelation of the residuals "
-        "is about 0 it found the motion, and the noise is larger than was said: by the root of the "
-        "reduced chi^2. Else the model is not that of the record (a number that is kept is wrong, "
-        "the law, or the units: all is dimensionless, of a machine machine.tau(t) and "
-        "X / machine.units.length), or a better fit was not found: look at plot(), free another "
-        "parameter, try a nearer guess or more starts."
+        "The best fit leaves more than noise: more than was given, or, where it was estimated, "
+        "residuals with a shape. Where their autocorrelation is about 0 it found the motion, and "
+        "the noise is larger than was said: by the root of the reduced chi^2. Else the model is "
+        "not that of the record (a number that is kept is wrong, the law, or the units: all is "
+        "dimensionless, of a machine machine.tau(t) and X / machine.units.length), or a better fit "
+        "was not found: look at plot(), free another parameter, try a nearer guess or more starts."
     ),
     Status.UNREACHABLE: (
         "No choice of the parameters within their bounds reaches the targets along this way; what "

@@ -195,3 +195,20 @@ def test_cycles_that_slip_faster_than_the_table_goes_are_told_of():
         cycle = jb.find_cycle(beyond.oscillator, beyond.start(0.0, 0.0))
     slowest = jnp.min(cycle.sample(2000)[:, 1]) * beyond.units.velocity
     assert (0.3 - slowest) / 0.4 == pytest.approx(1.59, abs=0.005)
+
+
+@pytest.mark.slow(first=True)
+def test_a_search_tells_of_it_once():
+    """The values that it looks at on its way have such cycles, too."""
+    table = jb.Tabulated((0.0, 0.02, 0.05, 0.1, 0.2, 0.4), (0.55, 0.48, 0.41, 0.36, 0.34, 0.35))
+
+    def make(velocity):
+        return jb.Machine(2.0, 800.0, 3.0, (jb.PhysicalBelt(velocity, table, 30.0),)).oscillator
+
+    for search in (
+        lambda: jb.refine(jb.NonsmoothFold(0), make, at=0.38),
+        lambda: jb.scan(make, span=(0.3, 0.5)),
+    ):
+        with pytest.warns(UserWarning, match="2.11 times the speed") as told:
+            search()
+        assert len(told) == 1

@@ -35,7 +35,7 @@ from ..cycles.attractors import (
     without_idle,
 )
 from ..cycles.chains import SIZES, Loop, cut
-from ..cycles.cycle import Cycle, as_loop, find_cycle, polish, unstable_cycle
+from ..cycles.cycle import Cycle, as_loop, cycle_from, polish, unstable_cycle
 from ..cycles.orbits import FINE_STRIDE
 from ..cycles.settling import AT_REST
 from ..model.equilibria import EquilibriumKind, candidates
@@ -243,7 +243,7 @@ class ParameterPath:
             return AttractingCycle(path, loop)
         # Where the cycle has other loops than those from which it is solved for, or meets a
         # boundary, it is followed.
-        ways = (lambda: polish(osc, cut([loop])[0], ok), lambda: find_cycle(osc, loop.entries[0]))
+        ways = (lambda: polish(osc, cut([loop])[0], ok), lambda: cycle_from(osc, loop.entries[0]))
         for cycle in (way() for way in ways[0 if closes else 1 :]):
             if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
                 if _is_off_rest(cycle):

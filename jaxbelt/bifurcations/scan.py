@@ -91,7 +91,7 @@ def scan(
     """
     resolution = as_whole(resolution, "resolution")
     points = search(ParameterPath(osc, where, span, conditions), resolution)
-    warn_of_extrapolation(point.cycle for point in points)
+    warn_of_extrapolation((point.cycle for point in points), depth=5)
     return points
 
 

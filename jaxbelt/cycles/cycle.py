@@ -62,6 +62,8 @@ FINE_STEPS, EXACT = 32, 1e-11
 #: And these, for long arcs that creep along a strongly damped oscillator's slow direction, where
 #: nothing is traced.
 FINER_STEPS = (128, 512)
+#: Speeds that differ by less than this part of them are one.
+SAME_SPEED = 1e-9
 
 
 class Cycle(eqx.Module):
@@ -351,8 +353,11 @@ def _slip_speeds(osc: Oscillator, modes: np.ndarray, x2: np.ndarray) -> list[np.
     ]
 
 
-def warn_of_extrapolation(cycles: Iterable[Cycle]) -> None:
-    """Warn where known cycles slip faster than what was measured of a belt's friction."""
+def warn_of_extrapolation(cycles: Iterable[Cycle], depth: int = 4) -> None:
+    """Warn where known cycles slip faster than what was measured of a belt's friction.
+
+    depth: the `stacklevel` of who called the entry that asks.
+    """
     worst, belt = 1.0, 0
     for cycle in cycles:
         if not is_concrete(cycle) or int(cycle.status) != Status.OK:
@@ -365,11 +370,11 @@ def warn_of_extrapolation(cycles: Iterable[Cycle]) -> None:
         for index, (speeds, end) in enumerate(zip(slips, ends, strict=True)):
             part = float(np.max(speeds, initial=0.0)) / end
             worst, belt = (part, index) if part > worst else (worst, belt)
-    if worst > 1 + ROUNDED_SPEED:
+    if worst > 1 + SAME_SPEED:
         warnings.warn(
             f"the mass slips on belt {belt} at {worst:.3g} times the speed at which the table of "
             "its friction ends: results rest on the extrapolation, measure up to there",
-            stacklevel=4,
+            stacklevel=depth,
         )
 
 
@@ -432,8 +437,6 @@ def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -
     return _polished(osc, loop, status, steps)[0]
 
 
-#: By this part of itself a speed is not above another one.
-ROUNDED_SPEED = 1e-9
 #: How often an orbit is followed on for MOST_ARCS where it has not settled: to a cycle with the
 #: multiplier 0.99, in loops of eight arcs, it has then come to 1e-7.
 MORE_BUDGETS = 15
@@ -455,6 +458,13 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     an equilibrium, to one of a continuum of closed orbits, or nothing repeats, the status says so.
     `ValueError` names an argument that is impossible.
     """
+    cycle = cycle_from(osc, y0, max_arcs)
+    warn_of_extrapolation([cycle])
+    return cycle
+
+
+def cycle_from(osc: Oscillator, y0: ArrayLike | tuple, max_arcs: int | None = None) -> Cycle:
+    """What `find_cycle` returns, without its warning."""
     check_oscillator(osc)
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
@@ -469,9 +479,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
         loop = pick(loop, slice(room_of(needed)))
     elif max_arcs is None:
         loop, status = pick(loop, slice(SIZES[0])), _if_it_fits(status, count, SIZES[0])
-    cycle = exactly(osc, loop, status)
-    warn_of_extrapolation([cycle])
-    return cycle
+    return exactly(osc, loop, status)
 
 
 #: Loops that are compared in one batch, and how often the interval between two of them is refined:

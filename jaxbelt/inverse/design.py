@@ -27,7 +27,7 @@ from ..checks import (
     shape_in_words,
     traceable,
 )
-from ..cycles.cycle import Cycle, cycle_of_zeros, find_cycle
+from ..cycles.cycle import Cycle, cycle_from, cycle_of_zeros
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
@@ -209,7 +209,7 @@ def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
     """The functionals of the cycle, NaN where there is none, their derivatives, and the cycle."""
 
     def achieved(u):
-        cycle = find_cycle(selection.put(osc, selection.values(u)), y0)
+        cycle = cycle_from(selection.put(osc, selection.values(u)), y0)
         values = jnp.stack([functional(cycle) for functional in functionals])
         values = jnp.where(cycle.status == Status.OK, values, jnp.nan)
         return values, (values, cycle)

@@ -40,7 +40,7 @@ from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .record import WINDOW, Record, record_of
+from .record import OVERESTIMATED, WINDOW, Record, Verdict, record_of, verdict_on
 from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of, told_to
 
 if TYPE_CHECKING:
@@ -52,11 +52,6 @@ JOIN = 3
 SEARCH_STEPS, LEARNING_RATE = 60, 0.1
 #: A start whose windows are further off than this (chi^2 per datum) is not followed further.
 HOPELESS = 6.0
-#: A fit as bad as this happens once in a million records, by noise.
-IMPLAUSIBLE = 1e-6
-#: Residuals with a larger autocorrelation, over 1/sqrt(data), are no noise; and of a reduced chi^2
-#: below that the noise was estimated too large.
-MOST_CORRELATED, OVERESTIMATED = 6.0, 0.2
 TOLERANCE = 1e-8
 #: Parameters nearer to zero than this may have errors of this size; and those whose error in a
 #: direction that is not told is this many of their sizes have a share in it.
@@ -423,11 +418,10 @@ def fit(
 
     noise: standard deviation of the data, of x1 and x2 as a pair where both are given; None
     estimates it from how far neighbouring data scatter about a smooth curve, for which a loop needs
-    some tens of them. bounds: for each
-    parameter (lower, upper) or None, which keeps positive what cannot be negative; a parameter
-    stays inside by reparametrisation, so an estimate at a bound is one that wants to leave. starts:
-    of the search, spread about the guess. report: is told of the progress, too, a line at a time,
-    such as `print`.
+    some tens of them. bounds: for each parameter (lower, upper) or None, which keeps positive what
+    cannot be negative; a parameter stays inside by reparametrisation, so an estimate at a bound is
+    one that wants to leave. starts: of the search, spread about the guess. report: is told of the
+    progress, too, a line at a time, such as `print`.
 
     What can be told from a record: the velocity of a belt that the mass sticks to, its static
     friction and the damping, well; the kinetic law where slip speeds vary; the velocity of a belt
@@ -447,6 +441,15 @@ def fit(
     freedom = data - u.size - 2
     require(freedom > 0, "ts", f"more data than the {u.size + 2} unknowns", data)
     tell(f"search: {starts} starts, {len(record.starts)} windows of {WINDOW} time units")
+    estimated = any(
+        sigma is None and np.any(np.isfinite(column))
+        for sigma, column in zip(sigmas, values.T, strict=True)
+    )
+
+    def judged(point: _Point) -> Verdict:
+        off = (values - _motion_of(point, values)) * _weights_of(record, values)
+        return verdict_on(off, point.chi2, freedom, estimated)
+
     best, count, evaluations = None, 0, 0
     for guess, states, misfit in _first_guesses(selection, u, oscillator, record, starts):
         count += 1
@@ -455,19 +458,17 @@ def fit(
         evaluations += point.evaluations
         if joined and (best is None or point.chi2 < best.chi2):
             best = point
-            if _plausibility(point.chi2, freedom) > IMPLAUSIBLE:
+            if judged(point).is_noise:
                 break
     if best is None:
         # Nothing came near: what the guess itself gives, with a status that says so.
         whole = np.arange(len(record.starts)) == 0
         best = _fit_windows(linearized, np.asarray(u), np.asarray(record.starts), whole, 0.0)
         evaluations += best.evaluations
-    counts = freedom, count, evaluations
-    estimated = any(
-        sigma is None and np.any(np.isfinite(column))
-        for sigma, column in zip(sigmas, values.T, strict=True)
+    verdict = judged(best), estimated
+    result = _result(
+        oscillator, selection, record, times, values, best, *verdict, count, evaluations
     )
-    result = _result(oscillator, selection, record, times, values, best, counts, estimated)
     tell(repr(result).splitlines()[0])
     return result
 
@@ -524,28 +525,35 @@ def _follow_up(linearized, u, starts, data: int, tell) -> tuple[_Point, bool]:
         u, starts, every = point.u, point.starts, min(JOIN * every, pieces)
 
 
-def _plausibility(chi2, freedom: int) -> float:
-    return float(jax.scipy.special.gammaincc(0.5 * freedom, 0.5 * chi2))
+def _motion_of(point: _Point, values: np.ndarray) -> np.ndarray:
+    """The fitted motion at the times of the data, like these."""
+    return point.ys.reshape(-1, 2)[: len(values)]
 
 
-def _result(oscillator, selection, record, ts, values, point: _Point, counts, estimated: bool):
-    p, (freedom, count, evaluations) = point.u.size, counts
+def _weights_of(record: Record, values: np.ndarray) -> np.ndarray:
+    return np.asarray(record.weights).reshape(-1, 2)[: len(values)]
+
+
+def _result(
+    oscillator,
+    selection,
+    record,
+    ts,
+    values,
+    point,
+    verdict: Verdict,
+    estimated,
+    count,
+    evaluations,
+):
+    p = point.u.size
     u = jnp.asarray(point.u)
     estimates = selection.values(u)
     slopes = np.append(np.diag(jax.jacfwd(selection.values)(u)), [1.0, 1.0])
     covariance = _inverse(point.blocks[0, :-1, :-1]) * slopes[:, None] * slopes
     errors = np.sqrt(np.diag(covariance))
-    ys = point.ys.reshape(-1, 2)[: len(values)]
-    weights = np.asarray(record.weights).reshape(-1, 2)[: len(values)]
-    off = values - ys
-    plausibility, autocorrelation = (
-        _plausibility(point.chi2, freedom),
-        _autocorrelation(off * weights),
-    )
-    # Noise that was taken from the record is no witness: it may be the motion's own.
-    is_shape = abs(autocorrelation) > MOST_CORRELATED / np.sqrt(np.sum(np.isfinite(values)))
-    is_shape &= estimated and point.chi2 > OVERESTIMATED * freedom
-    status = Status.OK if plausibility > IMPLAUSIBLE and not is_shape else Status.MISFIT
+    ys, weights = _motion_of(point, values), _weights_of(record, values)
+    status = Status.OK if verdict.is_noise else Status.MISFIT
     # Of a misfit finite errors mean nothing.
     most = _sizes(estimates) if status == Status.OK else np.finfo(float).max
     status = status if np.all(errors[:p] <= most) else Status.NOT_IDENTIFIED
@@ -562,11 +570,11 @@ def _result(oscillator, selection, record, ts, values, point: _Point, counts, es
         y0_standard_errors=jnp.asarray(errors[p:]),
         ts=jnp.asarray(ts),
         ys=jnp.asarray(ys),
-        residuals=jnp.asarray(off),
+        residuals=jnp.asarray(values - ys),
         noise=jnp.asarray(np.where(np.isfinite(noise), noise, np.nan)),
-        reduced_chi_squared=jnp.asarray(point.chi2 / freedom),
-        plausibility=jnp.asarray(plausibility),
-        autocorrelation=jnp.asarray(autocorrelation),
+        reduced_chi_squared=jnp.asarray(verdict.reduced_chi_squared),
+        plausibility=jnp.asarray(verdict.plausibility),
+        autocorrelation=jnp.asarray(verdict.autocorrelation),
         candidates=count,
         evaluations=evaluations,
         status=jnp.asarray(status.value),
@@ -586,11 +594,3 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     lost = np.any(np.abs(vectors[:, blind]) > 1e-4, axis=1) | ~seen
     inverse[lost, lost] = np.inf
     return inverse
-
-
-def _autocorrelation(off: np.ndarray) -> float:
-    """Of neighbouring weighted residuals, both components together."""
-    pairs = np.isfinite(off[1:]) & np.isfinite(off[:-1])
-    products = np.where(pairs, off[1:] * off[:-1], 0.0)
-    squares = np.where(pairs, 0.5 * (off[1:] ** 2 + off[:-1] ** 2), 0.0)
-    return float(np.sum(products) / np.sum(squares))

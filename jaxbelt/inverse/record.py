@@ -1,15 +1,23 @@
-"""A measured record of a motion, cut into the windows that a fit begins with."""
+"""A measured record of a motion, cut into the windows that a fit begins with, and whether what a
+fit leaves of it is noise."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.special import gammaincinv
+from scipy.special import gammaincc, gammaincinv
 
 #: Length of the first windows, less than half a loop: no phase is lost over it.
 WINDOW = 2.5
+#: A fit as bad as this happens once in a million records, by noise.
+IMPLAUSIBLE = 1e-6
+#: Residuals with a larger autocorrelation, over 1/sqrt(data), are no noise.
+MOST_CORRELATED = 6.0
+#: Of a smaller reduced chi^2 the noise was estimated too large.
+OVERESTIMATED = 0.2
 
 
 class Record(eqx.Module):
@@ -89,3 +97,35 @@ def local_cubics(ts: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.nda
     median = 2 * gammaincinv(0.5 * freedom, 0.5)
     noise = np.sqrt(np.median(np.sum(off**2, axis=1)) / median)
     return cubics[:, 0], cubics[:, 1], float(noise)
+
+
+class Verdict(NamedTuple):
+    """What residuals tell: see `Fit`. is_noise: whether they may be noise."""
+
+    reduced_chi_squared: float
+    plausibility: float
+    autocorrelation: float
+    is_noise: bool
+
+
+def verdict_on(off: np.ndarray, chi2: float, freedom: int, estimated: bool) -> Verdict:
+    """What weighted residuals tell, [samples, 2], NaN where there is no datum.
+
+    chi2: the sum of their squares; estimated: whether the noise was, of a column at least.
+    """
+    plausibility = float(gammaincc(0.5 * freedom, 0.5 * chi2))
+    correlation = _autocorrelation(off)
+    # Noise that was taken from the record is no witness: it may be the motion's own.
+    has_shape = abs(correlation) > MOST_CORRELATED / np.sqrt(np.sum(np.isfinite(off)))
+    suspect = estimated and has_shape and chi2 > OVERESTIMATED * freedom
+    return Verdict(
+        chi2 / freedom, plausibility, correlation, plausibility > IMPLAUSIBLE and not suspect
+    )
+
+
+def _autocorrelation(off: np.ndarray) -> float:
+    """Of neighbouring weighted residuals, both components together."""
+    pairs = np.isfinite(off[1:]) & np.isfinite(off[:-1])
+    products = np.where(pairs, off[1:] * off[:-1], 0.0)
+    squares = np.where(pairs, 0.5 * (off[1:] ** 2 + off[:-1] ** 2), 0.0)
+    return float(np.sum(products) / np.sum(squares))

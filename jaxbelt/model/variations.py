@@ -40,7 +40,7 @@ PASSES, TRACED_PASSES = 12, 5
 VALUES_SEEN, MERGED = 257, 1e-7
 #: A function whose tangent was asked for more often is compiled, which takes a few tenths of a
 #: second; uncompiled that of a machine in SI units takes some 20 ms.
-OFTEN = 128
+OFTEN = 64
 #: Guesses along each side of a plane for where an oscillator lies in it.
 GUESSES = 9
 
@@ -181,15 +181,26 @@ class Variation:
 
     def _tangent(self, values: Any) -> Family:
         """The oscillators that are tangent to the function there."""
+        structure, rest = None, []
+
+        def numbers(*p):
+            nonlocal structure, rest
+            leaves, structure = jax.tree.flatten(self.make(*p))
+            is_one = [is_real(leaf) for leaf in leaves]
+            rest = [None if one else leaf for leaf, one in zip(leaves, is_one, strict=True)]
+            pairs = zip(leaves, is_one, strict=True)
+            return [jnp.asarray(leaf, dtype=jnp.float64) for leaf, one in pairs if one]
+
         values = np.asarray(values) if is_concrete(values) else jnp.stack([*values])
         at = tuple(jnp.asarray(value) for value in values)
-        is_often_asked = len(self.tangents) >= OFTEN
-        numbers = self._compiled if is_often_asked else self._numbers_and_slopes
-        leaves, tangents = numbers(*at)
+        tangents, leaves = [], []
+        for place in range(len(at)):
+            along = tuple(jnp.asarray(np.float64(place == i)) for i in range(len(at)))
+            leaves, tangent = jax.jvp(numbers, at, along)
+            tangents.append(tangent)
         pack: Any = np if is_concrete(tangents) else jnp
         slopes = iter([pack.stack(rows) for rows in zip(*tangents, strict=True)])
         found = iter(leaves)
-        structure, rest = self._frame
         whole = [next(found) if other is None else other for other in rest]
         return Family(
             jax.tree.unflatten(structure, whole),
@@ -197,31 +208,9 @@ class Variation:
             values,
         )
 
-    def _numbers_and_slopes(self, *at):
-        """The numbers of the oscillator there, and of each parameter their derivatives by it."""
-
-        def numbers(*p):
-            leaves, structure = jax.tree.flatten(self.make(*p))
-            is_one = [is_real(leaf) for leaf in leaves]
-            pairs = list(zip(leaves, is_one, strict=True))
-            self._frame[:] = structure, [None if one else leaf for leaf, one in pairs]
-            return [jnp.asarray(leaf, dtype=jnp.float64) for leaf, one in pairs if one]
-
-        tangents, leaves = [], []
-        for place in range(len(at)):
-            along = tuple(jnp.asarray(np.float64(place == i)) for i in range(len(at)))
-            leaves, tangent = jax.jvp(numbers, at, along)
-            tangents.append(tangent)
-        return leaves, tangents
-
     @functools.cached_property
-    def _compiled(self) -> Callable:
-        return jax.jit(self._numbers_and_slopes)
-
-    @functools.cached_property
-    def _frame(self) -> list[Any]:
-        """What of an oscillator is no number: the tree, and its leaves (None: a number)."""
-        return []
+    def _compiled_tangent(self) -> Callable[[Any], Family]:
+        return eqx.filter_jit(lambda values: self._tangent(values))
 
     def family(self, values: Any) -> Family:
         """Oscillators that are linear in the parameters, and those of the variation near `values`,
@@ -232,12 +221,22 @@ class Variation:
             return self._tangent(values)
         place = tuple(np.asarray(values).tolist())
         if place not in self.tangents:
-            self.tangents[place] = self._tangent(values)
+            is_often_asked = len(self.tangents) >= OFTEN
+            tangent = self._compiled_tangent if is_often_asked else self._tangent
+            self.tangents[place] = tangent(np.asarray(values))
         return self.tangents[place]
 
     def oscillator(self, values: Any) -> Oscillator:
         """The oscillator at these values, [k]; whether it is a possible one is not asked."""
-        return self.family(values).oscillator if self.line is None else self.line.at(values)
+        if self.line is not None:
+            return self.line.at(values)
+        known = (
+            self.tangents.get(tuple(np.asarray(values).tolist())) if is_concrete(values) else None
+        )
+        if known is not None:
+            return known.oscillator
+        made = self.make(*(jnp.asarray(value) for value in values))
+        return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if is_real(x) else x, made)
 
     def oscillators(self, rows: np.ndarray) -> Oscillator:
         """Those at many values, [rows, k], as one with a row in each leaf."""

@@ -32,7 +32,7 @@ from ..checks import (
     require_wish,
 )
 from ..cycles.attractors import Runs, is_same
-from ..cycles.cycle import Cycle, find_cycle, unstable_cycle
+from ..cycles.cycle import Cycle, cycle_from, unstable_cycle
 from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator, check_oscillator
@@ -319,7 +319,7 @@ def _labels(
         kind, stuck = kinds[first], sticks[first]
         same, cycle, before = left & (kinds == kind), None, None
         if kind == "cycle":
-            cycle = find_cycle(osc, (float(dataset.x1[first[0]]), float(dataset.x2[first[1]])))
+            cycle = cycle_from(osc, (float(dataset.x1[first[0]]), float(dataset.x2[first[1]])))
             # Runs that differ by what a sweep does not tell exactly may still be of one cycle.
             before = next((one for one in found if one.is_of(cycle)), None)
             same &= runs.same(runs.at(first))[0]

@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike
 from ..activity import announced, tell
 from ..checks import as_positive, as_whole, outside_of_traces
 from ..cycles.attractors import APART, RUN, Runs, place_of
-from ..cycles.cycle import find_cycle
+from ..cycles.cycle import cycle_from
 from ..model.equilibria import equilibria
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
@@ -275,7 +275,7 @@ def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
         first = int(np.argmax(np.where(untold, beside, -1)))
         same = untold & runs.same(runs.at(first))[0]
         same[first] = True
-        cycle = find_cycle(osc, (float(runs.places[first, 1]), 0.0))
+        cycle = cycle_from(osc, (float(runs.places[first, 1]), 0.0))
         attracts = int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1 - ATTRACTS
         closed |= same & (not attracts)
         untold &= ~same
@@ -358,7 +358,7 @@ def _seeded(osc: Oscillator, one: _Met) -> _Met | None:
     cycle turns back; of points of rest the nearest."""
     place = np.zeros(len(PLACE))
     if one.kind == CYCLE:
-        cycle = find_cycle(osc, (float(one.place[1]), 0.0))
+        cycle = cycle_from(osc, (float(one.place[1]), 0.0))
         if int(cycle.status) != Status.OK or not bool(cycle.stable):
             return None
         place = place_of(cycle)

@@ -15,7 +15,7 @@ import numpy as np
 from ..activity import announced
 from ..checks import require, require_callable
 from ..cycles.attractors import Runs, is_same
-from ..cycles.cycle import find_cycle
+from ..cycles.cycle import cycle_from
 from ..model.oscillator import Oscillator
 from ..results import Status
 from .attractor import CYCLE, EQUILIBRIUM, UNDECIDED
@@ -201,7 +201,7 @@ def _settled(
     for number in sorted({number for pair in pairs for number in pair}):
         # From where the cycle turns back: there it is known best.
         x1_max = places[np.argmax(labels == number), 1]
-        cycles[number] = find_cycle(osc, (float(x1_max), 0.0))
+        cycles[number] = cycle_from(osc, (float(x1_max), 0.0))
         if int(cycles[number].status) != Status.OK or not bool(cycles[number].stable):
             settled[labels == number] = -1
     for one, other in pairs:
