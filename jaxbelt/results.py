@@ -115,8 +115,8 @@ ADVICE = {
     Status.INCOMPLETE: (
         "Not everything is told: in the gaps there may be cycles (a continuum of closed orbits, "
         "cycles about to merge, orbits that settle too slowly), or a separatrix is missing, of a "
-        "node on a contact edge, or was not followed far enough for the shock asked for. Move away "
-        "from the bifurcation point."
+        "node on a contact edge, or is unsettled, or was not followed far enough for the shock "
+        "asked for. Move away from the bifurcation point."
     ),
     Status.NEUTRAL: (
         "The orbit closes, and so do those beside it, as around a centre: no cycle that attracts, "

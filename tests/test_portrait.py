@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import pytest
+import scipy.linalg
 from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
@@ -340,3 +341,41 @@ def test_rounding_beside_an_equilibrium_on_an_edge_is_no_gap():
     assert int(found.status) == jb.Status.OK and not len(found.gaps)
     (cycle,) = found.cycles
     assert not found.unstable and bool(cycle.x1_min < -0.76 < cycle.x1_max)
+
+
+def test_a_separatrix_goes_on_outside_where_nothing_ends_its_last_arc():
+    """Backwards an overdamped oscillator that no belt touches runs away without another extremum.
+
+    In closed form there: x1'' = -a x1' - x1, from where the separatrix leaves the belts.
+    """
+    first = jb.Conti(static=0.917545147159, residual=0.488230806572, steepness=3.75629421489)
+    second = jb.Conti(static=0.759660614246, residual=0.414325928775, steepness=13.7697254784)
+    belts = (
+        jb.Belt(1.08317491456, first, 1.34935753813, lower=0.614361589913),
+        jb.Belt(0.321723922376, second, 1.03374906374, lower=0.051167768582, upper=0.644035983841),
+    )
+    osc = jb.Oscillator(2.82868521867, belts, omega=0.908402510527)
+    told = jb.portrait(osc)
+    assert told.status == jb.Status.OK
+    outside = [one for one in told.separatrices if one.end == "outside"]
+    assert len(outside) == 4
+    for one in outside:
+        assert np.max(np.abs(np.asarray(one.ys))) > told.reach
+        if one.side == "left":
+            ts, ys = np.asarray(one.ts), np.asarray(one.ys)
+            free = np.flatnonzero(ys[:, 0] <= float(belts[1].lower))
+            field = np.array([[0.0, 1.0], [-1.0, -2.82868521867]])
+            for i in free:
+                exact = scipy.linalg.expm(field * (ts[i] - ts[free[-1]])) @ ys[free[-1]]
+                assert ys[i] == pytest.approx(exact, rel=1e-9)
+
+
+def test_a_fixed_point_and_a_saddle_that_are_one_are_not_told_apart():
+    """They meet on the edge: the separatrix between them is shorter than rounding."""
+    edge = -0.66153846153846
+    law = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
+    belts = jb.Belt(-0.55, law, upper=edge), jb.Belt(0.3, law, lower=edge)
+    told = jb.portrait(jb.Oscillator(0.1, belts))
+    assert told.status == jb.Status.INCOMPLETE
+    (one,) = [s for s in told.separatrices if s.stable and s.end == "unsettled"]
+    assert float(one.point[0]) == edge

@@ -74,30 +74,33 @@ class Orbit(eqx.Module):
     done: Array
 
 
-def _arc(osc: Oscillator, orbit: Orbit, stride: float | Array) -> ArcEnd:
+def _arc(osc: Oscillator, orbit: Orbit, stride: float | Array, reach: float | Array) -> ArcEnd:
     """The next arc of an orbit, to an extremum at most."""
     mode, y = mode_of(orbit.code), (orbit.y[0], orbit.y[1])
 
     def slip():
-        arc = _graded_slip_arc(osc, mode, orbit.signs, y, jnp.asarray(stride))
+        bounds = jnp.asarray(stride), jnp.asarray(reach)
+        arc = _graded_slip_arc(osc, mode, orbit.signs, y, *bounds)
         return after_slip(osc, mode, orbit.signs, arc)
 
     return lax.cond(mode.any_stuck, lambda: stick_arc(osc, mode, y, jnp.asarray(jnp.inf)), slip)
 
 
 @lanes_in_one_kernel
-def _graded_slip_arc(osc: Oscillator, mode: Mode, signs: Signs, y, stride: Array) -> SlipArc:
-    integrator = Graded(osc, mode, stride)
+def _graded_slip_arc(
+    osc: Oscillator, mode: Mode, signs: Signs, y, stride: Array, reach: Array
+) -> SlipArc:
+    integrator = Graded(osc, mode, stride, reach)
     return slip_arc(osc, mode, signs, y, integrator, every_extremum=True)
 
 
 def _next_arc(
-    osc: Oscillator, orbit: Orbit, stride: float | Array
+    osc: Oscillator, orbit: Orbit, stride: float | Array, reach: float | Array
 ) -> tuple[dict[str, Array], Orbit]:
     """The next arc, a row of the columns by name; and the orbit after it, without that row."""
     codes = orbit.code
     stuck = mode_of(codes).any_stuck
-    end = _arc(osc, orbit, stride)
+    end = _arc(osc, orbit, stride, reach)
     y_end = jnp.stack(end.y)
     code = jnp.stack([jnp.asarray(c, dtype=orbit.y.dtype) for c in end.mode.codes])
 
@@ -146,16 +149,21 @@ def _next_arc(
 
 
 def _followed_while(
-    going: Callable[[Orbit], Array], osc: Oscillator, start: Orbit, stride: float | Array = STRIDE
+    going: Callable[[Orbit], Array],
+    osc: Oscillator,
+    start: Orbit,
+    stride: float | Array = STRIDE,
+    reach: float | Array = jnp.inf,
 ) -> Orbit:
-    """Arc after arc, from no arcs, as long as there is room and `going` says so."""
+    """Arc after arc, from no arcs, as long as there is room and `going` says so; an arc ends, too,
+    where |x1| or |x2| comes to `reach`."""
 
     def unfinished(orbit):
         return going(orbit) & (orbit.count < orbit.tops.size)
 
     def turn(state):
         number, orbit = state
-        row, after = _next_arc(osc, orbit, stride)
+        row, after = _next_arc(osc, orbit, stride, reach)
         # Of the columns, long ones, one row is written, the same of all lanes in a batch.
         own = unfinished(orbit)
         columns = {name: getattr(orbit, name) for name in row}
@@ -198,7 +206,7 @@ def _finely_from(osc: Oscillator, start: Orbit, reach: Array) -> Orbit:
         creeps = (orbit.status == Status.NOT_SETTLED) & (jnp.abs(orbit.y[1]) > CREEPING_SPEED)
         return (~orbit.done | on_the_way | creeps) & near
 
-    return _followed_while(going, osc, start, FINE_STRIDE)
+    return _followed_while(going, osc, start, FINE_STRIDE, reach)
 
 
 def follow(osc: Oscillator, y0: Array, budget: int, stride: float | Array = STRIDE) -> Orbit:

@@ -59,7 +59,7 @@ class Portrait(eqx.Module):
       (reach, inf) where there is a cycle farther out.
     - status: OK, or INCOMPLETE where there is a gap, or where an equilibrium on a contact edge is a
       stable node: the orbit that comes to it in its fast direction is a separatrix, too, and is not
-      given.
+      given; or where a stable separatrix is unsettled.
 
     Starts tell which basin they are in by where they lie: see `table` for all numbers, `plot` for
     the picture.
@@ -168,16 +168,18 @@ def portrait(osc: Oscillator) -> Portrait:
     cycles = tuple(cycle for cycle in map_.cycles if abs(float(cycle.multiplier)) < 1)
     unstable = tuple(cycle for cycle in map_.cycles if float(cycle.multiplier) > 1)
     gaps = np.array(sorted(map_.gaps)).reshape(-1, 2)
-    told = not len(gaps) and not _has_node_on_edge(osc, points)
+    separatrices = tuple(
+        _named(branch, map_, points, unstable if branch.stable else cycles) for branch in found
+    )
+    unsettled = any(one.stable and one.end == "unsettled" for one in separatrices)
+    told = not len(gaps) and not _has_node_on_edge(osc, points) and not unsettled
     status = Status.OK if told else Status.INCOMPLETE
     return Portrait(
         oscillator=osc,
         equilibria=points,
         cycles=cycles,
         unstable=unstable,
-        separatrices=tuple(
-            _named(branch, map_, points, unstable if branch.stable else cycles) for branch in found
-        ),
+        separatrices=separatrices,
         escapes=map_.escapes,
         reach=reach,
         gaps=jax.device_put(gaps),

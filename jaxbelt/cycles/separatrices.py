@@ -290,12 +290,6 @@ def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array):
     even = jnp.linspace(1.0, 0.0, ARC_SAMPLES, endpoint=False)
 
     def along(codes, mesh, y, duration):
-        def beyond(duration):
-            return ~(jnp.max(jnp.abs(flow(osc, codes, mesh, y, duration))) < 2 * reach)
-
-        # Where nothing turns it an orbit may go far in one arc.
-        duration = lax.while_loop(beyond, lambda duration: 0.8 * duration, duration)
-
         def advance(y, fraction):
             # A steep law, as near a node on a boundary, bounds the length of a stable step.
             (trace,) = trace_of(osc, mode_of(codes), *y)

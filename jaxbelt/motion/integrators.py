@@ -203,11 +203,13 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 
 
 class Graded(AbstractIntegrator):
-    """Steps of a stride over the `density` that the slip mode wants."""
+    """Steps of a stride over the `density` that the slip mode wants, as long as |x1| and |x2| are
+    < reach."""
 
     osc: Oscillator
     mode: Mode
     stride: float | Array = STRIDE
+    reach: float | Array = jnp.inf
 
     def march(self, field, y, is_outside):
         # A stuck lane of a batch has no slip arc to follow; it must not keep the others waiting.
@@ -215,8 +217,8 @@ class Graded(AbstractIntegrator):
 
         def unfinished(state):
             _, _, _, y, steps = state
-            finite = jnp.isfinite(y[0]) & jnp.isfinite(y[1])
-            going = (steps * self.stride < MAX_GRADED) & active & finite
+            near = (jnp.abs(y[0]) < self.reach) & (jnp.abs(y[1]) < self.reach)
+            going = (steps * self.stride < MAX_GRADED) & active & near
             return ((steps == 0) | ~is_outside(y)) & going
 
         def advance(state):

@@ -33,6 +33,8 @@ SAME, AT_REST = 1e-6, 1e-4
 CHORD = 0.02
 #: Smaller cycles than the first, at a pseudo-focus than the second, are not told from rest.
 TINY, TINY_AT_FOCUS = 1e-5, 1e-7
+#: A fixed point and a saddle as near to each other are one.
+AT_ROUNDING = 1e-12
 #: Round numbers meet Hopf points: there loops neither grow nor shrink, to any order that shows.
 CENTRE = 1e-12
 #: Time until the engine gives a run up.
@@ -111,7 +113,16 @@ def differences(osc: engine.Oscillator, told: jb.Portrait) -> tuple[list[str], C
     of_centres = [gap for gap in gaps if any(abs(gap[0] - x1) < 1e-4 for x1 in centres)]
     aside["gap at a Hopf point"] += len(of_centres)
     wrong = [f"gap {gap}" for gap in gaps if gap not in of_centres]
-    wrong += [f"{one}" for one in told.separatrices if one.end == "unsettled" and one.stable]
+    unsettled = [one for one in told.separatrices if one.end == "unsettled" and one.stable]
+    if unsettled and _has_fixed_point_at_saddle(told):
+        aside["fixed point and saddle on an edge"] += 1
+    else:
+        wrong += [f"{one}" for one in unsettled]
+    wrong += [
+        f"ends within reach: {one}"
+        for one in told.separatrices
+        if one.end == "outside" and np.max(np.abs(np.asarray(one.ys))) < told.reach
+    ]
     ids = np.full((SIDE, SIDE), -1)
     x1s, x2s = (np.linspace(*ends, SIDE) for ends in WINDOW)
     for i, x1 in enumerate(x1s):
@@ -130,7 +141,7 @@ def differences(osc: engine.Oscillator, told: jb.Portrait) -> tuple[list[str], C
             elif ids[i, j] < 0:
                 wrong.append(f"from {(x1, x2)} missing: {seen}")
     wrong += _invented(osc, told, set(ids.ravel().tolist()), aside)
-    if int(told.status) == jb.Status.INCOMPLETE and not len(told.gaps):
+    if int(told.status) == jb.Status.INCOMPLETE and not len(told.gaps) and not unsettled:
         aside["node on an edge"] += 1
     else:
         wrong += _not_parted(told, ids, x1s, x2s)
@@ -164,6 +175,14 @@ def _is_tiny(seen: engine.Attractor, told: jb.Portrait) -> bool:
     foci = np.asarray(told.equilibria.kind) == jb.EquilibriumKind.PSEUDO_FOCUS
     at_focus = np.any(np.abs(np.asarray(told.equilibria.x1)[foci] - seen.x1[0]) < 1e-3)
     return seen.x1[1] - seen.x1[0] < (TINY_AT_FOCUS if at_focus else TINY)
+
+
+def _has_fixed_point_at_saddle(told: jb.Portrait) -> bool:
+    """Whether the two are one up to rounding, as where they are about to vanish."""
+    x1, kinds = np.asarray(told.equilibria.x1), np.asarray(told.equilibria.kind)
+    saddles = x1[kinds == jb.EquilibriumKind.SADDLE]
+    fixed = x1[kinds == jb.EquilibriumKind.FIXED_POINT]
+    return bool(np.any(np.abs(saddles[:, None] - fixed) < AT_ROUNDING))
 
 
 def _invented(osc, told: jb.Portrait, seen: set[int], aside: Counter) -> list[str]:
