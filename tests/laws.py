@@ -30,6 +30,7 @@ class Nested(jb.AbstractFriction):
 
     With damping near 0.5 what is left is weak. Averaged over a loop it lets the amplitude A grow
     like -A (s - 0.04) (s - 0.08) (s - 0.16), s = A^2: between two attracting cycles lies a third.
+    At r = 0, far from what is met there, it is a friction again, 1.1.
     """
 
     static: jax.Array
@@ -41,7 +42,8 @@ class Nested(jb.AbstractFriction):
 def nested(r):
     v = 1.0 - r
     rest = (20 * 5.12e-4 * 2, -20 * 0.0224 * 8 / 3, 20 * 0.28 * 16 / 5, -20 * 128 / 35)
-    return 1.0 + 0.5 * v + sum(c * v ** (2 * i + 1) for i, c in enumerate(rest))
+    odd = sum(c * v ** (2 * i + 1) for i, c in enumerate(rest))
+    return 1.0 + 0.5 * v + odd + 56.0 * v**32
 
 
 NESTED = Nested(jnp.asarray(3.0))

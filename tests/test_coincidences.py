@@ -5,6 +5,8 @@ campaigns, `tests/campaign/engine.py`; `judge` says what counts as right (docs/c
 """
 
 import numpy as np
+import oracle
+import oracle_cycles
 import pytest
 
 import jaxbelt as jb
@@ -296,3 +298,21 @@ def test_audits_find_repeats_that_are_none(observe, monkeypatch):
 def test_what_cannot_be_audited_is_refused():
     with pytest.raises(ValueError, match="audit must be a share from 0 to 1, got 2"):
         jb.sweep(jb.presets.class_b, AXES, t1=1.0, audit=2.0)
+
+
+def test_belts_that_change_places_where_a_cycle_sticks_to_both():
+    """The slip arc between the two stick phases takes no time at the point; the cycle there is
+    that of one belt with the load of both."""
+    law = jb.Conti(1.2, 0.48, 10.0)
+
+    def make(velocity):
+        return jb.Oscillator(0.1, (jb.Belt(-0.55, law), jb.Belt(velocity, law)))
+
+    one = oracle.Oscillator(0.1, (oracle.Belt(-0.55, *oracle.conti(1.2, 0.48, 10.0), load=2.0),))
+    period = oracle_cycles.sticking_cycle(one).period
+    points = jb.scan(make, span=(-0.56, -0.54))
+    (point,) = [p for p in points if p.condition == jb.SlidingExchange((0, 1))]
+    assert "Unexplained" not in [p.kind for p in points]
+    for found in (point, *(jb.refine(point.condition, make, at=v) for v in (-0.551, -0.549))):
+        assert found.value == pytest.approx(-0.55, abs=1e-13)
+        assert found.cycle.period == pytest.approx(period, abs=1e-10)

@@ -6,6 +6,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import jaxbelt as jb
@@ -225,7 +226,7 @@ def test_a_corner_in_which_the_cycle_ends():
 def test_the_passage_of_an_edge_becomes_tangent():
     """The edge pushes away to both sides, and the cycle that passes it ends there."""
     points = jb.scan(jb.presets.class_c(0.31, 0.25, 0.7), nu1, (0.16, 0.2))
-    kinds = [jb.FoldOfCycles(), jb.Hopf(), jb.SaddleConnection(0), jb.GrazingEdge(0)]
+    kinds = [jb.FoldOfCycles(), jb.Hopf(), *[jb.SaddleConnection(0, 0)] * 2]
     assert [point.condition for point in points] == kinds
 
     def miss(nu):
@@ -244,9 +245,24 @@ def test_the_passage_of_an_edge_becomes_tangent():
         oracle.advance(oracle.class_a(0.31), tuple(passes.y_end), (1,), 100.0, until=until)
         return loops[1] - 0.7
 
-    expected = brentq(miss, 0.1846, 0.18475, xtol=1e-14)
-    assert points[3].value == pytest.approx(expected, abs=1e-11)
-    assert points[3].residual < 1e-12 and points[3].error < 1e-11
+    def miss_at_once(nu):
+        """How far from the edge it turns back after the first loop, by the right belt alone."""
+        loops = []
+
+        def until(item):
+            loops.extend([item.x1] if isinstance(item, oracle.Loop) and item.axis == 0 else [])
+            return len(loops) == 2
+
+        oracle.advance(oracle.class_a(nu), (0.7, 0.0), (1,), 100.0, until=until)
+        return loops[1] - 0.7
+
+    expected = [
+        brentq(miss, 0.1846, 0.18475, xtol=1e-14),
+        brentq(miss_at_once, 0.185, 0.1855, xtol=1e-14),
+    ]
+    for point, value in zip(points[2:], expected, strict=True):
+        assert point.value == pytest.approx(value, abs=1e-11)
+        assert point.residual < 1e-12 and point.error < 1e-11
 
 
 def test_a_belt_at_rest_that_no_cycle_sticks_to():
@@ -478,3 +494,77 @@ def test_where_one_type_of_boundary_equilibrium_turns_into_the_other():
         for nu, at in ((0.1, 0.72), (0.2, 0.66))
     ]
     assert sorted(types) == ["annihilation", "persistence"]
+
+
+@pytest.mark.parametrize(
+    ("velocity", "kind"), [(0.0, "persistence"), (-1.0, "annihilation")], ids=["held", "pushed"]
+)
+def test_the_kinetic_end_of_a_segment_comes_to_an_edge(velocity, kind):
+    """To the right of the edge kinetic friction 0.25 stops the mass up to x1 = 0.25, static
+    friction 0.5 holds it up to 0.5. With the edge beyond 0.25 what slips down is lost: to the
+    segment of the other belt, which is at rest, too, or to where that one pushes it."""
+    law = jb.Coulomb(0.5, 0.25)
+
+    def lower_of(edge):
+        return -0.2 if velocity == 0 else edge
+
+    def make(edge):
+        return jb.Oscillator(
+            1.0, (jb.Belt(velocity, law, upper=edge), jb.Belt(0.0, law, lower=lower_of(edge)))
+        )
+
+    (point,) = jb.scan(make, span=(0.15, 0.35))
+    assert point.condition == jb.BoundaryEquilibrium(0) and point.type == kind
+    assert float(point.value) == pytest.approx(0.25, abs=1e-12)
+    again = jb.refine(jb.BoundaryEquilibrium(0), make, at=0.27)
+    assert again.status == jb.Status.OK
+    assert float(again.value) == pytest.approx(0.25, abs=1e-12)
+
+
+def test_where_the_mass_is_pushed_back_nothing_ends_at_the_kinetic_limit():
+    def make(edge):
+        belts = (
+            jb.Belt(1.0, jb.Coulomb(1.0, 1.0), upper=edge),
+            jb.Belt(0.0, jb.Coulomb(0.5, 0.25), lower=edge),
+        )
+        return jb.Oscillator(1.0, belts)
+
+    assert jb.scan(make, span=(0.15, 0.35)) == ()
+
+
+def test_a_corner_beside_slip_onset_that_lies_on_the_edge_all_along():
+    """Belt 0 slips from 1.0 - 0.25 * 0.4 = 0.9 on, where its edge is; what happens in the corner of
+    belt 1 on the other side is found all the same."""
+
+    def make(nu):
+        belts = (
+            jb.Belt(0.4, jb.Stribeck(1.0, 0.5, 0.3), upper=0.9),
+            jb.Belt(nu, jb.Conti(0.8, 0.32, 10.0), lower=0.9),
+        )
+        return jb.Oscillator(0.25, belts)
+
+    def miss(nu):
+        """x2 where the orbit from the corner (0.9, 0.4) comes back to the edge, less nu, if belt 1
+        goes on to slip with one sign."""
+
+        def field(t, y):
+            return y[1], -y[0] - 0.25 * y[1] - 0.32 - 0.48 / (1 + 10.0 * (y[1] - nu))
+
+        def back(t, y):
+            return y[0] - 0.9
+
+        back.terminal, back.direction = True, -1.0
+        tight = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
+        run = solve_ivp(field, (0.0, 2.0), (0.9, 0.4), events=back, **tight)
+        return run.y_events[0][0, 1] - nu
+
+    points = jb.scan(make, span=(-0.8, -0.25))
+    kinds = ["CornerCollision", "CrossingSliding", "CornerCollision"]
+    assert [point.kind for point in points] == kinds
+    assert points[0].value == pytest.approx(brentq(miss, -0.41, -0.405, xtol=1e-14), abs=1e-11)
+    for belt in (0, 1):
+        for at in (-0.4059, -0.4058):
+            found = jb.refine(jb.CornerCollision(belt), make, at=at)
+            assert found.value == pytest.approx(float(points[0].value), abs=1e-11)
+        found = jb.refine(jb.CornerCollision(belt), make, at=-0.4025)
+        assert found.value == pytest.approx(float(points[2].value), abs=1e-9)

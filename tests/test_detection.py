@@ -15,6 +15,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
+from jaxbelt.bifurcations.conditions import CycleEquation
 from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import distinct
@@ -366,15 +367,34 @@ def test_a_fold_of_cycles_beyond_which_there_is_nothing():
         assert sticks == (value > crossing.value)
 
 
+class _Jump(CycleEquation):
+    """Changes its sign without a zero where the damping is 0.5."""
+
+    def equation(self, osc, chain, z):
+        return jnp.where(osc.damping > 0.5, 1.0, -1.0)
+
+
 @pytest.mark.slow(first=True)
 def test_a_change_that_no_condition_explains_is_reported():
+    (point,) = jb.scan(
+        jb.presets.class_a(0.2),
+        lambda osc: osc.damping,
+        (0.45, 0.57),
+        resolution=8,
+        conditions=[_Jump()],
+    )
+    assert point.kind == "Unexplained" and point.status == Status.UNEXPLAINED
+    assert point.value == pytest.approx(0.5, abs=1e-9)  # known to 1e-9 of the span
+    assert "Simulate on both sides" in repr(point)
+
+
+def test_what_kinetic_friction_stops_comes_to_the_edge_of_a_segment():
     """Belt 0 at rest holds the mass up to 1, but slipping on it takes 0.7 only: the part of the
     segment of equilibria below -0.7 holds but attracts nothing."""
     osc = jb.Oscillator(0.5, (jb.Belt(0.0, jb.Coulomb(1.0, 0.7), upper=-0.6),))
     (point,) = jb.scan(osc, lambda osc: osc.belts[0].upper, (-0.9, -0.5), resolution=8)
-    assert point.kind == "Unexplained" and point.status == Status.UNEXPLAINED
-    assert point.value == pytest.approx(-0.7, abs=1e-9)  # known to 1e-9 of the span
-    assert "Simulate on both sides" in repr(point)
+    assert point.condition == jb.BoundaryEquilibrium(0) and point.type == "annihilation"
+    assert point.value == pytest.approx(-0.7, abs=1e-14)
 
 
 @pytest.mark.parametrize(

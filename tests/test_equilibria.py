@@ -484,6 +484,37 @@ def test_derivatives_of_a_pseudo_focus_agree_with_differences():
     assert edge.tolist() == [0, 0, 1]
 
 
+@pytest.mark.parametrize(("velocity", "returns"), [(1.0, True), (-1.0, False)])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_segment_attracts_from_beyond_an_edge_that_pushes_back(velocity, returns, mirrored):
+    # Static friction 0.5 holds from the edge at 0.3 to 0.5, kinetic friction 0.25 stops nothing
+    # that slips down; beyond the edge the moving belt pushes it up again, or farther down.
+    way = -1.0 if mirrored else 1.0
+    side, other = ("upper", "lower") if mirrored else ("lower", "upper")
+    moving = {"velocity": way * velocity, other: way * 0.3}
+    still = {"velocity": 0.0, side: way * 0.3}
+    osc = jb.Oscillator(
+        1.0,
+        (
+            jb.Belt(friction=jb.Coulomb(1.0, 1.0), **moving),
+            jb.Belt(friction=jb.Coulomb(0.5, 0.25), **still),
+        ),
+    )
+    slow = oracle.Oscillator(
+        1.0,
+        (
+            oracle.Belt(moving["velocity"], *oracle.coulomb(1.0, 1.0), **{other: way * 0.3}),
+            oracle.Belt(0.0, *oracle.coulomb(0.5, 0.25), **{side: way * 0.3}),
+        ),
+    )
+    points = jb.equilibria(osc)
+    (row,) = np.flatnonzero(np.asarray(points.kind) == SEGMENT)
+    assert sorted(way * np.array([points.x1_lower[row], points.x1_upper[row]])) == [0.3, 0.5]
+    assert bool(points.stable[row]) == returns
+    end = oracle.simulate(slow, (way * 0.31, way * -1e-3), 60.0).y_end[0]
+    assert (0.3 <= way * end <= 0.5) == returns
+
+
 def test_derivatives_of_the_ends_of_a_segment():
     def ends(static, load, nu, edge):
         law = jb.Conti(static, 0.6, 10.0)

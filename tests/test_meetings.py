@@ -139,8 +139,8 @@ def test_where_they_meet():
 
 @pytest.mark.slow
 def test_their_curves():
-    """That of the cycle ends where a stick phase on belt 0 has no duration; the other one goes
-    on."""
+    """That of the cycle ends where a stick phase on belt 0 has no duration, and passes a point from
+    which on it sticks to belt 1, too; the other one goes on."""
 
     def make(upper, nu1):
         return beside(upper, 0.4, (0.2, nu1))
@@ -154,12 +154,18 @@ def test_their_curves():
         assert np.allclose(curve.values[:, 0], 0.4, rtol=0, atol=1e-15)
     assert np.ptp(meeting.values[:, 1]) == pytest.approx(0.4)
     assert exchange.ends == (Stop.STOPPED, Stop.LEFT_SPAN)
-    (end,) = exchange.special
-    assert (end.kind, end.belts) == ("DoubleSliding", (0,))
+    end, passed = exchange.special
+    assert [(one.kind, one.belts) for one in (end, passed)] == [
+        ("DoubleSliding", (0,)),
+        ("DoubleSliding", (1,)),
+    ]
 
-    def duration(nu1):
+    def duration(nu1, belt=0):
         cycle = oracle_cycles.sticking_cycle(oracle.class_c(0.2, nu1, 0.4), (0.41, 0.2))
-        return cycle.stick_durations[0]
+        return cycle.stick_durations[belt]
+
+    at = passed.values[1]
+    assert duration(at - 1e-4, 1) == 0 and 0 < duration(at + 1e-4, 1) < 0.1
 
     # It vanishes like a straight line.
     values = end.values[1] + np.array([1e-3, 2e-3])

@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..cycles.chains import SIZES, Chain, Loop
+from ..checks import is_concrete
+from ..cycles.chains import SIZES, Chain, Loop, cut
 from ..cycles.cycle import Cycle
 from ..cycles.shooting import meshed
 from ..model.modes import any_of, mode_of
@@ -177,10 +178,28 @@ def has_jump(belt: Belt) -> Array:
 # --- belts that change places ---------------------------------------------------------------------
 
 
+@jit
+def _loop_together(osc: Oscillator, belts: Array) -> tuple[Loop, Array]:
+    """The loop of the cycle that sticks to two belts at once if the second runs like the first, and
+    a status."""
+    velocity = velocity_of(osc, belts[0])
+    velocities = [
+        jnp.where(belts[1] == i, velocity, one.velocity) for i, one in enumerate(osc.belts)
+    ]
+    equal = eqx.tree_at(lambda o: [one.velocity for one in o.belts], osc, velocities)
+    _, _, orbit = orbit_after_stick(equal, belts[0])
+    loop, status = repeated_loop(orbit, SIZES[0], len(osc.belts))
+    held = jnp.any(loop.used & jnp.all(loop.codes[:, belts] == 0, axis=-1))
+    return loop, jnp.where((status == Status.OK) & ~held, Status.NOT_TOUCHED.value, status)
+
+
 class SlidingExchange(AbstractCycleCondition):
     """Two belts run at one velocity: where both touch, the cycle changes from one to the other.
 
     With laws that jump, or belts that hold differently, there may be another cycle beyond, or none.
+    Where it sticks to both belts, one after the other, the slip arc between them takes no time at
+    the point, like the square root of the difference of the velocities; then the cycle is found
+    that sticks to both at once.
     """
 
     belts: tuple[int, int]
@@ -205,6 +224,14 @@ class SlidingExchange(AbstractCycleCondition):
         meant = (status != Status.OK) | exchanges
         status = jnp.where(meant, status, Status.NOT_TOUCHED.value)
         return Encounter(chain, belts, jnp.asarray(-1), jnp.zeros(())), z, status
+
+    def solve(self, variation, osc, value, guess):
+        point = super().solve(variation, osc, value, guess)
+        if not is_concrete(point.status) or int(point.status) == Status.OK:
+            return point
+        loop, status = _loop_together(osc, jnp.stack(self.belts))
+        found = super().solve(variation, osc, value, (cut([loop])[0], status))
+        return found if int(found.status) == Status.OK else point
 
     @classmethod
     def at_coincidence(cls, belts):

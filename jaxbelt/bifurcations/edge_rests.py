@@ -6,7 +6,8 @@ There is no cycle at these points, and no unknown but the parameter.
   belts at rest there can hold: a fixed point, or the end of a segment, comes to lie on the edge. It
   goes on beyond the point (persistence) if the other side of the edge pushes to it, as a
   pseudo-focus, or holds the mass; if that pushes away, it meets the saddle of the edge and both
-  vanish (annihilation).
+  vanish (annihilation). Where the static limit of a belt at rest exceeds mu(0), orbits end only in
+  that part of the segment where mu(0) is enough; the end of that part may come to the edge, too.
 - `PseudoHopf`: at a pseudo-focus the leading term by which loops grow or shrink is zero. With the
   next one, of third order, |x2| at the edge obeys r' = rate r + a r^3, see `edge_focus`, and
   the cycle that is born has r^2 = -rate/a.
@@ -26,7 +27,18 @@ import numpy as np
 from jaxtyping import Array
 
 from ..checks import is_concrete, require_value
-from ..model.modes import Mode, capacity, edges, mode_acceleration, mode_of, select, settle
+from ..model.equilibria import EquilibriumKind
+from ..model.modes import (
+    Mode,
+    capacity,
+    edges,
+    force_rounding,
+    kinetic_capacity,
+    mode_acceleration,
+    mode_of,
+    select,
+    settle,
+)
 from ..model.oscillator import Oscillator
 from ..model.pseudofocus import edge_focus, field_at_rest
 from ..model.transitions import contact
@@ -72,18 +84,23 @@ class EdgeRest(_EdgeSystem):
     """What vanishes where an equilibrium lies on an edge.
 
     The needed force at rest on one side of it, less what belts at rest there can hold, in one of
-    the two directions (0 where none is at rest).
+    the two directions (0 where none is at rest). kinetic: whether that is their kinetic friction,
+    so that the part of a segment ends there in which orbits end.
     """
 
     edge: Array
     rightward: Array
     limit: Array
+    kinetic: Array
     codes: Array
 
     def balance(self, osc):
         at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
         needed = mode_acceleration(osc, mode, at, jnp.zeros(()))
-        return needed + self.limit * capacity(osc, mode)
+        return needed + self.limit * self._held(osc, mode)
+
+    def _held(self, osc: Oscillator, mode: Mode) -> Array:
+        return select(self.kinetic, kinetic_capacity(osc, mode), capacity(osc, mode))
 
     def meets_hopf(self, osc):
         # There is none for the end of a segment.
@@ -103,7 +120,8 @@ class EdgeRest(_EdgeSystem):
         segment that comes to the edge first.
         """
         at, rest = jnp.stack(edges(osc))[self.edge], jnp.zeros(())
-        left, right = (settle(osc, mode, at, rest) for mode in _beside_edge(osc, at))
+        sides = _beside_edge(osc, at)
+        left, right = (settle(osc, mode, at, rest, self._held(osc, mode)) for mode in sides)
         other = select(self.rightward, left, right)
         push = select(self.rightward, 1.0, -1.0) * mode_acceleration(osc, other, at, rest)
         # A segment to the right has its lower end where the needed force is what the belts hold.
@@ -112,10 +130,12 @@ class EdgeRest(_EdgeSystem):
         return push, stays | other.any_stuck
 
     def exists(self, osc, x):
-        # Whether the contacts on that side are those.
-        at = jnp.stack(edges(osc))[self.edge]
+        # Whether the contacts on that side are those, and the kinetic limit is one of its own.
+        at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
         left, right = _beside_edge(osc, at)
-        return jnp.all(jnp.stack(select(self.rightward, right, left).codes) == self.codes)
+        jumps = capacity(osc, mode) - kinetic_capacity(osc, mode) > force_rounding(at)
+        same = jnp.all(jnp.stack(select(self.rightward, right, left).codes) == self.codes)
+        return same & (~self.kinetic | jumps)
 
 
 class EdgeBalance(_EdgeSystem):
@@ -263,7 +283,8 @@ class _EdgeCondition(AbstractRestCondition):
 
 
 class BoundaryEquilibrium(_EdgeCondition):
-    """A fixed point, or the end of a segment, lies on a contact edge of a belt."""
+    """A fixed point, or the end of a segment, lies on a contact edge of a belt; or the end of that
+    part of a segment in which orbits end, where the static limit of a belt exceeds mu(0)."""
 
     caption: ClassVar[str] = "rest on edge, belt {belt}"
     line: ClassVar[Line] = Line("rest on edge", "#D55E00")
@@ -273,9 +294,13 @@ class BoundaryEquilibrium(_EdgeCondition):
 
     @classmethod
     def between(cls, before, after, edged):
-        # What passes an edge changes its kind or its contacts.
+        # What passes an edge changes its kind or its contacts, or a segment attracts no more.
         there, then = (
-            [(kind, modes) for kind, _, modes in label.equilibria] for label in (before, after)
+            [
+                (kind, stable and kind == EquilibriumKind.SEGMENT, modes)
+                for kind, stable, modes in label.equilibria
+            ]
+            for label in (before, after)
         )
         return super().between(before, after, edged) if there != then else []
 
@@ -329,12 +354,14 @@ def _edge_rest(osc: Oscillator, belt: int | Array) -> EdgeRest:
     for edge in _edges_of(osc, belt):
         sides = _beside_edge(osc, jnp.stack(edges(osc))[edge])
         cases += [
-            EdgeRest(edge, jnp.asarray(rightward), jnp.asarray(limit), jnp.stack(mode.codes))
+            EdgeRest(edge, *map(jnp.asarray, (rightward, limit, kinetic)), jnp.stack(mode.codes))
             for rightward, mode in zip((False, True), sides, strict=True)
             for limit in (-1.0, 1.0)
+            for kinetic in (False, True)
         ]
     missing = jnp.stack([jnp.abs(case.balance(osc)) for case in cases])
-    at = jnp.argmin(jnp.where(jnp.isfinite(missing), missing, jnp.inf))
+    exists = jnp.stack([case.exists(osc, jnp.asarray(NOTHING)) for case in cases])
+    at = jnp.argmin(jnp.where(jnp.isfinite(missing) & exists, missing, jnp.inf))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
 
 

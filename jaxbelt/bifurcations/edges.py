@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..checks import require_value
+from ..checks import is_concrete, require_value
 from ..cycles.chains import SIZES, Chain, Loop, following_codes
 from ..cycles.cycle import separating_loop
 from ..cycles.settling import AT_REST
@@ -100,6 +100,11 @@ class AbstractEdgeTouch(AbstractCycleCondition):
         return False
 
     @property
+    def farther(self) -> float | Array:
+        """Ends of arcs that are no farther from both are left out."""
+        return -1.0
+
+    @property
     def room(self):
         return SIZES[0] if self.repels else SIZES[1]
 
@@ -114,8 +119,8 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
     def as_data(self):
         # One program serves both kinds.
-        belt, wanted = (jnp.asarray(np.array(one)) for one in (self.belt, self.wanted))
-        return EdgeTouch(belt, wanted, self.repels)
+        numbers = (self.belt, self.wanted, self.farther)
+        return EdgeTouch(*(jnp.asarray(np.array(one)) for one in numbers), self.repels)
 
     def named(self, point):
         if self.repels:
@@ -137,10 +142,25 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
         """How far the nearest end of an arc is from both at once."""
-        return end_near_edge(osc, loop, self.belt, self.wanted).distance
+        return self._nearest_end(osc, loop).distance
+
+    def _nearest_end(self, osc: Oscillator, loop: Loop) -> "EdgeEnd":
+        return end_near_edge(osc, loop, self.belt, self.wanted, self.farther)
+
+    def solve(self, variation, osc, value, guess):
+        point = super().solve(variation, osc, value, guess)
+        if not is_concrete(point.status) or int(point.status) != Status.NO_CONVERGENCE:
+            return point
+        loop, _ = guess
+        # Slip onset may be on the edge whatever the parameter is, as at round numbers it is.
+        if float(self._nearest_end(osc, loop).distance) > HOLDS:
+            return point
+        others = EdgeTouch(self.belt, self.wanted, jnp.asarray(np.array(HOLDS)), self.repels)
+        found = super(AbstractEdgeTouch, others).solve(variation, osc, value, guess)
+        return found if int(found.status) == Status.OK else point
 
     def system(self, osc, loop, status):
-        near = end_near_edge(osc, loop, self.belt, self.wanted)
+        near = self._nearest_end(osc, loop)
         exists = (status != Status.OK) | jnp.isfinite(near.distance)
         status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
         loop, row = _without_excursion(osc, loop, near)
@@ -153,11 +173,16 @@ class EdgeTouch(AbstractEdgeTouch):
     """Such an end of whichever kind, and what programs know of both."""
 
     meant: float | Array = 0.0
+    least: float | Array = -1.0
     unstable: bool = eqx.field(static=True, default=False)
 
     @property
     def wanted(self):
         return self.meant
+
+    @property
+    def farther(self):
+        return self.least
 
     @property
     def repels(self):
@@ -247,10 +272,16 @@ class EdgeEnd(eqx.Module):
 
 
 @jit
-def end_near_edge(osc: Oscillator, loop: Loop, belt: int | Array, wanted: float | Array) -> EdgeEnd:
+def end_near_edge(
+    osc: Oscillator,
+    loop: Loop,
+    belt: int | Array,
+    wanted: float | Array,
+    farther: float | Array = -1.0,
+) -> EdgeEnd:
     """Of the ends of the arcs of a loop that nearest to an edge of the belt and something else.
 
-    wanted: 1 tangent to the edge, -1 in a corner, 0 either.
+    wanted: 1 tangent to the edge, -1 in a corner, 0 either. farther: of those farther from it.
     """
     n = len(osc.belts)
     names = Ends(n)
@@ -292,7 +323,8 @@ def end_near_edge(osc: Oscillator, loop: Loop, belt: int | Array, wanted: float 
         found = jnp.stack([*to_edges, to_extremum, *to_boundaries, *to_onsets])
         grazes = jnp.stack([loops, loops, True, *[False] * (n + 2)])
         usable = (end != names.unused) & jnp.where(grazes, wanted >= 0, wanted <= 0)
-        return jnp.where(usable & jnp.isfinite(found), found, jnp.inf), grazes, held
+        usable = usable & jnp.isfinite(found) & (found > farther)
+        return jnp.where(usable, found, jnp.inf), grazes, held
 
     rows = loop.codes, loop.ends, loop.entries, following, loop.exits
     found, grazes, held = jax.vmap(distances)(*rows)

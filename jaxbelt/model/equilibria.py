@@ -32,7 +32,15 @@ from ..checks import is_concrete, number, pick
 from ..numerics.compiling import jit
 from ..results import draw
 from ..tables import per_belt, require_single, table_of
-from .modes import STUCK, Mode, capacity, edges, mode_acceleration, settle
+from .modes import (
+    STUCK,
+    Mode,
+    capacity,
+    edges,
+    kinetic_capacity,
+    mode_acceleration,
+    settle,
+)
 from .oscillator import Oscillator, check_oscillator, has_possible_numbers
 from .pseudofocus import edge_focus
 from .rest import is_centre
@@ -73,7 +81,8 @@ class Equilibria(eqx.Module):
       left in a finite time; NaN for a segment.
     - stable: rate < 0. A segment is stable if disturbances of some part of it end in it again.
       That is where the needed force is less than the sum of u0_k mu_k(0); the rest of a segment,
-      if mu(0) is less than the static limit, holds but does not attract.
+      if mu(0) is less than the static limit, holds but does not attract, unless an edge ends it
+      beyond which the mass, having slipped away, is pushed back.
     - neutral: a centre: orbits around it are closed, so it neither attracts nor repels, and is not
       stable in the sense above. It is where the forces on each side are the same at x2 and -x2, as
       without damping and with friction that does not depend on the speed.
@@ -226,10 +235,11 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     eigenvalues = _eigenvalues(jnp.where(is_fixed[:, None, None], jacobian, jnp.eye(2)[None]))
     rate = jnp.real(eigenvalues[:, 0])
 
-    moving_hold = jnp.zeros_like(held)
-    for belt, stuck in zip(osc.belts, mode.stuck, strict=True):
-        moving_hold += jnp.where(stuck, belt.load * belt.friction.mu(jnp.zeros(())), 0.0)
-    attracts = jnp.maximum(pull - moving_hold, lower) < jnp.minimum(pull + moving_hold, upper)
+    kinetic = kinetic_capacity(osc, mode)
+    attracts = jnp.maximum(pull - kinetic, lower) < jnp.minimum(pull + kinetic, upper)
+    # Or what slips away passes an edge, is pushed back to it, and stops where it came from.
+    attracts |= (first == lower) & _pushes_back(osc, lower, rightward=False)
+    attracts |= (last == upper) & _pushes_back(osc, upper, rightward=True)
 
     neutral = is_fixed & is_centre(osc, mode)
     x1 = jnp.where(is_segment, 0.5 * (first + last), pull)
@@ -246,6 +256,15 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
         stable=jnp.where(is_segment, attracts, is_fixed & (rate < 0) & ~neutral) & exists,
         neutral=neutral,
     )
+
+
+def _pushes_back(osc: Oscillator, edge: Array, *, rightward: bool) -> Array:
+    """Whether the side of an edge that is given pushes a mass that slips there back to the edge."""
+    x1 = jnp.where(jnp.isfinite(edge), edge, 0.0)
+    rest = jnp.zeros_like(x1)
+    mode = settle(osc, contact(osc, x1, rest, rightward=rightward), x1, rest)
+    push = mode_acceleration(osc, mode, x1, rest) * (-1.0 if rightward else 1.0)
+    return jnp.isfinite(edge) & ~mode.any_stuck & (push > 0)
 
 
 def _codes(mode: Mode, exists: Array) -> Array:

@@ -121,6 +121,14 @@ def capacity(osc: Oscillator, mode: Mode) -> Array:
     return total
 
 
+def kinetic_capacity(osc: Oscillator, mode: Mode) -> Array:
+    """The friction of the stuck belts together as they begin to slip, the sum of u0_k mu_k(0)."""
+    total = jnp.zeros(())
+    for belt, stuck in zip(osc.belts, mode.stuck, strict=True):
+        total = total + jnp.where(stuck, belt.load * belt.friction.mu(jnp.zeros(())), 0.0)
+    return total
+
+
 def force_rounding(x1: Array, scale: Array | float = 1.0) -> Array:
     """A force, or x2', below this is 0 up to rounding, wherever that is asked.
 
@@ -135,8 +143,10 @@ def without_rounding(a: Array, x1: Array) -> Array:
     return jnp.where(jnp.abs(a) < force_rounding(x1), a - lax.stop_gradient(a), a)
 
 
-def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
+def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array, held: Array | None = None) -> Mode:
     """Keep the stuck belts of `mode` stuck if they can hold the needed force, else let them slip.
+
+    held: what they can hold together; None: their `capacity`.
 
     They slip with sign -sgn(needed): friction opposed the needed force until the limit. That one
     rule serves arrivals at a boundary (not held: the orbit crosses), contact edges met while
@@ -145,7 +155,7 @@ def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Mode:
     sticks; where no force is needed either, r'' = omega^2 x2 gives the sign.
     """
     needed = mode_acceleration(osc, mode, x1, x2)
-    held = capacity(osc, mode)
+    held = capacity(osc, mode) if held is None else held
     rounding = force_rounding(x1, held)
     slips = (jnp.abs(needed) > held + rounding) | (held == 0)
     onward = jnp.where(x2 < 0, -1.0, 1.0)
