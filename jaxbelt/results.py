@@ -96,8 +96,9 @@ ADVICE = {
     ),
     Status.NOT_TOUCHED: (
         "Nothing comes near the boundary or an edge of that belt here, so no such point is near, "
-        "or the cycle ends in it and exists on its other side only; try another belt or another "
-        "value of the parameter, or jb.scan with a span around it."
+        "or the cycle ends in it and exists on its other side only (or, of a condition of your "
+        "own, its equation has a value in no attracting cycle); try another belt or another value "
+        "of the parameter, or jb.scan with a span around it."
     ),
     Status.OTHER_KIND: (
         "The cycle does touch the boundary at a point near here, but the point is of another kind: "

@@ -9,6 +9,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Union
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +26,7 @@ from .cycles.portrait import Portrait
 from .cycles.shocks import FatalShock
 from .inverse.fit import Fit
 from .model.equilibria import Equilibria
-from .model.friction import Conti, Coulomb, Stribeck
+from .model.friction import LawInUnits
 from .model.machine import Machine, Units
 from .model.modes import STUCK, mode_acceleration, mode_of
 from .model.oscillator import Oscillator
@@ -51,16 +52,15 @@ DIMENSIONS = {
     "force": "force",
     "energy": "energy",
 }
-#: The same for the numbers of oscillators and laws, by their fields: a unit, and what 1 is in it.
+#: The same for the numbers of oscillators, by their fields: a unit, and what 1 is in it.
 UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "damping": ("N s m-1", lambda units: units.force / units.velocity),
     "velocity": ("m s-1", lambda units: units.velocity),
     "load": ("N", lambda units: units.force),
     **dict.fromkeys(("lower", "upper"), ("m", lambda units: units.length)),
-    **dict.fromkeys(("static", "residual", "kinetic"), ("1", lambda _: 1.0)),
-    "steepness": ("s m-1", lambda units: 1 / units.velocity),
-    "quadratic": ("s2 m-2", lambda units: 1 / units.velocity**2),
 }
+#: A number of a friction law that goes with a power of the speed does so to 1e-12.
+POWER_ROUNDING = 1e-12
 #: Numbers of a machine's oscillator and of a result's that differ by less, relative to their size,
 #: are the same: those of the one may have been computed in another way.
 SAME_MACHINE = 1e-9
@@ -381,13 +381,39 @@ def _unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
     """The unit of a parameter of a fit, and what 1 is in it; tied ones have to have the same."""
     told = set()
     for path in name.split(" = "):
-        law, _, field = path.partition(".friction.")
-        index = int(law.removeprefix("belts[").removesuffix("]")) if field else 0
-        own = field and not isinstance(osc.belts[index].friction, Conti | Coulomb | Stribeck)
-        symbol, size = ("", lambda _: 1.0) if own else UNITS_OF_FIELDS[path.rpartition(".")[2]]
-        told.add((symbol, float(size(units))))
+        if ".friction." in path:
+            told.add(_unit_in_law(path, osc, units))
+        else:
+            symbol, size = UNITS_OF_FIELDS[path.rpartition(".")[2]]
+            told.add((symbol, float(size(units))))
     require(len(told) == 1, "result", "of tied parameters with one unit", name)
     return told.pop()
+
+
+def _unit_in_law(path: str, osc: Oscillator, units: Units) -> tuple[str, float]:
+    """The same for a number of a friction law, by what becomes of it as speeds are given in another
+    unit; "" and 1 where the law takes speeds in the unit of whoever wrote it."""
+    number = names_of(osc).index(path)
+    leaves, structure = jax.tree.flatten(osc)
+    if not np.any(leaves[number]):
+        leaves[number] = jnp.ones(())
+        osc = jax.tree.unflatten(structure, leaves)
+    index = int(path.removeprefix("belts[").partition("]")[0])
+    law = osc.belts[index].friction
+    halved = law.in_units_of(jnp.asarray(2.0))
+    if isinstance(law, LawInUnits) or type(halved) is not type(law):
+        return "", 1.0
+    scaled = eqx.tree_at(lambda o: o.belts[index].friction, osc, halved)
+    ratio = float(jax.tree.leaves(scaled)[number] / leaves[number])
+    power = round(np.log2(ratio)) if ratio > 0 else 0
+    is_power = abs(ratio / 2.0**power - 1) < POWER_ROUNDING
+    require(is_power, "result", "of what goes with a power of the speed in in_units_of", path)
+    symbol = " ".join(
+        unit + (str(n) if n != 1 else "")
+        for n, unit in sorted(((power, "s"), (-power, "m")), reverse=True)
+        if n
+    )
+    return symbol or "1", float(units.velocity) ** -power
 
 
 def _units_of_start(units: Units) -> list[tuple[str, float]]:

@@ -139,7 +139,46 @@ def test_every_kind_of_the_package_carries_its_words(kind: type[AbstractConditio
 
 
 def test_what_is_no_plain_number_is_named():
-    with pytest.raises(ValueError, match="condition must be made of plain numbers"):
+    with pytest.raises(ValueError, match="condition must be made of plain finite numbers"):
         jb.refine(PeriodIs(jnp.asarray(8.0)), jb.presets.class_a(0.2), where=nu0)
     with pytest.raises(ValueError, match="belt must be 0: there is one belt, got 1"):
         jb.scan(jb.presets.class_a(0.2), nu0, (0.1, 0.2), conditions=[jb.GrazingSliding(1)])
+
+
+class Plain(CycleEquation):
+    """With nothing but its equation."""
+
+    size: float
+
+    def equation(self, osc, chain, z):
+        return jnp.sum(z[:, 2]) - self.size
+
+
+class Long(Plain):
+    def equation(self, osc, chain, z):
+        return z[:1, 2] - self.size
+
+
+class Untraceable(Plain):
+    def equation(self, osc, chain, z):
+        return float(np.max(z))
+
+
+def test_mistakes_in_a_condition_of_ones_own_are_named():
+    osc = jb.presets.class_a(0.2)
+    for one, words in (
+        (Plain(float("nan")), "condition must be made of plain finite numbers"),
+        (Long(8.0), "equation of Long must be a function that returns one float64"),
+        (Untraceable(8.0), "equation of Untraceable must be .*made of what JAX can trace"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            jb.refine(one, osc, where=nu0)
+        with pytest.raises(ValueError, match=words):
+            jb.scan(osc, nu0, (0.1, 0.2), conditions=[one])
+
+
+def test_a_condition_without_words_goes_by_its_name():
+    point = jb.refine(Plain(8.0), jb.presets.class_a(0.2), where=nu0)
+    assert point.status == Status.OK and point.condition.words == "Plain"
+    curve = jb.bifurcation_curve(point, (nu0, zeta), ((0.05, 0.4), (0.4, 0.6)))
+    assert curve.plot().get_legend_handles_labels()[1] == ["Plain"]

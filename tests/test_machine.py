@@ -242,6 +242,46 @@ def test_a_fit_of_a_law_of_ones_own_and_of_tied_parameters_in_si():
         jb.in_si(fit_of(m.oscillator, **{tied: 1.0}), doubled)
 
 
+class _Powers(jb.AbstractFriction):
+    """Its numbers go with several powers of the speed."""
+
+    static: jax.Array
+    velocity: jax.Array
+    square: jax.Array
+    count: float = 3.0
+
+    def mu(self, speed):
+        return self.static / (1 + speed / self.velocity + speed**2 / self.square)
+
+    def in_units_of(self, speed):
+        return _Powers(self.static, self.velocity / speed, self.square / speed**2, self.count)
+
+
+class _Shifted(_Powers):
+    def in_units_of(self, speed):
+        return _Shifted(self.static, self.velocity + speed, self.square / speed**2, self.count)
+
+
+def test_a_law_of_ones_own_that_takes_other_units_says_what_its_numbers_are_in():
+    def told(kind, name):
+        law = kind(jnp.asarray(0.4), jnp.asarray(0.05), jnp.asarray(0.02))
+        m = jb.Machine(MASS, STIFFNESS, DAMPING, [jb.PhysicalBelt(0.02, law, 5.0)])
+        path = f"belts[0].friction.{name}"
+        numbers = dict(zip(names_of(m.oscillator), jax.tree.leaves(m.oscillator), strict=True))
+        ours = jb.in_si(fit_of(m.oscillator, **{path: numbers[path]}), m)
+        return float(ours.estimate[0]), str(ours.unit.values[0])
+
+    for name, value, unit in (
+        ("static", 0.4, "1"),
+        ("velocity", 0.05, "m s-1"),
+        ("square", 0.02, "m2 s-2"),
+        ("count", 3.0, "1"),
+    ):
+        assert told(_Powers, name) == (pytest.approx(value, rel=1e-14), unit)
+    with pytest.raises(ValueError, match=r"of what goes with a power of the speed in in_units_of"):
+        told(_Shifted, "velocity")
+
+
 def test_a_picture_of_a_fit_in_si():
     """Two quantities on one axis have no common unit: they stay as they are."""
     m = machine()

@@ -87,11 +87,11 @@ def check_two_belts(belts: Any) -> None:
 class AbstractCondition(eqx.Module):
     """What is to happen at a bifurcation point."""
 
-    #: What is said of a point in a diagram, with {belt} for the number of the belt. A kind that
-    #: points are named by has this and a line; what is `sought` for a family needs neither.
-    caption: ClassVar[str]
-    #: How its curves are drawn.
-    line: ClassVar[Line]
+    #: What is said of a point in a diagram, with {belt} for the number of the belt; "": the name of
+    #: the class.
+    caption: ClassVar[str] = ""
+    #: How its curves are drawn; with the name of the class where its name is "".
+    line: ClassVar[Line] = Line("", "black", (0, (1, 1)))
     #: The name of what stays the same along a curve on which the kind changes; "": its own.
     family: ClassVar[str] = ""
     #: Whether orbits beside a point are slow to settle, so that it is seen from farther off only.
@@ -131,7 +131,8 @@ class AbstractCondition(eqx.Module):
     @property
     def words(self) -> str:
         """What is said of a point in a diagram."""
-        return self.caption.format(belt=" ".join(map(str, self.belts_concerned)))
+        caption = self.caption or type(self).__name__
+        return caption.format(belt=" ".join(map(str, self.belts_concerned)))
 
     @property
     def sought(self) -> "AbstractCondition":
@@ -155,8 +156,9 @@ class AbstractCondition(eqx.Module):
         belts = [vars(self)["belt"]] if "belt" in vars(self) else self.belts_concerned
         for belt in belts:
             check_belt(belt, len(osc.belts))
-        plain = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(self))
-        require(plain, "condition", "made of plain numbers", self)
+        leaves = jax.tree.leaves(self)
+        plain = all(isinstance(leaf, int | float) and np.isfinite(leaf) for leaf in leaves)
+        require(plain, "condition", "made of plain finite numbers", self)
 
     def as_data(self) -> Any:
         """The same with arrays for its numbers, as compiled programs take it."""

@@ -6,17 +6,19 @@ a given value is a `CycleEquation`, for which a class with one method will do.
 """
 
 import abc
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..cycles.chains import Chain, Loop, cut
+from ..checks import require, traceable
+from ..cycles.chains import SIZES, Chain, Loop, cut
 from ..cycles.cycle import Cycle, cycle_of
-from ..cycles.shooting import meshed
+from ..cycles.shooting import ARC_STEPS, meshed
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..numerics.compiling import jit
@@ -96,6 +98,27 @@ class CycleEquation(AbstractCycleCondition):
 
         The rows that `chain.used` does not name are padding, with a duration of zero.
         """
+
+    def check(self, osc):
+        super().check(osc)
+        kind, arcs = type(self).__name__, SIZES[0]
+        field = f"equation of {kind}"
+
+        def shaped(*shape: int, dtype: Any = float) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct(shape, dtype)
+
+        def equation(osc: Oscillator, z: Array, *columns: Array) -> Array:
+            return data.equation(osc, Chain(*columns), z)
+
+        def value() -> Any:
+            columns = shaped(arcs, len(osc.belts)), shaped(arcs, dtype=int), shaped(arcs, ARC_STEPS)
+            return jax.eval_shape(equation, osc, shaped(arcs, 3), *columns)
+
+        data = self.as_data()
+        found = traceable(value, field, "a function of the oscillator, the chain and the unknowns")
+        fits = isinstance(found, jax.ShapeDtypeStruct) and found.shape == ()
+        fits = fits and found.dtype == jnp.float64
+        require(fits, field, "a function that returns one float64", found)
 
     def judge(self, osc: Oscillator, z: Array, cycle: Cycle, slope: Array) -> tuple[Array, Array]:
         """As `CycleSystem.judge`."""

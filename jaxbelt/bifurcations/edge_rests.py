@@ -354,7 +354,13 @@ def _edge_rest(osc: Oscillator, belt: int | Array) -> EdgeRest:
     for edge in _edges_of(osc, belt):
         sides = _beside_edge(osc, jnp.stack(edges(osc))[edge])
         cases += [
-            EdgeRest(edge, *map(jnp.asarray, (rightward, limit, kinetic)), jnp.stack(mode.codes))
+            EdgeRest(
+                edge=edge,
+                rightward=jnp.asarray(rightward),
+                limit=jnp.asarray(limit),
+                kinetic=jnp.asarray(kinetic),
+                codes=jnp.stack(mode.codes),
+            )
             for rightward, mode in zip((False, True), sides, strict=True)
             for limit in (-1.0, 1.0)
             for kinetic in (False, True)

@@ -120,7 +120,8 @@ class AbstractEdgeTouch(AbstractCycleCondition):
     def as_data(self):
         # One program serves both kinds.
         numbers = (self.belt, self.wanted, self.farther)
-        return EdgeTouch(*(jnp.asarray(np.array(one)) for one in numbers), self.repels)
+        belt, wanted, farther = (jnp.asarray(np.array(one)) for one in numbers)
+        return EdgeTouch(belt, wanted, farther, self.repels)
 
     def named(self, point):
         if self.repels:

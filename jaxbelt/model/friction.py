@@ -4,7 +4,8 @@ A law is asked two things: `static`, the coefficient that holds a stuck mass, an
 coefficient while it slips. A slip mode keeps the sign of its relative velocity (see `modes`), so
 an integrator or a Newton iteration may ask for a speed slightly below zero; each law therefore
 continues smoothly a little beyond its boundary. A law of your own is a subclass of
-`AbstractFriction` with these two.
+`AbstractFriction` with these two. Laws of this module are not checked as those are: they are taken
+to be smooth, and to be traceable.
 """
 
 import abc

@@ -267,7 +267,8 @@ def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> A
         for rows in _stretches_of(kinds):
             rows = slice(rows.start, min(rows.stop + 1, len(path)))
             line = kinds[rows.start].line
-            style = {"color": line.colour, "linestyle": line.style, "label": line.name}
+            label = line.name or kinds[rows.start].__name__
+            style = {"color": line.colour, "linestyle": line.style, "label": label}
             ax.plot(*path[rows].T, linewidth=1.3, zorder=4, **style)
         for point in curve.special:
             if point.kind not in ("EqualVelocities", "BeltAtRest"):

@@ -1,6 +1,5 @@
 """Sweeps: runs in bulk through the lanes of `kernel`; `sweep` and `basins`.
 
-- `marks`: states that later ones are compared with, to find what repeats;
 - `observers`, `attractor`: what can be asked: final states, a user's reducer, attractors;
 - `moments`, `along`: reducers that see what is between the events, too;
 - `queue`: the compiled loop that fills lanes from a queue of runs; `threads`: a loop on each core;

@@ -172,7 +172,8 @@ def _observer(observe: Any) -> Observer:
     methods = ("init", "update", "finish")
     fits = all(callable(getattr(observe, name, None)) for name in methods)
     fits = fits and not isinstance(observe, type)
-    expected = '"final", "attractor" or an object with init, update, finish'
+    names = ", ".join(f'"{name}"' for name in NAMED)
+    expected = f"{names} or an object with init, update, finish"
     require_value(fits, "observe", expected, observe)
     if hasattr(observe, "at") or hasattr(observe, "rates"):
         checked(getattr(observe, "at", (AtEvents(),)))

@@ -104,7 +104,7 @@ def sweep(
     those of a job array; who ends last finishes the store, in which until then runs that are not
     done have the status and the kind -1, "not_done". progress: whether to show a bar; None: on a
     terminal, when it takes long. audit: share of the runs that are done once more without any
-    shortcut and compared, see `audit` for what is left out; the attributes audited and
+    shortcut and compared, of "final" and "attractor" only; the attributes audited and
     audit_differed say how many, and a warning says so where one differed.
 
     Uses every core (every device, if JAX has others). `ValueError` names the argument that is
