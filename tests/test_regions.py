@@ -166,10 +166,36 @@ def test_a_curve_that_goes_on_as_another_one_is_cut_there():
     x = np.linspace(0.0, 1.0, 51)
     straight = curve_along(np.column_stack([x, 0 * x]))
     bent = curve_along(np.column_stack([x, np.maximum(0.5 - x, 0)]))
-    cut = _without_known(bent, np.array([0.1, 0.4]), [straight], 0.02)
+    cut = _without_known(bent, np.array([0.1, 0.4]), [straight], 0.02, np.ones(2))
     assert cut.ends == (Stop.LEFT_SPAN, Stop.STOPPED)
     assert np.array_equal(cut.values, bent.values[: len(cut)])
     assert 0.46 <= cut.values[-1, 0] <= 0.5
     # Curves that only cross, or are of other cycles, stay whole.
     across = curve_along(np.column_stack([x, x - 0.5]))
-    assert _without_known(across, np.array([0.9, 0.4]), [straight], 0.02) is across
+    assert _without_known(across, np.array([0.9, 0.4]), [straight], 0.02, np.ones(2)) is across
+
+
+@pytest.mark.slow(first=True)
+def test_a_map_is_the_same_in_other_units():
+    """Points of one kind on two curves are two, too, where the other axis is much longer."""
+    nu0, steepness = np.linspace(0.21, 0.345, 4), np.linspace(38.0, 60.0, 3)
+
+    def steep(nu0, steepness):
+        law = jb.Conti(1.0, 0.6, steepness)
+        return jb.Oscillator(0.5, (jb.Belt(nu0, law), jb.Belt(0.35, law)))
+
+    def scaled(nu0, q):
+        return steep(nu0, 128 * q)
+
+    one = jb.region_map(steep, {"nu0": nu0, "steepness": steepness}, lines=1, step=0.05)
+    other = jb.region_map(scaled, {"nu0": nu0, "q": steepness / 128}, lines=1, step=0.05)
+    assert np.array_equal(one.label, other.label)
+
+    def told(map_, unit):
+        curves = [(curve, np.sort(curve.values[[0, -1]] / [1, unit], 0)) for curve in map_.curves]
+        return sorted((repr(curve.condition), *np.round(ends, 6).flat) for curve, ends in curves)
+
+    ours, theirs = told(one, 1), told(other, 1 / 128)
+    assert len(ours) == 2 and [a[0] for a in ours] == [b[0] for b in theirs]
+    for a, b in zip(ours, theirs, strict=True):
+        assert a[1:] == pytest.approx(b[1:], abs=2e-2)

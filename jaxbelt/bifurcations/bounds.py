@@ -52,16 +52,17 @@ class Bounds:
     """The curves in a plane, found so far.
 
     variation: of both parameters; values: of each, increasing; step: between the points of curves,
-    in units of the larger side / 1.4.
+    with both sides as long as 1.4.
     """
 
     def __init__(self, variation: Variation, values: Sequence[np.ndarray], step: float):
         self.variation, self.values = variation, values
         self.limits = np.array([(float(along[0]), float(along[-1])) for along in values])
-        self.step = step * float(np.max(self.limits[:, 1] - self.limits[:, 0])) / 1.4
+        self.step = step
+        #: What is 1 where distances are taken, of each parameter.
+        self.unit = np.ptp(self.limits, axis=1) / 1.4
         #: The mean size of a cell.
-        self.cell = np.array([np.ptp(ends) for ends in self.limits])
-        self.cell = self.cell / [len(along) - 1 for along in values]
+        self.cell = np.ptp(self.limits, axis=1) / [len(along) - 1 for along in values]
         self.curves: list[BifurcationCurve] = []
 
     def search_lines(self, lines: int) -> None:
@@ -115,7 +116,7 @@ class Bounds:
             others = [other for other in self.curves if other is not curve]
             known = [point for other in others for point in other.special]
             for end in (0, -1):
-                if (point := _meeting_at_end(curve, end, known, self.step)) is not None:
+                if (point := _meeting_at_end(curve, end, known, self.step, self.unit)) is not None:
                     where = (point, *curve.special) if end == 0 else (*curve.special, point)
                     curve = replace(curve, special=where)
             self.curves[number] = curve
@@ -136,13 +137,12 @@ class Bounds:
             pair = np.empty(2)
             pair[along], pair[1 - along] = float(point.value), fixed
             if point.status == Status.OK and not any(
-                _lies_on(point, pair, curve, self.step) for curve in self.curves
+                _lies_on(point, pair, curve, self.step, self.unit) for curve in self.curves
             ):
                 # As `step`, in the units in which curves are followed.
-                sides = np.ptp(self.limits, axis=1)
-                step = self.step * np.max(sides / self.variation.family(pair).units) / np.max(sides)
+                step = self.step * np.max(self.unit / self.variation.family(pair).units)
                 curve = follow_point(self.variation, point, pair, self.limits, step=float(step))
-                self.curves.append(_without_known(curve, pair, self.curves, self.step))
+                self.curves.append(_without_known(curve, pair, self.curves, self.step, self.unit))
 
     def away(self, rows: np.ndarray) -> np.ndarray:
         """How far from the way between the two cells the next curve passes, in cells, [pairs]."""
@@ -188,15 +188,19 @@ def _alike(rows: np.ndarray, at: int, motions: np.ndarray) -> np.ndarray:
 
 
 def _without_known(
-    curve: BifurcationCurve, start: np.ndarray, known: Sequence[BifurcationCurve], step: float
+    curve: BifurcationCurve,
+    start: np.ndarray,
+    known: Sequence[BifurcationCurve],
+    step: float,
+    unit: np.ndarray,
 ) -> BifurcationCurve:
     """The part of a curve, around where it began, that is on no other one: where curves of one kind
     meet in a point of codimension two, they may go on as one."""
     doubled = np.zeros(len(curve), bool)
     for other in known:
         if other.condition.lineage == curve.condition.lineage and len(other) > 1:
-            doubled |= _rows_on(curve, other, 0.02 * step)
-    begun = int(np.argmin(np.hypot(*(curve.values - start).T)))
+            doubled |= _rows_on(curve, other, 0.02 * step, unit)
+    begun = int(np.argmin(np.hypot(*((curve.values - start) / unit).T)))
     first, last = 0, len(curve) - 1
     # A few rows may be near where two curves cross.
     for row in range(begun, -1, -1):
@@ -210,12 +214,14 @@ def _without_known(
     return _shortened(curve, first, last)
 
 
-def _rows_on(curve: BifurcationCurve, other: BifurcationCurve, near: float) -> np.ndarray:
+def _rows_on(
+    curve: BifurcationCurve, other: BifurcationCurve, near: float, unit: np.ndarray
+) -> np.ndarray:
     """Which rows of a curve are on another one, in the same place, [rows]."""
-    path, found = other.path, np.zeros(len(curve), bool)
-    for row, (at, place) in enumerate(zip(curve.values, curve.places, strict=True)):
+    path, rows, found = other.path / unit, other.values / unit, np.zeros(len(curve), bool)
+    for row, (at, place) in enumerate(zip(curve.values / unit, curve.places, strict=True)):
         away, _ = _from_chords(at, path)
-        there = other.places[int(np.argmin(np.hypot(*(other.values - at).T)))]
+        there = other.places[int(np.argmin(np.hypot(*(rows - at).T)))]
         found[row] = np.min(away) < near and not is_elsewhere(place, there, SAME_PLACE)
     return found
 
@@ -258,7 +264,11 @@ def _shortened(curve: BifurcationCurve, first: int, last: int) -> BifurcationCur
 
 
 def _meeting_at_end(
-    curve: BifurcationCurve, end: int, known: Sequence[SpecialPoint], step: float
+    curve: BifurcationCurve,
+    end: int,
+    known: Sequence[SpecialPoint],
+    step: float,
+    unit: np.ndarray,
 ) -> SpecialPoint | None:
     """The point, of those known, in which a curve ends at its first row, 0, or its last one, -1, if
     it stops there for no reason that is known.
@@ -267,7 +277,8 @@ def _meeting_at_end(
     """
     if curve.ends[end] in (Stop.LEFT_SPAN, Stop.CLOSED) or curve.is_named(end):
         return None
-    rows = curve.values[:END_ROWS] if end == 0 else curve.values[::-1][:END_ROWS]
+    values = curve.values / unit
+    rows = values[:END_ROWS] if end == 0 else values[::-1][:END_ROWS]
     gone = np.append(0.0, np.cumsum(np.hypot(*np.diff(rows, axis=0).T)))
     degree = min(2, len(rows) - 1)
     # Where it was cut it may have gone a little beyond.
@@ -276,18 +287,25 @@ def _meeting_at_end(
     path = np.column_stack([np.polyval(fit, ahead) for fit in fits])
     found = []
     for point in known:
-        gap = float(np.hypot(*(point.values - rows[0])))
-        miss = float(np.min(np.hypot(*(path - point.values).T)))
+        at = np.array(point.values) / unit
+        gap = float(np.hypot(*(at - rows[0])))
+        miss = float(np.min(np.hypot(*(path - at).T)))
         if gap < MEETS * step and miss < MISSES * max(gap, 0.1 * step):
             found.append((gap, point))
     return min(found, key=lambda one: one[0])[1] if found else None
 
 
-def _lies_on(point: BifurcationPoint, at: np.ndarray, curve: BifurcationCurve, step: float) -> bool:
+def _lies_on(
+    point: BifurcationPoint,
+    at: np.ndarray,
+    curve: BifurcationCurve,
+    step: float,
+    unit: np.ndarray,
+) -> bool:
     """Whether a point is on a curve that is known."""
     if point.condition.lineage != curve.condition.lineage:
         return False
-    away, along = _from_chords(at, curve.values)
+    away, along = _from_chords(at / unit, curve.values / unit)
     places = curve.places[:-1] + along[:, None] * np.diff(curve.places, axis=0)
     own = point.place
     return any(
