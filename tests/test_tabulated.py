@@ -212,3 +212,19 @@ def test_a_search_tells_of_it_once():
         with pytest.warns(UserWarning, match="2.11 times the speed") as told:
             search()
         assert len(told) == 1
+
+
+@pytest.mark.slow(first=True)
+def test_diagrams_and_portraits_tell_of_it_once():
+    table = jb.Tabulated((0.0, 0.02, 0.05, 0.1, 0.2, 0.4), (0.55, 0.48, 0.41, 0.36, 0.34, 0.35))
+
+    def make(velocity):
+        return jb.Machine(2.0, 800.0, 3.0, (jb.PhysicalBelt(velocity, table, 30.0),)).oscillator
+
+    for call in (
+        lambda: jb.portrait(make(0.3)),
+        lambda: jb.bifurcation_diagram(make, span=(0.28, 0.3), rows=9, resolution=4),
+    ):
+        with pytest.warns(UserWarning, match="1.59 times the speed") as told:
+            call()
+        assert len(told) == 1

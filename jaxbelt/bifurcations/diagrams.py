@@ -23,7 +23,7 @@ import numpy as np
 from ..activity import announced, tell
 from ..checks import as_whole, outside_of_traces, require
 from ..cycles.chains import Loop, cut
-from ..cycles.cycle import Cycle, exactly, polish
+from ..cycles.cycle import Cycle, exactly, polish, warn_of_fast_loops
 from ..model.equilibria import candidates
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator
@@ -218,6 +218,10 @@ def bifurcation_diagram(
         at = [float(point.value) for point in found if point.status == Status.OK]
         nodes[stretch] = np.sort(np.append(nodes[stretch], at))
     path.look(np.concatenate(nodes))
+    if any(np.all(np.isfinite(belt.friction.measured_to)) for belt in path.at(path.first).belts):
+        loops = ((path.at(v), one.loop) for v, found in path.cycles.items() for one in found)
+        fast = ((osc, loop, np.asarray(loop.entries)[:, 1]) for osc, loop in loops)
+        warn_of_fast_loops(fast, depth=5)
     pieces = [*_equilibrium_pieces(path, nodes), *_cycle_pieces(path, nodes, labels)]
     names = [region_name(path.at(v), label) for v, label in zip(middles, labels, strict=True)]
     return BifurcationDiagram(

@@ -358,15 +358,21 @@ def warn_of_extrapolation(cycles: Iterable[Cycle], depth: int = 4) -> None:
 
     depth: the `stacklevel` of who called the entry that asks.
     """
+    known = (one for one in cycles if is_concrete(one) and int(one.status) == Status.OK)
+    loops = ((one.oscillator, one.chain, np.asarray(one.unknowns)[:, 1]) for one in known)
+    warn_of_fast_loops(loops, depth + 1)
+
+
+def warn_of_fast_loops(
+    loops: Iterable[tuple[Oscillator, Chain | Loop, np.ndarray]], depth: int
+) -> None:
+    """The same for loops of oscillators, with x2 at the entry of each arc, [arcs]."""
     worst, belt = 1.0, 0
-    for cycle in cycles:
-        if not is_concrete(cycle) or int(cycle.status) != Status.OK:
-            continue
-        ends = [float(np.asarray(one.friction.measured_to)) for one in cycle.oscillator.belts]
+    for osc, loop, x2 in loops:
+        ends = [float(np.asarray(one.friction.measured_to)) for one in osc.belts]
         if np.all(np.isinf(ends)):
             continue
-        x2 = np.asarray(cycle.unknowns)[:, 1]
-        slips = _slip_speeds(cycle.oscillator, modes_of(cycle.chain), x2)
+        slips = _slip_speeds(osc, modes_of(loop), x2)
         for index, (speeds, end) in enumerate(zip(slips, ends, strict=True)):
             part = float(np.max(speeds, initial=0.0)) / end
             worst, belt = (part, index) if part > worst else (worst, belt)

@@ -24,7 +24,7 @@ from ..model.modes import edges
 from ..model.oscillator import Oscillator, check_oscillator
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .cycle import Cycle
+from .cycle import Cycle, warn_of_extrapolation
 from .returns import Returns, reach_of
 from .separatrices import Separatrix, TracedSeparatrix, branches
 
@@ -167,6 +167,7 @@ def portrait(osc: Oscillator) -> Portrait:
     map_ = Returns(osc, rests, reach, [top for branch in found for top in branch.tops[:2].tolist()])
     cycles = tuple(cycle for cycle in map_.cycles if abs(float(cycle.multiplier)) < 1)
     unstable = tuple(cycle for cycle in map_.cycles if float(cycle.multiplier) > 1)
+    warn_of_extrapolation((*cycles, *unstable), depth=5)
     gaps = np.array(sorted(map_.gaps)).reshape(-1, 2)
     separatrices = tuple(
         _named(branch, map_, points, unstable if branch.stable else cycles) for branch in found
