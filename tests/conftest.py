@@ -1,9 +1,11 @@
 """What every test runs under: float64, JAX's strict promotion rules, checked annotations."""
 
+import ctypes
 import gc
 import os
 import random
 import time
+from pathlib import Path
 
 import pytest
 
@@ -22,6 +24,11 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 gc.set_threshold(200_000, 20, 100)
 
 START = time.monotonic()
+
+#: Memory from which on a worker drops its compiled programs, in bytes; those that are asked again
+#: come from the cache on disk. A hundred long tests would take three times as much. On Linux alone.
+MUCH_MEMORY = 4e9
+STATM = Path("/proc/self/statm")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -49,6 +56,19 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     minutes = item.config.getoption("minutes")
     if minutes is not None and time.monotonic() - START > 60 * minutes:
         pytest.skip(f"not begun after {minutes:g} minutes")
+
+
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Drops compiled programs between files, where they have become many."""
+    ends = nextitem is None or nextitem.path != item.path
+    if ends and STATM.exists():
+        pages = int(STATM.read_text().split()[1])
+        if pages * os.sysconf("SC_PAGE_SIZE") > MUCH_MEMORY:
+            jax.clear_caches()
+            gc.collect()
+            # What is free goes back to the system only when glibc is asked for that.
+            if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+                trim(0)
 
 
 def pytest_configure(config: pytest.Config) -> None:
