@@ -201,7 +201,7 @@ def test_a_mode_that_does_not_last_is_none(velocity):
     osc = Oscillator(0.1, (left, right), omega=2.0)
     (cycle,) = paths.label_of(osc, [(3.0, 0.0)]).cycles
     found = jb.find_cycle(package.oscillator(osc), (3.0, 0.0))
-    assert cycle.modes == itinerary(found.oscillator, found.chain)
+    assert cycle.modes == itinerary(found.oscillator, found)
     assert cycle.modes == ((0, -1), (2, -1), (2, 0), (1, 0), (1, -2), (1, -1))
 
 

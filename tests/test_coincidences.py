@@ -10,6 +10,7 @@ import oracle_cycles
 import pytest
 
 import jaxbelt as jb
+from jaxbelt.cycles.attractors import itinerary
 from jaxbelt.kernel.marks import Mark, code_of
 from jaxbelt.results import Status
 from jaxbelt.sweeps import threads
@@ -316,3 +317,33 @@ def test_belts_that_change_places_where_a_cycle_sticks_to_both():
     for found in (point, *(jb.refine(point.condition, make, at=v) for v in (-0.551, -0.549))):
         assert found.value == pytest.approx(-0.55, abs=1e-13)
         assert found.cycle.period == pytest.approx(period, abs=1e-10)
+
+
+def test_a_corner_at_a_value_that_the_search_looks_at():
+    """Slip onset on belt 1 is on its edge just where the belts run against each other, at -0.45,
+    a round part of the span."""
+
+    def make(velocity):
+        belts = (
+            jb.Belt(0.45, jb.Stribeck(0.5, 0.4, 0.4), 2.0),
+            jb.Belt(velocity, jb.Conti(0.8, 0.32, 1.0), 2.0, lower=-0.66642015508763, upper=0.5),
+        )
+        return jb.Oscillator(0.25, belts)
+
+    points = jb.scan(make, span=(-0.55, -0.35))
+    assert [point.condition for point in points] == [jb.CornerCollision(1)] * 2
+    assert points[1].value == pytest.approx(-0.45, abs=1e-12)
+
+
+def test_a_stick_phase_that_ends_on_an_edge_and_by_slip_onset():
+    """Which comes first is rounding, and no mode of a cycle: it repeats at the same values."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(residual):
+        other = jb.Conti(1.0, residual, 10.0)
+        belts = jb.Belt(-0.6, law, 1.5, lower=-1.47, upper=0.15), jb.Belt(-0.6, other, 1.5)
+        return jb.Oscillator(0.05, belts)
+
+    for residual in (0.553149166667, 0.6):
+        cycle = jb.find_cycle(make(residual), (-1.0, 0.0))
+        assert itinerary(cycle.oscillator, cycle) == ((-2, -1), (-1, -1), (0, 0))

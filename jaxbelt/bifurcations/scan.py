@@ -174,7 +174,7 @@ def edges_touched(
         return path.unstable(value, around)
 
     def modes(value):
-        return itinerary(path.at(value), unstable(value).chain)
+        return itinerary(path.at(value), unstable(value))
 
     def changes(values):
         known = [v for v in map(float, values) if unstable(v).status == Status.OK]
@@ -286,7 +286,8 @@ def _all_found(
     for value in condition.values(a, b):
         for one in condition.beginnings(path.at(value), path.cycles.get(value, [])):
             point = condition.found_from(path.variation, value, one)
-            if point is not None and low <= point.value <= high:
+            # At a value that was looked at it lies, up to rounding, on either side of that.
+            if point is not None and low - point.error <= point.value <= high + point.error:
                 yield point
 
 

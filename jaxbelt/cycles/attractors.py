@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 #: The modes of one loop, contact codes of all belts each, from the least of their orders on.
 Itinerary = tuple[tuple[int, ...], ...]
+#: An arc that takes no longer is there by rounding: those between two events at one place take
+#: 1e-26, and where a bifurcation is narrowed to 1e-9 of a span some 1e-9.
+MOMENT = 1e-13
 #: Places of one cycle that shooting solved for differ by less, relative to its size: its equations
 #: hold to 1e-9, and beside a fold a cycle moves by ten thousand times that.
 SOLVED = 1e-5
@@ -39,9 +42,12 @@ RUN = 1e3
 APART = 1e-2
 
 
-def itinerary(osc: Oscillator, loop: Chain | Loop) -> Itinerary:
-    """The modes of one loop in order, wherever it was begun."""
-    modes = without_idle(osc, modes_of(loop))
+def itinerary(osc: Oscillator, loop: Cycle | Loop) -> Itinerary:
+    """The modes of one loop in order, wherever it was begun, but for those that take no time: where
+    slip onset lies on an edge rounding tells which comes first."""
+    chain, rows = arcs_of(loop)
+    modes, lasts = modes_of(chain), rows[:, 2] > MOMENT
+    modes = without_idle(osc, modes[lasts] if np.any(lasts) else modes)
     changes = [
         tuple(mode.tolist())
         for before, mode in zip(np.roll(modes, 1, axis=0), modes, strict=True)
@@ -68,12 +74,16 @@ def stuck_belts(path: Itinerary) -> frozenset[int]:
 
 def place_of(cycle: Cycle | Loop) -> np.ndarray:
     """Where a cycle is: smallest and largest x1, smallest and largest x2, period."""
+    return extent(arcs_of(cycle)[1])
+
+
+def arcs_of(cycle: Cycle | Loop) -> tuple[Chain | Loop, np.ndarray]:
+    """The arcs of a cycle, and (x1, x2, T) of those that are used, [arcs, 3]."""
     if isinstance(cycle, Cycle):
         loop, rows = cycle.chain, np.asarray(cycle.unknowns)
     else:
         loop, rows = cycle, np.column_stack([cycle.entries, cycle.durations])
-    used = np.asarray(loop.ends) != Ends(loop.codes.shape[-1]).unused
-    return extent(rows[used])
+    return loop, rows[np.asarray(loop.ends) != Ends(loop.codes.shape[-1]).unused]
 
 
 def extent(rows: np.ndarray) -> np.ndarray:
@@ -92,7 +102,7 @@ def is_same(cycle: Cycle, other: Cycle, tolerance: float = SOLVED) -> bool:
     """Whether two cycles of one oscillator are one; both with status OK."""
     if int(cycle.status) != Status.OK or int(other.status) != Status.OK:
         return False
-    modes, others = (itinerary(one.oscillator, one.chain) for one in (cycle, other))
+    modes, others = (itinerary(one.oscillator, one) for one in (cycle, other))
     return modes == others and apart(place_of(cycle), place_of(other)) < tolerance
 
 
