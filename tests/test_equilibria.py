@@ -515,6 +515,17 @@ def test_a_segment_attracts_from_beyond_an_edge_that_pushes_back(velocity, retur
     assert (0.3 <= way * end <= 0.5) == returns
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_fixed_point_at_the_end_of_a_segment_is_that(mirrored):
+    """No belt touches to the left of 0, where the spring is at rest, and one at rest holds from
+    there on: what comes to rest at 0 is held."""
+    side = {"upper": 0.0} if mirrored else {"lower": 0.0}
+    osc = jb.Oscillator(0.25, (jb.Belt(0.0, jb.Conti(1.0, 0.6, 10.0), **side),))
+    points = jb.equilibria(osc)
+    assert points.kind.tolist() == [SEGMENT]
+    assert sorted([abs(points.x1_lower[0]), abs(points.x1_upper[0])]) == [0.0, 1.0]
+
+
 def test_derivatives_of_the_ends_of_a_segment():
     def ends(static, load, nu, edge):
         law = jb.Conti(static, 0.6, 10.0)

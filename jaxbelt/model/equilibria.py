@@ -227,6 +227,9 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
 
     possible = has_possible_numbers(osc)
     is_fixed = possible & (held == 0) & (lower <= pull) & (pull <= upper) & (lower < upper)
+    # On an edge beyond which belts at rest hold the mass it is the end of that segment.
+    is_fixed &= ~((pull == lower) & _beyond(osc, lower, rightward=False)[0].any_stuck)
+    is_fixed &= ~((pull == upper) & _beyond(osc, upper, rightward=True)[0].any_stuck)
     first, last = jnp.maximum(pull - held, lower), jnp.minimum(pull + held, upper)
     is_segment = possible & (held > 0) & (first < last)
     exists = is_fixed | is_segment
@@ -260,11 +263,17 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
 
 def _pushes_back(osc: Oscillator, edge: Array, *, rightward: bool) -> Array:
     """Whether the side of an edge that is given pushes a mass that slips there back to the edge."""
+    mode, pull = _beyond(osc, edge, rightward=rightward)
+    push = -pull if rightward else pull
+    return jnp.isfinite(edge) & ~mode.any_stuck & (push > 0)
+
+
+def _beyond(osc: Oscillator, edge: Array, *, rightward: bool) -> tuple[Mode, Array]:
+    """The mode at rest on a side of an edge, and x2' there; of an infinite edge that of 0."""
     x1 = jnp.where(jnp.isfinite(edge), edge, 0.0)
     rest = jnp.zeros_like(x1)
     mode = settle(osc, contact(osc, x1, rest, rightward=rightward), x1, rest)
-    push = mode_acceleration(osc, mode, x1, rest) * (-1.0 if rightward else 1.0)
-    return jnp.isfinite(edge) & ~mode.any_stuck & (push > 0)
+    return mode, mode_acceleration(osc, mode, x1, rest)
 
 
 def _codes(mode: Mode, exists: Array) -> Array:

@@ -251,7 +251,9 @@ def equilibria(osc: engine.Oscillator) -> tuple:
     ends = sorted({x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)})
     zones = list(pairwise([-inf, *ends, inf]))
     rows = [_rest_in_zone(osc, table, *zone) for zone in zones]
-    found = [row for row in rows if row is not None]
+    held_at = {end for zone in zones for end in _segment(osc, table, zone)}
+    # A fixed point on an edge to which a segment reaches is the end of that.
+    found = [row for row in rows if row and not (row[1] == 1 and row[0] in held_at)]
     for edge, left, right in zip(ends, zones, zones[1:], strict=False):
         row = _rest_on_edge(osc, table, edge, left, right)
         if row is not None:
@@ -277,6 +279,13 @@ def _side(osc, table, zone):
             slope = (engine.mu(row, speed + h) - engine.mu(row, speed - h)) / (2 * h)
             trace -= osc.omega * belt.load * slope
     return codes, pull, held, rubs, trace
+
+
+def _segment(osc, table, zone):
+    """The ends of the segment on which belts at rest hold the mass in a zone; (): there is none."""
+    _, pull, held, *_ = _side(osc, table, zone)
+    first, last = max(pull - held, zone[0]), min(pull + held, zone[1])
+    return (first, last) if first < last else ()
 
 
 def _rest_in_zone(osc, table, lower, upper):
