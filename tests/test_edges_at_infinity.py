@@ -156,7 +156,7 @@ def test_of_a_cycle():
 def test_of_a_nonsmooth_fold():
     """By V, the velocity of the first belt in m/s."""
 
-    def fold(p, at=0.04):
+    def fold(p, at=0.095):
         point = jb.refine(jb.NonsmoothFold(0), lambda V: machine(p, V).oscillator, at=at)
         return point.value
 
@@ -167,7 +167,7 @@ def test_of_a_nonsmooth_fold():
     ours = fold(AT)
     assert float(ours) == pytest.approx(theirs(AT), rel=1e-9)
     expected = by_differences(theirs)
-    near = functools.partial(fold, at=1.02 * float(ours))  # from 0.04 it is bracketed first
+    near = functools.partial(fold, at=1.02 * float(ours))
     assert jax.grad(near)(AT) == pytest.approx(expected, rel=TOLERANCE)
     rows = jax.jit(jax.vmap(jax.jacfwd(near)))(AT[None])
     assert rows[0] == pytest.approx(expected, rel=TOLERANCE)
