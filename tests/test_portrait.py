@@ -379,3 +379,49 @@ def test_a_fixed_point_and_a_saddle_that_are_one_are_not_told_apart():
     assert told.status == jb.Status.INCOMPLETE
     (one,) = [s for s in told.separatrices if s.stable and s.end == "unsettled"]
     assert float(one.point[0]) == edge
+
+
+def test_a_cycle_with_its_top_on_a_belt_at_rest_has_its_multiplier():
+    """There the friction of the belt changes its sign, and x2' by a factor."""
+    law = ("conti", 0.5, 0.25, 2.0, 0.0)
+    edge = 0.85869565217391
+    belts = engine.Belt(0.65, law, 1.0, -np.inf, edge), engine.Belt(0.0, law, 1.0, edge, np.inf)
+    osc = engine.Oscillator(0.1, belts)
+    told = jb.portrait(package.oscillator(osc))
+    (cycle,) = told.cycles
+    assert told.status == jb.Status.OK and len(told.unstable) == 1
+    top, period = float(cycle.x1_max), float(cycle.period)
+    assert top > edge
+
+    def top_after(x1):
+        run = engine.simulate(osc, (x1, 0.0), 1.5 * period)
+        at = (run.t > 0.5 * period) & (np.abs(run.y[:, 1]) < 1e-9) & (run.y[:, 0] > edge)
+        return run.y[at, 0][0]
+
+    slope = (top_after(top + 1e-6) - top_after(top - 1e-6)) / 2e-6
+    assert float(cycle.multiplier) == pytest.approx(slope, rel=1e-6)
+    found = jb.find_cycle(package.oscillator(osc), (3.0, 0.0))
+    assert float(found.multiplier) == pytest.approx(float(cycle.multiplier), rel=1e-9)
+
+
+def test_one_top_is_not_two_where_two_belts_at_rest_touch():
+    """Rounding made two arcs end in it, of which the second was taken for a loop that repeats."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+    told = jb.portrait(jb.Oscillator(0.1, (jb.Belt(0.0, law, lower=0.7), jb.Belt(0.0, law))))
+    assert told.status == jb.Status.OK and len(told.separatrices) == 2
+    for one in told.separatrices:
+        assert one.end == "outside" and np.max(np.abs(np.asarray(one.ys))) > told.reach
+
+
+def test_rounding_beside_a_pseudo_focus_is_no_gap():
+    laws = (
+        jb.Conti(1.24132057137, 1.14210672961, 14.2554871992),
+        jb.Conti(1.22484183836, 1.13191091395, 8.8225063106, 0.120664234962),
+    )
+    edge = -1.42790547637
+    belts = (
+        jb.Belt(1.17304874713, laws[0], 0.581673761753, upper=edge),
+        jb.Belt(-0.336211567652, laws[1], 1.22149573949, lower=edge),
+    )
+    told = jb.portrait(jb.Oscillator(0.077586547912, belts))
+    assert told.status == jb.Status.OK and not len(told.gaps)

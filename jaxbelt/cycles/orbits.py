@@ -114,11 +114,12 @@ def _next_arc(
         same = same & jnp.all(orbit.codes == codes[None], axis=-1)
         return jnp.max(jnp.where(same, jnp.arange(orbit.tops.size), -1))
 
-    # Nothing repeats where the arc ends in no top, which is NaN.
-    repeats = lax.cond(any_lane(is_top), repeated, lambda: jnp.asarray(-1))
-    shrinks = amplitude < orbit.top_before - orbit.low_before
     # Two arcs that both end at one top are no loop.
     loops = amplitude > force_rounding(y_end[0])
+    # Nothing repeats where the arc ends in no top, which is NaN.
+    repeats = lax.cond(any_lane(is_top), repeated, lambda: jnp.asarray(-1))
+    repeats = jnp.where(loops, repeats, -1)
+    shrinks = amplitude < orbit.top_before - orbit.low_before
     # An orbit that sticks is on a cycle, however small: it repeats exactly.
     # Around a pseudo-focus a loop is as wide as its velocity squared.
     repelled = jnp.any((orbit.low <= orbit.repellers) & (orbit.repellers <= y_end[0]))

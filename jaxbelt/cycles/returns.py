@@ -27,7 +27,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import pick
-from ..model.equilibria import Equilibria
+from ..model.equilibria import Equilibria, EquilibriumKind
 from ..model.far_out import contraction_far_out, is_bounded
 from ..model.modes import edges, mode_acceleration, settle
 from ..model.oscillator import Oscillator
@@ -55,6 +55,9 @@ CLOSEST = 1e-10
 #: Cycles around a pseudo-focus are looked for down to this width; their height is larger. Of tops
 #: that are nearer to the edge than that rounding says whether loops grow: they leave no gap.
 AT_FOCUS = 1e-7
+#: So far to both sides, over the distance from where its interval begins, it is seen whether a
+#: narrow gap is one of rounding.
+BESIDE = 0.3
 #: Tops at most, in search of all cycles.
 MOST_TOPS = 20_000
 #: Tops that return to themselves to this fraction do so up to the errors of orbits.
@@ -142,10 +145,7 @@ class Returns:
         for low, high in self.intervals:
             self._search(low, high)
         self.cycles = self._solved()
-        at_edges = [low for low, _ in self.intervals if low in self._edges]
-        self.gaps = [
-            gap for gap in self.gaps if not any(0 <= gap[1] - low < AT_FOCUS for low in at_edges)
-        ]
+        self.gaps = [gap for gap in self.gaps if not self._is_rounding(gap, rests)]
         outermost = self.intervals[-1][1]
         grows, bounded = bool(self(np.array([outermost]))[0] > outermost), bool(is_bounded(osc))
         self.escapes = grows and not bounded
@@ -169,6 +169,27 @@ class Returns:
             tops.append(np.asarray(after)[: len(batch)])
             loops.append(ways)
         return np.concatenate(tops), loops
+
+    def _is_rounding(self, gap: tuple[float, float], rests: Equilibria) -> bool:
+        """Whether no cycle passes a gap: the map changes its sign there by rounding.
+
+        So it is next to the edge from which an interval begins; at the edge where one ends; and
+        where a gap is as narrow as rounding, but loops grow within it as they do outside.
+        """
+        (low, high), *_ = [*(i for i in self.intervals if i[0] <= gap[0] < i[1]), (np.nan, np.nan)]
+        away, narrow = gap[1] - low, NARROWEST * (1 + abs(gap[1]))
+        at_end = high in self._edges and high - gap[1] < narrow
+        if at_end or (low in self._edges and away < AT_FOCUS):
+            return True
+        if not gap[1] - gap[0] < narrow:
+            return False
+        beside = np.array([gap[0] - BESIDE * away, gap[1] + BESIDE * away])
+        within, outside = self(beside) - beside
+        here = np.asarray(rests.x1) == low
+        if np.any(here & (np.asarray(rests.kind) == EquilibriumKind.PSEUDO_FOCUS)):
+            # That close to it the map is rounding, but its stability is known.
+            within = -1.0 if np.any(here & np.asarray(rests.stable)) else 1.0
+        return bool(within * outside > 0)
 
     def _intervals_of_tops(self, rests: Equilibria) -> list[tuple[float, float]]:
         """The intervals of the axis in which a mass at rest is pulled to the left."""

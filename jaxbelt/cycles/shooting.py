@@ -496,7 +496,9 @@ def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, 
     before_crossing = mode_acceleration(osc, mode_of(codes), last[0], last[1])
     after_crossing = mode_acceleration(osc, mode_of(following), entry[0], entry[1])
     slips = jnp.all(codes != 0) & (unknown[2] != 0)
-    crosses = (end < len(osc.belts)) & jnp.all(following != 0)
+    # The boundary of a belt at rest is passed in an extremum of x1.
+    flips = (end == Ends(len(osc.belts)).extremum_x1) & jnp.any(codes * following == -1)
+    crosses = ((end < len(osc.belts)) | flips) & jnp.all(following != 0)
     ratio = after_crossing / jnp.where(crosses, before_crossing, 1.0)
     growth = jnp.where(slips, jnp.exp(jnp.where(slips, way * after[2], 0.0)), 1.0)
     error = jnp.maximum(jnp.max(jnp.abs(after[:2] - target)), jnp.abs(guard))

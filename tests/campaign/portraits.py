@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbelt as jb
+from jaxbelt.cycles.separatrices import SEPARATRIX_ARCS
 
 from . import engine, package
 from .cases import PAPER, random_case, rational_case, special_positions, structures
@@ -35,6 +36,10 @@ CHORD = 0.02
 TINY, TINY_AT_FOCUS = 1e-5, 1e-7
 #: A fixed point and a saddle as near to each other are one.
 AT_ROUNDING = 1e-12
+#: Multipliers are those of differences to this, but of steeper maps and smaller cycles.
+SLOPE, STEEP, SMALL = 1e-2, 100.0, 1e-2
+#: At a top x2 is zero, up to rounding.
+AT_TOP = 1e-9
 #: Round numbers meet Hopf points: there loops neither grow nor shrink, to any order that shows.
 CENTRE = 1e-12
 #: Time until the engine gives a run up.
@@ -121,7 +126,10 @@ def differences(osc: engine.Oscillator, told: jb.Portrait) -> tuple[list[str], C
     wrong += [
         f"ends within reach: {one}"
         for one in told.separatrices
-        if one.end == "outside" and np.max(np.abs(np.asarray(one.ys))) < told.reach
+        if one.end == "outside"
+        and np.max(np.abs(np.asarray(one.ys))) < told.reach
+        # Of one that was followed as long as any is, loops grow.
+        and one.arcs.ends.size < SEPARATRIX_ARCS
     ]
     ids = np.full((SIDE, SIDE), -1)
     x1s, x2s = (np.linspace(*ends, SIDE) for ends in WINDOW)
@@ -146,6 +154,10 @@ def differences(osc: engine.Oscillator, told: jb.Portrait) -> tuple[list[str], C
     else:
         wrong += _not_parted(told, ids, x1s, x2s)
     wrong += [f"not unstable: {one}" for one in told.unstable if not _repels(osc, one, told)]
+    for one in (*told.cycles, *told.unstable):
+        slope = _slope(osc, one)
+        if not abs(slope - float(one.multiplier)) <= SLOPE * max(1.0, float(one.multiplier)):
+            wrong.append(f"multiplier {one.multiplier} for {slope}: {one}")
     return wrong, aside
 
 
@@ -258,6 +270,24 @@ def _repels(osc: engine.Oscillator, cycle: jb.Cycle, told: jb.Portrait) -> bool:
         if not moved > 1 + 0.3 * min(float(cycle.multiplier) - 1, 1.0):
             return False
     return True
+
+
+def _slope(osc: engine.Oscillator, cycle: jb.Cycle) -> float:
+    """The slope of the map from top to top at a cycle, by differences; that of steep ones, and of
+    small cycles, as it is told: there differences say nothing."""
+    size, multiplier = float(cycle.x1_max - cycle.x1_min), float(cycle.multiplier)
+    if multiplier > STEEP or size < SMALL:
+        return multiplier
+    ends = []
+    for side in (-1e-6, 1e-6):
+        start = float(cycle.x1_max) + side * size, 0.0
+        run = engine.simulate(osc, start, 2 * float(cycle.period), turns=True)
+        # At the boundary of a belt at rest a top is an event of that.
+        late = (run.t > 0.5 * float(cycle.period)) & (np.abs(run.y[:, 1]) < AT_TOP)
+        tops = run.y[late, 0]
+        tops = tops[np.abs(tops - float(cycle.x1_max)) < 1e-3 * size]
+        ends.append(tops[0] if tops.size else np.nan)
+    return float((ends[1] - ends[0]) / (2e-6 * size))
 
 
 def settings(options) -> dict:
