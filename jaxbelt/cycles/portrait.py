@@ -202,6 +202,10 @@ def _named(
 ) -> Separatrix:
     """The separatrix, with where it leads to or comes from; cycles: those that may be that."""
     end, to = _end_of(branch, map_, points, cycles)
+    if branch.stable and end == "equilibrium" and points.stable[to]:
+        # But for rounding none comes from where all ends that is near; of a segment it may.
+        if int(points.kind[to]) != EquilibriumKind.SEGMENT:
+            end, to = "unsettled", -1
     ts, ys = jax.device_put((branch.ts, branch.ys))
     point = jax.device_put(np.array(branch.point))
     return Separatrix(point, branch.side, branch.stable, ts, ys, end, to, branch.arcs)

@@ -57,7 +57,7 @@ CLOSEST = 1e-10
 AT_FOCUS = 1e-7
 #: So far to both sides, over the distance from where its interval begins, it is seen whether a
 #: narrow gap is one of rounding.
-BESIDE = 0.3
+AROUND = 0.3
 #: Tops at most, in search of all cycles.
 MOST_TOPS = 20_000
 #: Tops that return to themselves to this fraction do so up to the errors of orbits.
@@ -183,7 +183,7 @@ class Returns:
             return True
         if not gap[1] - gap[0] < narrow:
             return False
-        beside = np.array([gap[0] - BESIDE * away, gap[1] + BESIDE * away])
+        beside = np.array([gap[0] - AROUND * away, gap[1] + AROUND * away])
         within, outside = self(beside) - beside
         here = np.asarray(rests.x1) == low
         if np.any(here & (np.asarray(rests.kind) == EquilibriumKind.PSEUDO_FOCUS)):

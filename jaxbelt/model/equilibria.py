@@ -228,8 +228,8 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     possible = has_possible_numbers(osc)
     is_fixed = possible & (held == 0) & (lower <= pull) & (pull <= upper) & (lower < upper)
     # On an edge beyond which belts at rest hold the mass it is the end of that segment.
-    is_fixed &= ~((pull == lower) & _beyond(osc, lower, rightward=False)[0].any_stuck)
-    is_fixed &= ~((pull == upper) & _beyond(osc, upper, rightward=True)[0].any_stuck)
+    is_fixed &= ~((pull == lower) & _at_rest_beside(osc, lower, rightward=False)[0].any_stuck)
+    is_fixed &= ~((pull == upper) & _at_rest_beside(osc, upper, rightward=True)[0].any_stuck)
     first, last = jnp.maximum(pull - held, lower), jnp.minimum(pull + held, upper)
     is_segment = possible & (held > 0) & (first < last)
     exists = is_fixed | is_segment
@@ -263,12 +263,12 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
 
 def _pushes_back(osc: Oscillator, edge: Array, *, rightward: bool) -> Array:
     """Whether the side of an edge that is given pushes a mass that slips there back to the edge."""
-    mode, pull = _beyond(osc, edge, rightward=rightward)
+    mode, pull = _at_rest_beside(osc, edge, rightward=rightward)
     push = -pull if rightward else pull
     return jnp.isfinite(edge) & ~mode.any_stuck & (push > 0)
 
 
-def _beyond(osc: Oscillator, edge: Array, *, rightward: bool) -> tuple[Mode, Array]:
+def _at_rest_beside(osc: Oscillator, edge: Array, *, rightward: bool) -> tuple[Mode, Array]:
     """The mode at rest on a side of an edge, and x2' there; of an infinite edge that of 0."""
     x1 = jnp.where(jnp.isfinite(edge), edge, 0.0)
     rest = jnp.zeros_like(x1)
