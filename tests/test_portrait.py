@@ -404,6 +404,24 @@ def test_a_cycle_with_its_top_on_a_belt_at_rest_has_its_multiplier():
     assert float(found.multiplier) == pytest.approx(float(cycle.multiplier), rel=1e-9)
 
 
+def test_an_unstable_cycle_with_its_top_on_a_belt_at_rest_has_its_multiplier():
+    law = ("conti", 0.5, 0.25, 2.0, 0.0)
+    belts = engine.Belt(0.65, law), engine.Belt(0.0, law, 0.05, 0.55)
+    osc = engine.Oscillator(0.1, belts)
+    cycle = jb.unstable_cycle(package.oscillator(osc))
+    assert cycle.status == jb.Status.OK and float(cycle.x1_max) > 0.55
+
+    def top_after(x1):
+        run = engine.simulate(osc, (x1, 0.0), 1.5 * float(cycle.period))
+        at = (run.t > 0.5 * float(cycle.period)) & (np.abs(run.y[:, 1]) < 1e-9)
+        return run.y[at & (run.y[:, 0] > 0.55), 0][0]
+
+    top = float(cycle.x1_max)
+    assert top_after(top) == pytest.approx(top, abs=1e-9)
+    slope = (top_after(top + 1e-6) - top_after(top - 1e-6)) / 2e-6
+    assert float(cycle.multiplier) == pytest.approx(slope, rel=1e-5) and slope > 1.1
+
+
 def test_one_top_is_not_two_where_two_belts_at_rest_touch():
     """Rounding made two arcs end in it, of which the second was taken for a loop that repeats."""
     law = jb.Conti(1.0, 0.6, 10.0)
