@@ -181,9 +181,9 @@ class Returns:
         at_end = high in self._edges and high - gap[1] < narrow
         if at_end or (low in self._edges and away < AT_FOCUS):
             return True
-        if not gap[1] - gap[0] < narrow:
-            return False
         beside = np.array([gap[0] - AROUND * away, gap[1] + AROUND * away])
+        if not (gap[1] - gap[0] < narrow and beside[1] < high):
+            return False
         within, outside = self(beside) - beside
         here = np.asarray(rests.x1) == low
         if np.any(here & (np.asarray(rests.kind) == EquilibriumKind.PSEUDO_FOCUS)):
