@@ -120,10 +120,10 @@ def in_si(
     changes the velocity alone; of both, a distance in the dimensionless plane, it stays as it is.
     Of a basin stability: its `table()`, which has no units. Of a fit: over `parameter`, the names
     in its table, `estimate`, `standard_error`, `lower` and `upper` (the confidence interval of 95
-    per cent), each in the
-    `unit` beside it (a `load` is the normal force), and a parameter of a law of one's own is in
-    the power of m/s that its `in_units_of` tells, or stays as the law has it, with the unit ""; over `t` the fitted motion, `x1` and `x2`, and `x1_residual`
-    and `x2_residual`, datum minus motion. Of a diagram, or of fractions: over `row`, the columns of
+    per cent), each in the `unit` beside it (a `load` is the normal force), and a parameter of a law
+    of one's own is in the power of m/s that its `in_units_of` tells, or stays as the law has it,
+    with the unit ""; over `t` the fitted motion, `x1` and `x2`, and `x1_residual` and
+    `x2_residual`, datum minus motion. Of a diagram, or of fractions: over `row`, the columns of
     its `table()`; a special point is a row with the branch -1; `value`, of the parameter, is in m/s
     for the velocity of a belt, in N for a load (the normal force), in m for a contact edge, in N
     s/m for the damping, and that of a function's argument stays as the function takes it. Of a
