@@ -215,6 +215,12 @@ def traceable(function: Callable[[], Any], field: str, expected: str) -> Any:
         ) from error
 
 
+def require_one_float(found: Any, field: str, expected: str) -> None:
+    """`ValueError` unless what `jax.eval_shape` gave is one float64."""
+    fits = isinstance(found, jax.ShapeDtypeStruct) and found.shape == ()
+    require(fits and found.dtype == np.float64, field, expected, found)
+
+
 def outside_of_traces(function: Callable, instead: str = "") -> Any:
     """Makes an entry one that refuses to be called under `jit`, `vmap` or derivatives, by what is
     traced: how much there is in its numbers decides what it computes. instead: what else to do

@@ -183,12 +183,16 @@ def test_a_cycle_that_a_fold_ends_just_beside_its_hopf_point_is_seen():
     assert float(hopf.value) == pytest.approx(0.0749666018134, abs=1e-11)
 
 
-def test_cycles_that_slip_faster_than_the_table_goes_are_told_of():
+def machine(velocity):
     table = jb.Tabulated((0.0, 0.02, 0.05, 0.1, 0.2, 0.4), (0.55, 0.48, 0.41, 0.36, 0.34, 0.35))
+    return jb.Machine(2.0, 800.0, 3.0, (jb.PhysicalBelt(velocity, table, 30.0),))
 
-    def machine(velocity):
-        return jb.Machine(2.0, 800.0, 3.0, (jb.PhysicalBelt(velocity, table, 30.0),))
 
+def on_table(velocity):
+    return machine(velocity).oscillator
+
+
+def test_cycles_that_slip_faster_than_the_table_goes_are_told_of():
     within, beyond = machine(0.12), machine(0.3)
     jb.find_cycle(within.oscillator, within.start(0.0, 0.0))
     with pytest.warns(UserWarning, match=r"slips on belt 0 at 1\.59 times the speed at which"):
@@ -200,14 +204,9 @@ def test_cycles_that_slip_faster_than_the_table_goes_are_told_of():
 @pytest.mark.slow(first=True)
 def test_a_search_tells_of_it_once():
     """The values that it looks at on its way have such cycles, too."""
-    table = jb.Tabulated((0.0, 0.02, 0.05, 0.1, 0.2, 0.4), (0.55, 0.48, 0.41, 0.36, 0.34, 0.35))
-
-    def make(velocity):
-        return jb.Machine(2.0, 800.0, 3.0, (jb.PhysicalBelt(velocity, table, 30.0),)).oscillator
-
     for search in (
-        lambda: jb.refine(jb.NonsmoothFold(0), make, at=0.38),
-        lambda: jb.scan(make, span=(0.3, 0.5)),
+        lambda: jb.refine(jb.NonsmoothFold(0), on_table, at=0.38),
+        lambda: jb.scan(on_table, span=(0.3, 0.5)),
     ):
         with pytest.warns(UserWarning, match="2.11 times the speed") as told:
             search()
@@ -216,14 +215,9 @@ def test_a_search_tells_of_it_once():
 
 @pytest.mark.slow(first=True)
 def test_diagrams_and_portraits_tell_of_it_once():
-    table = jb.Tabulated((0.0, 0.02, 0.05, 0.1, 0.2, 0.4), (0.55, 0.48, 0.41, 0.36, 0.34, 0.35))
-
-    def make(velocity):
-        return jb.Machine(2.0, 800.0, 3.0, (jb.PhysicalBelt(velocity, table, 30.0),)).oscillator
-
     for call in (
-        lambda: jb.portrait(make(0.3)),
-        lambda: jb.bifurcation_diagram(make, span=(0.28, 0.3), rows=9, resolution=4),
+        lambda: jb.portrait(on_table(0.3)),
+        lambda: jb.bifurcation_diagram(on_table, span=(0.28, 0.3), rows=9, resolution=4),
     ):
         with pytest.warns(UserWarning, match="1.59 times the speed") as told:
             call()

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import require, traceable
+from ..checks import require_one_float, traceable
 from ..cycles.chains import SIZES, Chain, Loop, cut
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import ARC_STEPS, meshed
@@ -101,8 +101,7 @@ class CycleEquation(AbstractCycleCondition):
 
     def check(self, osc):
         super().check(osc)
-        kind, arcs = type(self).__name__, SIZES[0]
-        field = f"equation of {kind}"
+        field, arcs = f"equation of {type(self).__name__}", SIZES[0]
 
         def shaped(*shape: int, dtype: Any = float) -> jax.ShapeDtypeStruct:
             return jax.ShapeDtypeStruct(shape, dtype)
@@ -116,9 +115,7 @@ class CycleEquation(AbstractCycleCondition):
 
         data = self.as_data()
         found = traceable(value, field, "a function of the oscillator, the chain and the unknowns")
-        fits = isinstance(found, jax.ShapeDtypeStruct) and found.shape == ()
-        fits = fits and found.dtype == jnp.float64
-        require(fits, field, "a function that returns one float64", found)
+        require_one_float(found, field, "a function that returns one float64")
 
     def judge(self, osc: Oscillator, z: Array, cycle: Cycle, slope: Array) -> tuple[Array, Array]:
         """As `CycleSystem.judge`."""

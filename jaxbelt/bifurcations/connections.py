@@ -39,9 +39,9 @@ from ..cycles.attractors import extent
 from ..cycles.chains import SIZES, Chain, Loop, cut
 from ..cycles.cycle import cycle_of
 from ..cycles.orbits import Orbit, follow_from, place_of_rest
-from ..cycles.returns import side_pulls
 from ..cycles.separatrices import mode_onward
 from ..cycles.shooting import admissible, flow, meshed
+from ..model.equilibria import side_pulls
 from ..model.modes import edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family

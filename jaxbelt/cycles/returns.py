@@ -27,11 +27,10 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import pick
-from ..model.equilibria import Equilibria, EquilibriumKind
+from ..model.equilibria import Equilibria, EquilibriumKind, side_pulls
 from ..model.far_out import contraction_far_out, is_bounded
-from ..model.modes import edges, mode_acceleration, settle
+from ..model.modes import edges
 from ..model.oscillator import Oscillator
-from ..model.transitions import contact
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .attractors import distinct
@@ -82,18 +81,6 @@ class Bracket(NamedTuple):
 
     low: float
     high: float
-
-
-@jit
-def side_pulls(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
-    """x2' of a mass at rest just left and just right of each x1, [places]; 0 where a belt holds
-    it."""
-    rest = jnp.zeros_like(x1)
-    modes = [settle(osc, contact(osc, x1, rest, rightward=s), x1, rest) for s in (False, True)]
-    left, right = (
-        jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, rest)) for mode in modes
-    )
-    return left, right
 
 
 @jit

@@ -35,7 +35,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import number
-from ..model.equilibria import Equilibria, EquilibriumKind
+from ..model.equilibria import Equilibria, EquilibriumKind, side_pulls
 from ..model.modes import (
     STUCK,
     Mode,
@@ -55,7 +55,6 @@ from ..tables import table_of
 from .backwards import reversed_in_time
 from .chains import Loop
 from .orbits import follow_finely, place_of_rest
-from .returns import side_pulls
 from .shooting import flow, meshed, trace_of
 
 if TYPE_CHECKING:

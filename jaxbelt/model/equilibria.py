@@ -228,8 +228,12 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     possible = has_possible_numbers(osc)
     is_fixed = possible & (held == 0) & (lower <= pull) & (pull <= upper) & (lower < upper)
     # On an edge beyond which belts at rest hold the mass it is the end of that segment.
-    is_fixed &= ~((pull == lower) & _at_rest_beside(osc, lower, rightward=False)[0].any_stuck)
-    is_fixed &= ~((pull == upper) & _at_rest_beside(osc, upper, rightward=True)[0].any_stuck)
+    places = (jnp.where(jnp.isfinite(edge), edge, 0.0) for edge in (lower, upper))
+    (below, pull_below), (above, pull_above) = (
+        at_rest_beside(osc, x1, rightward=side)
+        for x1, side in zip(places, (False, True), strict=True)
+    )
+    is_fixed &= ~((pull == lower) & below.any_stuck) & ~((pull == upper) & above.any_stuck)
     first, last = jnp.maximum(pull - held, lower), jnp.minimum(pull + held, upper)
     is_segment = possible & (held > 0) & (first < last)
     exists = is_fixed | is_segment
@@ -241,8 +245,8 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     kinetic = kinetic_capacity(osc, mode)
     attracts = jnp.maximum(pull - kinetic, lower) < jnp.minimum(pull + kinetic, upper)
     # Or what slips away passes an edge, is pushed back to it, and stops where it came from.
-    attracts |= (first == lower) & _pushes_back(osc, lower, rightward=False)
-    attracts |= (last == upper) & _pushes_back(osc, upper, rightward=True)
+    attracts |= (first == lower) & ~below.any_stuck & (pull_below > 0)
+    attracts |= (last == upper) & ~above.any_stuck & (pull_above < 0)
 
     neutral = is_fixed & is_centre(osc, mode)
     x1 = jnp.where(is_segment, 0.5 * (first + last), pull)
@@ -261,19 +265,24 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     )
 
 
-def _pushes_back(osc: Oscillator, edge: Array, *, rightward: bool) -> Array:
-    """Whether the side of an edge that is given pushes a mass that slips there back to the edge."""
-    mode, pull = _at_rest_beside(osc, edge, rightward=rightward)
-    push = -pull if rightward else pull
-    return jnp.isfinite(edge) & ~mode.any_stuck & (push > 0)
-
-
-def _at_rest_beside(osc: Oscillator, edge: Array, *, rightward: bool) -> tuple[Mode, Array]:
-    """The mode at rest on a side of an edge, and x2' there; of an infinite edge that of 0."""
-    x1 = jnp.where(jnp.isfinite(edge), edge, 0.0)
+def at_rest_beside(osc: Oscillator, x1: Array, *, rightward: bool) -> tuple[Mode, Array]:
+    """The mode of a mass at rest just beside each x1, [places], on that side, and x2' there."""
     rest = jnp.zeros_like(x1)
     mode = settle(osc, contact(osc, x1, rest, rightward=rightward), x1, rest)
     return mode, mode_acceleration(osc, mode, x1, rest)
+
+
+@jit
+def side_pulls(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
+    """x2' of a mass at rest just left and just right of each x1, [places]; 0 where a belt holds
+    it."""
+    (left, pull_left), (right, pull_right) = (
+        at_rest_beside(osc, x1, rightward=side) for side in (False, True)
+    )
+    return (
+        jnp.where(left.any_stuck, 0.0, pull_left),
+        jnp.where(right.any_stuck, 0.0, pull_right),
+    )
 
 
 def _codes(mode: Mode, exists: Array) -> Array:

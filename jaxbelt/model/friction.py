@@ -32,6 +32,7 @@ from ..checks import (
     is_concrete,
     number,
     require,
+    require_one_float,
     require_value,
     traceable,
 )
@@ -120,9 +121,8 @@ def check_law(law: AbstractFriction) -> None:
         return jax.eval_shape(law.mu, speed)
 
     found = traceable(coefficients, f"mu of {kind.__name__}", "a function of the speed")
-    fits = isinstance(found, jax.ShapeDtypeStruct) and found.shape == ()
-    fits = fits and found.dtype == jnp.float64
-    require(fits, f"mu of {kind.__name__}", "a function that returns one float64 a speed", found)
+    expected = "a function that returns one float64 a speed"
+    require_one_float(found, f"mu of {kind.__name__}", expected)
     _traced.add(kind)
 
 

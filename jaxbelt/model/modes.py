@@ -115,17 +115,18 @@ def fastest_rate(a_by_x2: Array) -> Array:
 
 def capacity(osc: Oscillator, mode: Mode) -> Array:
     """The largest force that the stuck belts can hold together, the sum of u0_k mus_k."""
-    total = jnp.zeros(())
-    for belt, stuck in zip(osc.belts, mode.stuck, strict=True):
-        total = total + jnp.where(stuck, belt.load * belt.friction.static, 0.0)
-    return total
+    return _of_stuck(osc, mode, [belt.friction.static for belt in osc.belts])
 
 
 def kinetic_capacity(osc: Oscillator, mode: Mode) -> Array:
     """The friction of the stuck belts together as they begin to slip, the sum of u0_k mu_k(0)."""
+    return _of_stuck(osc, mode, [belt.friction.mu(jnp.zeros(())) for belt in osc.belts])
+
+
+def _of_stuck(osc: Oscillator, mode: Mode, coefficients: list[Array]) -> Array:
     total = jnp.zeros(())
-    for belt, stuck in zip(osc.belts, mode.stuck, strict=True):
-        total = total + jnp.where(stuck, belt.load * belt.friction.mu(jnp.zeros(())), 0.0)
+    for belt, stuck, mu in zip(osc.belts, mode.stuck, coefficients, strict=True):
+        total = total + jnp.where(stuck, belt.load * mu, 0.0)
     return total
 
 

@@ -50,8 +50,8 @@ class AtSection:
 
     function: of the oscillator and scalars x1, x2, traced; its value passes 0 there. It has to be
     smooth wherever runs come, also across boundaries of belts: a jump, as of the sign of a relative
-    velocity or by jnp.where, is no passage, and runs that come to it end with the status
-    TOO_MANY_STEPS. direction: 1 where the value rises, -1 where it falls, 0 for both.
+    velocity or by jnp.where, is no passage, and a run that comes to it may end there, with the
+    status TOO_MANY_STEPS. direction: 1 where the value rises, -1 where it falls, 0 for both.
     """
 
     function: Any
