@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from ..checks import is_concrete
 from .oscillator import Oscillator, acceleration
@@ -123,7 +123,7 @@ def kinetic_capacity(osc: Oscillator, mode: Mode) -> Array:
     return _of_stuck(osc, mode, [belt.friction.mu(jnp.zeros(())) for belt in osc.belts])
 
 
-def _of_stuck(osc: Oscillator, mode: Mode, coefficients: list[Array]) -> Array:
+def _of_stuck(osc: Oscillator, mode: Mode, coefficients: Sequence[ArrayLike]) -> Array:
     total = jnp.zeros(())
     for belt, stuck, mu in zip(osc.belts, mode.stuck, coefficients, strict=True):
         total = total + jnp.where(stuck, belt.load * mu, 0.0)
