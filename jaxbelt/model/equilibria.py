@@ -79,10 +79,11 @@ class Equilibria(eqx.Module):
       a fixed point; at a pseudo-focus (tr_L/a_L + tr_R/|a_R|) / (3 (1/a_L + 1/|a_R|)), or -inf
       where a belt at rest touches, which ends them in a finite time; inf at a saddle, which is
       left in a finite time; NaN for a segment.
-    - stable: rate < 0. A segment is stable if disturbances of some part of it end in it again.
-      That is where the needed force is less than the sum of u0_k mu_k(0); the rest of a segment,
-      if mu(0) is less than the static limit, holds but does not attract, unless an edge ends it
-      beyond which the mass, having slipped away, is pushed back.
+    - stable: rate < 0. A segment is stable if small disturbances of some part of it stay small and
+      end in it again. That is where the needed force is less than the sum of u0_k mu_k(0); the
+      rest of a segment, if mu(0) is less than the static limit, holds but does not attract, unless
+      an edge ends it beyond which the mass, having slipped away, is pushed back. A mass that slips
+      away and comes back only after a large motion is no sign of stability.
     - neutral: a centre: orbits around it are closed, so it neither attracts nor repels, and is not
       stable in the sense above. It is where the forces on each side are the same at x2 and -x2, as
       without damping and with friction that does not depend on the speed.

@@ -301,11 +301,13 @@ def _rest_in_zone(osc, table, lower, upper):
 
 
 def _returns(osc, first, last):
-    """Whether runs from beside an end of a segment, up and down, end in it again."""
+    """Whether runs from beside an end of a segment, up and down, end in it again, not far away: a
+    large motion may lead back by chance."""
     near = 1e-3 * (last - first)
     for x1 in (first + near, last - near):
+        begin, end = max(first, x1 - 10 * near), min(last, x1 + 10 * near)
         ends = [engine.attractor(osc, (x1, x2), t_max=PATIENCE) for x2 in (-1e-5, 1e-5)]
-        if all(one.kind == "stuck" and first <= one.x1[0] <= last for one in ends):
+        if all(one.kind == "stuck" and begin <= one.x1[0] <= end for one in ends):
             return True
     return False
 
