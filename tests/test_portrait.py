@@ -311,8 +311,31 @@ def test_a_separatrix_that_creeps_to_a_node_comes_from_there():
     ts = -np.asarray(one.ts)[::-1]
     span, tight = (0.0, ts[-1]), {"rtol": 1e-12, "atol": 1e-14}
     run = solve_ivp(backwards, span, [0.7, 0.0], "LSODA", dense_output=True, **tight)
-    # What is drawn is as exact as one step between two samples.
-    assert np.max(np.abs(np.asarray(one.ys)[::-1] - run.sol(ts).T)) < 1e-6
+    assert np.max(np.abs(np.asarray(one.ys)[::-1] - run.sol(ts).T)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("damping", "numbers", "load", "at"),
+    [(1.0, (1.0, 0.6, 10.0), 2.0, 1.4), (0.7, (1.05, 0.63, 14.5), 1.5, 1.45)],
+)
+def test_long_arcs_are_sampled_by_steps_that_fit(damping, numbers, load, at):
+    """Backwards from the edge to the end of the segment in one arc, which is fast beside the edge
+    and lasts for many times as long beside the end, where the law is steep."""
+    static, residual, steepness = numbers
+    law = jb.Conti(static, residual, steepness)
+    belts = jb.Belt(0.0, law, load), jb.Belt(1.5, jb.Conti(1.0, 0.6, 10.0), 1.0, lower=-at)
+    told = jb.portrait(jb.Oscillator(damping, belts))
+    (one,) = (s for s in told.separatrices if s.stable and s.side == "left" and s.end != "outside")
+    assert (one.end, one.to) == ("equilibrium", 0)
+
+    def backwards(t, y):
+        brake = load * ((static - residual) / (1 + steepness * y[1]) + residual)
+        return [-y[1], y[0] + damping * y[1] + brake]
+
+    ts = -np.asarray(one.ts)[::-1]
+    span, tight = (0.0, ts[-1]), {"rtol": 1e-12, "atol": 1e-14}
+    run = solve_ivp(backwards, span, [-at, 0.0], "LSODA", dense_output=True, **tight)
+    assert np.max(np.abs(np.asarray(one.ys)[::-1] - run.sol(ts).T)) < 1e-9
 
 
 @pytest.mark.slow(first=True)

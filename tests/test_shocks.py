@@ -3,12 +3,14 @@
 The campaign is `python -m tests.campaign shocks`; what it found is in docs/checked.md.
 """
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 import jaxbelt as jb
-from tests.campaign import derivatives, shocks
+from tests.campaign import derivatives, engine, package, shocks
 from tests.campaign.cases import Case
 
 #: The mass rests at sigma -+ 0.7, mu(0.3) = 0.6 + 0.4/4; between is the saddle at the edge, 0.
@@ -113,3 +115,65 @@ def test_shocks_are_the_engines(seed):
     assert shocks.differences(osc, y0, direction, told)[0] == []
     slopes = shocks.slope_error(osc, y0, direction, derivatives.directions(Case(osc, y0), rng))
     assert slopes is None or slopes[0] < shocks.SAME_SLOPE * (1 + slopes[1])
+
+
+#: Slip on the boundary of a belt at rest, steep there, is a node in the end of its segment, and on
+#: the edge that cuts this off is a saddle; the belt that touches beyond drives to the right.
+NODE = engine.Oscillator(
+    0.1,
+    (
+        engine.Belt(0.0, ("conti", 1.25, 0.55, 13.0, 0.0), 1.7, upper=-0.35),
+        engine.Belt(0.75, ("conti", 0.95, 0.35, 9.0, 0.2), 0.35, lower=-0.35),
+    ),
+)
+#: A pseudo-focus on an edge, over which the separatrix of the other edge passes.
+ON_AN_EDGE = engine.Oscillator(
+    0.7,
+    (
+        engine.Belt(0.0, ("conti", 1.05, 0.63, 14.5, 0.0), 1.5, lower=0.2),
+        engine.Belt(-0.55, ("conti", 1.0, 0.6, 12.5, 0.0), 1.3, lower=-0.25),
+    ),
+)
+
+
+def _bisected(osc: engine.Oscillator, x1: float, outer: float) -> float:
+    """The x2, between 0 and outer, from which on runs end elsewhere than those from (x1, 0)."""
+
+    def end(x2):
+        return round(engine.attractor(osc, (x1, x2)).x1[0], 3)
+
+    rest, inner = end(0.0), 0.0
+    assert end(outer) != rest
+    while abs(outer - inner) > 1e-10:
+        middle = 0.5 * (inner + outer)
+        inner, outer = (middle, outer) if end(middle) == rest else (inner, middle)
+    return abs(outer)
+
+
+@pytest.mark.parametrize(("numbers", "outer"), [(NODE, -1.5), (ON_AN_EDGE, 1.5)])
+def test_shocks_where_separatrices_creep_and_where_attractors_lie_on_edges(numbers, outer):
+    osc = package.oscillator(numbers)
+    x1 = float(jb.equilibria(osc).x1[0 if numbers is ON_AN_EDGE else 1])
+
+    def distance(osc):
+        return jb.minimal_fatal_shock(osc, (x1, 0.0), direction="x2")
+
+    shock = distance(osc)
+    assert int(shock.status) == jb.Status.OK
+    assert float(shock.distance) == pytest.approx(_bisected(numbers, x1, outer), abs=1e-8)
+    slope = float(jax.grad(lambda osc: distance(osc).distance)(osc).belts[0].load)
+    sides = []
+    for change in (-1e-4, 1e-4):
+        belt = replace(numbers.belts[0], load=numbers.belts[0].load + change)
+        sides.append(_bisected(replace(numbers, belts=(belt, numbers.belts[1])), x1, outer))
+    assert slope == pytest.approx((sides[1] - sides[0]) / 2e-4, abs=1e-5)
+
+
+def test_a_segment_ends_in_its_boundary():
+    """Of a velocity, too, the smallest shock is none: in a corner of either curve."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+    belts = jb.Belt(0.0, law, 2.0), jb.Belt(1.5, law, lower=-1.4, upper=0.55)
+    told = jb.portrait(jb.Oscillator(1.0, belts))
+    for direction in ("x2", "both"):
+        shock = jb.minimal_fatal_shock(told, (-1.7, 0.0), direction=direction)
+        assert int(shock.status) == jb.Status.OK and float(shock.distance) == 0

@@ -38,7 +38,7 @@ class Meeting(eqx.Module):
 
     With P on the first curve, Q on the second and d = P - Q two equations hold. In any direction: d
     is normal to either curve, where that is not in a corner. Along x2: d1 = 0, and where neither is
-    in a corner, the curves are parallel.
+    in a corner, the curves are parallel; or both are in corners, where one curve ends in the other.
     """
 
     pieces: Array
@@ -185,8 +185,7 @@ def _tries_of(one: _PieceParts, other: _PieceParts, along_x2: bool) -> tuple[_Tr
     choices = [_choices(parts, pairs[:, k]) for k, parts in enumerate((one, other))]
     for s, s_fixed, s_there in choices[0]:
         for t, t_fixed, t_there in choices[1]:
-            # Two corners are not above one another.
-            possible = s_there & t_there & ~(along_x2 & s_fixed & t_fixed)
+            possible = s_there & t_there
             fractions = np.stack([s, t], axis=1)[possible]
             fixed = np.stack([s_fixed, t_fixed], axis=1)[possible]
             found.append((np.flatnonzero(possible), fractions, fixed))
@@ -241,7 +240,8 @@ def equations_of(places: tuple[Array, Array, Array], stay: Array, fixed: Array, 
             second = jnp.where(fixed[k], stay[k], second)
             row = jnp.where(fixed[k], unit[k], row)
         rows = jnp.stack([jnp.stack([dp[0], -dq[0]]), row])
-        return jnp.stack([d[0], second]), rows
+        both = jnp.all(fixed)
+        return jnp.where(both, stay, jnp.stack([d[0], second])), jnp.where(both, unit, rows)
     values, mixed = jnp.stack([d @ dp, -(d @ dq)]), -(dp @ dq)
     diagonal = dp @ dp + d @ ddp, dq @ dq - d @ ddq
     rows = jnp.stack([jnp.stack([diagonal[0], mixed]), jnp.stack([mixed, diagonal[1]])])
@@ -279,12 +279,14 @@ def _solved_for(
     found = _newton_in_parts(osc, *both, *jax.device_put((start, fixed, width)), along_x2)
     fractions, d, last = (np.asarray(one) for one in found)
     low, high = begin - BEYOND * width, begin + (1 + BEYOND) * width
-    inside = (np.maximum(low, 0.0) <= fractions) & (fractions <= np.minimum(high, 1.0))
+    # Where a piece ends above the other curve, as on an edge, rounding says on which side of it.
+    inside = np.maximum(low, -FOUND) <= fractions
+    inside &= fractions <= np.minimum(high, 1.0 + FOUND)
     good = np.all(inside | fixed, axis=1) & (last < FOUND)
     if along_x2:
         good &= np.abs(d[:, 0]) < FOUND
     lengths = np.abs(d[:, 1]) if along_x2 else np.hypot(d[:, 0], d[:, 1])
-    return fractions[:n], np.where(good, lengths, np.inf)[:n]
+    return np.clip(fractions[:n], 0.0, 1.0), np.where(good, lengths, np.inf)[:n]
 
 
 @jit

@@ -36,14 +36,13 @@ from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from .backwards import BackwardCycle
 from .chains import Chain, Loop
+from .creeping import cut_finely, power_of_2
 from .cycle import Cycle
 from .separatrices import Separatrix, tangencies
 from .shooting import end_guard, flow, meshed, solve_closed
 
-#: Integration steps in an arc of a separatrix.
+#: Integration steps in an arc of a separatrix, or in a piece of one.
 STEPS = 16
-#: Numbers of arcs are rounded up to a power of 2, this at least: a program for each.
-FEWEST_ARCS = 16
 
 
 class Pieces(eqx.Module):
@@ -210,10 +209,11 @@ def _solved_anew(osc: Oscillator, chain: Chain, z: Array) -> Array:
 class OpenOutline(Outline):
     """A stable separatrix, followed backwards from its point.
 
-    chain: its arcs, of which the last may end by nothing ("unused"); durations: theirs. origin: of
-    which sort its point is and numbers that say which: "edge", its number; "segment", the row of
-    `equilibria`, and 0 for its lower and 1 for its upper end; "boundary", the belt, and the zone
-    between edges; "corner", the belt, and the edge.
+    chain: its arcs, or pieces of them: one that ends by nothing ("unused") goes on in the next, and
+    the last one may be cut off so; durations: theirs. origin: of which sort its point is and
+    numbers that say which: "edge", its number; "segment", the row of `equilibria`, and 0 for its
+    lower and 1 for its upper end; "boundary", the belt, and the zone between edges; "corner", the
+    belt, and the edge.
     """
 
     chain: Chain
@@ -281,13 +281,10 @@ def outline_of_cycle(cycle: Cycle) -> ClosedOutline:
 
 def outline_of_separatrix(osc: Oscillator, separatrix: Separatrix) -> OpenOutline:
     """The outline of a stable separatrix."""
-    arcs = separatrix.arcs
+    arcs = cut_finely(moved_in_time(osc, jnp.asarray(-1.0)), separatrix.arcs)
     count = len(arcs.durations)
-    room = FEWEST_ARCS
-    while room < count:
-        room *= 2
-    rows = np.minimum(np.arange(room), count - 1)
-    own = np.arange(room) < count
+    rooms = np.arange(power_of_2(count))
+    rows, own = np.minimum(rooms, count - 1), rooms < count
     loop = pick(arcs, rows)
     ends = np.where(own, np.asarray(loop.ends), Ends(len(osc.belts)).unused)
     durations = np.where(own, np.asarray(loop.durations), 0.0)

@@ -31,7 +31,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array
 
 from ..checks import number
@@ -54,18 +53,17 @@ from ..results import Status, draw
 from ..tables import table_of
 from .backwards import reversed_in_time
 from .chains import Loop
+from .creeping import arc_samples
 from .orbits import follow_finely, place_of_rest
-from .shooting import flow, meshed, trace_of
+from .shooting import trace_of
 
 if TYPE_CHECKING:
     import pandas
 
 #: Arcs for which a separatrix is followed: some 40 loops.
 SEPARATRIX_ARCS = 256
-#: Samples of each arc at even times, and as many where the friction law bends.
-ARC_SAMPLES = 16
-#: Steps from one of these states to the next.
-STEPS_BETWEEN = 1000
+#: Samples of each arc.
+ARC_SAMPLES = 32
 
 
 class Separatrix(eqx.Module):
@@ -284,30 +282,11 @@ def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array):
     rest = place_of_rest(osc, orbit)
     used = jnp.arange(SEPARATRIX_ARCS) < orbit.count
     durations = jnp.where(used & jnp.isfinite(orbit.durations), orbit.durations, 0.0)
-    loop = Loop(orbit.codes, orbit.ends, orbit.entries, durations)
-    chain, _ = meshed(osc, loop, ARC_SAMPLES)
-    even = jnp.linspace(1.0, 0.0, ARC_SAMPLES, endpoint=False)
 
-    def along(codes, mesh, y, duration):
-        def advance(y, fraction):
-            # A steep law, as near a node on a boundary, bounds the length of a stable step.
-            (trace,) = trace_of(osc, mode_of(codes), *y)
-            steps = jnp.clip(
-                jnp.nan_to_num(jnp.ceil(jnp.abs(trace) * duration * fraction)), 1, STEPS_BETWEEN
-            )
+    def samples(codes, entry, duration):
+        return arc_samples(osc, codes, entry, duration, ARC_SAMPLES)
 
-            def step(_, y):
-                return flow(osc, codes, jnp.ones(1), y, duration * fraction / steps)
-
-            y = lax.fori_loop(0, steps.astype(int), step, y)
-            return y, y
-
-        # As near to each other as the law's bends, and the picture, ask.
-        at = jnp.sort(jnp.concatenate([jnp.cumsum(mesh), even])).at[-1].set(1.0)
-        _, states = lax.scan(advance, y, jnp.diff(at, prepend=0.0))
-        return duration * at, states
-
-    return orbit, rest, *each(along)(chain.codes, chain.mesh, orbit.entries, durations)
+    return orbit, rest, *each(samples)(orbit.codes, orbit.entries, durations)
 
 
 @jit

@@ -1,0 +1,131 @@
+"""States along an arc, however long it lasts, and arcs cut into pieces that a mesh can take.
+
+An arc may creep: to a node on the boundary of a belt, say, near which it stays for a hundred times
+as long as it moved, while steps of integration stay as short as the law is steep there.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..checks import pick
+from ..model.modes import mode_acceleration, mode_of
+from ..model.oscillator import Oscillator
+from ..motion.arcs import Ends
+from ..motion.integrators import STRIDE, density
+from ..numerics.compiling import each, jit
+from .chains import Loop
+from .shooting import flow
+
+#: Steps of integration, of order 12, in an arc at most.
+STEPS_ALONG = 100_000
+#: The steps of density one that a piece takes at most; a mesh has 16 steps for it.
+PIECE = 8.0
+#: Pieces that are cut off arcs in one go.
+CUT_AT_ONCE = 32
+
+
+def places_along(
+    osc: Oscillator, codes: Array, y: Array, duration: Array, rate: Callable, marks: Array
+) -> tuple[Array, Array, Array]:
+    """Times since the entry of an arc, and states, [n] and [n, 2], where the integral of a rate, a
+    function of the state, comes to each of the marks in order, or else where the arc ends; and this
+    integral at the last of them."""
+    mode = mode_of(codes)
+
+    def to(carry, mark):
+        def before(carry):
+            _, left, total = carry
+            return (left > 0) & (total < mark)
+
+        def step(carry):
+            y, left, total = carry
+            wanted = jnp.maximum(STRIDE / density(osc, mode, *y), duration / STEPS_ALONG)
+            length, pace = jnp.minimum(wanted, left), rate(y)
+            passes = total + pace * length > mark
+            length = jnp.where(passes, (mark - total) / pace, length)
+            total = jnp.where(passes, mark, total + pace * length)
+            return flow(osc, codes, jnp.ones(1), y, length), left - length, total
+
+        carry = lax.while_loop(before, step, carry)
+        y, left, _ = carry
+        return carry, (duration - left, y)
+
+    start = y, duration, jnp.zeros(())
+    (_, _, total), (ts, states) = lax.scan(to, start, marks)
+    return ts, states, total
+
+
+def arc_samples(osc: Oscillator, codes: Array, y: Array, duration: Array, n: int):
+    """Times and states of n samples of an arc, the last at its end: three quarters of them evenly
+    along its way in the plane, the others by the number of steps that it wants."""
+    mode = mode_of(codes)
+
+    def speed(y):
+        pull = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, *y))
+        return jnp.hypot(y[1], pull)
+
+    def wanted(y):
+        return density(osc, mode, *y)
+
+    end = jnp.full(1, jnp.inf)
+    length, steps = (places_along(osc, codes, y, duration, rate, end)[2] for rate in (speed, wanted))
+
+    def both(y):
+        return 0.75 * speed(y) / length + 0.25 * wanted(y) / steps
+
+    marks = jnp.append(jnp.arange(1, n) / n, jnp.inf)
+    return places_along(osc, codes, y, duration, both, marks)[:2]
+
+
+def cut_finely(osc: Oscillator, loop: Loop) -> Loop:
+    """Arcs one after another, none of which wants more steps than PIECE, the others cut into such
+    pieces; a piece that is not the last of its arc ends by nothing ("unused")."""
+    count = len(loop.ends)
+    padded = pick(loop, np.minimum(np.arange(power_of_2(count)), count - 1))
+    entries, left = map(np.array, (padded.entries, padded.durations))
+    left[count:] = 0.0
+    pieces: list[list[tuple[np.ndarray, float]]] = [[] for _ in range(count)]
+    while np.any(left > 0):
+        # Arcs that are done take no step.
+        found = _first_pieces(osc, padded.codes, *jax.device_put((entries, left)))
+        ts, states = map(np.asarray, found)
+        for arc in np.flatnonzero(left > 0):
+            begins = np.vstack([entries[arc], states[arc, :-1]])
+            for begin, duration in zip(begins, np.diff(ts[arc], prepend=0.0), strict=True):
+                if duration > 0:
+                    pieces[arc].append((begin, float(duration)))
+        entries, left = states[:, -1], left - ts[:, -1]
+    for own, entry in zip(pieces, np.asarray(loop.entries), strict=True):
+        if not own:  # an arc of no duration
+            own.append((entry, 0.0))
+    rows = np.repeat(np.arange(count), [len(own) for own in pieces])
+    told = pick(loop, rows)
+    is_last = np.append(rows[1:] != rows[:-1], True)
+    ends = np.where(is_last, np.asarray(told.ends), Ends(len(osc.belts)).unused)
+    begins = np.stack([begin for own in pieces for begin, _ in own])
+    durations = np.array([duration for own in pieces for _, duration in own])
+    columns = jax.device_put((ends, begins, durations))
+    return eqx.tree_at(lambda a: (a.ends, a.entries, a.durations), told, columns)
+
+
+def power_of_2(count: int, least: int = 16) -> int:
+    """A count rounded up, so that few shapes are compiled."""
+    return max(least, 1 << (count - 1).bit_length())
+
+
+@jit
+def _first_pieces(osc: Oscillator, codes: Array, entries: Array, durations: Array):
+    def of_arc(codes, y, duration):
+        def wanted(y):
+            return density(osc, mode_of(codes), *y)
+
+        marks = PIECE * jnp.arange(1.0, CUT_AT_ONCE + 1)
+        return places_along(osc, codes, y, duration, wanted, marks)[:2]
+
+    return each(of_arc)(codes, entries, durations)
