@@ -74,13 +74,14 @@ def arc_samples(osc: Oscillator, codes: Array, y: Array, duration: Array, n: int
         return density(osc, mode, *y)
 
     end = jnp.full(1, jnp.inf)
-    length, steps = (places_along(osc, codes, y, duration, rate, end)[2] for rate in (speed, wanted))
+    arc = osc, codes, y, duration
+    length, steps = (places_along(*arc, rate, end)[2] for rate in (speed, wanted))
 
     def both(y):
         return 0.75 * speed(y) / length + 0.25 * wanted(y) / steps
 
     marks = jnp.append(jnp.arange(1, n) / n, jnp.inf)
-    return places_along(osc, codes, y, duration, both, marks)[:2]
+    return places_along(*arc, both, marks)[:2]
 
 
 def cut_finely(osc: Oscillator, loop: Loop) -> Loop:

@@ -20,6 +20,7 @@ from math import inf, isfinite
 
 import numpy as np
 
+import jaxbelt as jb
 from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import place_of
@@ -500,6 +501,12 @@ def _both_sides(path: ParameterPath, point, special, brute: Brute, report: Repor
         for cycle in label.cycles:
             if all(cycle.modes != one.modes for one in other.cycles):
                 brute.learn(value, cycle.state)
+    if sides[0].name == sides[1].name:
+        # One that hardly attracts, beside a fold, is reached by no run in time; from a start on it
+        # the engine says whether it is there.
+        for value in (at - away, at + away):
+            for cycle in jb.portrait(package.oscillator(brute.case.at(value))).cycles:
+                brute.learn(value, (float(cycle.x1_max), 0.0))
     if all(side.decided for side in sides) and sides[0].name == sides[1].name:
         report.wrong.append(f"nothing changes at {point!r}: {_words(sides[0])}")
 
