@@ -18,30 +18,30 @@ from ..model.modes import mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..motion.integrators import STRIDE, density
-from ..numerics.compiling import each, jit
+from ..numerics.compiling import each, jit, power_of_two
 from .chains import Loop
 from .shooting import flow
 
 #: Steps of integration, of order 12, in an arc at most.
 STEPS_ALONG = 100_000
-#: The steps of density one that a piece takes at most; a mesh has 16 steps for it.
+#: The integral of the density of steps over a piece at most, so that a mesh of 16 steps takes it.
 PIECE = 8.0
-#: Pieces that are cut off arcs in one go.
-CUT_AT_ONCE = 32
+#: Pieces that are cut off arcs in one go; room for arcs, or pieces, at least.
+CUT_AT_ONCE, FEWEST = 32, 16
 
 
 def places_along(
     osc: Oscillator, codes: Array, y: Array, duration: Array, rate: Callable, marks: Array
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array]:
     """Times since the entry of an arc, and states, [n] and [n, 2], where the integral of a rate, a
-    function of the state, comes to each of the marks in order, or else where the arc ends; and this
-    integral at the last of them."""
+    function of the state, comes to each of the marks in order, or else where the arc ends."""
     mode = mode_of(codes)
 
     def to(carry, mark):
         def before(carry):
             _, left, total = carry
-            return (left > 0) & (total < mark)
+            # Where there is no rate, NaN, it is the end of the arc.
+            return (left > 0) & ~(total >= mark)
 
         def step(carry):
             y, left, total = carry
@@ -56,39 +56,33 @@ def places_along(
         y, left, _ = carry
         return carry, (duration - left, y)
 
-    start = y, duration, jnp.zeros(())
-    (_, _, total), (ts, states) = lax.scan(to, start, marks)
-    return ts, states, total
+    return lax.scan(to, (y, duration, jnp.zeros(())), marks)[1]
 
 
-def arc_samples(osc: Oscillator, codes: Array, y: Array, duration: Array, n: int):
+def arc_samples(
+    osc: Oscillator, codes: Array, y: Array, exit_: Array, duration: Array, n: int
+) -> tuple[Array, Array]:
     """Times and states of n samples of an arc, the last at its end: three quarters of them evenly
-    along its way in the plane, the others by the number of steps that it wants."""
+    along its way in the plane, the others evenly in time.
+
+    x1 and x2 are monotone: |dx1| + |dx2| of the arc is the integral of that of its steps.
+    """
     mode = mode_of(codes)
+    way = jnp.sum(jnp.abs(exit_ - y))
 
-    def speed(y):
+    def rate(y):
         pull = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, *y))
-        return jnp.hypot(y[1], pull)
-
-    def wanted(y):
-        return density(osc, mode, *y)
-
-    end = jnp.full(1, jnp.inf)
-    arc = osc, codes, y, duration
-    length, steps = (places_along(*arc, rate, end)[2] for rate in (speed, wanted))
-
-    def both(y):
-        return 0.75 * speed(y) / length + 0.25 * wanted(y) / steps
+        return 0.75 * (jnp.abs(y[1]) + jnp.abs(pull)) / way + 0.25 / duration
 
     marks = jnp.append(jnp.arange(1, n) / n, jnp.inf)
-    return places_along(*arc, both, marks)[:2]
+    return places_along(osc, codes, y, duration, rate, marks)
 
 
 def cut_finely(osc: Oscillator, loop: Loop) -> Loop:
-    """Arcs one after another, none of which wants more steps than PIECE, the others cut into such
-    pieces; a piece that is not the last of its arc ends by nothing ("unused")."""
+    """Arcs one after another, those that are longer than PIECE cut into such pieces; one that is
+    not the last of its arc ends by nothing ("unused")."""
     count = len(loop.ends)
-    padded = pick(loop, np.minimum(np.arange(power_of_2(count)), count - 1))
+    padded = pick(loop, np.minimum(np.arange(power_of_two(count, FEWEST)), count - 1))
     entries, left = map(np.array, (padded.entries, padded.durations))
     left[count:] = 0.0
     pieces: list[list[tuple[np.ndarray, float]]] = [[] for _ in range(count)]
@@ -115,11 +109,6 @@ def cut_finely(osc: Oscillator, loop: Loop) -> Loop:
     return eqx.tree_at(lambda a: (a.ends, a.entries, a.durations), told, columns)
 
 
-def power_of_2(count: int, least: int = 16) -> int:
-    """A count rounded up, so that few shapes are compiled."""
-    return max(least, 1 << (count - 1).bit_length())
-
-
 @jit
 def _first_pieces(osc: Oscillator, codes: Array, entries: Array, durations: Array):
     def of_arc(codes, y, duration):
@@ -127,6 +116,6 @@ def _first_pieces(osc: Oscillator, codes: Array, entries: Array, durations: Arra
             return density(osc, mode_of(codes), *y)
 
         marks = PIECE * jnp.arange(1.0, CUT_AT_ONCE + 1)
-        return places_along(osc, codes, y, duration, wanted, marks)[:2]
+        return places_along(osc, codes, y, duration, wanted, marks)
 
     return each(of_arc)(codes, entries, durations)

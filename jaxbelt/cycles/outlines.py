@@ -33,10 +33,10 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator
 from ..model.transitions import contact
 from ..motion.arcs import Ends
-from ..numerics.compiling import jit
+from ..numerics.compiling import jit, power_of_two
 from .backwards import BackwardCycle
 from .chains import Chain, Loop
-from .creeping import cut_finely, power_of_2
+from .creeping import FEWEST, cut_finely
 from .cycle import Cycle
 from .separatrices import Separatrix, tangencies
 from .shooting import end_guard, flow, meshed, solve_closed
@@ -283,7 +283,7 @@ def outline_of_separatrix(osc: Oscillator, separatrix: Separatrix) -> OpenOutlin
     """The outline of a stable separatrix."""
     arcs = cut_finely(moved_in_time(osc, jnp.asarray(-1.0)), separatrix.arcs)
     count = len(arcs.durations)
-    rooms = np.arange(power_of_2(count))
+    rooms = np.arange(power_of_two(count, FEWEST))
     rows, own = np.minimum(rooms, count - 1), rooms < count
     loop = pick(arcs, rows)
     ends = np.where(own, np.asarray(loop.ends), Ends(len(osc.belts)).unused)

@@ -282,11 +282,13 @@ def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array):
     rest = place_of_rest(osc, orbit)
     used = jnp.arange(SEPARATRIX_ARCS) < orbit.count
     durations = jnp.where(used & jnp.isfinite(orbit.durations), orbit.durations, 0.0)
+    last = (jnp.arange(SEPARATRIX_ARCS) == orbit.count - 1)[:, None]
+    exits = jnp.where(last, orbit.y, jnp.roll(orbit.entries, -1, axis=0))
 
-    def samples(codes, entry, duration):
-        return arc_samples(osc, codes, entry, duration, ARC_SAMPLES)
+    def samples(codes, entry, exit_, duration):
+        return arc_samples(osc, codes, entry, exit_, duration, ARC_SAMPLES)
 
-    return orbit, rest, *each(samples)(orbit.codes, orbit.entries, durations)
+    return orbit, rest, *each(samples)(orbit.codes, orbit.entries, exits, durations)
 
 
 @jit

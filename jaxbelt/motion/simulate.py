@@ -19,7 +19,7 @@ from ..model.modes import has_edges, without_edges
 from ..model.oscillator import Oscillator, check_oscillator, has_possible_numbers
 from ..model.rest import start_at_focus
 from ..model.transitions import contact
-from ..numerics.compiling import jit
+from ..numerics.compiling import jit, power_of_two
 from ..results import EventKind, Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .runs import Rules, arcs_of_run, stacked_codes, state_at_end, states_at
@@ -283,7 +283,7 @@ def simulate(
     )
     given = y0, t0, t1, ts, rtol, atol
     span = float(t1 - t0) if is_concrete((t0, t1)) else 100.0
-    resolution = 0 if ts is not None else _power_of_two(10 * span, 512)
+    resolution = 0 if ts is not None else _room_for(10 * span, 512)
     if formulation != "filippov":
         name = "v_star" if formulation == "switch" else "eps"
         width = as_numbers(v_star if formulation == "switch" else eps, name)
@@ -320,7 +320,7 @@ def _budgets(
     expected, is_default = "a positive integer", max_segments is None
     if max_segments is None:
         # Around a pseudo-focus at a contact edge a run has many short arcs.
-        max_segments = _power_of_two((64 if edges else 8) * span, 512)
+        max_segments = _room_for((64 if edges else 8) * span, 512)
     is_count = isinstance(max_segments, int) and max_segments > 0
     require(is_count, "max_segments", expected, max_segments)
     followed = max_segments
@@ -331,7 +331,7 @@ def _budgets(
         rate = 1.5 + 0.5 * belts
         followed = min(max_segments, max(128, 64 * math.ceil(rate * span / 64)))
     if max_events is None:
-        room = _power_of_two((16 if edges else 4) * span, 64) if padded else max_segments
+        room = _room_for((16 if edges else 4) * span, 64) if padded else max_segments
         max_events = min(max_segments, room)
     require(isinstance(max_events, int) and max_events > 0, "max_events", expected, max_events)
     return Rules(max_segments, followed), max_events
@@ -348,8 +348,8 @@ def _checked_times(ts: ArrayLike | list | tuple, t0: ArrayLike, t1: ArrayLike) -
     return ts
 
 
-def _power_of_two(value: float, least: int) -> int:
-    return max(least, 2 ** math.ceil(math.log2(min(value, 2.0**20))))
+def _room_for(value: float, least: int) -> int:
+    return power_of_two(math.ceil(min(value, 2.0**20)), least)
 
 
 def _without_padding(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:

@@ -159,6 +159,11 @@ def _traced_once_anywhere(function: Callable) -> Callable:
     return call
 
 
+def power_of_two(count: int, least: int) -> int:
+    """A count rounded up to a power of two, `least` or more, so that few shapes are compiled."""
+    return max(least, 1 << (count - 1).bit_length())
+
+
 def each(function: Callable) -> Callable:
     """`jax.vmap` of a function of trees with a row in each array; on the CPU one row after another.
 
