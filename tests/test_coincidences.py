@@ -14,7 +14,7 @@ from jaxbelt.cycles.attractors import itinerary
 from jaxbelt.kernel.marks import Mark, code_of
 from jaxbelt.results import Status
 from jaxbelt.sweeps import threads
-from tests.campaign import compare, package
+from tests.campaign import compare, engine, package
 from tests.campaign.cases import PAPER, Case
 from tests.campaign.engine import Belt, Oscillator
 
@@ -206,7 +206,7 @@ def test_labels_of_round_numbers(structure):
 @pytest.mark.parametrize("name", [name for name in CASES if name != "hard push"])
 def test_find_cycle_settles_on_round_numbers(name):
     osc, y0 = CASES[name]
-    found, known = jb.find_cycle(package.oscillator(osc), y0), compare.engine.attractor(osc, y0)
+    found, known = jb.find_cycle(package.oscillator(osc), y0), engine.attractor(osc, y0)
     if known.kind == "cycle":
         loops = known.period / float(found.period)
         # The engine may tell several loops; both are far more exact than this.
@@ -347,3 +347,24 @@ def test_a_stick_phase_that_ends_on_an_edge_and_by_slip_onset():
     for residual in (0.553149166667, 0.6):
         cycle = jb.find_cycle(make(residual), (-1.0, 0.0))
         assert itinerary(cycle.oscillator, cycle) == ((-2, -1), (-1, -1), (0, 0))
+
+
+def test_a_cycle_ends_just_beside_where_two_belts_run_together():
+    """It is told apart where no pseudo-focus is about, around which loops are lost in rounding."""
+
+    def numbers(velocity):
+        laws = ("coulomb", 0.504701, 0.2643582), ("coulomb", 0.88806, 0.7142546)
+        belts = (
+            Belt(-0.7094468, laws[0], 1.68557, upper=0.751135),
+            Belt(velocity, laws[1], 1.3878348, lower=-0.4312801),
+        )
+        return Oscillator(0.02107395, belts, 1.214963)
+
+    osc = package.oscillator(numbers(-0.7))
+    points = jb.scan(osc, lambda osc: osc.belts[1].velocity, (-0.73, -0.69))
+    kinds = [jb.SlidingExchange((0, 1)), jb.GrazingSliding(0)]
+    assert [point.condition for point in points] == kinds
+    assert points[0].value == -0.7094468 and 4e-6 < points[1].value - points[0].value < 5e-6
+    start, at = tuple(np.asarray(points[1].cycle.unknowns)[0, :2]), float(points[1].value)
+    sides = [engine.attractor(numbers(at + away), start) for away in (-1e-8, 1e-8)]
+    assert [side.kind for side in sides] == ["cycle", "equilibrium"]

@@ -101,6 +101,8 @@ class ParameterPath:
         # From which value to which other one, from which cycle to which, of those that do not
         # stick; None where there is none.
         self._goes_on: dict[tuple[float, float], dict[int, int | None]] = {}
+        # Whether there is one at a value.
+        self._pseudo_foci: dict[float, bool] = {}
         # Between which values labels are found by fine orbits.
         self._fine: list[tuple[float, float]] = []
         self._coincidences = self.variation.coincidences(self.first, self.last)
@@ -121,10 +123,17 @@ class ParameterPath:
         """The values just below and just above; farther off where motions are slow to settle."""
         # Not nearer in a short span: a loop counts as repeated when it does so to 1e-7.
         distance = CLOSE * (self.unit + self.length)
+        far = value - 30.0 * distance, value + 30.0 * distance
         # Loops around a pseudo-focus with a velocity below 1e-5 are lost in rounding.
-        if slow or (value in self.breaks and self.edged):
-            distance *= 30.0
+        if slow or (value in self.breaks and any(map(self._has_pseudo_focus, far))):
+            return far
         return value - distance, value + distance
+
+    def _has_pseudo_focus(self, value: float) -> bool:
+        if value not in self._pseudo_foci:
+            kinds = candidates(self.at(value)).kind if self.edged else ()
+            self._pseudo_foci[value] = EquilibriumKind.PSEUDO_FOCUS in np.asarray(kinds)
+        return self._pseudo_foci[value]
 
     @property
     def edged(self) -> list[int]:
