@@ -93,6 +93,30 @@ def at_nu0(osc, nu):
     )
 
 
+@pytest.mark.parametrize(("guess", "exact"), [(0.23, (np.sqrt(8) - 1) / 10), (0.25, 0.3)])
+def test_the_nearer_of_two_fixed_points_that_change(guess, exact):
+    """One on either side of an edge beyond which friction is twice as strong."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(nu):
+        return jb.Oscillator(0.5, (jb.Belt(nu, law), jb.Belt(nu, law, lower=1.0)))
+
+    point = jb.refine(jb.Hopf(), make, at=guess)
+    assert point.value == pytest.approx(exact, abs=1e-13)
+    assert (float(point.x1) > 1.0) == (exact == 0.3)
+
+
+@pytest.mark.parametrize("belt", [0, 1])
+def test_grazing_on_either_of_two_belts_that_share_the_load_of_one(belt):
+    def make(nu):
+        half = jb.Belt(nu, jb.presets.class_a(0.2).belts[0].friction, load=0.5)
+        return jb.Oscillator(0.5, (half, half, class_b(nu).belts[1]))
+
+    point = jb.refine(jb.GrazingSliding(belt), make, at=-0.44)
+    assert point.status == Status.OK
+    assert point.value == pytest.approx(-0.455724862289, abs=1e-11)
+
+
 def test_points_of_another_system():
     osc = other_system()
     hopf = jb.refine(jb.Hopf(), osc, where=nu0)

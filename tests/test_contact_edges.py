@@ -334,6 +334,44 @@ def test_what_fits_no_such_point_is_told_so():
             jb.refine(condition, jb.presets.class_a(0.2), where=nu0)
 
 
+def test_one_edge_of_two_on_which_something_rests_whatever_the_parameter():
+    """At 0.25 belt 0 alone holds on the right of the edge at any load of belt 1; on the edge at 0
+    the two balance where the loads are equal."""
+    law = jb.Coulomb(0.5, 0.25)
+
+    def make(load):
+        right = jb.Belt(-1.0, law, load=load, lower=0.0, upper=0.25)
+        return jb.Oscillator(0.5, (jb.Belt(0.6, law, upper=1.4), right))
+
+    points = [jb.refine(jb.BoundaryEquilibrium(1), make, at=at) for at in (0.93, 1.0, 1.1)]
+    for point in (*points, *jb.scan(make, span=(0.9, 1.25))):
+        assert point.condition == jb.BoundaryEquilibrium(1) and point.type == "persistence"
+        assert (point.value, point.x1) == pytest.approx((1.0, 0.0), abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("guess", "value", "edge", "kind"),
+    [
+        (0.74, 0.7, 0.2, "annihilation"),
+        (0.76, 0.8, 0.2, "annihilation"),
+        (1.5, 0.8, 0.2, "annihilation"),
+        (1.6, 2.3, 0.6, "persistence"),
+        (2.36, 2.4, 0.6, "persistence"),
+    ],
+)
+def test_the_nearest_of_what_comes_to_either_edge_from_either_side(guess, value, edge, kind):
+    """Belt 0 pulls with load / 4, belt 1 with 0.025 more between its edges."""
+    law = jb.Coulomb(0.5, 0.25)
+
+    def make(load):
+        inner = jb.Belt(1.0, law, load=0.1, lower=0.2, upper=0.6)
+        return jb.Oscillator(0.5, (jb.Belt(1.0, law, load=load), inner))
+
+    point = jb.refine(jb.BoundaryEquilibrium(1), make, at=guess)
+    assert (point.value, point.x1) == pytest.approx((value, edge), abs=1e-13)
+    assert point.type == kind
+
+
 def test_the_end_of_a_segment_on_an_edge():
     """Belt 1 at rest holds what is within its capacity of the pull of belt 0."""
     osc = jb.presets.class_d(0.35, 0.0, 0.0, 0.6)

@@ -332,7 +332,7 @@ class BifurcationPoint(eqx.Module):
     cycle: at the point, with a status that says why where there is none (at a Hopf point it has
     shrunk to the equilibrium, at `SuddenSliding` its period is infinite); multiplier: of the cycle
     on the side where it does not stick to the belt, for `NonsmoothFold` and `GrazingSliding`, else
-    NaN; x1: where the mass is at rest at the point, NaN where that is no unknown of it; status: a
+    NaN; x1: where the mass is at rest at the point where its equations tell it, else NaN; status: a
     `Status` code. Where it is not OK the value is NaN.
     """
 

@@ -1,7 +1,8 @@
 """Conditions on a cycle, and what a condition of one's own is written with.
 
 `AbstractCycleCondition` shares what conditions on a cycle have in common, as
-`rests.AbstractRestCondition` does for a state of rest. A functional of an attracting cycle that has
+`rests.AbstractRestCondition` does for a state of rest; those of sticking to a belt are of several
+belts where these run together. A functional of an attracting cycle that has
 a given value is a `CycleEquation`, for which a class with one method will do.
 """
 
@@ -82,6 +83,24 @@ def _solved_point(family: Family, system: CycleSystem, z0, p0, status):
     cycle, slope = cycle_of(osc, system.ordinary, z, *numbers)
     status, multiplier = system.judge(osc, z, cycle, slope)
     return point_of(family, solution, cycle, multiplier, status), (z, solution.p)
+
+
+class AbstractStickCondition(AbstractCycleCondition):
+    """A condition on how a cycle begins, or ends, to stick to a belt; which may be several that run
+    at one velocity."""
+
+    belt: int | Array
+
+    def covers(self, point):
+        if super().covers(point):
+            return True
+        named, chain = point.condition, point.cycle.chain
+        if not isinstance(named, AbstractStickCondition) or type(self) is not type(named):
+            return False
+        pair = np.array([self.belt, named.belt])
+        one, other = (point.oscillator.belts[belt].velocity for belt in pair)
+        stuck = np.asarray(chain.codes)[np.asarray(chain.used)][:, pair] == 0
+        return bool(one == other and np.any(stuck) and np.all(stuck[:, 0] == stuck[:, 1]))
 
 
 class CycleEquation(AbstractCycleCondition):

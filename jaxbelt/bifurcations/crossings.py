@@ -27,7 +27,7 @@ from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..results import EventKind, Status
 from .base import Line, check_two_belts
-from .conditions import AbstractCycleCondition
+from .conditions import AbstractCycleCondition, AbstractStickCondition
 from .guesses import nearest, orbit_after_stick, repeated_loop, without_arcs
 from .special import SpecialPoint
 from .systems import (
@@ -72,7 +72,7 @@ def arrival_tests(osc: Oscillator, chain: Chain, z: Array, row: Array):
     return contact_tests("DoubleSliding", nearest, jnp.ones(nearest.shape, bool))
 
 
-class CrossingSliding(AbstractCycleCondition):
+class CrossingSliding(AbstractStickCondition):
     """The cycle crosses the boundary of a belt, and begins to stick to it where it did.
 
     It arrives at one end of where the mass sticks: that of slip onset, at which a stick phase
@@ -81,8 +81,6 @@ class CrossingSliding(AbstractCycleCondition):
     static limit exceeds mu(0), it goes far beyond the boundary at once, and may not come back
     (jump).
     """
-
-    belt: int | Array
 
     caption: ClassVar[str] = "crossing-sliding, belt {belt}"
     line: ClassVar[Line] = Line("crossing-sliding", "#CC79A7", (0, (5, 1.5)))

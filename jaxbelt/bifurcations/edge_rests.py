@@ -47,7 +47,7 @@ from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status
 from .base import AbstractCondition, Line
-from .rests import NOTHING, AbstractRestCondition, criticality, limit_near
+from .rests import NOTHING, AbstractRestOfSeveral, criticality, limit_near
 from .special import SpecialPoint, Trail
 from .systems import RestSystem, Tests, small_newton, velocity_of
 
@@ -71,6 +71,9 @@ class _EdgeSystem(RestSystem):
 
     def residual(self, osc, x):
         return self.balance(osc)[None]
+
+    def x1(self, osc, x):
+        return jnp.stack(edges(osc))[self.edge]
 
     def tests(self, osc, x):
         return {("BoundaryHopf", ()): self.meets_hopf(osc), **self.type_tests(osc)}
@@ -257,7 +260,7 @@ def _edges_passed(trail: Trail) -> np.ndarray:
     return ends[(ends >= n) & (ends < 3 * n)] - n
 
 
-class _EdgeCondition(AbstractRestCondition):
+class _EdgeCondition(AbstractRestOfSeveral):
     """A condition on what lies at rest on a contact edge of a belt."""
 
     belt: int | Array
@@ -266,16 +269,15 @@ class _EdgeCondition(AbstractRestCondition):
         super().check(osc)
         check_edge(osc, self.belt)
 
-    def guess(self, osc, size):
-        return None
-
-    def _system_at_edge(self, osc: Oscillator) -> _EdgeSystem:
+    def _systems_at_edges(self, osc: Oscillator) -> tuple[_EdgeSystem, Array]:
+        """One for each edge, and whether it can hold at all, a row each."""
         raise NotImplementedError
 
-    def system(self, osc, guess):
-        system = self._system_at_edge(osc)
-        has_edge = jnp.isfinite(jnp.stack(edges(osc))[system.edge])
-        return system, NOTHING, jnp.where(has_edge, Status.OK.value, Status.NOT_TOUCHED.value)
+    def systems(self, osc):
+        systems, can_hold = self._systems_at_edges(osc)
+        can_hold &= jnp.isfinite(jnp.stack(edges(osc)))[systems.edge]
+        status = jnp.where(can_hold, Status.OK.value, Status.NOT_TOUCHED.value)
+        return systems, jnp.zeros((status.size, 0)), status
 
     @classmethod
     def between(cls, before, after, edged) -> Sequence[AbstractCondition]:
@@ -289,8 +291,8 @@ class BoundaryEquilibrium(_EdgeCondition):
     caption: ClassVar[str] = "rest on edge, belt {belt}"
     line: ClassVar[Line] = Line("rest on edge", "#D55E00")
 
-    def _system_at_edge(self, osc):
-        return _edge_rest(osc, self.belt)
+    def _systems_at_edges(self, osc):
+        return _edge_rests(osc, self.belt)
 
     @classmethod
     def between(cls, before, after, edged):
@@ -305,7 +307,7 @@ class BoundaryEquilibrium(_EdgeCondition):
         return super().between(before, after, edged) if there != then else []
 
     def type_of(self, point):
-        push, persists = _across_edge(point.oscillator, self.belt)
+        push, persists = _across(self.followed(point)[0], point.oscillator)
         if not persists and abs(push) < HOLDS:
             return "degenerate"
         return "persistence" if persists or push > 0 else "annihilation"
@@ -320,14 +322,15 @@ class PseudoHopf(_EdgeCondition):
     caption: ClassVar[str] = "pseudo-Hopf, belt {belt}"
     line: ClassVar[Line] = Line("pseudo-Hopf", "#D55E00", (0, (5, 1.5)))
 
-    def _system_at_edge(self, osc):
-        return _edge_balance(osc, self.belt)
+    def _systems_at_edges(self, osc):
+        systems = _edge_balances(osc, self.belt)
+        return systems, jnp.ones(systems.edge.size, bool)
 
     def type_of(self, point):
-        return criticality(*_pseudo_growth(point.oscillator, self.belt))
+        return criticality(*_growth(self.followed(point)[0], point.oscillator))
 
     def coefficient(self, point):
-        return _pseudo_growth(point.oscillator, self.belt)[0]
+        return _growth(self.followed(point)[0], point.oscillator)[0]
 
 
 def check_edge(osc: Oscillator, belt: Any, field: str = "belt") -> None:
@@ -348,8 +351,9 @@ def _beside_edge(osc: Oscillator, at: Array) -> tuple[Mode, Mode]:
     return contact(osc, at, rest, rightward=False), contact(osc, at, rest, rightward=True)
 
 
-def _edge_rest(osc: Oscillator, belt: int | Array) -> EdgeRest:
-    """The equation of a boundary equilibrium at an edge of a belt that is nearest to hold."""
+def _edge_rests(osc: Oscillator, belt: int | Array) -> tuple[EdgeRest, Array]:
+    """The equations of a boundary equilibrium at the edges of a belt, and whether each is one of
+    its own, a row each."""
     cases = []
     for edge in _edges_of(osc, belt):
         sides = _beside_edge(osc, jnp.stack(edges(osc))[edge])
@@ -365,31 +369,24 @@ def _edge_rest(osc: Oscillator, belt: int | Array) -> EdgeRest:
             for limit in (-1.0, 1.0)
             for kinetic in (False, True)
         ]
-    missing = jnp.stack([jnp.abs(case.balance(osc)) for case in cases])
     exists = jnp.stack([case.exists(osc, jnp.asarray(NOTHING)) for case in cases])
-    at = jnp.argmin(jnp.where(jnp.isfinite(missing) & exists, missing, jnp.inf))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases), exists
 
 
 @jit
-def _across_edge(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
-    return _edge_rest(osc, belt).across(osc)
+def _across(system: EdgeRest, osc: Oscillator) -> tuple[Array, Array]:
+    return system.across(osc)
 
 
 @jit
-def _pseudo_growth(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
-    return _edge_balance(osc, belt).growth(osc)
+def _growth(system: EdgeBalance, osc: Oscillator) -> tuple[Array, Array]:
+    return system.growth(osc)
 
 
-def _edge_balance(osc: Oscillator, belt: int | Array) -> EdgeBalance:
-    """The equation of the pseudo-focus at an edge of a belt, of two the one nearer to balance."""
+def _edge_balances(osc: Oscillator, belt: int | Array) -> EdgeBalance:
+    """The equations of the pseudo-foci at the edges of a belt, a row each."""
     positions = jnp.stack(edges(osc))
     cases = [
         EdgeBalance(edge, *_beside_edge(osc, positions[edge])) for edge in _edges_of(osc, belt)
     ]
-    size = [
-        jnp.where(case.exists(osc, jnp.asarray(NOTHING)), jnp.abs(case.balance(osc)), jnp.inf)
-        for case in cases
-    ]
-    at = jnp.argmin(jnp.stack(size))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[at], *cases)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)

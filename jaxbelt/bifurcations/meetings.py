@@ -170,6 +170,9 @@ class EdgesAtRest(RestSystem):
     def residual(self, osc, x):
         return self.pair.gap(osc)[None]
 
+    def x1(self, osc, x):
+        return jnp.stack(edges(osc))[self.pair.first]
+
     def exists(self, osc, x):
         """Whether there is something at rest on, or between, them in either order."""
         positions = jnp.stack(edges(osc))

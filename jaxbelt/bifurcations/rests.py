@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
@@ -51,6 +51,8 @@ from .systems import RestSystem, judged_by, small_newton, third_derivative, velo
 
 #: The unknowns of a state of rest of which all is known.
 NOTHING = np.zeros(0)
+#: The guess of a condition on several states of rest that means any of them.
+ANY = np.array(-1)
 #: Coefficients smaller than this part of their terms are zero: points are good to some 1e-12.
 DEGENERATE = 1e-9
 #: Nearer to a contact edge than this, relative to their size, a fixed point lies on it.
@@ -89,8 +91,7 @@ def _prepared_rest(condition: AbstractRestCondition, osc: Oscillator, guess):
     return condition.system(lax.stop_gradient(osc), guess)
 
 
-@jit
-def _solved_rest(family: Family, system: RestSystem, x0, p0, status, why):
+def _rest_point(family: Family, system: RestSystem, x0, p0, status, why):
     def equations(family, u):
         return system.residual(family.at(u[-1:]), u[:-1])
 
@@ -100,8 +101,80 @@ def _solved_rest(family: Family, system: RestSystem, x0, p0, status, why):
     judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
     judged = jnp.where(size < HOLDS, judged, Status.NO_CONVERGENCE.value)
     status = judged_by(error, family, jnp.where(status == Status.OK, judged, status))
-    x1 = x[0] if x.size else jnp.nan
+    x1 = system.x1(family.at(p), x)
     return point_without_cycle(family, p, steps, size, error, status, why, x1), (x, p)
+
+
+_solved_rest = jit(_rest_point)
+
+
+class AbstractRestOfSeveral(AbstractRestCondition):
+    """A condition on any of several states of rest: the point nearest to the guess counts.
+
+    Its guess is the number of the one that is meant, or ANY.
+    """
+
+    @abc.abstractmethod
+    def systems(self, osc: Oscillator) -> tuple[RestSystem, Any, Array]:
+        """The system of each, its unknowns, and a status, a row each; compiled."""
+
+    def system(self, osc, guess):
+        systems, x, status = self.systems(osc)
+        is_meant = (guess < 0) | (jnp.arange(status.size) == guess)
+        return systems, x, jnp.where(is_meant, status, Status.NOT_TOUCHED.value)
+
+    def guess(self, osc, size):
+        return ANY
+
+    def guess_near(self, beginning):
+        return beginning
+
+    def beginnings(self, osc, cycles):
+        systems, x, status = self.as_data().prepared(osc, ANY)
+        order = np.argsort(np.asarray(_misses(systems, osc, x)))
+        return [np.array(row) for row in order if status[row] == Status.OK]
+
+    def solved(self, family, system, x, p, status):
+        return _solved_nearest(family, system, x, p, status, jnp.asarray(self.no_cycle.value))
+
+    def followed(self, point):
+        systems, x, status = self.as_data().prepared(point.oscillator, ANY)
+        row = row_at(systems, point.oscillator, x, status, point.x1)
+        return jax.tree.map(lambda leaf: leaf[row], (systems, x))
+
+
+@jit
+def _misses(systems: RestSystem, osc: Oscillator, x: Array) -> Array:
+    """The largest error in the equations of each, [rows]; inf where it has none."""
+    missed = jax.vmap(lambda system, x: jnp.max(jnp.abs(system.residual(osc, x))))(systems, x)
+    return jnp.where(jnp.isfinite(missed), missed, jnp.inf)
+
+
+@jit
+def row_at(systems: RestSystem, osc: Oscillator, x: Array, status: Array, x1: Array) -> Array:
+    """The row that holds, with the mass at rest at x1."""
+    places = jax.vmap(lambda system, x: system.x1(osc, x))(systems, x)
+    misses = _misses(systems, osc, x) + jnp.abs(places - x1)
+    return jnp.argmin(jnp.where(status == Status.OK, misses, jnp.inf))
+
+
+@jit
+def _solved_nearest(family: Family, systems: RestSystem, x0, p0, status, why):
+    """Of the points of all systems that nearest to the guess; where there is none, what is said of
+    the system that comes nearest to its equations at the guess."""
+
+    def solved(family, row):
+        system, x, said = jax.tree.map(lambda leaf: leaf[row], (systems, x0, status))
+        return _rest_point(family, system, x, p0, said, why)
+
+    # The choice has no derivative; nor would that of what is found, beside rows of NaN.
+    fixed = lax.stop_gradient(family)
+    points, _ = jax.vmap(lambda row: solved(fixed, row))(jnp.arange(status.size))
+    misses = jnp.where(status == Status.OK, _misses(systems, fixed.at(p0), x0), jnp.inf)
+    away = jnp.where(points.status == Status.OK, jnp.abs(points.value - p0[0]), jnp.inf)
+    row = jnp.where(jnp.any(jnp.isfinite(away)), jnp.argmin(away), jnp.argmin(misses))
+    point, (x, p) = solved(family, row)
+    return point, (x0.at[row].set(x), p)
 
 
 # --- the Hopf point -------------------------------------------------------------------------------
@@ -145,39 +218,22 @@ def _edge_rounding(x1: Array) -> Array:
     return EDGE_ROUNDING * (1 + jnp.abs(x1))
 
 
-class Hopf(AbstractRestCondition):
+class Hopf(AbstractRestOfSeveral):
     """A fixed point changes its stability: eqs. (27), (28) of the paper, for any friction law."""
 
     caption: ClassVar[str] = "Hopf"
     line: ClassVar[Line] = Line("Hopf", "#009E73", (0, (5, 1.5)))
 
-    def guess(self, osc, size):
-        return candidates(osc)
-
-    def guess_near(self, beginning: Equilibria):
-        return beginning
-
-    def beginnings(self, osc, cycles):
-        rests = candidates(osc)
-        fixed = np.flatnonzero(np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT)
-        order = fixed[np.argsort(np.abs(np.asarray(rests.rate)[fixed]))]
-        return [_only(rests, np.arange(len(rests)) == row) for row in order] or [None]
-
-    def system(self, osc, guess: Equilibria):
-        rests = lax.stop_gradient(guess)
+    def systems(self, osc):
+        rests = lax.stop_gradient(candidates(osc))
         fixed = rests.kind == EquilibriumKind.FIXED_POINT
-        row = jnp.argmin(jnp.where(fixed, jnp.abs(rests.rate), jnp.inf))
-        x1 = jnp.where(fixed[row], rests.x1[row], 0.0)
-        status = jnp.where(jnp.any(fixed), Status.OK.value, Status.NO_FIXED_POINT.value)
-        return HopfSystem(rests.modes[row].astype(float)), x1[None], status
+        status = jnp.where(fixed, Status.OK.value, Status.NO_FIXED_POINT.value)
+        x1 = jnp.where(fixed, rests.x1, 0.0)
+        return HopfSystem(rests.modes.astype(float)), x1[:, None], status
 
     @classmethod
     def between(cls, before, after, edged):
         return [cls()] if before.equilibria != after.equilibria else []
-
-    def followed(self, point):
-        osc, data = point.oscillator, self.as_data()
-        return data.prepared(osc, _rest_at(osc, point.x1))[:2]
 
     def type_of(self, point):
         return criticality(*_hopf_growth(point.oscillator, point.x1))
@@ -187,19 +243,6 @@ class Hopf(AbstractRestCondition):
 
     def place(self, point):
         return np.array([point.x1, point.x1, 0.0, 0.0, 0.0])
-
-
-def _only(rests: Equilibria, rows: ArrayLike) -> Equilibria:
-    """Equilibria as if there were those in some rows only."""
-    return eqx.tree_at(lambda one: one.kind, rests, jnp.where(rows, rests.kind, 0))
-
-
-def _rest_at(osc: Oscillator, x1: Array) -> Equilibria:
-    """The fixed point nearest to x1."""
-    rests = candidates(osc)
-    fixed = rests.kind == EquilibriumKind.FIXED_POINT
-    nearest = jnp.argmin(jnp.where(fixed, jnp.abs(rests.x1 - x1), jnp.inf))
-    return _only(rests, jnp.arange(len(rests)) == nearest)
 
 
 def criticality(coefficient: Array, size: Array) -> str:
@@ -215,7 +258,9 @@ def _hopf_growth(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
 
     NaN on a contact edge: no loop is on one side of it, however small.
     """
-    system, x1, _ = Hopf().system(osc, _rest_at(osc, x1))
+    systems, x, status = Hopf().systems(osc)
+    row = row_at(systems, osc, x, status, x1)
+    system, x1 = jax.tree.map(lambda leaf: leaf[row], (systems, x))
     sizes = []
     for belt, code in zip(osc.belts, system.codes, strict=True):
         alone = eqx.tree_at(lambda o: o.belts, osc, (belt,))

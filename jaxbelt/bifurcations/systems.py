@@ -129,6 +129,10 @@ class RestSystem(AbstractSystem):
         """What to watch along its curve."""
         return {}
 
+    def x1(self, osc: Oscillator, x: Array) -> Array:
+        """Where the mass rests, NaN where that is not known."""
+        return x[0] if x.size else jnp.asarray(jnp.nan)
+
     def linearized(self, osc_of, x, p):
         def value(u):
             return self.residual(osc_of(u[x.size :]), u[: x.size])

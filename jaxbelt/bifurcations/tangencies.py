@@ -34,7 +34,7 @@ from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS, newton
 from ..results import EventKind, Status
 from .base import Line
-from .conditions import AbstractCycleCondition
+from .conditions import AbstractStickCondition
 from .guesses import HINT_BUDGET, least_push, orbit_after_stick
 from .special import SpecialPoint
 from .systems import (
@@ -101,13 +101,12 @@ class Encounter(CycleSystem):
         return tests, True, jnp.where(self.is_tangency, slope, jnp.nan)
 
 
-class AbstractTangency(AbstractCycleCondition):
+class AbstractTangency(AbstractStickCondition):
     """A cycle is tangent to the boundary of a belt.
 
     wanted: 1 a fold, -1 grazing, 0 either.
     """
 
-    belt: int | Array
     family: ClassVar[str] = "tangency"
     more_arcs: ClassVar[int] = 1
     bends: ClassVar[bool] = True
