@@ -307,7 +307,7 @@ class BoundaryEquilibrium(_EdgeCondition):
         return super().between(before, after, edged) if there != then else []
 
     def type_of(self, point):
-        push, persists = _across(self.followed(point)[0], point.oscillator)
+        push, persists = _across_edge(self.followed(point)[0], point.oscillator)
         if not persists and abs(push) < HOLDS:
             return "degenerate"
         return "persistence" if persists or push > 0 else "annihilation"
@@ -327,10 +327,10 @@ class PseudoHopf(_EdgeCondition):
         return systems, jnp.ones(systems.edge.size, bool)
 
     def type_of(self, point):
-        return criticality(*_growth(self.followed(point)[0], point.oscillator))
+        return criticality(*_loop_growth(self.followed(point)[0], point.oscillator))
 
     def coefficient(self, point):
-        return _growth(self.followed(point)[0], point.oscillator)[0]
+        return _loop_growth(self.followed(point)[0], point.oscillator)[0]
 
 
 def check_edge(osc: Oscillator, belt: Any, field: str = "belt") -> None:
@@ -374,12 +374,12 @@ def _edge_rests(osc: Oscillator, belt: int | Array) -> tuple[EdgeRest, Array]:
 
 
 @jit
-def _across(system: EdgeRest, osc: Oscillator) -> tuple[Array, Array]:
+def _across_edge(system: EdgeRest, osc: Oscillator) -> tuple[Array, Array]:
     return system.across(osc)
 
 
 @jit
-def _growth(system: EdgeBalance, osc: Oscillator) -> tuple[Array, Array]:
+def _loop_growth(system: EdgeBalance, osc: Oscillator) -> tuple[Array, Array]:
     return system.growth(osc)
 
 

@@ -139,7 +139,7 @@ class AbstractRestOfSeveral(AbstractRestCondition):
 
     def followed(self, point):
         systems, x, status = self.as_data().prepared(point.oscillator, ANY)
-        row = row_at(systems, point.oscillator, x, status, point.x1)
+        row = row_that_holds(systems, point.oscillator, x, status, point.x1)
         return jax.tree.map(lambda leaf: leaf[row], (systems, x))
 
 
@@ -151,7 +151,7 @@ def _misses(systems: RestSystem, osc: Oscillator, x: Array) -> Array:
 
 
 @jit
-def row_at(systems: RestSystem, osc: Oscillator, x: Array, status: Array, x1: Array) -> Array:
+def row_that_holds(systems: RestSystem, osc: Oscillator, x: Array, status: Array, x1: Array) -> Array:
     """The row that holds, with the mass at rest at x1."""
     places = jax.vmap(lambda system, x: system.x1(osc, x))(systems, x)
     misses = _misses(systems, osc, x) + jnp.abs(places - x1)
@@ -259,7 +259,7 @@ def _hopf_growth(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
     NaN on a contact edge: no loop is on one side of it, however small.
     """
     systems, x, status = Hopf().systems(osc)
-    row = row_at(systems, osc, x, status, x1)
+    row = row_that_holds(systems, osc, x, status, x1)
     system, x1 = jax.tree.map(lambda leaf: leaf[row], (systems, x))
     sizes = []
     for belt, code in zip(osc.belts, system.codes, strict=True):
