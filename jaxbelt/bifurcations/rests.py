@@ -151,7 +151,9 @@ def _misses(systems: RestSystem, osc: Oscillator, x: Array) -> Array:
 
 
 @jit
-def row_that_holds(systems: RestSystem, osc: Oscillator, x: Array, status: Array, x1: Array) -> Array:
+def row_that_holds(
+    systems: RestSystem, osc: Oscillator, x: Array, status: Array, x1: Array
+) -> Array:
     """The row that holds, with the mass at rest at x1."""
     places = jax.vmap(lambda system, x: system.x1(osc, x))(systems, x)
     misses = _misses(systems, osc, x) + jnp.abs(places - x1)
