@@ -23,6 +23,7 @@ import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.cli import app
 from jaxbelt.kernel.lanes import Observer, Variable
+from jaxbelt.numerics.widths import SideBySide
 from jaxbelt.sweeps import store, threads
 from jaxbelt.sweeps.question import Question
 from jaxbelt.sweeps.threads import CHUNK
@@ -84,7 +85,7 @@ def test_a_motion_that_grows_beyond_all_bounds_keeps_nobody_waiting(observe):
 
 
 def test_many_chunks_lose_no_run():
-    n = 2 * CHUNK + 1000
+    n = 2 * CHUNK.here + 1000
     many = jb.sweep(jb.presets.class_b, {"nu0": np.linspace(-0.7, 0.7, n), "nu1": [0.35]}, t1=2.0)
     assert np.sum(many.status == Status.OK) == n
     assert np.all(np.isfinite(many.x1_end))
@@ -379,7 +380,7 @@ def test_more_runs_than_are_counted_are_refused_at_once():
 @pytest.mark.slow(first=True)
 def test_several_derivatives_are_each_by_itself(monkeypatch):
     """Also where the runs are in many chunks, and a long one ends in a later chunk."""
-    monkeypatch.setattr(threads, "CHUNK", 96)
+    monkeypatch.setattr(threads, "CHUNK", SideBySide(96, 96))
     axes = {"nu0": np.linspace(-0.6, 0.6, 20), "nu1": np.linspace(-0.5, 0.5, 15)}
 
     def sweep(*names):

@@ -25,11 +25,14 @@ from ..model.events import event_between
 from ..model.modes import Mode
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import any_lane, one_kernel
+from ..numerics.widths import SideBySide
 from ..results import Status
 from .loops import RepeatedLoop
 
-#: Lanes of a group, at most, and rounds that one piece of machine code makes.
-LANES_AT_ONCE, PAGE = 128, 8
+#: Lanes of a group, at most.
+LANES_AT_ONCE = SideBySide(on_cpu=128, elsewhere=2**14)
+#: Rounds that one piece of machine code makes.
+PAGE = 8
 #: An arc of a batch ends where a multiple of this time is passed: longer ones would take more steps
 #: for their derivatives, of the whole and of samples within.
 LONGEST_ARC = 2.0
@@ -37,7 +40,7 @@ LONGEST_ARC = 2.0
 ARCS_AT_ONCE = 64
 #: Rounds of all lanes for which a book has room, of 180 bytes each; a group of fewer lanes where it
 #: has to have more for each.
-BOOK = 2**20
+BOOK = SideBySide(on_cpu=2**20, elsewhere=2**24)
 #: The tolerance of a lane's steps over that of the run. A run by itself is far more accurate than
 #: its tolerance, and is to be the same in a batch; at order eight a hundred times the accuracy
 #: takes 1.8 times the steps.

@@ -28,6 +28,7 @@ from ..numerics.compiling import (
     with_batches,
 )
 from ..numerics.extrapolation import increments, scheme
+from ..numerics.widths import SideBySide
 from .integrators import State, density, slip_field
 
 #: A step of order twelve times the density of steps that is wanted there. Of 5,000 arcs of random
@@ -38,14 +39,15 @@ LENGTH = 0.3
 GROUPS = (8, 32, 16, 4)
 MOST_STEPS = math.prod(GROUPS)
 #: Arcs that are flown side by side, at most.
-SIDE_BY_SIDE = 64
+FLOWN_AT_ONCE = SideBySide(on_cpu=64, elsewhere=2**14)
 #: Runs, at most, and arcs of each, that are sorted by their numbers of steps together; and how many
-#: arcs these are, at most.
-RUNS, ROWS, MOST_FLIGHTS = 128, 128, 2048
+#: arcs these are, at most: times `MOST_STEPS`, a whole number of 32 bits.
+RUNS, ROWS = SideBySide(on_cpu=128, elsewhere=2**14), 128
+MOST_FLIGHTS = SideBySide(on_cpu=2**11, elsewhere=2**16)
 #: Arcs whose steps are found at once.
-LOOKED_AT = 128
+LOOKED_AT = SideBySide(on_cpu=128, elsewhere=2**14)
 #: Groups into which these are divided, at least.
-LEAST_GROUPS = 16
+LEAST_GROUPS = SideBySide(on_cpu=16, elsewhere=4)
 #: Largest density of steps, so that all numbers stay finite.
 DENSEST = 1e4
 #: Along an arc the steps vary by the ratio of the densities at its ends to this power: between the
@@ -220,8 +222,8 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32)) % flights
     places = jnp.zeros_like(order).at[order].set(jnp.arange(flights, dtype=jnp.int32))
     # A few groups at least, for all of a group wait for the longest.
-    most = min(SIDE_BY_SIDE, largest_power(max(1, LARGEST // count)))
-    size = min(most, max(1, flights // LEAST_GROUPS))
+    most = min(FLOWN_AT_ONCE.here, largest_power(max(1, LARGEST.here // count)))
+    size = min(most, max(1, flights // LEAST_GROUPS.here))
     graded = jnp.stack([number, is_even, ratio, wanted.astype(float)], axis=1)
     table = _as_columns(jnp.concatenate([table, graded], axis=1)[order], size)
 
@@ -260,7 +262,7 @@ def _all_steps(by_run, shared, table: Array, unpack: Callable) -> Array:
         varied, rest = eqx.combine(shared, own)
         return jax.vmap(of_one, (*axes, 0, 0), 1)(varied, rest, arcs, ones)
 
-    size = min(len(table), LOOKED_AT)
+    size = min(len(table), LOOKED_AT.here)
     groups = _as_columns(table, size)
     steps = lax.map(lambda columns: looked(shared, columns, jnp.ones(size)), groups)
     return jnp.moveaxis(steps, 1, 0).reshape(3, -1)

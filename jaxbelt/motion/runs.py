@@ -266,7 +266,7 @@ def _followed_rows(lane, axis_size: int, batched, args, rules: Rules):
     shapes = jax.eval_shape(one, [leaf[0] for leaf in rows])
     room = shapes[1].t.shape[0]
     rounds = -(-room // PAGE) * PAGE
-    width = min(LANES_AT_ONCE, -(-axis_size // 8) * 8, max(8, BOOK // rounds))
+    width = min(LANES_AT_ONCE.here, -(-axis_size // 8) * 8, max(8, BOOK.here // rounds))
     batch = Batch(width, rounds, room, rules.max_segments, len(osc.belts))
     groups = -(-axis_size // width)
 

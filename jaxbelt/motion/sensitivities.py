@@ -147,8 +147,9 @@ def _sensitivities(by_run, varied, rest, arcs: Arc, remaining: Array) -> Sensiti
     """`sensitivities` of runs side by side, [runs, arcs, inputs]."""
     runs, rows = remaining.shape
     inputs = 4 + sum(sizes_of(by_run, varied))
-    width = min(largest_power(2 * runs - 1), largest_power(max(1, LARGEST // inputs)), RUNS)
-    depth = min(ROWS, max(1, MOST_FLIGHTS // width))
+    fitting = largest_power(max(1, LARGEST.here // inputs))
+    width = min(largest_power(2 * runs - 1), fitting, RUNS.here)
+    depth = min(ROWS, max(1, MOST_FLIGHTS.here // width))
     blocks, chunks = -(-runs // width), -(-rows // depth)
     padding = (0, blocks * width - runs), (0, chunks * depth - rows)
 
@@ -221,7 +222,7 @@ def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, carry: Carry):
     creeps = jax.vmap(creep, (axes, 0))(of_runs, arcs)
     slopes = slopes_of(_passed, by_run, varied, rest, run, arcs, remaining, arcs.used)
     # As many rows at once as fit into one piece of machine code.
-    size = min(depth, largest_power(max(1, LARGEST // carry[1].size)))
+    size = min(depth, largest_power(max(1, LARGEST.here // carry[1].size)))
     rows = jax.tree.map(
         lambda leaf: leaf.reshape(depth // size, size, width, *leaf.shape[1:]),
         (slopes, arcs.used, creeps, arcs.begins_loop, arcs.again.astype(float)),
@@ -329,7 +330,7 @@ def _slopes_of_samples(by_run, varied, rest, starts: Array, since: Array, codes:
     from, the time since then, and the parameters."""
     runs, samples = since.shape
     total = runs * samples
-    size = min(MOST_FLIGHTS, largest_power(2 * total - 1))
+    size = min(MOST_FLIGHTS.here, largest_power(2 * total - 1))
 
     def chunks(leaf):
         leaf = leaf.reshape(total, *leaf.shape[2:])

@@ -27,6 +27,8 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
+from .widths import SideBySide, is_cpu
+
 #: Whether to use only what is promised.
 PLAIN = os.environ.get("JAXBELT_PLAIN", "0") not in ("", "0")
 
@@ -85,7 +87,7 @@ def known(options: dict[str, Any]) -> dict[str, Any] | None:
     def trial():
         return int(jax.jit(lambda: 7, compiler_options=options)()) == 7
 
-    if jax.default_backend() == "cpu" and _usable(f"XLA's options {', '.join(options)}", trial):
+    if is_cpu() and _usable(f"XLA's options {', '.join(options)}", trial):
         return options
     return None
 
@@ -170,7 +172,7 @@ def each(function: Callable) -> Callable:
     There a loop over some dozen rows takes as long as they do together, and compiles in half the
     time. Leaves that are no arrays are the same for all rows.
     """
-    if jax.default_backend() != "cpu":
+    if not is_cpu():
         return eqx.filter_vmap(function, in_axes=lambda leaf: 0 if _is_array(leaf) else None)
 
     def mapped(*trees):
@@ -245,9 +247,8 @@ def axes_of(flags):
     return jax.tree.map(lambda flag: 0 if flag else None, flags)
 
 
-#: Lanes of a group: more of them wait for the slowest, and leave the processor's caches; fewer take
-#: less time than XLA's calls of what they do.
-GROUP = 64
+#: Lanes of a group.
+GROUP = SideBySide(on_cpu=64, elsewhere=2**14)
 
 
 def in_groups(function: Callable) -> Callable:
@@ -256,11 +257,12 @@ def in_groups(function: Callable) -> Callable:
 
     def batch(_, axis_size, batched, *args):
         lane, leaves = of_lane(function, batched, args)
-        if axis_size <= GROUP:
+        size = GROUP.here
+        if axis_size <= size:
             return jax.vmap(lane)(leaves)
-        groups = -(-axis_size // GROUP)
+        groups = -(-axis_size // size)
         # The last one is filled with its last lane.
-        lanes = np.minimum(np.arange(groups * GROUP), axis_size - 1).reshape(groups, GROUP)
+        lanes = np.minimum(np.arange(groups * size), axis_size - 1).reshape(groups, size)
         done = lax.map(lambda own: jax.vmap(lane)([leaf[own] for leaf in leaves]), lanes)
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:axis_size], done)
 
@@ -325,8 +327,8 @@ POSSIBLE = frozenset(
     square squeeze stack stop_gradient sub tan tanh transpose unvmap_any while xor""".split()
 )
 #: Largest array there. XLA computes large loops on several threads, which fails inside one piece
-#: (seen at 4,096 numbers, not at 3,000).
-LARGEST = 1024
+#: (seen at 4,096 numbers, not at 3,000). There are pieces on the CPU only.
+LARGEST = SideBySide(on_cpu=1024, elsewhere=2**30)
 
 #: Whether what is traced becomes part of a piece already.
 _is_part = contextvars.ContextVar("is_part", default=False)
@@ -344,7 +346,7 @@ def one_kernel(function: Callable) -> Callable:
 
     @functools.wraps(function)
     def call(*args):
-        usable = jax.default_backend() == "cpu" and _usable("kernels of one piece", _try_piece)
+        usable = is_cpu() and _usable("kernels of one piece", _try_piece)
         return (piece if usable else function)(*args)
 
     return call
@@ -375,7 +377,7 @@ def _as_piece(function: Callable) -> Callable:
 def _is_possible(jaxpr: Any) -> bool:
     for equation in jaxpr.eqns:
         sizes = [variable.aval.size for variable in equation.outvars]
-        if equation.primitive.name not in POSSIBLE or max(sizes, default=0) > LARGEST:
+        if equation.primitive.name not in POSSIBLE or max(sizes, default=0) > LARGEST.here:
             return False
         parts = [getattr(one, "jaxpr", one) for one in jax.tree.leaves(equation.params)]
         if not all(_is_possible(part) for part in parts if hasattr(part, "eqns")):

@@ -51,7 +51,7 @@ def differing(
     the audited ones, a row each, in the form of the kernel's results.
     """
     rows = np.concatenate(
-        [rows_of(part) for part in np.array_split(runs, -(-len(runs) // CHUNK))], axis=1
+        [rows_of(part) for part in np.array_split(runs, -(-len(runs) // CHUNK.here))], axis=1
     )
     long_way = dataclasses.replace(program, observer=Final(skip=False), captures=False)
     final = _results(long_way, shared, rows, numbers)

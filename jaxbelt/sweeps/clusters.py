@@ -20,6 +20,7 @@ from typing import Any
 import jax
 
 from ..checks import require_value
+from ..numerics.widths import is_cpu
 from .question import Question
 from .store import Store
 from .work import Tell, counts, do_runs
@@ -104,7 +105,7 @@ def do_block(packed: bytes, place: str, block: int) -> dict[str, Any]:
         store.look(block)
         if not store.is_done(block):
             store.began = time.monotonic()
-            threads = 1 if jax.default_backend() == "cpu" else None
+            threads = 1 if is_cpu() else None
             do_runs(question, store, [block], lambda _: None, threads=threads, watch=watch)
         return {"block": block, "statuses": counts(store.statuses(block))}
 

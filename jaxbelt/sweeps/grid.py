@@ -21,7 +21,10 @@ from ..checks import (
 )
 from ..kernel.lanes import Observer, Program
 from ..model.oscillator import Oscillator, check_scalars, its_oscillator
-from .threads import CHUNK
+from ..numerics.compiling import power_of_two
+
+#: Rows that are made of a few runs, too, so that few shapes are compiled.
+ROWS = 2**14
 
 
 class Grid:
@@ -89,8 +92,8 @@ class Grid:
 
     def rows(self, runs: np.ndarray, derivatives: tuple[str, ...] = ()) -> np.ndarray:
         """Starts and varying parameters of some runs, [1 + derivatives, columns, runs]."""
-        # Of one size, for one compiled program.
-        padded = np.concatenate([runs, np.zeros(CHUNK - len(runs), runs.dtype)])
+        padding = power_of_two(len(runs), ROWS) - len(runs)
+        padded = np.concatenate([runs, np.zeros(padding, runs.dtype)])
         places = np.unravel_index(padded, self.shape)
         values = {
             name: axis[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)

@@ -34,12 +34,13 @@ from .grid import Grid
 from .moments import AtEvents, bytecode, checked
 from .observers import Final, Reduce
 from .reducers import check_reducer
-from .threads import CHUNK
 
 #: Default t1 of attractor runs: some 500 loops, where nearly all have long been decided.
 LONG_ENOUGH = 30_000.0
 #: The observers that have a name.
 NAMED: dict[str, type[Observer]] = {"final": Final, "attractor": Attractor}
+#: Points of the grid that tell what `make` is, at most; the same on every machine.
+SAMPLE = 2**14
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,12 +133,12 @@ class Question:
     def identity(self) -> dict[str, str]:
         """What makes two sweeps the same, by the names of the arguments.
 
-        `make` counts by what it gives, at up to `CHUNK` points of the grid: its numbers to eleven
+        `make` counts by what it gives, at up to `SAMPLE` points of the grid: its numbers to eleven
         digits, which do not depend on the machine, and the friction laws of its oscillator by
         their types, numbers and, if they are not this package's, source.
         """
         grid = self.grid
-        sample = np.unique(np.linspace(0, grid.runs - 1, CHUNK).astype(int))
+        sample = np.unique(np.linspace(0, grid.runs - 1, SAMPLE).astype(int))
         rows = grid.rows(sample)
         leaves, _ = jax.tree_util.tree_flatten_with_path(grid.example)
         parameters = [f"{jax.tree_util.keystr(path)}={float(leaf)!r}" for path, leaf in leaves]

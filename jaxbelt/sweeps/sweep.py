@@ -277,7 +277,7 @@ def explain(
     """
     question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives)
     grid, table = question.grid, question.table
-    sample = np.unique(np.linspace(0, grid.runs - 1, SAMPLE).astype(int))
+    sample = np.unique(np.linspace(0, grid.runs - 1, CHUNK.here).astype(int))
 
     def rows_of(first: int, last: int) -> np.ndarray:
         return grid.rows(sample[first:last], question.derivatives)
@@ -307,7 +307,3 @@ def explain(
         compile_seconds=compiling,
         seconds=seconds * grid.runs / len(sample),
     )
-
-
-#: Runs that `explain` does, at most: two chunks of the queue would be no better a sample.
-SAMPLE = CHUNK

@@ -22,6 +22,7 @@ from ..checks import require
 from ..kernel.lanes import Program
 from ..kernel.rounds import STEPS_PER_ROUND
 from ..numerics.compiling import wide
+from ..numerics.widths import SideBySide, is_cpu
 from .queue import ROUNDS_PER_PASS, Call, Common, advance, differentiable, idle
 
 #: Steps that a run may take for each 100 units of time before it is given up. On its way to a
@@ -29,15 +30,14 @@ from .queue import ROUNDS_PER_PASS, Call, Common, advance, differentiable, idle
 STEP_BUDGET = 400_000
 #: Runs that the kernel is given at once: enough that a call costs nothing beside them, and few
 #: enough that the threads end together.
-CHUNK = 2**14
-#: Lanes. On the CPU so few that they stay in the nearest cache, and so many that a refill is cheap
-#: for each; other devices need far more.
-WIDTH = {"cpu": 128}
+CHUNK = SideBySide(on_cpu=2**14, elsewhere=2**20)
+#: Lanes, so many that a refill is cheap for each.
+WIDTH = SideBySide(on_cpu=128, elsewhere=2**20)
 #: Seconds in which an interrupt is to be heard; a call of the kernel takes half of that or less.
 PATIENCE = 0.5
 #: Passes of the first call, before it is known how long one takes: about a seventh of a second on
 #: the CPU; with derivatives, or where there are more lanes, a pass takes longer.
-FIRST_PASSES = {"cpu": 2000}
+FIRST_PASSES = SideBySide(on_cpu=2000, elsewhere=100)
 
 
 @functools.lru_cache(maxsize=32)
@@ -49,7 +49,7 @@ def compiled(program: Program) -> Callable:
 
 def workers() -> int:
     """Threads that run the kernel: one a core on the CPU, one a device elsewhere."""
-    if jax.default_backend() != "cpu":
+    if not is_cpu():
         return jax.local_device_count()
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -96,8 +96,8 @@ def run(
         put,
         columns,
         derivatives,
-        _Chunks(runs, threads, CHUNK),
-        FIRST_PASSES.get(jax.default_backend(), 100) // (1 + derivatives),
+        _Chunks(runs, threads, CHUNK.here),
+        FIRST_PASSES.here // (1 + derivatives),
     )
     devices = jax.local_devices()
     # Compiled once, before the threads that would each do it again, and like all else not on the
@@ -113,7 +113,7 @@ def run(
 
 def _first_streams(program: Program, shared, columns: int, derivatives: int) -> Any:
     """The stream that a kernel starts from, and its derivatives, all zero."""
-    stream = idle(program, shared, WIDTH.get(jax.default_backend(), 2**17), columns)
+    stream = idle(program, shared, WIDTH.here, columns)
     return stream, [jax.tree.map(jnp.zeros_like, differentiable(stream))] * derivatives
 
 
@@ -167,8 +167,7 @@ class _Team:
 
     def _queue(self) -> np.ndarray:
         """Room for a chunk: of one size, for one compiled kernel."""
-        width = WIDTH.get(jax.default_backend(), 2**17)
-        return np.zeros((1 + self.derivatives, self.columns, CHUNK + width))
+        return np.zeros((1 + self.derivatives, self.columns, CHUNK.here + WIDTH.here))
 
     def _chunk(self, queue, first: int, last: int, drain: bool, streams, passes: int):
         """Call the kernel until a chunk is taken (with `drain`: done); calls take half of PATIENCE
