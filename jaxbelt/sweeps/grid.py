@@ -24,7 +24,7 @@ from ..model.oscillator import Oscillator, check_scalars, its_oscillator
 from ..numerics.compiling import power_of_two
 
 #: Rows that are made of a few runs, too, so that few shapes are compiled.
-ROWS = 2**14
+FEWEST_ROWS = 2**14
 
 
 class Grid:
@@ -92,7 +92,7 @@ class Grid:
 
     def rows(self, runs: np.ndarray, derivatives: tuple[str, ...] = ()) -> np.ndarray:
         """Starts and varying parameters of some runs, [1 + derivatives, columns, runs]."""
-        padding = power_of_two(len(runs), ROWS) - len(runs)
+        padding = power_of_two(len(runs), FEWEST_ROWS) - len(runs)
         padded = np.concatenate([runs, np.zeros(padding, runs.dtype)])
         places = np.unravel_index(padded, self.shape)
         values = {
