@@ -92,7 +92,8 @@ ADVICE = {
     ),
     Status.NO_UNSTABLE_CYCLE: (
         "There is no unstable cycle between a stable equilibrium and the motion outside of it: no "
-        "equilibrium is stable, or everything comes to rest there."
+        "equilibrium is stable, or everything comes to rest there, or the cycle passes the "
+        "boundary of a belt; jb.portrait finds those that do."
     ),
     Status.NOT_TOUCHED: (
         "Nothing comes near the boundary or an edge of that belt here, so no such point is near, "

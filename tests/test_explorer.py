@@ -1,5 +1,6 @@
 """The live explorer: its sliders are the numbers of an oscillator, and moving one redraws."""
 
+import numpy as np
 import pytest
 
 import jaxbelt as jb
@@ -29,6 +30,44 @@ def test_sliders_move_the_oscillator_and_the_picture():
     # Entries of the key are lines without data.
     begins = [line.get_xdata()[0] for line in portrait.lines if len(line.get_xdata())]
     assert max(begins) == 2.5
+
+
+def three_belts():
+    velocities = np.linspace(0.0, 3.0, 13)
+    measured = jb.Tabulated(velocities, 0.6 + 0.4 / (1 + 5 * velocities))
+    belts = (
+        jb.Belt(0.4, measured, upper=1.0),
+        jb.Belt(-0.2, jb.Stribeck(1.0, 0.6, 0.2)),
+        jb.Belt(0.4, jb.Conti(1.0, 0.6, 10.0), load=0.0),
+    )
+    return jb.Oscillator(0.2, belts)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "osc",
+    [
+        jb.presets.class_a(0.25),
+        jb.presets.class_c(-0.3, 0.3, sigma=0.2),
+        jb.Oscillator(0.0, (jb.Belt(0.0, jb.Coulomb(0.5, 0.25)),)),
+        three_belts(),
+    ],
+    ids=["a", "c", "Coulomb", "three"],
+)
+def test_every_slider_goes_to_both_of_its_ends(osc):
+    """Each draws a picture, or says which number cannot be."""
+    explorer = jb.explore(osc, t1=20.0)
+    png, message = explorer.widget.children[1].children
+    for name, slider in explorer.sliders.items():
+        begun = slider.value
+        for end in (slider.min, slider.max):
+            before = bytes(png.value)
+            slider.value = end
+            assert slider.value == end
+            told = message.value.startswith(("OK", "STUCK_FOREVER"))
+            assert told != ("must be" in message.value), (name, message.value)
+            assert told or bytes(png.value) == before
+            slider.value = begun
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from .style import belt_colour
 #: Where the sliders of these numbers end, at least; other numbers go from 0 to 1 at least. They go
 #: to twice the value with which they begin, too.
 RANGES = {
+    "friction.velocity": (0.0, 1.0),
     "velocity": (-1.0, 1.0),
     "lower": (-2.0, 2.0),
     "upper": (-2.0, 2.0),
@@ -140,7 +141,8 @@ def _empty(ax: Axes) -> None:
 
 
 def _slider(ipywidgets: Any, name: str, value: float) -> Any:
-    least, most = RANGES.get(name.rpartition(".")[2], (0.0, 1.0))
+    *_, last = path = name.split(".")
+    least, most = RANGES.get(".".join(path[-2:]), RANGES.get(last, (0.0, 1.0)))
     least, most = min(least, 2 * value), max(most, 2 * value)
     return ipywidgets.FloatSlider(
         value,

@@ -40,6 +40,7 @@ from .style import (
     belt_colour,
     figure_of,
     journal_figure,
+    key_columns,
     key_entries,
     new_axes,
     new_figure,
@@ -105,12 +106,13 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
     entries = key_entries([upper])
     if entries:
         labels = sorted(entries)
+        width = upper.get_window_extent().width * 72 / figure_of(upper).dpi
         upper.legend(
             [entries[label] for label in labels],
             labels,
             loc="lower right",
             bbox_to_anchor=(1.0, 1.0),
-            ncols=len(labels),
+            ncols=key_columns(width, labels),
             frameon=False,
             borderaxespad=0.2,
         )

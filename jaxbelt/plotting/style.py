@@ -107,7 +107,7 @@ def draw_key(figure: Figure, note: str = "", *, leave_out: Axes | None = None) -
         entries.values(),
         entries.keys(),
         loc="outside lower center",
-        ncols=_key_columns(72 * figure.get_size_inches()[0], list(entries)),
+        ncols=key_columns(72 * figure.get_size_inches()[0], list(entries)),
         frameon=False,
         handlelength=1.8,
         columnspacing=1.4,
@@ -141,14 +141,14 @@ def add_key(ax: Axes) -> None:
         bbox_to_anchor=(0.5, 0.0),
         bbox_transform=ax.transAxes + below,
         borderaxespad=0.0,
-        ncols=_key_columns(width, list(entries), room),
+        ncols=key_columns(width, list(entries), room),
         frameon=False,
         handlelength=2.2,
         columnspacing=1.4,
     )
 
 
-def _key_columns(width: float, labels: Sequence[str], room: float = 0.0) -> int:
+def key_columns(width: float, labels: Sequence[str], room: float = 0.0) -> int:
     """How many columns of a key there is room for in a width, in points; rows of one length. Rather
     than one two that need more, within what there is room for beside the axes, too."""
     size = matplotlib.rcParams["font.size"]
