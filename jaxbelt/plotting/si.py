@@ -197,12 +197,12 @@ def _scale_artist(artist: Artist, ax: Axes, sizes: np.ndarray) -> None:
     """Multiply the coordinates of an artist that are data."""
     # Matplotlib before 3.11 misspells it.
     names = ("contains_branch_separately", "contains_branch_seperately")
-    in_data = next(getattr(Transform, name) for name in names if hasattr(Transform, name))
+    in_data = next(name for name in names if hasattr(Transform, name))
 
     def of_data(transform: Any) -> np.ndarray:
         transform = ax.transData if transform == "data" else transform
         known = isinstance(transform, Transform)
-        return np.where(known and in_data(transform, ax.transData), sizes, 1.0)
+        return np.where(known and getattr(transform, in_data)(ax.transData), sizes, 1.0)
 
     def scaled(place: Any, transform: Any) -> tuple[float, float]:
         x, y = place * of_data(transform)
