@@ -61,10 +61,8 @@ def phase_plane():
     """A run in the phase plane, and the stick-slip cycle that it settles on."""
     osc = jb.presets.class_b(nu0=-0.2, nu1=0.35)
     run = jb.simulate(osc, y0=(2.0, 0.0), t1=40.0)
-    figure = journal_figure(5.2, 3.6)
     cycle = jb.find_cycle(osc, y0=(2.0, 0.0))
-    jb.plot_phase_portrait(osc, run, cycles=[cycle], ax=figure.subplots())
-    return figure
+    return jb.plot_phase_portrait(osc, run, cycles=[cycle]).figure
 
 
 def diagram():

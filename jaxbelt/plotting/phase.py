@@ -227,7 +227,7 @@ def plot_phase_portrait(
         else:
             style = {"linewidth": 1.0, "linestyle": (0, (4, 2.2)), "label": "unstable cycle"}
         ax.plot(*loop.T, color="black", solid_joinstyle="round", zorder=4, **style)
-        _draw_arrowheads(ax, loop, "black", [int(np.argmin(loop[:, 1]))])
+        _draw_arrowheads(ax, loop, "black", [_lowest(loop)])
     for equilibrium in rests:
         draw_equilibrium(ax, equilibrium)
     ax.set_xlabel("displacement $x_1$")
@@ -439,6 +439,13 @@ def _index_at_distance(ax: Axes, path: np.ndarray, distance: float) -> int:
     steps = np.diff(path, axis=0) / [right - left, top - bottom]
     gone = np.concatenate([[0.0], np.cumsum(np.hypot(*steps.T))])
     return int(np.searchsorted(gone, min(distance, gone[-1] / 2)))
+
+
+def _lowest(path: np.ndarray) -> int:
+    """The lowest point of a path; the middle one where it is level there, as along a belt."""
+    x2 = path[:, 1]
+    (lowest,) = np.nonzero(x2 <= x2.min() + 1e-6 * np.ptp(x2))
+    return int(lowest[len(lowest) // 2])
 
 
 def _draw_arrowheads(ax: Axes, path: np.ndarray, colour: str, indices: Sequence[int]) -> None:
