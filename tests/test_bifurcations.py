@@ -117,6 +117,21 @@ def test_grazing_on_either_of_two_belts_that_share_the_load_of_one(belt):
     assert point.value == pytest.approx(-0.455724862289, abs=1e-11)
 
 
+@pytest.mark.slow(first=True)
+def test_a_belt_that_does_not_touch_where_another_is_crossed_has_no_part_in_it():
+    """They run at one velocity, and the cycle sticks to both; it crosses the boundary of belt 0
+    where belt 1 does not touch."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(load):
+        belts = jb.Belt(0.6, law, load=load), jb.Belt(0.6, law, load=1.5, lower=0.4)
+        return jb.Oscillator(0.02, belts)
+
+    point = jb.refine(jb.CrossingSliding(0), make, at=0.14)
+    assert point.value == pytest.approx(0.144938215991, abs=1e-10)
+    assert jb.refine(jb.CrossingSliding(1), make, at=0.14).status != Status.OK
+
+
 def test_points_of_another_system():
     osc = other_system()
     hopf = jb.refine(jb.Hopf(), osc, where=nu0)

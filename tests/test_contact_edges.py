@@ -372,6 +372,27 @@ def test_the_nearest_of_what_comes_to_either_edge_from_either_side(guess, value,
     assert point.type == kind
 
 
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_a_fixed_point_comes_to_an_edge_on_which_a_segment_ends_all_along(mirror):
+    """On the other side belt 1 at rest stops the mass by kinetic friction up to the edge, whatever
+    the load of belt 0 is, which pulls with 0.6 + 0.4 / 3 of it."""
+    law, held = jb.Conti(1.0, 0.6, 10.0), jb.Coulomb(0.5, 0.25)
+    sides = (
+        ({"upper": 0.25}, {"lower": 0.25}) if mirror > 0 else ({"lower": -0.25}, {"upper": -0.25})
+    )
+
+    def make(load, nu=0.2):
+        belts = (jb.Belt(mirror * nu, law, load=load, **sides[0]), jb.Belt(0.0, held, **sides[1]))
+        return jb.Oscillator(0.5, belts)
+
+    point = jb.refine(jb.BoundaryEquilibrium(0), make, at=0.33)
+    assert point.value == pytest.approx(0.25 / (0.6 + 0.4 / 3), abs=1e-14)
+    assert point.type == "persistence"
+    curve = jb.bifurcation_curve(point, make, ((0.3, 0.4), (0.1, 0.4)))
+    loads, speeds = np.asarray(curve.values).T
+    np.testing.assert_allclose(loads * (0.6 + 0.4 / (1 + 10 * speeds)), 0.25, atol=1e-12)
+
+
 def test_the_end_of_a_segment_on_an_edge():
     """Belt 1 at rest holds what is within its capacity of the pull of belt 0."""
     osc = jb.presets.class_d(0.35, 0.0, 0.0, 0.6)

@@ -333,7 +333,8 @@ class BifurcationPoint(eqx.Module):
     shrunk to the equilibrium, at `SuddenSliding` its period is infinite); multiplier: of the cycle
     on the side where it does not stick to the belt, for `NonsmoothFold` and `GrazingSliding`, else
     NaN; x1: where the mass is at rest at the point where its equations tell it, else NaN; status: a
-    `Status` code. Where it is not OK the value is NaN.
+    `Status` code. Where it is not OK the value is NaN. member: which of several states of rest it
+    is, as its condition counts them.
     """
 
     condition: AbstractCondition = eqx.field(static=True)
@@ -347,6 +348,7 @@ class BifurcationPoint(eqx.Module):
     oscillator: Oscillator
     cycle: Cycle
     status: Array
+    member: ArrayLike = 0
 
     @property
     def kind(self) -> str:

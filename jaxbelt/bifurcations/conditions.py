@@ -1,9 +1,9 @@
 """Conditions on a cycle, and what a condition of one's own is written with.
 
 `AbstractCycleCondition` shares what conditions on a cycle have in common, as
-`rests.AbstractRestCondition` does for a state of rest; those of sticking to a belt are of several
-belts where these run together. A functional of an attracting cycle that has
-a given value is a `CycleEquation`, for which a class with one method will do.
+`rests.AbstractRestCondition` does for a state of rest; `AbstractStickCondition` knows that two
+belts may do all that they do together. A functional of an attracting cycle that has a given value
+is a `CycleEquation`, for which a class with one method will do.
 """
 
 import abc
@@ -86,8 +86,8 @@ def _solved_point(family: Family, system: CycleSystem, z0, p0, status):
 
 
 class AbstractStickCondition(AbstractCycleCondition):
-    """A condition on how a cycle begins, or ends, to stick to a belt; which may be several that run
-    at one velocity."""
+    """A condition on how a cycle begins, or ends, to stick to a belt; or to another one, where the
+    two run at one velocity and touch the mass at the same times."""
 
     belt: int | Array
 
@@ -99,8 +99,9 @@ class AbstractStickCondition(AbstractCycleCondition):
             return False
         pair = np.array([self.belt, named.belt])
         one, other = (point.oscillator.belts[belt].velocity for belt in pair)
-        stuck = np.asarray(chain.codes)[np.asarray(chain.used)][:, pair] == 0
-        return bool(one == other and np.any(stuck) and np.all(stuck[:, 0] == stuck[:, 1]))
+        # Both touch, or none, all along: what happens to one of them happens to the other.
+        codes = np.asarray(chain.codes)[np.asarray(chain.used)][:, pair]
+        return bool(one == other and np.all(codes[:, 0] == codes[:, 1]))
 
 
 class CycleEquation(AbstractCycleCondition):

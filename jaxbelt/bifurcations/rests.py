@@ -15,6 +15,7 @@ contact edges is in `edge_rests`.
 
 import abc
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -22,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
@@ -51,7 +52,7 @@ from .systems import RestSystem, judged_by, small_newton, third_derivative, velo
 
 #: The unknowns of a state of rest of which all is known.
 NOTHING = np.zeros(0)
-#: The guess of a condition on several states of rest that means any of them.
+#: As the guess of a condition on several states of rest: any of them.
 ANY = np.array(-1)
 #: Coefficients smaller than this part of their terms are zero: points are good to some 1e-12.
 DEGENERATE = 1e-9
@@ -109,7 +110,8 @@ _solved_rest = jit(_rest_point)
 
 
 class AbstractRestOfSeveral(AbstractRestCondition):
-    """A condition on any of several states of rest: the point nearest to the guess counts.
+    """A condition on any of several states of rest: the point nearest to the guess counts, of a
+    function of the parameter that which is nearest along its tangents.
 
     Its guess is the number of the one that is meant, or ANY.
     """
@@ -139,7 +141,7 @@ class AbstractRestOfSeveral(AbstractRestCondition):
 
     def followed(self, point):
         systems, x, status = self.as_data().prepared(point.oscillator, ANY)
-        row = row_that_holds(systems, point.oscillator, x, status, point.x1)
+        row = row_that_holds(systems, point.oscillator, x, status, point.x1, point.member)
         return jax.tree.map(lambda leaf: leaf[row], (systems, x))
 
 
@@ -152,12 +154,15 @@ def _misses(systems: RestSystem, osc: Oscillator, x: Array) -> Array:
 
 @jit
 def row_that_holds(
-    systems: RestSystem, osc: Oscillator, x: Array, status: Array, x1: Array
+    systems: RestSystem, osc: Oscillator, x: Array, status: Array, x1: Array, row: ArrayLike
 ) -> Array:
-    """The row that holds, with the mass at rest at x1."""
+    """The row that holds, with the mass at rest at x1; of several this one if it is among them:
+    another may hold on the other side of the edge whatever the parameter is."""
     places = jax.vmap(lambda system, x: system.x1(osc, x))(systems, x)
     misses = _misses(systems, osc, x) + jnp.abs(places - x1)
-    return jnp.argmin(jnp.where(status == Status.OK, misses, jnp.inf))
+    misses = jnp.where(status == Status.OK, misses, jnp.inf)
+    holds = misses[row] < jnp.min(misses) + HOLDS
+    return jnp.where(holds, row, jnp.argmin(misses))
 
 
 @jit
@@ -176,7 +181,7 @@ def _solved_nearest(family: Family, systems: RestSystem, x0, p0, status, why):
     away = jnp.where(points.status == Status.OK, jnp.abs(points.value - p0[0]), jnp.inf)
     row = jnp.where(jnp.any(jnp.isfinite(away)), jnp.argmin(away), jnp.argmin(misses))
     point, (x, p) = solved(family, row)
-    return point, (x0.at[row].set(x), p)
+    return replace(point, member=row), (x0.at[row].set(x), p)
 
 
 # --- the Hopf point -------------------------------------------------------------------------------
@@ -238,10 +243,10 @@ class Hopf(AbstractRestOfSeveral):
         return [cls()] if before.equilibria != after.equilibria else []
 
     def type_of(self, point):
-        return criticality(*_hopf_growth(point.oscillator, point.x1))
+        return criticality(*_hopf_growth(point.oscillator, point.x1, point.member))
 
     def coefficient(self, point):
-        return _hopf_growth(point.oscillator, point.x1)[0]
+        return _hopf_growth(point.oscillator, point.x1, point.member)[0]
 
     def place(self, point):
         return np.array([point.x1, point.x1, 0.0, 0.0, 0.0])
@@ -255,13 +260,13 @@ def criticality(coefficient: Array, size: Array) -> str:
 
 
 @jit
-def _hopf_growth(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
+def _hopf_growth(osc: Oscillator, x1: Array, row: ArrayLike) -> tuple[Array, Array]:
     """The first Lyapunov coefficient at the Hopf point at x1, and the size of its terms.
 
     NaN on a contact edge: no loop is on one side of it, however small.
     """
     systems, x, status = Hopf().systems(osc)
-    row = row_that_holds(systems, osc, x, status, x1)
+    row = row_that_holds(systems, osc, x, status, x1, row)
     system, x1 = jax.tree.map(lambda leaf: leaf[row], (systems, x))
     sizes = []
     for belt, code in zip(osc.belts, system.codes, strict=True):
