@@ -26,8 +26,10 @@ from .shooting import flow
 STEPS_ALONG = 100_000
 #: The integral of the density of steps over a piece at most, so that a mesh of 16 steps takes it.
 PIECE = 8.0
-#: Pieces that are cut off arcs in one go; room for arcs, or pieces, at least.
-CUT_AT_ONCE, FEWEST = 32, 16
+#: Pieces that are cut off each arc in one compiled call.
+CUT_AT_ONCE = 32
+#: Rows of the arrays of arcs and pieces, at least, so that few shapes are compiled.
+FEWEST = 16
 
 
 def places_along(
@@ -65,7 +67,8 @@ def arc_samples(
     """Times and states of n samples of an arc, the last at its end: three quarters of them evenly
     along its way in the plane, the others evenly in time.
 
-    x1 and x2 are monotone: |dx1| + |dx2| of the arc is the integral of that of its steps.
+    x1 and x2 are monotone, as extrema end arcs: |dx1| + |dx2| of the arc is the integral of that of
+    its steps.
     """
     mode = mode_of(codes)
     way = jnp.sum(jnp.abs(exit_ - y))
@@ -79,8 +82,8 @@ def arc_samples(
 
 
 def cut_finely(osc: Oscillator, loop: Loop) -> Loop:
-    """Arcs one after another, those that are longer than PIECE cut into such pieces; one that is
-    not the last of its arc ends by nothing ("unused")."""
+    """Arcs one after another, those that want more steps than a PIECE does cut into pieces; one that
+    is not the last of its arc ends by nothing ("unused")."""
     count = len(loop.ends)
     padded = pick(loop, np.minimum(np.arange(power_of_two(count, FEWEST)), count - 1))
     entries, left = map(np.array, (padded.entries, padded.durations))

@@ -41,7 +41,7 @@ MOST_STEPS = math.prod(GROUPS)
 #: Arcs that are flown side by side, at most.
 FLOWN_AT_ONCE = SideBySide(on_cpu=64, elsewhere=2**14)
 #: Runs, at most, and arcs of each, that are sorted by their numbers of steps together; and how many
-#: arcs these are, at most: times `MOST_STEPS`, a whole number of 32 bits.
+#: arcs these are, at most: with `MOST_STEPS` each still a whole number of 32 bits, for sorting.
 RUNS, ROWS = SideBySide(on_cpu=128, elsewhere=2**14), 128
 MOST_FLIGHTS = SideBySide(on_cpu=2**11, elsewhere=2**16)
 #: Arcs whose steps are found at once.

@@ -6,11 +6,11 @@ import jax
 
 
 class SideBySide(NamedTuple):
-    """How many of something are done at once.
+    """How many of something are done at once, or a limit of that.
 
-    on_cpu: so many that XLA's calls cost nothing beside them, and so few that they stay in the
-    nearest cache and need not wait long for the slowest of them; elsewhere: on a device with
-    thousands of cores, which takes as long for a few as for so many.
+    Lanes on the CPU are so many that XLA's calls cost nothing beside them, and so few that they
+    stay in the nearest cache and need not wait long for the slowest; a device with thousands of
+    cores takes as long for a few as for thousands.
     """
 
     on_cpu: int
