@@ -82,8 +82,8 @@ def arc_samples(
 
 
 def cut_finely(osc: Oscillator, loop: Loop) -> Loop:
-    """Arcs one after another, those that want more steps than a PIECE does cut into pieces; one that
-    is not the last of its arc ends by nothing ("unused")."""
+    """Arcs one after another, those that want more steps than a PIECE takes cut into pieces; one
+    that is not the last of its arc ends by nothing ("unused")."""
     count = len(loop.ends)
     padded = pick(loop, np.minimum(np.arange(power_of_two(count, FEWEST)), count - 1))
     entries, left = map(np.array, (padded.entries, padded.durations))
