@@ -227,7 +227,7 @@ def plot_phase_portrait(
         else:
             style = {"linewidth": 1.0, "linestyle": (0, (4, 2.2)), "label": "unstable cycle"}
         ax.plot(*loop.T, color="black", solid_joinstyle="round", zorder=4, **style)
-        _draw_arrowheads(ax, loop, "black", [_lowest(loop)])
+        _draw_arrowheads(ax, loop, "black", _lowest(loop))
     for equilibrium in rests:
         draw_equilibrium(ax, equilibrium)
     ax.set_xlabel("displacement $x_1$")
@@ -441,11 +441,13 @@ def _index_at_distance(ax: Axes, path: np.ndarray, distance: float) -> int:
     return int(np.searchsorted(gone, min(distance, gone[-1] / 2)))
 
 
-def _lowest(path: np.ndarray) -> int:
-    """The lowest point of a path; the middle one where it is level there, as along a belt."""
+def _lowest(path: np.ndarray) -> list[int]:
+    """The lowest point of a path; the middle one where it is level there, as along a belt; none
+    where the path is not known."""
     x2 = path[:, 1]
     (lowest,) = np.nonzero(x2 <= x2.min() + 1e-6 * np.ptp(x2))
-    return int(lowest[len(lowest) // 2])
+    middle = len(lowest) // 2
+    return lowest[middle : middle + 1].tolist()
 
 
 def _draw_arrowheads(ax: Axes, path: np.ndarray, colour: str, indices: Sequence[int]) -> None:
