@@ -10,7 +10,8 @@ import pytest
 
 import jaxbelt as jb
 
-#: Programs as they are traced for another device, but with lanes that a CPU does in seconds.
+#: Programs as they are traced for another device, but with lanes of a sweep that a CPU does in
+#: seconds. `is_cpu` is changed itself, as other modules have it by its name.
 ELSEWHERE = """
 import sys
 import jax
@@ -50,4 +51,6 @@ def test_lanes_as_on_another_device(tmp_path, request):
     assert run.returncode == 0, run.stderr
     found, expected = np.load(file), computed()
     for name, values in expected.items():
-        np.testing.assert_allclose(found[name], values, rtol=1e-9, atol=1e-9, err_msg=name)
+        is_slope = name == "slopes" or name.startswith("d_")
+        tol = 1e-9 if is_slope else 1e-12
+        np.testing.assert_allclose(found[name], values, rtol=tol, atol=tol, err_msg=name)

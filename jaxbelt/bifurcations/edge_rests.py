@@ -369,7 +369,14 @@ def _edge_rests(osc: Oscillator, belt: int | Array) -> tuple[EdgeRest, Array]:
             for limit in (-1.0, 1.0)
             for kinetic in (False, True)
         ]
-    exists = jnp.stack([case.exists(osc, jnp.asarray(NOTHING)) for case in cases])
+    # Where no belt holds anything, the two limits are one equation.
+    exists = jnp.stack(
+        [
+            case.exists(osc, jnp.asarray(NOTHING))
+            & ((case.limit < 0) | (capacity(osc, mode_of(case.codes)) > 0))
+            for case in cases
+        ]
+    )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases), exists
 
 

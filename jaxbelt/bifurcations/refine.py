@@ -65,7 +65,8 @@ def refine(
 
     Newton's method follows one cycle: of the attracting ones at the guess that which is nearest to
     the condition. So of points on coexisting cycles it need not find the nearest; `scan` finds all.
-    Of states of rest all are solved for, and the point that is nearest along the tangent is taken.
+    Of several states of rest, as on two edges, all are solved for, and the point that is nearest,
+    of a function along its tangent, is taken.
     Where it does not converge, what `scan` does is done around the guess, up to 0.2 to both sides,
     and the nearest point of that kind is taken, of any cycle; so it is where it ends further from
     the guess than 0.05, or, after a first step of more than 0.25, or of folds of cycles and of what

@@ -141,7 +141,7 @@ class AbstractRestOfSeveral(AbstractRestCondition):
 
     def followed(self, point):
         systems, x, status = self.as_data().prepared(point.oscillator, ANY)
-        row = row_that_holds(systems, point.oscillator, x, status, point.x1, point.member)
+        row = _row_that_holds(systems, point.oscillator, x, status, point.x1, point.member)
         return jax.tree.map(lambda leaf: leaf[row], (systems, x))
 
 
@@ -153,7 +153,7 @@ def _misses(systems: RestSystem, osc: Oscillator, x: Array) -> Array:
 
 
 @jit
-def row_that_holds(
+def _row_that_holds(
     systems: RestSystem, osc: Oscillator, x: Array, status: Array, x1: Array, row: ArrayLike
 ) -> Array:
     """The row that holds, with the mass at rest at x1; of several this one if it is among them:
@@ -243,10 +243,10 @@ class Hopf(AbstractRestOfSeveral):
         return [cls()] if before.equilibria != after.equilibria else []
 
     def type_of(self, point):
-        return criticality(*_hopf_growth(point.oscillator, point.x1, point.member))
+        return criticality(*_hopf_growth(*self.followed(point), point.oscillator))
 
     def coefficient(self, point):
-        return _hopf_growth(point.oscillator, point.x1, point.member)[0]
+        return _hopf_growth(*self.followed(point), point.oscillator)[0]
 
     def place(self, point):
         return np.array([point.x1, point.x1, 0.0, 0.0, 0.0])
@@ -260,14 +260,11 @@ def criticality(coefficient: Array, size: Array) -> str:
 
 
 @jit
-def _hopf_growth(osc: Oscillator, x1: Array, row: ArrayLike) -> tuple[Array, Array]:
-    """The first Lyapunov coefficient at the Hopf point at x1, and the size of its terms.
+def _hopf_growth(system: HopfSystem, x1: Array, osc: Oscillator) -> tuple[Array, Array]:
+    """The first Lyapunov coefficient at a Hopf point, x1 [1], and the size of its terms.
 
     NaN on a contact edge: no loop is on one side of it, however small.
     """
-    systems, x, status = Hopf().systems(osc)
-    row = row_that_holds(systems, osc, x, status, x1, row)
-    system, x1 = jax.tree.map(lambda leaf: leaf[row], (systems, x))
     sizes = []
     for belt, code in zip(osc.belts, system.codes, strict=True):
         alone = eqx.tree_at(lambda o: o.belts, osc, (belt,))
