@@ -94,14 +94,19 @@ class AbstractStickCondition(AbstractCycleCondition):
     def covers(self, point):
         if super().covers(point):
             return True
-        named, chain = point.condition, point.cycle.chain
+        named = point.condition
         if not isinstance(named, AbstractStickCondition) or type(self) is not type(named):
             return False
         pair = np.array([self.belt, named.belt])
-        one, other = (point.oscillator.belts[belt].velocity for belt in pair)
-        # Both touch, or none, all along: what happens to one of them happens to the other.
-        codes = np.asarray(chain.codes)[np.asarray(chain.used)][:, pair]
-        return bool(one == other and np.all(codes[:, 0] == codes[:, 1]))
+        one, other = (float(point.oscillator.belts[belt].velocity) for belt in pair)
+        return one == other and bool(_touch_alike(point.cycle.chain, pair))
+
+
+@jit
+def _touch_alike(chain: Chain, pair: Array) -> Array:
+    """Whether both belts touch, or none, all along: what happens to one happens to the other."""
+    one, other = chain.codes[:, pair].T
+    return jnp.all((one == other) | ~chain.used)
 
 
 class CycleEquation(AbstractCycleCondition):
