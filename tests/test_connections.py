@@ -139,6 +139,7 @@ def test_the_nearest_of_two_beside_each_other():
     assert point.value == pytest.approx(min(grazing), abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_point_symmetry():
     point = jb.refine(jb.SaddleConnection(1), over, at=0.3)
     mirrored = jb.refine(jb.SaddleConnection(0), lambda s: over(0.4, s), at=-0.3)
@@ -207,6 +208,7 @@ def test_a_connection_that_shrinks_to_its_saddle():
     assert end.values == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_no_courses_where_orbits_depend_on_the_parameter_with_jumps():
     """With belts at rest, and laws that jump."""
 
@@ -221,6 +223,23 @@ def test_no_courses_where_orbits_depend_on_the_parameter_with_jumps():
 
     assert [len(one) for one in courses(with_law(law, 0.5))] == [2, 2]
     assert courses(with_law(jumps, 0.5)) == courses(with_law(law, 0.0)) == [(), ()]
+
+
+def test_no_saddle_where_a_fixed_point_lies_on_the_edge():
+    """On round numbers, but for rounding: it pushes to no side, whatever the damping is."""
+    first, second = jb.Conti(1.0, 0.6, 10.0), jb.Conti(0.5, 0.2, 5.0)
+
+    def make(damping):
+        belts = jb.Belt(-0.4, first, upper=0.6), jb.Belt(0.55, second, lower=-0.4)
+        return jb.Oscillator(damping, belts, omega=2.0)
+
+    rests = jb.equilibria(make(0.5))
+    assert float(rests[1].x1) == pytest.approx(-0.4, abs=1e-15)
+    assert set(rests.kind.tolist()) == {jb.EquilibriumKind.FIXED_POINT}
+    assert courses_of(varied(make, None, (1.0,)).oscillators(np.array([[0.36]]))) == [()]
+    (point,) = jb.scan(make, span=(0.35, 0.6), resolution=8)
+    # The trace: 2 * 4 / (1 + 10 * 0.4)^2 + 2 * 1.5 / (1 + 5 * 0.55)^2
+    assert point.kind == "Hopf" and float(point.value) == pytest.approx(0.32 + 0.64 / 3, abs=1e-14)
 
 
 def test_no_saddle_no_connection():
