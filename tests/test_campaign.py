@@ -91,6 +91,15 @@ def test_a_passage_of_an_edge():
     assert run.y_end[0] == pytest.approx(0.3 * np.cos(t) + speed * np.sin(t), **EXACT)
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_slip_onset_on_an_edge_is_none(side):
+    # At 0.5 the belt can just hold the mass, and beyond the edge nothing pulls at it any more.
+    edge = {"upper": 0.5} if side > 0 else {"lower": -0.5}
+    belts = coulomb(0.5 * side, 1.0, 0.5), coulomb(-0.5 * side, 1.0, 0.5, **edge)
+    run = engine.simulate(Oscillator(0.0, belts), (0.4 * side, 0.5 * side), 2.0)
+    check(run, [(0.2, EDGE, 1, 0.5 * side, 0.5 * side), (1.2, SLIP, 0, side, 0.5 * side)])
+
+
 def test_rest_is_recognised():
     law = ("conti", 1.0, 0.6, 10.0)
     at_rest = Oscillator(0.5, (Belt(0.0, law),))

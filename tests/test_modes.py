@@ -94,6 +94,8 @@ TABLE = [
         (-0.1, 0.5), (0, BELOW), (EDGE, 1), (0, 0)),
     Row("another is left: still held",   (belt(0.5), belt(-0.2, upper=0.0)),
         (-0.1, 0.5), (0, -1), (EDGE, 1), (0, ABOVE)),
+    Row("another is left at the limit: still held", (belt(0.5), belt(-0.5, upper=0.5)),
+        (0.4, 0.5), (0, -1), (EDGE, 1), (0, ABOVE)),
     Row("another is left: torn off",     (belt(0.5), belt(0.9, 3.0, upper=1.4)),
         (1.3, 0.5), (0, 1), (EDGE, 1), (1, ABOVE)),
     Row("its own is left: slip",         (belt(0.5, upper=0.0), belt(-0.2)),

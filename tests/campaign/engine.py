@@ -637,7 +637,8 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
             end = _force(z, w, B, s, 0.0, x2) + ahead * held
             edge = L[1] if on > 0 else L[0]
             margin = min(margin, abs(edge - end))
-            is_slip = ahead * (edge - end) >= 0
+            # The limit of static friction is still held: on an edge the edge comes first.
+            is_slip = ahead * (edge - end) > 1e-15 * (held + abs(end))
             if not is_slip:
                 end = edge
             duration = max((end - x1) / x2, 0.0)
