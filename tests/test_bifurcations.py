@@ -106,6 +106,7 @@ def test_the_nearer_of_two_fixed_points_that_change(guess, exact):
     assert (float(point.x1) > 1.0) == (exact == 0.3)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("belt", [0, 1])
 def test_grazing_on_either_of_two_belts_that_share_the_load_of_one(belt):
     def make(nu):
@@ -233,6 +234,7 @@ def test_fold_of_cycles(nu):
     assert point.cycle.signature == ()
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("short", [1e-2, 1e-3])
 def test_fold_of_small_cycles(short):
     """For damping 0.5 and nu 0.4 the Hopf point is degenerate. For less damping the fold

@@ -319,6 +319,7 @@ def test_belts_that_change_places_where_a_cycle_sticks_to_both():
         assert found.cycle.period == pytest.approx(period, abs=1e-10)
 
 
+@pytest.mark.slow(first=True)
 def test_a_corner_at_a_value_that_the_search_looks_at():
     """Slip onset on belt 1 is on its edge just where the belts run against each other, at -0.45,
     a round part of the span."""

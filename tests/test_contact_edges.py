@@ -156,6 +156,7 @@ def test_points_of_sequential_belts():
     assert oracle_cycles.sticking_cycle(make(corner + 1e-7), T=400.0) is None
 
 
+@pytest.mark.slow(first=True)
 def test_an_edge_that_pushes_away_ends_the_cycle():
     """It touches the lower edge of belt 1; from beyond, the mass goes to another equilibrium."""
     points = jb.scan(jb.presets.class_d(0.3, 0.2, -0.2, 0.6), nu0, (-0.7, 0.7))
@@ -591,6 +592,7 @@ def test_where_the_mass_is_pushed_back_nothing_ends_at_the_kinetic_limit():
     assert jb.scan(make, span=(0.15, 0.35)) == ()
 
 
+@pytest.mark.slow(first=True)
 def test_a_corner_beside_slip_onset_that_lies_on_the_edge_all_along():
     """Belt 0 slips from 1.0 - 0.25 * 0.4 = 0.9 on, where its edge is; what happens in the corner of
     belt 1 on the other side is found all the same."""

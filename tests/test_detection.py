@@ -476,6 +476,7 @@ def _edge_beside_the_equilibrium(distance):
     return at
 
 
+@pytest.mark.slow(first=True)
 def test_what_holds_all_along_is_no_point():
     # Rounding decides on which side the edge is; what is added makes it do so on any machine.
     at = _edge_beside_the_equilibrium(lambda v: 4e-16 * jnp.sin(1e3 * v))
@@ -549,7 +550,7 @@ def test_the_error_of_a_double_root_is_told(start):
     assert point.status != Status.OK or abs(point.value - 0.3) <= point.error
 
 
-@pytest.mark.parametrize("unit", [1e3, 1e-3])
+@pytest.mark.parametrize("unit", [1e3, pytest.param(1e-3, marks=pytest.mark.slow(first=True))])
 def test_the_unit_of_the_parameter_makes_no_difference(unit):
     along = _edge_beside_the_equilibrium(lambda v: 4e-16 * jnp.sin(1e3 * v))
     found = jb.scan(lambda s: along(s / unit), span=(0.22 * unit, 0.24 * unit), resolution=4)

@@ -76,6 +76,7 @@ def slopes_of_end():
 TOLERANCE = 1e-6
 
 
+@pytest.mark.slow(first=True)
 def test_of_a_run(slopes_of_end):
     assert jax.grad(end)(AT) == pytest.approx(slopes_of_end, rel=TOLERANCE)
 

@@ -138,6 +138,7 @@ def test_of_many_cycles_that_to_which_most_runs_lead_is_looked_into(monkeypatch)
     assert left.tolist() == [False] * 2 + [True] * 3 + [False] * 3
 
 
+@pytest.mark.slow(first=True)
 def test_without_damping_all_starts_are_undecided():
     """Two belts with constant friction, one to each side of the motion: circles, for ever. They
     close, and attract nothing."""

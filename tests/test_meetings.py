@@ -204,6 +204,7 @@ def test_an_orbit_that_settles_slowly():
     assert (cycle.x1_min, cycle.x1_max) == pytest.approx(seen.x1, abs=1e-8)
 
 
+@pytest.mark.slow(first=True)
 def test_a_small_cycle_within_an_unstable_one_within_another():
     (fold,) = jb.scan(beside, span=(0.4002, 0.405), resolution=8)
     assert fold.kind == "FoldOfCycles" and fold.error < 1e-11
@@ -214,6 +215,7 @@ def test_a_small_cycle_within_an_unstable_one_within_another():
         assert seen.kind == "cycle" and seen.x1[1] == pytest.approx(reached, abs=1e-3)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(("gap", "speed"), [(1e-5, 9e-3), (1e-6, 6e-3), (1e-15, 9e-3)])
 def test_a_pseudo_focus_does_not_capture_loops_around_another_edge(gap, speed):
     """Small loops around one of the edges shrink, larger ones around both grow."""

@@ -115,6 +115,7 @@ def test_saddle_is_an_equilibrium_where_nothing_rests():
     assert not np.any(jb.equilibria(jb.presets.class_c(-0.3, 0.3, 0.8)).kind == 4)
 
 
+@pytest.mark.slow(first=True)
 def test_friction_that_grows_holds_a_cycle_far_out():
     """Friction that grows as the square of the speed outweighs negative damping: nothing goes to
     infinity, and a cycle attracts what does without that growth."""

@@ -151,7 +151,10 @@ def _bisected(osc: engine.Oscillator, x1: float, outer: float) -> float:
     return abs(outer)
 
 
-@pytest.mark.parametrize(("numbers", "outer"), [(NODE, -1.5), (ON_AN_EDGE, 1.5)])
+@pytest.mark.parametrize(
+    ("numbers", "outer"),
+    [pytest.param(NODE, -1.5, marks=pytest.mark.slow(first=True)), (ON_AN_EDGE, 1.5)],
+)
 def test_shocks_where_separatrices_creep_and_where_attractors_lie_on_edges(numbers, outer):
     """Against bisection with the engine, and the derivative against differences of that."""
     osc = package.oscillator(numbers)
@@ -173,6 +176,7 @@ def test_shocks_where_separatrices_creep_and_where_attractors_lie_on_edges(numbe
     assert error < 1e-6 and slope == pytest.approx(float(expected), abs=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_a_segment_ends_in_its_boundary():
     """Of a velocity, too, the smallest shock is none: in a corner of either curve."""
     law = jb.Conti(1.0, 0.6, 10.0)

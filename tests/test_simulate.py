@@ -734,7 +734,8 @@ def test_times_that_do_not_increase_under_a_trace():
     np.testing.assert_allclose(jax.jit(states)(ts)[order], states(ts[order]), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("edges", [False, pytest.param(True, marks=pytest.mark.slow(first=True))])
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("edges", [False, True])
 def test_derivatives_of_a_sample_are_those_of_it_alone(edges):
     """Those of many samples are made each from the one before; round numbers and others, in both
     modes of derivatives."""
@@ -773,6 +774,7 @@ def test_derivatives_of_a_sample_are_those_of_it_alone(edges):
         assert np.all(np.abs(backward(numbers, ts, weights) - told) <= 1e-11 * (1 + size))
 
 
+@pytest.mark.slow(first=True)
 def test_samples_that_are_not_used_are_not_made():
     """The last of the default samples is the final state alone, for values and for derivatives in
     forward mode: the compiled program does not contain the others."""
@@ -791,6 +793,7 @@ def test_samples_that_are_not_used_are_not_made():
             np.testing.assert_allclose(one, other, rtol=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_no_samples_in_a_batch():
     """An empty `ts` is possible under every transformation."""
 
