@@ -34,7 +34,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..checks import number
-from ..model.equilibria import Equilibria, EquilibriumKind, side_pulls
+from ..model.equilibria import Equilibria, EquilibriumKind, at_rest_beside
 from ..model.modes import (
     STUCK,
     Mode,
@@ -142,8 +142,7 @@ def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[TracedSep
     found: list[TracedSeparatrix | None] = []
     parting: list[float] = []
     for x1 in positions[np.isfinite(positions)].tolist():
-        left, right = (float(pull[0]) for pull in side_pulls(osc, jax.device_put(np.array([x1]))))
-        if left > 0 or right < 0 or left == right == 0:
+        if not _orbits_part(osc, jax.device_put(np.array([x1]))):
             continue
         parting.append(x1)
         for stable, side in product((False, True), ("left", "right")):
@@ -168,6 +167,18 @@ def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[TracedSep
 def _as_arrays(*numbers: float | int | bool) -> list[Array]:
     """Numbers as arrays of one type, so that one program serves all."""
     return [jnp.asarray(np.array(number)) for number in numbers]
+
+
+@jit
+def _orbits_part(osc: Oscillator, x1: Array) -> Array:
+    """Whether orbits part at an edge, x1 [1]: one side pushes away, the other one, too, or a belt
+    holds the mass there. A fixed point that lies on the edge, but for rounding, does not part them.
+    """
+    left, right = (at_rest_beside(osc, x1, rightward=side) for side in (False, True))
+    least = force_rounding(x1)
+    pushes = (-left[1] > least) & ~left[0].any_stuck, (right[1] > least) & ~right[0].any_stuck
+    parts = (pushes[0] | left[0].any_stuck) & (pushes[1] | right[0].any_stuck)
+    return (parts & (pushes[0] | pushes[1]))[0]
 
 
 @jit

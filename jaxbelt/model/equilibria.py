@@ -37,10 +37,10 @@ from .modes import (
     Mode,
     capacity,
     edges,
+    force_rounding,
     kinetic_capacity,
     mode_acceleration,
     settle,
-    without_rounding,
 )
 from .oscillator import Oscillator, check_oscillator, has_possible_numbers
 from .pseudofocus import edge_focus
@@ -277,13 +277,13 @@ def at_rest_beside(osc: Oscillator, x1: Array, *, rightward: bool) -> tuple[Mode
 @jit
 def side_pulls(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
     """x2' of a mass at rest just left and just right of each x1, [places]; 0 where a belt holds
-    it, or where it is 0 up to rounding: a fixed point lies there, which pushes nowhere."""
+    it."""
     (left, pull_left), (right, pull_right) = (
         at_rest_beside(osc, x1, rightward=side) for side in (False, True)
     )
     return (
-        jnp.where(left.any_stuck, 0.0, without_rounding(pull_left, x1)),
-        jnp.where(right.any_stuck, 0.0, without_rounding(pull_right, x1)),
+        jnp.where(left.any_stuck, 0.0, pull_left),
+        jnp.where(right.any_stuck, 0.0, pull_right),
     )
 
 
@@ -328,8 +328,10 @@ def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equil
     slips = is_edge & ~left.any_stuck & ~right.any_stuck
     is_focus, is_saddle = slips & focus.exists, jnp.zeros_like(slips)
     if with_saddles:
-        pulls = side_pulls(osc, x1)
-        is_saddle = slips & (pulls[0] < 0) & (pulls[1] > 0)
+        pulls = [mode_acceleration(osc, mode, x1, rest) for mode in (left, right)]
+        # A fixed point on the edge, but for rounding, does not push.
+        least = force_rounding(x1)
+        is_saddle = slips & (pulls[0] < -least) & (pulls[1] > least)
     exists = (is_focus | is_saddle) & has_possible_numbers(osc)
     # A belt at rest brakes on the way out and on the way back: each loop takes off a fraction of
     # the velocity that does not go to 0 with it, so infinitely many loops take a finite time.

@@ -958,10 +958,18 @@ def _repeats(run, tops, same, periods):
         close = np.abs(y[half:] - y[half - lag : -lag]) <= same
         return np.all(close) and np.array_equal(codes[half:], codes[half - lag : -lag])
 
+    def extent(p, before):
+        """Of the loop that ends so many tops before the last one."""
+        last = len(tops) - 1 - before
+        return np.ptp(run.y[tops[last - p] : tops[last] + 1], axis=0)
+
     for p in range(1, min(periods, half // 4) + 1):
         if alike(p):
-            # And against what creeps as many periods apart as there are.
-            return (tops[-1 - p], tops[-1]) if alike(half // p * p) else None
+            # And against what creeps as many periods apart as there are; the tops of loops around
+            # an edge that pushes hard tell little of how they shrink.
+            far = half // p * p
+            is_cycle = alike(far) and np.all(np.abs(extent(p, 0) - extent(p, far)) <= same)
+            return (tops[-1 - p], tops[-1]) if is_cycle else None
     return None
 
 
