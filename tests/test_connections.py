@@ -226,7 +226,8 @@ def test_no_courses_where_orbits_depend_on_the_parameter_with_jumps():
 
 
 def test_no_saddle_where_a_fixed_point_lies_on_the_edge():
-    """On round numbers, but for rounding: it pushes to no side, whatever the damping is."""
+    """On round numbers, but for rounding: it pushes to no side, whatever the damping is; and as the
+    other side pushes away, nothing changes where its trace vanishes."""
     first, second = jb.Conti(1.0, 0.6, 10.0), jb.Conti(0.5, 0.2, 5.0)
 
     def make(damping):
@@ -237,9 +238,7 @@ def test_no_saddle_where_a_fixed_point_lies_on_the_edge():
     assert float(rests[1].x1) == pytest.approx(-0.4, abs=1e-15)
     assert set(rests.kind.tolist()) == {jb.EquilibriumKind.FIXED_POINT}
     assert courses_of(varied(make, None, (1.0,)).oscillators(np.array([[0.36]]))) == [()]
-    (point,) = jb.scan(make, span=(0.35, 0.6), resolution=8)
-    # The trace: 2 * 4 / (1 + 10 * 0.4)^2 + 2 * 1.5 / (1 + 5 * 0.55)^2
-    assert point.kind == "Hopf" and float(point.value) == pytest.approx(0.32 + 0.64 / 3, abs=1e-14)
+    assert not rests.stable[1] and jb.scan(make, span=(0.35, 0.6), resolution=8) == ()
 
 
 def test_no_saddle_no_connection():

@@ -741,3 +741,70 @@ def test_bad_input_is_named():
         many = jax.vmap(jb.presets.class_a)(jnp.array([0.1, 0.2]))
         with pytest.raises(ValueError, match=r"must be a scalar \(use jax\.vmap"):
             function(many)
+
+
+# --- on an edge, but for rounding -----------------------------------------------------------------
+
+LAW = jb.Conti(1.0, 0.6, 10.0)
+BITS = [-1, 0, 1]  # of the edge
+
+
+def shifted(x, bits):
+    return float(x + bits * np.spacing(x))
+
+
+@pytest.mark.parametrize("bits", BITS)
+@pytest.mark.parametrize("damping", [1.05, 1.08])
+def test_a_fixed_point_on_an_edge_is_there_whatever_its_last_bit(bits, damping):
+    """At 0.8 - 0.65, where beyond the edge a belt pushes back. Loops shrink where the trace of
+    the left side is negative: 4 / (1 + 10 * 0.1)^2 + 4 / (1 + 10 * 0.7)^2 = 1.0625."""
+    belts = jb.Belt(0.1, LAW, upper=shifted(0.15, bits)), jb.Belt(-0.7, LAW, lower=-0.5)
+    osc = jb.Oscillator(damping, belts)
+    rests = jb.equilibria(osc)
+    assert [one.name for one in map(jb.EquilibriumKind, rests.kind.tolist())] == ["FIXED_POINT"]
+    assert float(rests.x1[0]) == pytest.approx(0.15, abs=1e-15)
+    assert float(rests.rate[0]) == pytest.approx((1.0625 - damping) / 2, abs=1e-12)
+    assert bool(rests.stable[0]) == (damping > 1.0625)
+
+
+def test_where_runs_come_to_rest_is_told_though_others_are_near():
+    belts = jb.Belt(0.1, LAW, upper=0.15), jb.Belt(-0.7, LAW, lower=-0.5)
+    osc = jb.Oscillator(2.0, (*belts, jb.Belt(0.3, LAW, 4.0, lower=1.0)))
+    told = jb.basins(osc, x1=np.linspace(0.1, 0.9, 5), x2=np.linspace(-0.2, 0.2, 5))
+    assert told.label.attrs["flag_meanings"] == "undecided rest_at_0.150"
+    assert bool((told.label == 0).all())
+
+
+@pytest.mark.parametrize("edges", [(0.3, 0.3), (0.3, 0.1 + 0.2), (0.1 + 0.2, 0.3)])
+def test_edges_that_differ_by_rounding_are_one(edges):
+    """Around a pseudo-focus with pushes a and traces b of the sides, loops grow where the sum of
+    b/a is positive."""
+    upper, lower = edges
+
+    def make(damping):
+        return jb.Oscillator(
+            damping, (jb.Belt(0.1, LAW, upper=upper), jb.Belt(-0.2, LAW, lower=lower))
+        )
+
+    rests = jb.equilibria(make(0.5))
+    assert rests.kind.tolist() == [jb.EquilibriumKind.PSEUDO_FOCUS] and not rests.stable[0]
+    left, right = 0.8 - 0.3, 0.6 + 0.4 / 3 + 0.3
+    zero = (1 / left + 4 / 9 / right) / (1 / left + 1 / right)
+    assert float(jb.refine(jb.PseudoHopf(0), make, at=0.8).value) == pytest.approx(zero, abs=1e-13)
+
+
+def test_what_a_belt_at_rest_holds_in_one_point_is_no_segment():
+    held = jb.Belt(0.0, jb.Coulomb(0.8, 0.8), lower=0.0, upper=0.85)
+    osc = jb.Oscillator(0.5, (jb.Belt(0.3, jb.Conti(1.2, 0.7, 10.0), 2.0), held))
+    rests = jb.equilibria(osc)  # 2 * 0.825 - 0.8 = 0.85
+    assert rests.kind.tolist() == [jb.EquilibriumKind.FIXED_POINT]
+    assert float(rests.x1[0]) == pytest.approx(1.65, abs=1e-14)
+
+
+def test_the_end_of_a_segment_is_no_fixed_point():
+    belts = jb.Belt(0.1, jb.Conti(0.5, 0.2, 5.0), 0.5), jb.Belt(0.0, LAW, lower=0.2)
+    assert jb.equilibria(jb.Oscillator(0.5, belts)).kind.tolist() == [jb.EquilibriumKind.SEGMENT]
+
+
+def test_a_fixed_point_on_an_edge_is_listed_once():
+    assert len(jb.equilibria(jb.presets.class_c(0.3, 0.3, 0.7))) == 1

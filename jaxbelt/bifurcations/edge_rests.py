@@ -41,7 +41,7 @@ from ..model.modes import (
 )
 from ..model.oscillator import Oscillator
 from ..model.pseudofocus import edge_focus, field_at_rest
-from ..model.transitions import contact
+from ..model.transitions import contact_beside
 from ..model.variations import Family
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
@@ -348,7 +348,8 @@ def _edges_of(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
 def _beside_edge(osc: Oscillator, at: Array) -> tuple[Mode, Mode]:
     """The contacts at rest to the left and to the right of an edge."""
     rest = jnp.zeros_like(at)
-    return contact(osc, at, rest, rightward=False), contact(osc, at, rest, rightward=True)
+    left, right = (contact_beside(osc, at, rest, rightward=side) for side in (False, True))
+    return left, right
 
 
 def _edge_rests(osc: Oscillator, belt: int | Array) -> tuple[EdgeRest, Array]:

@@ -40,7 +40,7 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.pseudofocus import edge_focus
-from ..model.transitions import contact
+from ..model.transitions import contact_beside
 from ..model.variations import Family, Variation
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
@@ -455,7 +455,8 @@ def _focus_changes(osc: Oscillator, belt: int | Array, edge: Array) -> Array:
 
     Where it attracts on both sides nothing changes; nor where another belt at rest brakes there.
     """
-    beside = [contact(osc, edge, jnp.zeros(()), rightward=right) for right in (False, True)]
+    rest = jnp.zeros(())
+    beside = [contact_beside(osc, edge, rest, rightward=right) for right in (False, True)]
     sides = [jnp.stack(mode.codes) for mode in beside]
     loads, others = jnp.stack([one.load for one in osc.belts]), jnp.arange(len(osc.belts)) != belt
     touched, braked, attracts = (jnp.asarray(flag) for flag in (False, False, True))

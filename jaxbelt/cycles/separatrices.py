@@ -46,7 +46,7 @@ from ..model.modes import (
     select,
 )
 from ..model.oscillator import Oscillator
-from ..model.transitions import contact, mode_of_state
+from ..model.transitions import contact, contact_beside, mode_of_state
 from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit
 from ..results import Status, draw
@@ -194,7 +194,7 @@ def _repels(osc: Oscillator, x1: Array, rightward: Array) -> Array:
 
 def mode_onward(osc: Oscillator, x1: Array, rightward: Array) -> Mode:
     """The slip mode beside (x1, 0) to one side; a belt at rest opposes the motion to there."""
-    sides = (contact(osc, x1, jnp.zeros(()), rightward=side) for side in (True, False))
+    sides = (contact_beside(osc, x1, jnp.zeros(()), rightward=side) for side in (True, False))
     mode = select(rightward, *sides)
     backward = jnp.where(rightward, -1.0, 1.0)
     return Mode(tuple(jnp.where(code == STUCK, backward, code) for code in mode.codes))

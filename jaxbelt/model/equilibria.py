@@ -41,11 +41,12 @@ from .modes import (
     kinetic_capacity,
     mode_acceleration,
     settle,
+    without_rounding,
 )
 from .oscillator import Oscillator, check_oscillator, has_possible_numbers
 from .pseudofocus import edge_focus
 from .rest import is_centre
-from .transitions import contact
+from .transitions import contact, contact_beside
 
 if TYPE_CHECKING:
     import pandas
@@ -171,8 +172,9 @@ def equilibria(osc: Oscillator) -> Equilibria:
     parameter that is impossible.
 
     A segment that reaches across a contact edge is given in pieces, one a zone, each with its own
-    contact codes. A fixed point exactly on an edge is listed with the zone that it belongs to, and
-    its eigenvalues and stability are those of that side alone.
+    contact codes. A fixed point on an edge, but for rounding, is listed with the zone that it
+    belongs to, of two with the left one, and its eigenvalues are those of that side alone; it is
+    stable where these are and the other side does not push away from it.
     """
     check_oscillator(osc)
     found = _all_candidates(osc)
@@ -227,17 +229,30 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     mode = Mode(tuple(jnp.where((c == STUCK) & (held == 0), 1.0, c) for c in mode.codes))
     pull = mode_acceleration(osc, mode, rest, rest)
 
-    possible = has_possible_numbers(osc)
-    is_fixed = possible & (held == 0) & (lower <= pull) & (pull <= upper) & (lower < upper)
-    # On an edge beyond which belts at rest hold the mass it is the end of that segment.
+    rounding = force_rounding(pull, 1.0 + held)
+    possible = has_possible_numbers(osc) & (upper - lower > rounding)
     places = (jnp.where(jnp.isfinite(edge), edge, 0.0) for edge in (lower, upper))
     (below, pull_below), (above, pull_above) = (
         at_rest_beside(osc, x1, rightward=side)
         for x1, side in zip(places, (False, True), strict=True)
     )
-    is_fixed &= ~((pull == lower) & below.any_stuck) & ~((pull == upper) & above.any_stuck)
+    up_from_below, down_from_above = (
+        jnp.where(beside.any_stuck, 0.0, sign * without_rounding(force, pull))
+        for beside, sign, force in ((below, 1.0, pull_below), (above, -1.0, pull_above))
+    )
+
+    is_fixed = possible & (held == 0) & (lower - rounding < pull) & (pull < upper + rounding)
+    on_lower, on_upper = (jnp.abs(pull - edge) < rounding for edge in (lower, upper))
+    # On an edge beyond which belts at rest hold the mass it is the end of that segment; and what
+    # lies there for either side is listed with the left one.
+    is_fixed &= ~(on_lower & (up_from_below == 0)) & ~(on_upper & above.any_stuck)
     first, last = jnp.maximum(pull - held, lower), jnp.minimum(pull + held, upper)
-    is_segment = possible & (held > 0) & (first < last)
+    at_first, at_last = first - lower < rounding, upper - last < rounding
+    # A segment of one point, an edge, is one if the other side pushes back to it.
+    is_point = at_last & (down_from_above > 0) | at_first & (up_from_below > 0)
+    least = jnp.where(is_point, -rounding, rounding)
+    is_segment = possible & (held > 0) & (last - first > least)
+    first = jnp.where(is_segment, jnp.minimum(first, last), first)
     exists = is_fixed | is_segment
 
     jacobian = jax.vmap(lambda mode, x1: _field_jacobian(osc, mode, x1))(mode, pull)
@@ -247,11 +262,14 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     kinetic = kinetic_capacity(osc, mode)
     attracts = jnp.maximum(pull - kinetic, lower) < jnp.minimum(pull + kinetic, upper)
     # Or what slips away passes an edge, is pushed back to it, and stops where it came from.
-    attracts |= (first == lower) & ~below.any_stuck & (pull_below > 0)
-    attracts |= (last == upper) & ~above.any_stuck & (pull_above < 0)
+    attracts |= at_first & (up_from_below > 0)
+    attracts |= at_last & (down_from_above > 0)
 
-    neutral = is_fixed & is_centre(osc, mode)
-    x1 = jnp.where(is_segment, 0.5 * (first + last), pull)
+    # Nothing stays where the other side of the edge pushes away.
+    stays = ~(on_lower & (up_from_below < 0)) & ~(on_upper & (down_from_above < 0))
+    neutral = is_fixed & is_centre(osc, mode) & stays
+    on_edge = lax.stop_gradient(jnp.clip(pull, lower, upper) - pull)
+    x1 = jnp.where(is_segment, 0.5 * (first + last), pull + on_edge)
     kind = jnp.where(is_segment, EquilibriumKind.SEGMENT.value, EquilibriumKind.FIXED_POINT.value)
     return Equilibria(
         kind=jnp.where(exists, kind, 0),
@@ -262,7 +280,7 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
         jacobian=jnp.where(is_fixed[:, None, None], jacobian, jnp.nan),
         eigenvalues=jnp.where(is_fixed[:, None], eigenvalues, complex(np.nan, np.nan)),
         rate=jnp.where(is_fixed, rate, jnp.nan),
-        stable=jnp.where(is_segment, attracts, is_fixed & (rate < 0) & ~neutral) & exists,
+        stable=jnp.where(is_segment, attracts, is_fixed & (rate < 0) & ~neutral & stays) & exists,
         neutral=neutral,
     )
 
@@ -270,7 +288,7 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
 def at_rest_beside(osc: Oscillator, x1: Array, *, rightward: bool) -> tuple[Mode, Array]:
     """The mode of a mass at rest just beside each x1, [places], on that side, and x2' there."""
     rest = jnp.zeros_like(x1)
-    mode = settle(osc, contact(osc, x1, rest, rightward=rightward), x1, rest)
+    mode = settle(osc, contact_beside(osc, x1, rest, rightward=rightward), x1, rest)
     return mode, mode_acceleration(osc, mode, x1, rest)
 
 
@@ -317,21 +335,21 @@ def _eigenvalues(matrix: Array) -> Array:
 
 def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equilibria:
     before = jnp.concatenate([jnp.full(1, -jnp.inf), positions[:-1]])
-    # Edges at one place count once; finite numbers stand in for the infinite ones.
-    is_edge = jnp.isfinite(positions) & (positions > before)
+    # Edges at one place count once, but for rounding; finite numbers stand in for infinite ones.
+    is_edge = jnp.isfinite(positions) & (positions - before > force_rounding(positions))
     x1 = jnp.where(is_edge, positions, 0.0)
     rest = jnp.zeros_like(x1)
-    on_left, on_right = (contact(osc, x1, rest, rightward=side) for side in (False, True))
+    on_left, on_right = (contact_beside(osc, x1, rest, rightward=side) for side in (False, True))
     left, right = (settle(osc, contacts, x1, rest) for contacts in (on_left, on_right))
     focus = edge_focus(osc, left, right, x1)
     # Where a belt at rest holds the mass, the segment on that side ends here.
     slips = is_edge & ~left.any_stuck & ~right.any_stuck
-    is_focus, is_saddle = slips & focus.exists, jnp.zeros_like(slips)
-    if with_saddles:
-        pulls = [mode_acceleration(osc, mode, x1, rest) for mode in (left, right)]
-        # A fixed point on the edge, but for rounding, does not push.
-        least = force_rounding(x1)
-        is_saddle = slips & (pulls[0] < -least) & (pulls[1] > least)
+    # A fixed point on the edge, but for rounding, does not push.
+    to_left, to_right = (
+        without_rounding(mode_acceleration(osc, m, x1, rest), x1) for m in (left, right)
+    )
+    is_focus = slips & (to_left > 0) & (to_right < 0)
+    is_saddle = slips & (to_left < 0) & (to_right > 0) & with_saddles
     exists = (is_focus | is_saddle) & has_possible_numbers(osc)
     # A belt at rest brakes on the way out and on the way back: each loop takes off a fraction of
     # the velocity that does not go to 0 with it, so infinitely many loops take a finite time.

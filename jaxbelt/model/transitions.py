@@ -383,3 +383,9 @@ def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
         is_above = x1 >= belt.upper if rightward else x1 > belt.upper
         codes.append(jnp.where(is_below, BELOW, jnp.where(is_above, ABOVE, sign)))
     return Mode(tuple(codes))
+
+
+def contact_beside(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
+    """`contact` just beside x1, past all edges that are one with it up to rounding."""
+    away = jnp.where(jnp.isfinite(x1), force_rounding(x1), 0.0)
+    return contact(osc, x1 + away if rightward else x1 - away, x2, rightward=rightward)

@@ -352,20 +352,28 @@ class _Found(NamedTuple):
         return self.cycle is not None and is_same(self.cycle, cycle)
 
 
+#: Runs end no further from the equilibrium that captures them.
+NEAR_REST = 1e-2
+
+
 def rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of an equilibrium that each may have come to: its x1, and the number of its segment; and the
     ends of all segments, [segments, 2].
 
-    A run ends in the neighbourhood of the equilibrium. A segment across an edge is in pieces.
+    A run ends near the equilibrium; where none is near, it is told where the run is. A segment
+    across an edge is in pieces.
     """
     found = equilibria(osc)
     is_segment = np.asarray(found.kind) == EquilibriumKind.SEGMENT
-    is_point = ~is_segment & np.asarray(found.stable)
+    is_point = ~is_segment & (np.asarray(found.kind) != EquilibriumKind.SADDLE)
     lower, upper = np.asarray(found.x1_lower), np.asarray(found.x1_upper)
-    points, pieces = np.asarray(found.x1)[is_point], np.stack([lower, upper], 1)[is_segment]
-    rest, segment, ends = x1, np.zeros(x1.shape, int), np.zeros((0, 2))
-    if len(points):
-        rest = points[np.argmin(np.abs(x1[..., None] - points), axis=-1)]
+    rest, pieces = np.round(x1 / NEAR_REST) * NEAR_REST, np.stack([lower, upper], 1)[is_segment]
+    segment, ends = np.zeros(x1.shape, int), np.zeros((0, 2))
+    for which in (is_point, is_point & np.asarray(found.stable)):
+        points = np.asarray(found.x1)[which]
+        if len(points):
+            nearest = points[np.argmin(np.abs(x1[..., None] - points), axis=-1)]
+            rest = np.where(np.abs(nearest - x1) < NEAR_REST, nearest, rest)
     if len(pieces):
         begins = np.append(True, pieces[1:, 0] > pieces[:-1, 1])
         outside = np.maximum(pieces[:, 0] - x1[..., None], x1[..., None] - pieces[:, 1])

@@ -44,6 +44,8 @@ SAME = 1e-6
 #: Events at places that differ by less, relative to their size, happen at once: either may come
 #: first, by rounding.
 ONE_PLACE = 1e-14
+#: Edges, and rests beside them, that differ by less are one.
+ONE_EDGE = 1e-12
 #: Smaller cycles than this one around a pseudo-focus are not told from it.
 TINY = 1e-3
 #: Events at the end of a run that passes too many, some loops.
@@ -249,12 +251,23 @@ def equilibria(osc: engine.Oscillator) -> tuple:
     """Where the mass can rest, (kind, stable, contact codes): 1 a fixed point, 2 a segment, 3 a
     pseudo-focus; from left to right."""
     table = osc.table()
-    ends = sorted({x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)})
+    ends = []
+    for x in sorted(x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)):
+        if not ends or x - ends[-1] > ONE_EDGE:
+            ends.append(x)
     zones = list(pairwise([-inf, *ends, inf]))
     rows = [_rest_in_zone(osc, table, *zone) for zone in zones]
-    held_at = {end for zone in zones for end in _segment(osc, table, zone)}
-    # A fixed point on an edge to which a segment reaches is the end of that.
-    found = [row for row in rows if row and not (row[1] == 1 and row[0] in held_at)]
+    held_at = [end for zone in zones for end in _segment(osc, table, zone)]
+    found: list = []
+    for row in filter(None, rows):
+        # A fixed point on an edge to which a segment reaches is the end of that; and one that lies
+        # there for either side is one.
+        others = [*held_at, *(other[0] for other in found if other[1] == 1)]
+        if row[1] == 1 and any(abs(row[0] - x) < ONE_EDGE for x in others):
+            continue
+        if row[1] == 1:
+            row = (*row[:2], row[2] and not _leaves_edge(osc, table, row[0], zones), row[3])
+        found.append(row)
     for edge, left, right in zip(ends, zones, zones[1:], strict=False):
         row = _rest_on_edge(osc, table, edge, left, right)
         if row is not None:
@@ -263,12 +276,22 @@ def equilibria(osc: engine.Oscillator) -> tuple:
     return tuple((kind, bool(stable), _told(osc, codes)) for _, kind, stable, codes in found)
 
 
+def _leaves_edge(osc, table, x1, zones) -> bool:
+    """Whether a fixed point lies on an edge and the other side pushes away from it."""
+    for left, right in pairwise(zones):
+        if abs(x1 - left[1]) < ONE_EDGE:
+            pulls = [_side(osc, table, zone)[1] - x1 for zone in (left, right)]
+            helds = [_side(osc, table, zone)[2] for zone in (left, right)]
+            return pulls[0] < -helds[0] - ONE_EDGE or pulls[1] > helds[1] + ONE_EDGE
+    return False
+
+
 def _side(osc, table, zone):
     """At rest in a zone: contact codes, the pull, what belts at rest hold and rub with, trace."""
     codes, pull, held, rubs, trace = [], 0.0, 0.0, 0.0, -osc.damping
     for row, belt in zip(table, osc.belts, strict=True):
-        if zone[0] < belt.lower or zone[1] > belt.upper:
-            codes.append(-2 if zone[0] < belt.lower else 2)
+        if zone[0] < belt.lower - ONE_EDGE or zone[1] > belt.upper + ONE_EDGE:
+            codes.append(-2 if zone[0] < belt.lower - ONE_EDGE else 2)
             continue
         codes.append(int(np.sign(belt.velocity)))
         if belt.velocity == 0:
@@ -286,7 +309,7 @@ def _segment(osc, table, zone):
     """The ends of the segment on which belts at rest hold the mass in a zone; (): there is none."""
     _, pull, held, *_ = _side(osc, table, zone)
     first, last = max(pull - held, zone[0]), min(pull + held, zone[1])
-    return (first, last) if first < last else ()
+    return (first, last) if last - first > ONE_EDGE else ()
 
 
 def _rest_in_zone(osc, table, lower, upper):
@@ -294,11 +317,13 @@ def _rest_in_zone(osc, table, lower, upper):
     if held == 0:
         # A belt at rest that can hold nothing slips.
         codes = [1 if code == 0 else code for code in codes]
-        return (pull, 1, trace < 0, tuple(codes)) if lower <= pull <= upper else None
+        is_here = lower - ONE_EDGE < pull < upper + ONE_EDGE
+        return (pull, 1, trace < 0, tuple(codes)) if is_here else None
     first, last = max(pull - held, lower), min(pull + held, upper)
     attracts = max(pull - rubs, lower) < min(pull + rubs, upper)
     attracts = attracts or (first < last and _returns(osc, first, last))
-    return (0.5 * (first + last), 2, attracts, tuple(codes)) if first < last else None
+    is_here = last - first > ONE_EDGE
+    return (0.5 * (first + last), 2, attracts, tuple(codes)) if is_here else None
 
 
 def _returns(osc, first, last):
@@ -316,7 +341,7 @@ def _returns(osc, first, last):
 def _rest_on_edge(osc, table, edge, left, right):
     (codes, pull, held, rubs, trace), other = _side(osc, table, left), _side(osc, table, right)
     (a, b), capacity = (pull - edge, other[1] - edge), max(held, other[2])
-    if not a > held or not -b > other[2]:
+    if not a > held + ONE_EDGE or not -b > other[2] + ONE_EDGE:
         return None
     # Which way belts rub there makes no difference.
     signs = [code if abs(code) == 2 else 1 for code in codes]
