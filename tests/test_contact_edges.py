@@ -1,5 +1,7 @@
 """Bifurcations at contact edges: against the oracle and closed forms, found, refined, followed."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -629,3 +631,56 @@ def test_a_corner_beside_slip_onset_that_lies_on_the_edge_all_along():
             assert found.value == pytest.approx(float(points[0].value), abs=1e-11)
         found = jb.refine(jb.CornerCollision(belt), make, at=-0.4025)
         assert found.value == pytest.approx(float(points[2].value), abs=1e-9)
+
+
+def with_onset_on_its_edge(residual, *, edge=0.8, side=1):
+    """Slip onset on the belt is at x1 = side (1 - 0.5 * 0.4), where it ends; beyond it is none."""
+    ends = {"upper": edge} if side > 0 else {"lower": -edge}
+    return jb.Oscillator(0.5, (jb.Belt(0.4 * side, jb.Conti(1.0, residual, 10.0), **ends),))
+
+
+def farthest_after_onset():
+    """x1 where the mass that slips off the belt at (0.8, 0.4) turns back: free, damped motion."""
+    half, x1, x2 = 0.25, 0.8, 0.4
+    frequency = np.sqrt(1 - half**2)
+    t = np.arctan2(x2 * frequency, x1 + half * x2) / frequency
+    swing = np.cos(frequency * t) * x1 + np.sin(frequency * t) * (x2 + half * x1) / frequency
+    return np.exp(-half * t) * swing
+
+
+@functools.cache
+def fold_with_onset_on_its_edge():
+    """The residual friction with which the orbit from there comes back tangent to the boundary."""
+
+    def gap(residual):
+        law = oracle.conti(1.0, residual, 10.0)
+        osc = oracle.Oscillator(0.5, (oracle.Belt(0.4, *law, upper=0.8),))
+        return oracle_cycles.gap_from(osc, (0.8, 0.4), (oracle.ABOVE,), (0,))
+
+    return brentq(gap, 0.25, 0.35, xtol=1e-14)
+
+
+@pytest.mark.parametrize("guess", [0.31, 0.25])
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("offset", [0.0, -1e-13, 1e-13])
+def test_a_fold_where_slip_onset_lies_on_the_edge(offset, side, guess):
+    """Beyond the fold no cycle sticks, and the orbit from the edge begins with slip."""
+
+    def make(residual):
+        return with_onset_on_its_edge(residual, edge=0.8 + offset, side=side)
+
+    point = jb.refine(jb.NonsmoothFold(0), make, at=guess)
+    assert point.status == Status.OK
+    # The oracle integrates to 1e-13.
+    assert point.value == pytest.approx(fold_with_onset_on_its_edge(), abs=1e-11)
+    farthest = point.cycle.x1_max if side > 0 else -point.cycle.x1_min
+    # The arc beyond the edge is good to 1e-12; the edge is off by 1e-13.
+    assert farthest == pytest.approx(farthest_after_onset(), abs=1e-12)
+
+
+def test_a_fold_where_slip_onset_lies_on_the_edge_is_told_once():
+    points = jb.scan(with_onset_on_its_edge, span=(0.3, 0.9))
+    # Beside the fold the mass comes to rest on the edge, where mu(0.4) = r + (1 - r)/5 is 0.8.
+    assert [point.kind for point in points] == ["NonsmoothFold", "BoundaryEquilibrium"]
+    values = (fold_with_onset_on_its_edge(), 0.75)
+    assert [float(point.value) for point in points] == pytest.approx(values, abs=1e-11)

@@ -236,7 +236,10 @@ def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tup
     rows = jnp.arange(HINT_BUDGET)
     near = (orbit.ends == Ends(n).extremum_x2) & (exits[:, 1] * jnp.sign(velocity) > 0) & (rows > 0)
     last = jnp.argmax(near)
-    first_loop = eqx.tree_at(lambda o: (o.repeats, o.count), orbit, (jnp.asarray(0), last + 1))
+    # The row of the stick phase is left out. From an edge on which slip onset lies the orbit begins
+    # with slip, and that arc is part of the loop.
+    before = jnp.where(jnp.any(orbit.codes[0] == STUCK), 0, -1)
+    first_loop = eqx.tree_at(lambda o: (o.repeats, o.count), orbit, (before, last + 1))
     returns = jnp.any(near) & ~jnp.any(
         (rows > 0) & (rows <= last) & jnp.any(orbit.codes == 0, axis=-1)
     )
