@@ -4,6 +4,8 @@ Tolerances: the fixed steps of shooting are good to about 1e-12 per arc, the ora
 loop; 1e-10 leaves room for the amplification by an unstable multiplier of 20.
 """
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,8 @@ from scipy.integrate import solve_ivp
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
 from jaxbelt.cycles.chains import cut
-from jaxbelt.cycles.cycle import as_loop, polish
+from jaxbelt.cycles.cycle import FINE_STEPS, as_loop, polish
+from jaxbelt.motion.arcs import Ends
 from jaxbelt.numerics.compiling import GROUP
 
 START = (3.0, 0.0)
@@ -140,6 +143,25 @@ def test_no_cycle_crosses_where_the_mass_would_stick():
     assert below.status == Status.OK and above.status == Status.NOT_ADMISSIBLE
     sticks = jb.find_cycle(jb.Oscillator(-0.59564, belts), (1.0, 0.0))
     assert sticks.status == Status.OK and jb.stick_duration(sticks, 0) > 0
+
+
+def test_no_arc_of_a_cycle_passes_an_extremum_of_x1():
+    """What solves the equations of a chain that does not mark it would tell a wrong amplitude."""
+    osc = jb.Oscillator(0.5, (jb.Belt(0.4, jb.Conti(1.0, 0.25, 10.0), upper=0.9),))
+    cycle = jb.find_cycle(osc, (0.9, 0.4))
+    loop = as_loop(cycle, 16)
+    marked = np.flatnonzero(loop.ends == Ends(1).extremum_x1)
+    assert cycle.status == Status.OK and marked.size == 2
+    for row in marked:
+        merged = replace(
+            loop,
+            ends=loop.ends.at[row].set(loop.ends[row + 1]),
+            durations=loop.durations.at[row].add(loop.durations[row + 1]),
+        )
+        rows = np.append(np.delete(np.arange(16), row + 1), 15)  # the last one is not used
+        merged = jax.tree.map(lambda leaf, rows=rows: leaf[rows], merged)
+        found = polish(osc, merged, jnp.asarray(Status.OK.value), FINE_STEPS)
+        assert found.status == Status.NOT_ADMISSIBLE
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -553,8 +553,9 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
     """Whether the oscillator moves like that, as far as equations hold.
 
     Every arc has a duration >= 0 and stays inside its mode: both ends are looked at; between them
-    x1, x2 and the needed force are monotone. All belts to which the mass sticks have its velocity.
-    None crosses a boundary, or goes on from one beyond an edge, where the mass would stick.
+    x1, x2 and the needed force are monotone, and no extremum of x1 is passed unmarked. All belts to
+    which the mass sticks have its velocity. None crosses a boundary, or goes on from one beyond an
+    edge, where the mass would stick.
     """
     belts = range(len(osc.belts))
 
@@ -567,6 +568,9 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
             holds = ~mode.any_stuck | (jnp.abs(needed) <= capacity(osc, mode) + HOLDS)
             together = jnp.where(codes == 0, jnp.abs(velocities - osc.omega * y[1]), 0.0)
             fine = fine & jnp.all(inside >= -HOLDS) & holds & jnp.all(together <= HOLDS)
+        # An arc along which x2 changes its sign passes an extremum of x1 that is no end of an arc.
+        lowest, highest = jnp.minimum(unknown[1], exit_[1]), jnp.maximum(unknown[1], exit_[1])
+        fine = fine & ((lowest >= -HOLDS) | (highest <= HOLDS))
         # At the point of a corner what follows the edge has no duration.
         on_boundary = jnp.abs(velocities - osc.omega * exit_[1]) <= HOLDS
         goes_on = on_boundary & (jnp.abs(after) == 1) & lasts
