@@ -597,3 +597,14 @@ def test_two_equilibria_that_change_at_one_value(varied):
         for point in points:
             curve = jb.bifurcation_curve(point, of_both, span=((0.15, 0.22), (0.4, 0.6)))
             assert np.all(np.sign(curve.places[:, 0]) == np.sign(float(point.x1)))
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("span", [(0.0, 0.5), (-0.5, 0.0)])
+def test_nothing_happens_where_a_load_vanishes(span):
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(value):
+        return jb.Oscillator(0.25, (jb.Belt(0.3, law, jnp.abs(value), upper=0.6), jb.Belt(0.1, law)))
+
+    assert jb.scan(make, span=span, resolution=8) == ()
