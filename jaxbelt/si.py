@@ -6,6 +6,7 @@ result of an observable of one's own, stays as it is.
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Union
 
@@ -69,6 +70,8 @@ AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
 SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
 
 
+#: Where the mass rests, at the end of the words for an attractor of `basins`.
+REST = re.compile(r"(?<=rest.at.)-?\d+\.\d+$")
 #: What else to do with a result that `in_si` does not take.
 INSTEAD = {
     BifurcationPoint: "; its value is in the unit of the argument where a function was given in "
@@ -112,24 +115,26 @@ def in_si(
     a trajectory comes without `force`.
 
     Of a trajectory: `t` in s, `x1` in m, `x2` in m/s, `force`, the friction on the mass, in N
-    (exact formulation only), and `mode` at each sample; `t_event`, `x1_event`, `x2_event`,
-    `event_kind` and `event_belt`. Of a cycle: `period`, `stick_duration` of each belt, `x1_min`,
-    `x1_max`, `x2_min`, `x2_max`, `amplitude`, and `energy`, what friction and dashpot turn into
-    heat in one period. Of a portrait: over `row`, the columns of its `table()`, `rate` in 1/s. Of a
-    shock: `x1` and `x2` of its start, `shock_x1`, `shock_x2`, and `distance`, in m/s where it
-    changes the velocity alone; of both, a distance in the dimensionless plane, it stays as it is.
-    Of a basin stability: its `table()`, which has no units. Of a fit: over `parameter`, the names
-    in its table, `estimate`, `standard_error`, `lower` and `upper` (the confidence interval of 95
-    per cent), each in the `unit` beside it (a `load` is the normal force), and a parameter of a law
-    of one's own is in the power of m/s that its `in_units_of` tells, or stays as the law has it,
-    with the unit ""; over `t` the fitted motion, `x1` and `x2`, and `x1_residual` and
-    `x2_residual`, datum minus motion. Of a diagram, or of fractions: over `row`, the columns of
-    its `table()`; a special point is a row with the branch -1; `value`, of the parameter, is in m/s
-    for the velocity of a belt, in N for a load (the normal force), in m for a contact edge, in N
-    s/m for the damping, and that of a function's argument stays as the function takes it. Of a
-    dataset: its own variables, with derivatives by starts and parameters where the units are the
-    same in all runs; results of an observable of one's own stay dimensionless, and so does the
-    attribute `start`. `TypeError` for anything else.
+    (exact formulation only), and `mode` at each sample, those after the event where one falls on an
+    event (the limit of a jump of the force from the left is no sample); `t_event`, `x1_event`,
+    `x2_event`, `event_kind` and `event_belt`. Of a cycle: `period`, `stick_duration` of each belt,
+    `x1_min`, `x1_max`, `x2_min`, `x2_max`, `amplitude`, and `energy`, what friction and dashpot
+    turn into heat in one period. Of a portrait: over `row`, the columns of its `table()`, `rate` in
+    1/s. Of a shock: `x1` and `x2` of its start, `shock_x1`, `shock_x2`, and `distance`, in m/s
+    where it changes the velocity alone; of both, a distance in the dimensionless plane, it stays as
+    it is. Of a basin stability: its `table()`, which has no units. Of a fit: over `parameter`, the
+    names in its table, `estimate`, `standard_error`, `lower` and `upper` (the confidence interval
+    of 95 per cent), each in the `unit` beside it (a `load` is the normal force), and a parameter of
+    a law of one's own is in the power of m/s that its `in_units_of` tells, or stays as the law has
+    it, with the unit ""; over `t` the fitted motion, `x1` and `x2`, and `x1_residual` and
+    `x2_residual`, datum minus motion. Of a diagram, or of fractions: over `row`, the columns of its
+    `table()`; a special point is a row with the branch -1; `value`, of the parameter, is in m/s for
+    the velocity of a belt, in N for a load (the normal force), in m for a contact edge, in N s/m
+    for the damping, and that of a function's argument stays as the function takes it. Of a dataset:
+    its own variables, with derivatives by starts and parameters where the units are the same in all
+    runs; results of an observable of one's own stay dimensionless, and so does the attribute
+    `start`; the words for `label` of basins tell in m where the mass rests. `TypeError` for
+    anything else.
 
     Where a function was given in place of an oscillator, the value of a `BifurcationPoint` and
     those of a `BifurcationCurve` are in the units of its arguments already; the cycle at a point is
@@ -177,6 +182,16 @@ def units_of(machine: Any) -> Units:
     along = "what is along an argument of it: a diagram, fractions, the dataset of a sweep"
     told = f"; a function is for {along}" if callable(machine) else ""
     raise ValueError(f"machine must be a Machine, got {in_words(machine)}{told}")
+
+
+def rest_in_m(words: str, units: Units) -> str:
+    """The words for an attractor with where the mass rests in m, with the digits that are known."""
+
+    def in_m(found: re.Match) -> str:
+        digits = len(found[0].replace(".", "").lstrip("-0"))
+        return f"{float(found[0]) * float(units.length):.{max(1, digits)}g} m"
+
+    return REST.sub(in_m, words)
 
 
 def check_machine(result: Any, machine: Any) -> None:
@@ -494,6 +509,9 @@ def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
         old = dataset[name]
         values = (old * unit).transpose(*old.dims).values
         changed[name] = (old.dims, values, old.attrs | told)
+    if words := dataset["label"].attrs.get("flag_meanings") if "label" in dataset else None:
+        in_m = " ".join(rest_in_m(word, units).replace(" ", "_") for word in words.split())
+        changed["label"] = dataset["label"].assign_attrs(flag_meanings=in_m).variable
     coordinates = {name: changed.pop(name) for name in axes if name in changed}
     told = {"units": "SI where a variable says so; else dimensionless"}
     if str(start := dataset.attrs.get("start", "")).startswith("x"):  # not along the axes

@@ -283,12 +283,15 @@ def test_a_law_of_ones_own_that_takes_other_units_says_what_its_numbers_are_in()
 
 
 def test_a_picture_of_a_fit_in_si():
-    """Two quantities on one axis have no common unit: they stay as they are."""
     m = machine()
     both = fit_of(m.oscillator, damping=0.1)
-    ax = jb.plot_in_si(both, m)
-    assert ax.get_xlabel() == "time $t$ (s)"
-    assert ax.get_ylabel() == "displacement $x_1$, velocity $x_2$"
+    ax, ours = jb.plot_in_si(both, m), jb.in_si(both, m)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time $t$ (s)", "displacement $X$ (m)")
+    for one, name in zip(ax.figure.axes, ("x1", "x2"), strict=True):
+        record, motion = (line.get_xydata() for line in one.lines)
+        assert np.allclose(motion, np.stack([ours.t, ours[name]], axis=1), rtol=1e-12)
+        data = ours[name] + ours[f"{name}_residual"]
+        assert np.allclose(record, np.stack([ours.t, data], axis=1), rtol=1e-12)
     alone = dataclasses.replace(both, residuals=both.residuals.at[:, 1].set(jnp.nan))
     assert jb.plot_in_si(alone, m).get_ylabel() == "displacement $X$ (m)"
     plt.close("all")
@@ -398,6 +401,21 @@ def test_basins_in_si():
     plt.close("all")
 
 
+def test_words_for_basins_tell_the_place_of_rest_in_si():
+    m = machine()
+    words = "undecided cycle_that_never_sticks rest_at_0.230 rest_at_-1.234"
+    told = {"flag_values": np.array([-1, 0, 1, 2]), "flag_meanings": words}
+    axes = {"x1": ("x1", [1.0, 2.0, 3.0]), "x2": ("x2", [0.0])}
+    dataset = xr.Dataset({"label": (("x1", "x2"), [[0], [1], [2]], told)}, axes)
+    ours = jb.in_si(dataset, m)
+    places = [
+        f"rest_at_{x1 * 5.0 / STIFFNESS:{of}}_m" for x1, of in ((0.23, ".3g"), (-1.234, ".4g"))
+    ]
+    assert ours.label.flag_meanings.split() == [*words.split()[:2], *places]
+    assert jb.decoded(ours).label.values[:, 0].tolist() == [words.split()[1], *places]
+    assert np.array_equal(ours.label, dataset.label) and dataset.label.flag_meanings == words
+
+
 def test_pictures_in_si(run):
     m = machine()
     ax = jb.plot_phase_portrait(m.oscillator, run)
@@ -439,7 +457,7 @@ def test_in_si_everything_stays_where_it_is(run):
         lambda: jb.plot_vector_field(osc),
         lambda: jb.plot_vector_field(osc, kind="arrows"),
         lambda: jb.plot_friction_law(osc.belts[0].friction),
-        *(run.plot, events.plot, run.arcs.plot, jb.equilibria(osc).plot),
+        *(events.plot, run.arcs.plot, jb.equilibria(osc).plot),
         lambda: jb.plot_time_history(run),
     ]
     for draw in pictures:
@@ -474,7 +492,7 @@ def test_a_measurement_beside_a_picture_in_si(run):
     assert np.array_equal(line.get_xydata(), np.stack([t, X], axis=1))
     ax.set_xlim(0.1, 0.2)
     assert jb.plot_in_si(run, m, ax).get_xlim() == (0.1, 0.2)
-    assert [one.get_xdata()[-1] for one in ax.lines[1:]] == pytest.approx([0.5] * 4)
+    assert [one.get_xdata()[-1] for one in ax.lines[1:]] == pytest.approx([0.5] * 2)
     # A call that fails leaves the limits alone.
     with pytest.raises(TypeError):
         jb.plot_in_si(run, m, ax, colour="red")
@@ -483,7 +501,42 @@ def test_a_measurement_beside_a_picture_in_si(run):
     # And what was drawn without units is converted once.
     ax = run.plot()
     jb.plot_in_si(run, m, ax)
-    assert [one.get_xdata()[-1] for one in ax.lines] == pytest.approx([0.5] * 4)
+    assert [one.get_xdata()[-1] for one in ax.lines] == pytest.approx([0.5] * 2)
+    plt.close("all")
+
+
+@pytest.mark.parametrize("is_new", [True, False])
+def test_a_trajectory_in_si_has_the_numbers_of_in_si(run, is_new):
+    """In new axes, and beside a measurement; the velocity has an axis of its own."""
+    m, ours = machine(), jb.in_si(run, machine())
+    ax = None
+    if not is_new:
+        ax = plt.subplots()[1]
+        (measured,) = ax.plot([0.0, 0.5], [-0.01, 0.02])
+    dimensionless = run.plot().get_ylim()
+    ax = jb.plot_in_si(run, m, ax)
+    line = ax.lines[-1]
+    (aside,) = (one for one in ax.figure.axes if one is not ax)
+    (other,) = aside.lines
+    for drawn, shown, name in ((ax, line, "x1"), (aside, other, "x2")):
+        t, values = np.transpose(shown.get_xydata())
+        assert t[-1] == pytest.approx(0.5)
+        # The lines have samples of their own besides: each of in_si is among them, or between two.
+        assert np.interp(ours.t, t, values) == pytest.approx(
+            ours[name].values, abs=1e-3 * max(values)
+        )
+        assert drawn.get_ylim()[0] < min(values) and max(values) < drawn.get_ylim()[1]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time $t$ (s)", "displacement $X$ (m)")
+    assert aside.get_ylabel() == r"velocity $\dot X$ (m/s)"
+    assert aside.get_xlim() == ax.get_xlim() == pytest.approx((0.0, 0.5))
+    if is_new:
+        for one, unit in ((ax, m.units.length), (aside, m.units.velocity)):
+            assert one.get_ylim() == pytest.approx(np.multiply(dimensionless, float(unit)))
+    else:
+        assert measured.get_ydata().tolist() == [-0.01, 0.02] and ax.get_ylim()[1] < 0.03
+        assert jb.plot_in_si(run, m, ax).figure.axes == [ax, aside] and len(aside.lines) == 2
+    words = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert {"displacement $X$", r"velocity $\dot X$"} < set(words)
     plt.close("all")
 
 

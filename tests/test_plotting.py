@@ -81,6 +81,18 @@ def test_time_history_shades_every_stick_phase_in_the_colour_of_its_belt(two_sid
     assert [ax.get_ylabel() for ax in axes] == ["displacement $x_1$", "velocity $x_2$"]
 
 
+def test_the_key_of_a_trajectory_has_the_belts_in_order(two_sided):
+    _, trajectory = two_sided
+    arcs = eqx.tree_at(lambda a: a.mode, trajectory.arcs, trajectory.arcs.mode[:, ::-1])
+    swapped = eqx.tree_at(lambda run: run.arcs, trajectory, arcs)
+    firsts = {stick_phases(run)[0][0] for run in (trajectory, swapped)}
+    assert firsts == {0, 1}
+    for run in (trajectory, swapped):
+        words = [text.get_text() for text in run.plot().get_legend().get_texts()]
+        assert words[-2:] == ["sticks to belt 0", "sticks to belt 1"]
+    plt.close("all")
+
+
 def test_a_stick_phase_across_a_contact_edge_is_one(two_sided):
     arcs = jb.Arcs(
         t=jnp.array([0.0, 1.0, 3.0, 4.0, jnp.nan]),

@@ -33,7 +33,7 @@ def plot_trajectory(trajectory: Trajectory, ax: Axes | None = None) -> Axes:
     t, ys = path_of(trajectory)
     ax.plot(t, ys[:, 0], color="black", linewidth=1.1, label="displacement $x_1$")
     ax.plot(t, ys[:, 1], color="0.35", linewidth=0.9, linestyle="--", label="velocity $x_2$")
-    for belt, begin, end in stick_phases(trajectory):
+    for belt, begin, end in sorted(stick_phases(trajectory)):  # the key has the belts in order
         ax.axvspan(begin, end, label=f"sticks to belt {belt}", zorder=0, **belt_shading(belt))
     ax.margins(x=0)
     ax.set_xlabel(r"time $\tau$")

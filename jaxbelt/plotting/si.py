@@ -1,6 +1,5 @@
 """Pictures in SI units: what any picture of this package shows, in s, m and m/s."""
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,7 +17,7 @@ from matplotlib.transforms import Affine2D, Bbox, Transform
 
 from ..checks import require
 from ..model.machine import Units
-from ..si import AlongParameter, check_machine, units_along, units_of
+from ..si import AlongParameter, check_machine, rest_in_m, units_along, units_of
 from .draw import draw_result
 from .style import figure_of, in_fractions, parameter_label, require_axes
 
@@ -39,10 +38,6 @@ SI_PARAMETERS = {
 }
 
 
-#: A displacement in a key: where the mass rests, see `basins`.
-REST = re.compile(r"(?<=rest at )-?\d+\.\d+$")
-
-
 def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any) -> Any:
     """A picture with times in s, displacements in m and velocities in m/s, also in its key.
 
@@ -53,7 +48,9 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     the axes.
 
     Limits and coordinates of these axes are in SI units, so that a measurement can be drawn over
-    it: `ax.plot(t_in_s, X_in_m)`; what was in `ax` before is taken to be in them. The parameter of
+    it: `ax.plot(t_in_s, X_in_m)`; what was in `ax` before is taken to be in them. Where one axis
+    shows displacement and velocity, as in the picture of a trajectory, it is that of displacement,
+    and velocity has one of its own at the right, in other axes of the same figure. The parameter of
     a diagram or of fractions is in SI units, too: that of a function's argument as the function
     takes it, whose unit only you know: `ax.set_xlabel("belt velocity $V$ (m/s)")`. Other axes that
     show something else, or tell their unit, stay as they are. `ValueError` where no axis can be
@@ -113,19 +110,13 @@ def _units_of_picture(result: Any, machine: Any) -> tuple[Units, tuple[float, st
 
 
 def _relabel_key(ax: Axes, units: Units) -> None:
-    unit = float(units.length)
-
-    def in_m(found: re.Match) -> str:
-        # With the digits that are known.
-        digits = len(found[0].replace(".", "").lstrip("-0"))
-        return f"{float(found[0]) * unit:.{max(1, digits)}g} m"
-
     for artist in ax.get_children():
-        if REST.search(label := str(artist.get_label())):
-            artist.set_label(REST.sub(in_m, label))
+        if (words := rest_in_m(label := str(artist.get_label()), units)) != label:
+            artist.set_label(words)
     for key in [ax.get_legend(), *figure_of(ax).legends]:
         for text in key.get_texts() if key else ():
-            text.set_text(REST.sub(in_m, text.get_text()))
+            words = rest_in_m(text.get_text(), units)
+            text.set_text(words.replace("$x_1$", "$X$").replace("$x_2$", r"$\dot X$"))
 
 
 class _Before:
@@ -145,27 +136,53 @@ class _Before:
 
 
 def _convert(every: Sequence[Axes], units: Units, before: _Before | None) -> bool:
-    """Put axes in SI units that show one quantity that has some; whether there are any."""
+    """Put axes in SI units that show a quantity that has some; whether there are any."""
     is_any = False
     for one in every:
         for number in (0, 1):
-            found = _quantity_of(_axis(one, number).get_label_text())
-            if found is not None:
-                quantity, label = found
-                _scale(one, number, float(getattr(units, quantity)), label, before)
-                is_any = True
+            shown = _axis(one, number).get_label_text().split(", ")
+            if not all(part in LABELS for part in shown):
+                continue
+            quantity, label = LABELS[shown[0]]
+            if len(shown) == 2:
+                _put_velocity_aside(one, float(units.velocity), LABELS[shown[1]][1], before)
+            _scale(one, number, float(getattr(units, quantity)), label, before)
+            is_any = True
     return is_any
+
+
+def _put_velocity_aside(ax: Axes, unit: float, label: str, before: _Before | None) -> None:
+    """Move the velocities of axes that show displacements, too, to an axis at the right."""
+    limits = ax.get_ylim()
+    lines = [line for line in ax.lines if "$x_2$" in str(line.get_label())]
+    aside = _right_of(ax, label)
+    for line in lines:
+        if before is None or line not in before.artists:
+            _scale_artist(line, ax, np.array([1.0, unit]))
+            line.remove()
+            line.set_transform(aside.transData)
+            aside.add_line(line)
+    ax.relim()
+    if before is None:
+        aside.set_ylim(limits[0] * unit, limits[1] * unit, auto=None)
+    else:
+        aside.autoscale_view(scalex=False)
+
+
+def _right_of(ax: Axes, label: str) -> Axes:
+    """The axes with this label in the place of others, made unless they are there."""
+    for one in ax.get_shared_x_axes().get_siblings(ax):
+        here = np.allclose(one.get_position().bounds, ax.get_position().bounds)
+        if one is not ax and here and one.get_ylabel() == label:
+            return one
+    aside = ax.twinx()
+    aside.set_xmargin(ax.get_xmargin())
+    aside.set_ylabel(label)
+    return aside
 
 
 def _axis(ax: Axes, number: int) -> Axis:
     return (ax.xaxis, ax.yaxis)[number]
-
-
-def _quantity_of(text: str) -> tuple[str, str] | None:
-    """What the label of an axis tells of it, and the label in SI units; None where it has none."""
-    shown = [LABELS[part] for part in text.split(", ") if part in LABELS]
-    # Two quantities on one axis have no common unit.
-    return shown[0] if len(shown) == 1 else None
 
 
 def _scale(ax: Axes, number: int, unit: float, label: str, before: _Before | None) -> None:
