@@ -1,6 +1,7 @@
 """Machines in SI units: the oscillator that they are, and results brought back."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -591,6 +592,39 @@ def test_results_along_a_parameter_in_si():
     for name, size in sizes.items():
         (ours,) = {tuple(jb.in_si(one, m).value.values) for one in along(name)[:1]}
         assert ours[0] == pytest.approx(0.5 * size)
+    plt.close("all")
+
+
+def doubled(cycle):
+    return 2 * cycle.period
+
+
+@pytest.mark.parametrize(
+    ("quantity", "unit", "label"),
+    [
+        (jb.energy_fed, "energy", "energy fed (J)"),
+        (functools.partial(jb.stick_duration, belt=0), "time", "stick duration (belt 0) (s)"),
+        (jb.peak, "length", "peak (m)"),
+        (functools.partial(jb.peak, coordinate="x2"), "velocity", "peak (coordinate x2) (m/s)"),
+        (jb.period, "time", "period (s)"),
+        (jb.stick_fraction, None, "stick fraction"),
+        (doubled, None, "doubled (dimensionless)"),
+        (lambda cycle: jb.stick_duration(cycle, 0), None, "quantity (dimensionless)"),
+    ],
+)
+def test_a_quantity_of_a_diagram_in_si(quantity, unit, label):
+    m, diagram = machine(), along()[2]
+    size = 1.0 if unit is None else float(getattr(m.units, unit))
+    plain, ours = diagram.plot(quantity=quantity), jb.plot_in_si(diagram, m, quantity=quantity)
+    assert ours.get_ylabel() == label
+    assert ours.lines[0].get_ydata() == pytest.approx(plain.lines[0].get_ydata() * size, rel=1e-12)
+    assert np.all(np.isfinite(ours.lines[0].get_ydata()))
+    # Beside what is there in SI units, too.
+    _, ax = plt.subplots()
+    (before,) = ax.plot([0.1, 0.2], [1.0, 2.0])
+    jb.plot_in_si(diagram, m, ax, quantity=quantity)
+    assert ax.get_ylabel() == label and before.get_ydata().tolist() == [1.0, 2.0]
+    assert ax.lines[1].get_ydata() == pytest.approx(ours.lines[0].get_ydata())
     plt.close("all")
 
 

@@ -1,6 +1,7 @@
 """Pictures in SI units: what any picture of this package shows, in s, m and m/s."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -15,9 +16,21 @@ from matplotlib.text import Annotation, Text
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D, Bbox, Transform
 
+from ..bifurcations.diagrams import BifurcationDiagram
 from ..checks import require
+from ..cycles.functionals import (
+    amplitude,
+    energy_dissipated,
+    energy_fed,
+    gap,
+    peak,
+    period,
+    slip_duration,
+    stick_duration,
+    stick_fraction,
+)
 from ..model.machine import Units
-from ..si import AlongParameter, check_machine, rest_in_m, units_along, units_of
+from ..si import SYMBOLS, AlongParameter, check_machine, rest_in_m, units_along, units_of
 from .draw import draw_result
 from .style import figure_of, in_fractions, parameter_label, require_axes
 
@@ -36,6 +49,14 @@ SI_PARAMETERS = {
     "velocity": "belt velocity $V_%$",
     "load": "normal force $N_%$",
 }
+#: What the functionals of this package are; "": the coordinate tells, None: a pure number.
+FUNCTIONALS: dict[Any, str | None] = {
+    **dict.fromkeys((period, stick_duration, slip_duration), "time"),
+    **dict.fromkeys((energy_fed, energy_dissipated), "energy"),
+    **dict.fromkeys((amplitude, peak), ""),
+    gap: "velocity",
+    stick_fraction: None,
+}
 
 
 def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any) -> Any:
@@ -52,10 +73,12 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     shows displacement and velocity, as in the picture of a trajectory, it is that of displacement,
     and velocity has one of its own at the right, in other axes of the same figure. The parameter of
     a diagram or of fractions is in SI units, too: that of a function's argument as the function
-    takes it, whose unit only you know: `ax.set_xlabel("belt velocity $V$ (m/s)")`. Other axes that
-    show something else, or tell their unit, stay as they are. `ValueError` where no axis can be
-    converted, as in the picture of a sweep (draw what `in_si` returns instead), where the units
-    vary along the parameter, and for a wrong argument.
+    takes it, whose unit only you know: `ax.set_xlabel("belt velocity $V$ (m/s)")`. Its `quantity`
+    is in SI units where that is a functional of this package, such as `energy_fed`, also in
+    `functools.partial`; what a function of your own gives stays as it is, and the label says
+    "(dimensionless)". Other axes that show something else, or tell their unit, stay as they are.
+    `ValueError` where no axis can be converted, as in the picture of a sweep (draw what `in_si`
+    returns instead), where the units vary along the parameter, and for a wrong argument.
     """
     require_axes(ax)
     units, parameter = _units_of_picture(result, machine)
@@ -71,6 +94,9 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
         every = [axes] if isinstance(axes, Axes) else list(axes)
         shown = [repr(axis.get_label_text()) for one in every for axis in (one.xaxis, one.yaxis)]
         is_done = _convert(every, units, before)
+        quantity = options.get("quantity")
+        if isinstance(result, BifurcationDiagram) and callable(quantity) and not is_done:
+            _convert_functional(axes, quantity, units, before)
         if parameter is not None:
             _scale(axes, 0, *parameter, before)
     finally:
@@ -149,6 +175,24 @@ def _convert(every: Sequence[Axes], units: Units, before: _Before | None) -> boo
             _scale(one, number, float(getattr(units, quantity)), label, before)
             is_any = True
     return is_any
+
+
+def _convert_functional(
+    ax: Axes, functional: Callable, units: Units, before: _Before | None
+) -> None:
+    """Put the values of a functional of cycles in SI units where their unit is known."""
+    name, coordinate = ax.get_ylabel(), "x1"
+    if isinstance(functional, functools.partial):
+        coordinate = functional.keywords.get("coordinate", coordinate)
+        functional = functional.func
+    # One of somebody's own may have no hash.
+    known = [quantity for one, quantity in FUNCTIONALS.items() if one is functional]
+    if not known:
+        ax.set_ylabel(f"{name} (dimensionless)")
+    elif known[0] is not None:
+        quantity = known[0] or {"x1": "length", "x2": "velocity"}[coordinate]
+        unit, symbol = float(getattr(units, quantity)), in_fractions(SYMBOLS[quantity])
+        _scale(ax, 1, unit, f"{name} ({symbol})", before)
 
 
 def _put_velocity_aside(ax: Axes, unit: float, label: str, before: _Before | None) -> None:
