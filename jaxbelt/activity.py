@@ -6,6 +6,7 @@ shown; the logger "jaxbelt" is told in any case: of ends at the level INFO, of t
 """
 
 import functools
+import inspect
 import logging
 import threading
 import time
@@ -14,6 +15,8 @@ from typing import Any, ClassVar
 
 from rich.console import Console
 from rich.progress import Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from .spelling import check_names
 
 #: Seconds before anything is shown that nobody asked for. A busy machine may take another one, and
 #: nobody is to see nothing for more than two.
@@ -107,11 +110,15 @@ class Activity:
 
 
 def announced(name: str) -> Callable[[Callable], Any]:
-    """Makes a function one that says what it does while it takes long; name: what that is."""
+    """Makes a function one that says what it does while it takes long, and that tells its arguments
+    where one has another name; name: of the function."""
 
     def decorate(function: Callable) -> Callable:
+        names = list(inspect.signature(function).parameters)
+
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
+            check_names(name, names, kwargs)
             with Activity(name):
                 return function(*args, **kwargs)
 

@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from .numerics.compiling import is_concrete, is_outermost, require_own_threads
-from .spelling import did_you_mean
+from .spelling import check_names, did_you_mean
 
 TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
 
@@ -154,8 +154,15 @@ def refuse_interval(values: Any, field: str) -> None:
     """Raise where an interval came, (first, last), and all values are wanted: they would be two."""
     if isinstance(values, tuple) and len(values) == 2:
         first, last = map(in_words, values)
-        expected = f"all values, such as np.linspace({first}, {last}, 201)"
-        came = f"{in_words(values)}; for two values write {list(values)}"
+        # Values have to increase: two that do not would be refused as well.
+        are_numbers = all(
+            np.shape(one) == () and np.asarray(one).dtype.kind in "iuf" for one in values
+        )
+        ascends = are_numbers and bool(values[0] < values[1])
+        if are_numbers and not ascends:
+            first, last = last, first
+        expected = f"all values, increasing, such as np.linspace({first}, {last}, 201)"
+        came = in_words(values) + (f"; for two values write {list(values)}" if ascends else "")
         require(False, field, expected, came)
 
 
@@ -223,13 +230,14 @@ def require_one_float(found: Any, field: str, expected: str) -> None:
 
 def outside_of_traces(function: Callable, instead: str = "") -> Any:
     """Makes an entry one that refuses to be called under `jit`, `vmap` or derivatives, by what is
-    traced: how much there is in its numbers decides what it computes. instead: what else to do
-    there, the end of the message."""
+    traced: how much there is in its numbers decides what it computes; and that tells its arguments
+    where one has another name. instead: what else to do in a trace, the end of the message."""
     name, signature = function.__name__, inspect.signature(function)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         require_own_threads()
+        check_names(name, signature.parameters, kwargs)
         scope = f"{name} is not for jit, vmap or derivatives"
         if not _is_known((args, kwargs)):
             given = signature.bind_partial(*args, **kwargs).arguments

@@ -1,6 +1,6 @@
 """What was perhaps meant by a word that is not known."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 #: Digits, and the letters that they are written for.
@@ -11,6 +11,22 @@ def did_you_mean(word: Any, names: Iterable[str]) -> str:
     """A question that names what was perhaps meant by a word, or nothing."""
     best = near(word, names)[:1]
     return f" (did you mean {best[0]!r}?)" if best else ""
+
+
+def check_names(
+    of: str, names: Iterable[str], given: Iterable[str], others: Mapping[str, str] | None = None
+) -> None:
+    """`TypeError` where an argument has a name that is not among those taken; it tells these, and
+    which was meant. of: who takes them; others: what arguments are sometimes called."""
+    *first, last = names = list(names)
+    known = f"{', '.join(first)} and {last}" if first else last
+
+    def told(name):
+        meant = [(others or {}).get(name.lower(), ""), *near(name, names)]
+        return ", ".join([*[one for one in meant if one in names][:1], f"not {name}"])
+
+    if wrong := [name for name in given if name not in names]:
+        raise TypeError(f"{of}() takes {known}: {', '.join(map(told, wrong))}")
 
 
 def near(word: Any, names: Iterable[str]) -> list[str]:

@@ -76,6 +76,10 @@ MISTAKES = [
     ("jb.Oscillator([0.5, 0.6], (belt,))", r"damping must be a scalar .*, got shape \(2,\)"),
     ("jb.Oscillator(np.float32(0.5), (belt,))", "damping must be float64, got float32"),
     ("jb.Oscillator(0.5, (belt,), omega=0)", r"omega must be > 0, got 0\.0"),
+    (
+        "jb.Oscillator(0.5, machine.belts)",
+        r"belts\[0\] must be a Belt, got PhysicalBelt\(.*; the .* Machine is machine\.oscillator$",
+    ),
     ("jb.Oscillator(dampng=0.5, belts=(belt,))", "unexpected keyword argument 'dampng'"),
     ("jb.plot_sweep(dataset, 'knd')", "variable must be \"kind\", got 'knd'"),
     (
@@ -160,7 +164,12 @@ MISTAKES = [
     ("jb.simulate(osc, (3.0, 0.0), 30.0, ts=row[::-1])", "ts must be increasing, got .*from 20 to"),
     ("jb.simulate(osc, (3.0, 0.0), 10.0, ts=100)", r"ts must be of shape \(n\), got shape \(\)"),
     ("jb.simulate(osc, (3.0, 0.0), 10.0, rtol=-1e-8)", "rtol must be > 0, got -1e-08"),
-    ("jb.simulate(osc, (3.0, 0.0), 10.0, tol=1e-8)", "unexpected keyword argument 'tol'"),
+    (
+        "jb.simulate(osc, (3.0, 0.0), 10.0, tol=1e-8)",
+        r"^simulate\(\) takes osc, y0, t1, t0, .* and max_events: [ra]tol, not tol$",
+    ),
+    ("jb.simulate(osc, (1.0, 0.0), t_end=5.0)", r"simulate\(\) takes osc, y0, t1, .*: not t_end$"),
+    ("jb.find_cycle(osc, y_0=(3.0, 0.0))", r"find_cycle\(\) takes osc, y0 and .*: y0, not y_0$"),
     ("jb.simulate(osc, (3.0, 0.0), 9.0, formulation='exact')", "formulation must be .*got 'exact'"),
     ("jb.simulate(osc, (3.0, 0.0), 9.0, max_segments=1e3)", f"max_segments {WHOLE}1000.0"),
     # --- cycles, equilibria, functionals
@@ -324,7 +333,7 @@ MISTAKES = [
     ),
     (
         "jb.region_map(jb.presets.class_b, {'nu0': (0, 1), 'nu1': row})",
-        r"nu0 must be all values, such as np.linspace\(0, 1, 201\), got \(0, 1\)",
+        r"nu0 must be all values, increasing, such as np.linspace\(0, 1, 201\), got \(0, 1\)",
     ),
     ("jb.region_map(jb.presets.class_b, {'nu0': row, 'nu1': [0.3]})", "nu1 must be two values or"),
     # --- sweeps and basins
@@ -401,6 +410,10 @@ MISTAKES = [
     ("jb.AtSection('x1')", "function must be a function of osc, x1 and x2, got 'x1'"),
     ("jb.AtTimes([3.0, 1.0])", r"times must be .*increasing, got \[3\. 1\.\]"),
     ("jb.basins(osc, x1=(0, 3), x2=(-1, 1))", r"x1 must be .*linspace\(0, 3, 201\), got \(0, 3\)"),
+    ("jb.basins(osc, x1=(1, 0), x2=(0, 1))", r"x1 .*linspace\(0, 1, 201\), got \(1, 0\)$"),
+    ("jb.basins(osc, x1=(0, 3), x2=row)", r"got \(0, 3\); for two values write \[0, 3\]$"),
+    ("jb.basins(osc, x=row, x2=row)", r"basins\(\) takes oscillator, x1, .*: x1, not x$"),
+    ("jb.sweep(jb.presets.class_b, AXES, t_1=9.0)", r"sweep\(\) takes make, .*: t1, not t_1$"),
     ("jb.basins(osc, row, row)", "takes 1 positional argument but 3 were given"),
     ("jb.basins(osc, x1=row[::-1], x2=row)", "x1 must be increasing, got an array .*from 20 to 0"),
     (

@@ -27,7 +27,7 @@ from ..checks import (
     require,
     require_value,
 )
-from ..spelling import near
+from ..spelling import check_names
 from .friction import AbstractFriction, as_friction
 from .oscillator import Belt, Oscillator, as_belts, as_edge, check_oscillator, scaled_edge
 
@@ -65,16 +65,8 @@ OTHER_NAMES = {
 
 
 def _check_names(of: Any, given: Iterable[str]) -> None:
-    """`TypeError` where an argument has another name than a field; it tells which was meant."""
     names = [field.name for field in dataclasses.fields(of)]
-
-    def told(name):
-        meant = [OTHER_NAMES.get(name.lower(), ""), *near(name, names)]
-        return ", ".join([*[one for one in meant if one in names][:1], f"not {name}"])
-
-    if wrong := [name for name in given if name not in names]:
-        known = f"{', '.join(names[:-1])} and {names[-1]}"
-        raise TypeError(f"{of.__name__}() takes {known}: {', '.join(map(told, wrong))}")
+    check_names(of.__name__, names, given, OTHER_NAMES)
 
 
 class PhysicalBelt(eqx.Module):

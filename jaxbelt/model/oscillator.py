@@ -174,7 +174,11 @@ class Oscillator(eqx.Module):
             rule.enforce("")
         require(len(osc.belts) > 0, "belts", "at least one Belt", "none")
         for i, belt in enumerate(osc.belts):
-            require_value(isinstance(belt, Belt), f"belts[{i}]", "a Belt", belt)
+            if not isinstance(belt, Belt):
+                # A machine's belts are in SI units, and its oscillator's are not.
+                is_physical = type(belt).__name__ == "PhysicalBelt"
+                hint = "; the Oscillator of a Machine is machine.oscillator" * is_physical
+                require(False, f"belts[{i}]", "a Belt", in_words(belt) + hint)
             Belt.check(belt, f"belt {i}")
 
     def rules(self) -> list[Rule]:
