@@ -242,7 +242,9 @@ def main(names: list[str]) -> None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         note = f"Measured on {cores} cores of {platform.machine()}, with jaxbelt {jb.__version__}"
         note += f" and jax {jax.__version__}. The first call compiles what the rows above did not."
-        page = "\n".join([*lines, "", note, ""])
+        more = "Derivatives and batches of `find_cycle`, such as `jax.vmap(jax.grad(amplitude))"
+        more += "(numbers)`, compile for up to a minute, longer on a busy machine."
+        page = "\n".join([*lines, "", note, "", more, ""])
         (Path(__file__).parent / "costs.md").write_text(page, encoding="utf-8")
 
 

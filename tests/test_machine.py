@@ -77,6 +77,18 @@ def test_friction_force(run):
     assert np.allclose(ours.force[~stuck], force[~stuck], rtol=0, atol=1e-9)
 
 
+def test_the_force_at_an_event_is_that_after_it():
+    m = machine()
+    ours = jb.in_si(jb.simulate(m.oscillator, m.start(0.003, 0.0), m.tau(0.1)), m)
+    (event,) = np.flatnonzero(jb.decoded(ours).event_kind.values == "stick")
+    row = int(np.argmin(np.abs(ours.t.values - float(ours.t_event[event]))))
+    assert float(ours.t[row]) == float(ours.t_event[event])
+    before, at, _ = ours.force.values[row - 1 : row + 2]
+    held = STIFFNESS * float(ours.x1[row]) + DAMPING * 0.02
+    assert at == pytest.approx(held, rel=1e-9) and abs(before - at) > 0.1
+    assert ours["mode"].values[row, 0] == 0 != ours["mode"].values[row - 1, 0]
+
+
 def test_a_trajectory_of_another_machine(run):
     with pytest.raises(ValueError, match=r"its belt 0 at velocity 0\.189.*sticks .* at 0\.126"):
         jb.in_si(run, machine(0.03))

@@ -26,6 +26,9 @@ AXES = {"nu0": np.linspace(-0.6, 0.55, 5), "nu1": np.array([0.35, -0.2, 0.1])}
 OPTIONS = dict(observe="attractor", progress=False)
 
 
+RUNS_OF_BLOCK = stores.BLOCK_RUNS
+
+
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
     monkeypatch.setattr(stores, "BLOCK_RUNS", 4)
@@ -85,6 +88,15 @@ def test_blocks_are_boxes_that_hold_every_run_once(shape, size, box):
     grid = np.arange(np.prod(shape)).reshape(shape)
     for b, part in enumerate(runs):
         assert np.array_equal(grid[blocks.slices(b)].ravel(), part)
+
+
+@pytest.mark.parametrize(
+    ("shape", "count"), [((RUNS_OF_BLOCK,), 1), ((256, 512), 1), ((RUNS_OF_BLOCK + 1,), 2)]
+)
+def test_the_docs_tell_how_many_runs_a_block_has(shape, count):
+    assert len(Blocks(shape, RUNS_OF_BLOCK)) == count
+    pages = [(TESTS.parent / page).read_text("utf-8") for page in ("README.md", "docs/clusters.md")]
+    assert all(f"{RUNS_OF_BLOCK:,} runs" in page for page in [*pages, jb.sweep.__doc__])
 
 
 def test_a_store_is_what_the_sweep_gives(path, whole):

@@ -202,6 +202,15 @@ def test_cycles_that_slip_faster_than_the_table_goes_are_told_of():
 
 
 @pytest.mark.slow(first=True)
+def test_runs_that_slip_faster_than_the_table_goes_are_not_told_of():
+    """A warning would fail this."""
+    beyond, row = machine(0.3), [0.0, 1.0]
+    jb.simulate(beyond.oscillator, beyond.start(0.0, 0.0), 50.0)
+    jb.sweep(lambda: beyond.oscillator, {"x1": row}, y0=(0.0, 0.0), observe="attractor")
+    jb.basins(beyond.oscillator, x1=row, x2=row)
+
+
+@pytest.mark.slow(first=True)
 def test_a_search_tells_of_it_once():
     """The values that it looks at on its way have such cycles, too."""
     for search in (

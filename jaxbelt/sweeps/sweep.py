@@ -96,16 +96,17 @@ def sweep(
 
     derivatives: names of axes. Adds `d_<variable>_d_<axis>` for every variable that is a float, by
     forward mode; NaN where the variable is not finite. store: a folder for the results as they come
-    in, a Zarr group that `xarray.open_zarr` opens; the same call with the same store goes on where
-    one was interrupted, and returns at once what is finished. executor: a
-    `dask.distributed.Client`, whose workers then do the blocks of the store, in a folder that all
-    of them see; a worker that dies costs the block that it was at. blocks: (first, last), which
-    blocks of the store to do, `last` not among them, for processes that share one store, such as
-    those of a job array; who ends last finishes the store, in which until then runs that are not
-    done have the status and the kind -1, "not_done". progress: whether to show a bar; None: on a
-    terminal, when it takes long. audit: share of the runs that are done once more without any
-    shortcut and compared, of "final" and "attractor" only; the attributes audited and
-    audit_differed say how many, and a warning says so where one differed.
+    in, a Zarr group that `xarray.open_zarr` opens; it has blocks of up to 131,072 runs, each
+    written when it is whole, so of a sweep of no more runs than that nothing is kept where it is
+    interrupted; the same call with the same store goes on where one was interrupted, and returns at
+    once what is finished. executor: a `dask.distributed.Client`, whose workers then do the blocks
+    of the store, in a folder that all of them see; a worker that dies costs the block that it was
+    at. blocks: (first, last), which blocks of the store to do, `last` not among them, for processes
+    that share one store, such as those of a job array; who ends last finishes the store, in which
+    until then runs that are not done have the status and the kind -1, "not_done". progress: whether
+    to show a bar; None: on a terminal, when it takes long. audit: share of the runs that are done
+    once more without any shortcut and compared, of "final" and "attractor" only; the attributes
+    audited and audit_differed say how many, and a warning says so where one differed.
 
     Uses every core (every device, if JAX has others). `ValueError` names the argument that is
     impossible, a store of another sweep among them, and says what differs. `KeyboardInterrupt` ends
