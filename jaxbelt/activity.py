@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 from rich.console import Console
 from rich.progress import Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from .spelling import check_names
+from .spelling import refuse_other_names
 
 #: Seconds before anything is shown that nobody asked for. A busy machine may take another one, and
 #: nobody is to see nothing for more than two.
@@ -118,7 +118,7 @@ def announced(name: str) -> Callable[[Callable], Any]:
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
-            check_names(name, names, kwargs)
+            refuse_other_names(name, names, kwargs)
             with Activity(name):
                 return function(*args, **kwargs)
 

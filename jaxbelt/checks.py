@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from .numerics.compiling import is_concrete, is_outermost, require_own_threads
-from .spelling import check_names, did_you_mean
+from .spelling import refuse_other_names, did_you_mean
 
 TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
 
@@ -237,7 +237,7 @@ def outside_of_traces(function: Callable, instead: str = "") -> Any:
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         require_own_threads()
-        check_names(name, signature.parameters, kwargs)
+        refuse_other_names(name, signature.parameters, kwargs)
         scope = f"{name} is not for jit, vmap or derivatives"
         if not _is_known((args, kwargs)):
             given = signature.bind_partial(*args, **kwargs).arguments

@@ -13,19 +13,20 @@ def did_you_mean(word: Any, names: Iterable[str]) -> str:
     return f" (did you mean {best[0]!r}?)" if best else ""
 
 
-def check_names(
+def refuse_other_names(
     of: str, names: Iterable[str], given: Iterable[str], others: Mapping[str, str] | None = None
 ) -> None:
     """`TypeError` where an argument has a name that is not among those taken; it tells these, and
     which was meant. of: who takes them; others: what arguments are sometimes called."""
-    *first, last = names = list(names)
-    known = f"{', '.join(first)} and {last}" if first else last
+    names = list(names)
 
     def told(name):
         meant = [(others or {}).get(name.lower(), ""), *near(name, names)]
         return ", ".join([*[one for one in meant if one in names][:1], f"not {name}"])
 
     if wrong := [name for name in given if name not in names]:
+        *first, last = names or ["nothing"]
+        known = f"{', '.join(first)} and {last}" if first else last
         raise TypeError(f"{of}() takes {known}: {', '.join(map(told, wrong))}")
 
 

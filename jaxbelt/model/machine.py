@@ -27,7 +27,7 @@ from ..checks import (
     require,
     require_value,
 )
-from ..spelling import check_names
+from ..spelling import refuse_other_names
 from .friction import AbstractFriction, as_friction
 from .oscillator import Belt, Oscillator, as_belts, as_edge, check_oscillator, scaled_edge
 
@@ -64,9 +64,9 @@ OTHER_NAMES = {
 }
 
 
-def _check_names(of: Any, given: Iterable[str]) -> None:
+def _check_fields(of: Any, given: Iterable[str]) -> None:
     names = [field.name for field in dataclasses.fields(of)]
-    check_names(of.__name__, names, given, OTHER_NAMES)
+    refuse_other_names(of.__name__, names, given, OTHER_NAMES)
 
 
 class PhysicalBelt(eqx.Module):
@@ -91,7 +91,7 @@ class PhysicalBelt(eqx.Module):
     )
 
     def __new__(cls, *_: Any, **given: Any):
-        _check_names(cls, given)
+        _check_fields(cls, given)
         return super().__new__(cls)
 
     def __check_init__(self):
@@ -130,7 +130,7 @@ class Machine(eqx.Module):
     )
 
     def __new__(cls, *_: Any, **given: Any):
-        _check_names(cls, given)
+        _check_fields(cls, given)
         return super().__new__(cls)
 
     def __check_init__(self):
