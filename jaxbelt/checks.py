@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from .numerics.compiling import is_concrete, is_outermost, require_own_threads
-from .spelling import refuse_other_names, did_you_mean
+from .spelling import did_you_mean, refuse_other_names
 
 TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
 
