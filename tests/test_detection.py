@@ -481,16 +481,14 @@ def test_what_holds_all_along_is_no_point():
     # Rounding decides on which side the edge is; what is added makes it do so on any machine.
     at = _edge_beside_the_equilibrium(lambda v: 4e-16 * jnp.sin(1e3 * v))
     assert jb.refine(jb.BoundaryEquilibrium(1), at, at=0.23).status == Status.DEGENERATE
-    hopf, along = jb.scan(at, span=(0.22, 0.24), resolution=4)
-    assert hopf.kind == "Hopf" and along.status == Status.DEGENERATE
-    assert along.condition == jb.BoundaryEquilibrium(1)
-    assert along.value == pytest.approx(0.23) and along.error == pytest.approx(0.01)
+    (hopf,) = jb.scan(at, span=(0.22, 0.24), resolution=4)
+    assert hopf.kind == "Hopf"
     diagram = jb.bifurcation_diagram(at, span=(0.22, 0.24), resolution=4, rows=16)
     assert [b for _, b, _ in diagram.regions] == [pytest.approx(float(hopf.value)), 0.24]
 
 
 @pytest.mark.slow(first=True)
-@pytest.mark.parametrize("distance", [0.0, 1e-15, -1e-15])
+@pytest.mark.parametrize("distance", [0.0, 1e-15, -1e-15, 1e-9])
 def test_a_fixed_point_on_an_edge_all_along_has_a_hopf_point(distance):
     """Its trace is that of the second belt, 0.4 / 0.5 exp(-0.8 / 0.5) - damping, and the edge of
     the first one lies on it: on the other side that belt's force is missing, and pushes back."""
@@ -503,7 +501,7 @@ def test_a_fixed_point_on_an_edge_all_along_has_a_hopf_point(distance):
         belts = jb.Belt(-sign * 0.3, own, **ends), jb.Belt(sign * 0.8, stribeck)
         osc = jb.Oscillator(0.2, belts)
         points = jb.scan(osc, lambda osc: osc.damping, span=(0.0, 0.4), resolution=8)
-        kind = "PseudoHopf" if distance > 0 else "Hopf"
+        kind = "PseudoHopf" if distance > 1e-12 else "Hopf"
         assert {point.kind for point in points} == {kind, "CornerCollision", "NonsmoothFold"}
         (hopf,) = [point for point in points if point.kind == kind]
         assert hopf.value == pytest.approx(0.8 * np.exp(-1.6), abs=1e-13)
@@ -554,8 +552,7 @@ def test_the_error_of_a_double_root_is_told(start):
 def test_the_unit_of_the_parameter_makes_no_difference(unit):
     along = _edge_beside_the_equilibrium(lambda v: 4e-16 * jnp.sin(1e3 * v))
     found = jb.scan(lambda s: along(s / unit), span=(0.22 * unit, 0.24 * unit), resolution=4)
-    assert [point.status for point in found] == [Status.OK, Status.DEGENERATE]
-    assert float(found[1].error) == pytest.approx(0.01 * unit)
+    assert [point.kind for point in found] == ["Hopf"]
     # A double root, known to 5e-8 units, and a simple one, from farther off than 0.5.
     double = jb.refine(
         jb.BoundaryEquilibrium(1), lambda s: _edge_at_the_least_friction(s / unit), at=0.2999 * unit
@@ -605,6 +602,8 @@ def test_nothing_happens_where_a_load_vanishes(span):
     law = jb.Conti(1.0, 0.6, 10.0)
 
     def make(value):
-        return jb.Oscillator(0.25, (jb.Belt(0.3, law, jnp.abs(value), upper=0.6), jb.Belt(0.1, law)))
+        return jb.Oscillator(
+            0.25, (jb.Belt(0.3, law, jnp.abs(value), upper=0.6), jb.Belt(0.1, law))
+        )
 
     assert jb.scan(make, span=span, resolution=8) == ()

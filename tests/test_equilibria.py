@@ -767,6 +767,7 @@ def test_a_fixed_point_on_an_edge_is_there_whatever_its_last_bit(bits, damping):
     assert bool(rests.stable[0]) == (damping > 1.0625)
 
 
+@pytest.mark.slow(first=True)
 def test_where_runs_come_to_rest_is_told_though_others_are_near():
     belts = jb.Belt(0.1, LAW, upper=0.15), jb.Belt(-0.7, LAW, lower=-0.5)
     osc = jb.Oscillator(2.0, (*belts, jb.Belt(0.3, LAW, 4.0, lower=1.0)))

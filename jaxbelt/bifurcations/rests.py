@@ -34,6 +34,7 @@ from ..model.modes import (
     capacity,
     edge_guards,
     edges,
+    force_rounding,
     mode_acceleration,
     mode_of,
 )
@@ -56,8 +57,6 @@ NOTHING = np.zeros(0)
 ANY = np.array(-1)
 #: Coefficients smaller than this part of their terms are zero: points are good to some 1e-12.
 DEGENERATE = 1e-9
-#: Nearer to a contact edge than this, relative to their size, a fixed point lies on it.
-EDGE_ROUNDING = 1e-14
 #: Where sudden sliding is looked for, relative to where the belt is at rest: orbits that settle
 #: soon first; other points may be nearer than where they do.
 BESIDE = (1e-2, -1e-2, 1e-4, -1e-4)
@@ -201,14 +200,14 @@ class HopfSystem(RestSystem):
         # On an edge, too, where the fixed point may lie all along a path: the part of a loop on its
         # side grows on one side of the point and shrinks on the other.
         slips = jnp.stack(boundary_guards(osc, mode_of(self.codes), jnp.zeros(()))) > 0
-        return jnp.all(slips) & (self._nearest_edge(osc, x) >= -_edge_rounding(x[0]))
+        return jnp.all(slips) & (self._nearest_edge(osc, x) >= -force_rounding(x[0]))
 
     def _nearest_edge(self, osc, x):
         return jnp.min(jnp.stack(edge_guards(osc, mode_of(self.codes), x[0])))
 
     def is_on_edge(self, osc: Oscillator, x: Array) -> Array:
         """Whether the fixed point lies on a contact edge, to rounding."""
-        return self._nearest_edge(osc, x) <= _edge_rounding(x[0])
+        return self._nearest_edge(osc, x) <= force_rounding(x[0])
 
     def tests(self, osc, x):
         nearest = self._nearest_edge(osc, x)
@@ -219,10 +218,6 @@ class HopfSystem(RestSystem):
 
     def place(self, x):
         return np.array([x[0], x[0], 0.0, 0.0, 0.0])
-
-
-def _edge_rounding(x1: Array) -> Array:
-    return EDGE_ROUNDING * (1 + jnp.abs(x1))
 
 
 class Hopf(AbstractRestOfSeveral):
