@@ -189,12 +189,12 @@ def portrait(osc: Oscillator) -> Portrait:
 
 
 def _has_node_on_edge(osc: Oscillator, points: Equilibria) -> bool:
-    """Whether a stable node lies on a contact edge, up to rounding."""
+    """Whether a node that attracts from its side lies on a contact edge, up to rounding."""
     x1, at = np.asarray(points.x1), np.asarray(jnp.stack(edges(osc)))
     on_edge = np.min(np.abs(x1[:, None] - at), axis=1, initial=np.inf) < ON_EDGE
     fixed = np.asarray(points.kind) == EquilibriumKind.FIXED_POINT
     is_node = np.isreal(np.asarray(points.eigenvalues)[:, 0])
-    return bool(np.any(on_edge & fixed & is_node & np.asarray(points.stable)))
+    return bool(np.any(on_edge & fixed & is_node & (np.asarray(points.rate) < 0)))
 
 
 def _named(
