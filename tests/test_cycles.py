@@ -437,7 +437,7 @@ def test_a_batch_of_cycles_is_each_of_them():
         numbers = jnp.stack([cycle.period, cycle.stick_durations[0], cycle.multiplier])
         return numbers, (numbers, cycle.status)
 
-    nus = jnp.linspace(-0.35, 0.65, GROUP + 37)
+    nus = jnp.linspace(-0.35, 0.65, GROUP.here + 37)
     slopes, (numbers, status) = jax.jit(jax.vmap(jax.jacrev(of, has_aux=True)))(nus)
     assert set(status.tolist()) > {Status.OK.value, Status.EQUILIBRIUM.value}
     alone = jax.jit(jax.jacfwd(of, has_aux=True))
