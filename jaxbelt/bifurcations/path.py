@@ -91,7 +91,6 @@ class ParameterPath:
         for condition in conditions:
             condition.check(self.osc)
         self.conditions = conditions
-        self.first, self.last = self._inside(self.first), self._inside(self.last)
         self.length = self.last - self.first
         #: In which the parameter is measured.
         self.unit = float(self.variation.family(np.array([0.5 * (self.first + self.last)])).unit)
@@ -110,12 +109,12 @@ class ParameterPath:
         self._meetings = self.variation.meetings(self.first, self.last)
         self.breaks = sorted(self._coincidences.keys() | self._meetings.keys())
 
-    def _inside(self, end: float) -> float:
+    def inside(self, end: float) -> float:
         """An end of the span; or where a load vanishes there a value beside it: labels name no belt
         without load, but as the load vanishes nothing happens."""
         middle = 0.5 * (self.first + self.last)
-        pairs = zip(self.at(end).belts, self.at(middle).belts, strict=True)
-        vanishes = any(float(one.load) == 0 != float(other.load) for one, other in pairs)
+        here, there = ([float(b.load) for b in self.at(at).belts] for at in (end, middle))
+        vanishes = any(a == 0 and b != 0 for a, b in zip(here, there, strict=True))
         return end + CLOSE * (middle - end) if vanishes else end
 
     def at(self, value: float) -> Oscillator:

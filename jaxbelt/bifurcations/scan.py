@@ -103,7 +103,8 @@ def search(
     near: from the ends of intervals narrower than this fraction of it points are solved for.
     """
     points = [point for at in path.breaks for point in _at_break(path, at)]
-    ends = [path.first, *(v for at in path.breaks for v in path.beside(at)), path.last]
+    first, last = path.inside(path.first), path.inside(path.last)
+    ends = [first, *(v for at in path.breaks for v in path.beside(at)), last]
     width = (path.last - path.first) / resolution
     stretches = [np.empty(0)]  # a short span may have none beside a break
     for a, b in zip(ends[::2], ends[1::2], strict=True):
