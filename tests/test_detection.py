@@ -607,3 +607,19 @@ def test_nothing_happens_where_a_load_vanishes(span):
         )
 
     assert jb.scan(make, span=span, resolution=8) == ()
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("damping", [0.5, 2.0])
+def test_an_edge_that_stays_on_the_fixed_point_is_no_point(damping):
+    """All loads and edges grow alike, on round numbers, and the fixed point with them."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(size):
+        belts = (
+            jb.Belt(0.1, law, size, upper=0.15 * size),
+            jb.Belt(-0.7, law, size, lower=-0.5 * size),
+        )
+        return jb.Oscillator(damping, belts)
+
+    assert jb.scan(make, span=(0.5, 1.5), resolution=16) == ()

@@ -42,7 +42,7 @@ from ..cycles.orbits import Orbit, follow_from, place_of_rest
 from ..cycles.separatrices import mode_onward
 from ..cycles.shooting import admissible, flow, meshed
 from ..model.equilibria import side_pulls
-from ..model.modes import edges, force_rounding, mode_acceleration, mode_of
+from ..model.modes import edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
@@ -287,10 +287,9 @@ def _states_along(osc: Oscillator, system: Connection, x: Array) -> Array:
 
 @jit
 def saddles(osc: Oscillator) -> Array:
-    """Whether both sides push away from the point (sigma, 0) of each edge, [edges]; a fixed point
-    that lies on the edge, but for rounding, does not."""
+    """Whether both sides push away from the point (sigma, 0) of each edge, [edges]."""
     left, right = _pushes_away(osc)
-    return jnp.minimum(left, right) > force_rounding(jnp.stack(edges(osc)))
+    return (left > 0) & (right > 0)
 
 
 def _pushes_away(osc: Oscillator) -> tuple[Array, Array]:

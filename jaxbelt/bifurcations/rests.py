@@ -27,14 +27,13 @@ from jaxtyping import Array, ArrayLike
 
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
-from ..model.equilibria import Equilibria, EquilibriumKind, candidates
+from ..model.equilibria import Equilibria, EquilibriumKind, candidates, edge_rounding
 from ..model.modes import (
     STUCK,
     boundary_guards,
     capacity,
     edge_guards,
     edges,
-    force_rounding,
     mode_acceleration,
     mode_of,
 )
@@ -200,14 +199,14 @@ class HopfSystem(RestSystem):
         # On an edge, too, where the fixed point may lie all along a path: the part of a loop on its
         # side grows on one side of the point and shrinks on the other.
         slips = jnp.stack(boundary_guards(osc, mode_of(self.codes), jnp.zeros(()))) > 0
-        return jnp.all(slips) & (self._nearest_edge(osc, x) >= -force_rounding(x[0]))
+        return jnp.all(slips) & (self._nearest_edge(osc, x) >= -edge_rounding(x[0]))
 
     def _nearest_edge(self, osc, x):
         return jnp.min(jnp.stack(edge_guards(osc, mode_of(self.codes), x[0])))
 
     def is_on_edge(self, osc: Oscillator, x: Array) -> Array:
         """Whether the fixed point lies on a contact edge, to rounding."""
-        return self._nearest_edge(osc, x) <= force_rounding(x[0])
+        return self._nearest_edge(osc, x) <= edge_rounding(x[0])
 
     def tests(self, osc, x):
         nearest = self._nearest_edge(osc, x)

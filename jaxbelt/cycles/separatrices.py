@@ -174,11 +174,12 @@ def _orbits_part(osc: Oscillator, x1: Array) -> Array:
     """Whether orbits part at an edge, x1 [1]: one side pushes away, the other one, too, or a belt
     holds the mass there. A fixed point that lies on the edge, but for rounding, does not part them.
     """
-    left, right = (at_rest_beside(osc, x1, rightward=side) for side in (False, True))
-    least = force_rounding(x1)
-    pushes = (-left[1] > least) & ~left[0].any_stuck, (right[1] > least) & ~right[0].any_stuck
-    parts = (pushes[0] | left[0].any_stuck) & (pushes[1] | right[0].any_stuck)
-    return (parts & (pushes[0] | pushes[1]))[0]
+    (left, a_left), (right, a_right) = (
+        at_rest_beside(osc, x1, rightward=side) for side in (False, True)
+    )
+    holds = left.any_stuck & right.any_stuck
+    parts = (left.any_stuck | (a_left < 0)) & (right.any_stuck | (a_right > 0)) & ~holds
+    return parts[0]
 
 
 @jit

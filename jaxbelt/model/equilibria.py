@@ -41,7 +41,6 @@ from .modes import (
     kinetic_capacity,
     mode_acceleration,
     settle,
-    without_rounding,
 )
 from .oscillator import Oscillator, check_oscillator, has_possible_numbers
 from .pseudofocus import edge_focus
@@ -229,18 +228,16 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     mode = Mode(tuple(jnp.where((c == STUCK) & (held == 0), 1.0, c) for c in mode.codes))
     pull = mode_acceleration(osc, mode, rest, rest)
 
-    rounding = force_rounding(pull, 1.0 + held)
-    possible = has_possible_numbers(osc) & (upper - lower > rounding)
+    possible = has_possible_numbers(osc) & (upper - lower > force_rounding(pull))
     places = (jnp.where(jnp.isfinite(edge), edge, 0.0) for edge in (lower, upper))
     (below, pull_below), (above, pull_above) = (
         at_rest_beside(osc, x1, rightward=side)
         for x1, side in zip(places, (False, True), strict=True)
     )
-    up_from_below, down_from_above = (
-        jnp.where(beside.any_stuck, 0.0, sign * without_rounding(force, pull))
-        for beside, sign, force in ((below, 1.0, pull_below), (above, -1.0, pull_above))
-    )
+    up_from_below = jnp.where(below.any_stuck, 0.0, pull_below)
+    down_from_above = jnp.where(above.any_stuck, 0.0, -pull_above)
 
+    rounding = edge_rounding(pull, 1.0 + held)
     is_fixed = possible & (held == 0) & (lower - rounding < pull) & (pull < upper + rounding)
     on_lower, on_upper = (jnp.abs(pull - edge) < rounding for edge in (lower, upper))
     # On an edge beyond which belts at rest hold the mass it is the end of that segment; and what
@@ -285,11 +282,19 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     )
 
 
+def edge_rounding(x1: Array, scale: Array | float = 1.0) -> Array:
+    """Nearer to a contact edge than this a fixed point lies on it: x1 and forces of size `scale`
+    are good to some 1e-16 of themselves, and nothing is integrated, see `force_rounding`."""
+    return 1e-14 * (scale + jnp.abs(x1))
+
+
 def at_rest_beside(osc: Oscillator, x1: Array, *, rightward: bool) -> tuple[Mode, Array]:
-    """The mode of a mass at rest just beside each x1, [places], on that side, and x2' there."""
+    """The mode of a mass at rest just beside each x1, [places], on that side, and x2' there, which
+    is 0 for a fixed point, but for rounding; its derivatives stay."""
     rest = jnp.zeros_like(x1)
     mode = settle(osc, contact_beside(osc, x1, rest, rightward=rightward), x1, rest)
-    return mode, mode_acceleration(osc, mode, x1, rest)
+    a = mode_acceleration(osc, mode, x1, rest)
+    return mode, jnp.where(jnp.abs(a) < edge_rounding(x1), a - lax.stop_gradient(a), a)
 
 
 @jit
@@ -339,21 +344,18 @@ def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equil
     is_edge = jnp.isfinite(positions) & (positions - before > force_rounding(positions))
     x1 = jnp.where(is_edge, positions, 0.0)
     rest = jnp.zeros_like(x1)
-    on_left, on_right = (contact_beside(osc, x1, rest, rightward=side) for side in (False, True))
-    left, right = (settle(osc, contacts, x1, rest) for contacts in (on_left, on_right))
+    (left, a_left), (right, a_right) = (
+        at_rest_beside(osc, x1, rightward=side) for side in (False, True)
+    )
     focus = edge_focus(osc, left, right, x1)
     # Where a belt at rest holds the mass, the segment on that side ends here.
     slips = is_edge & ~left.any_stuck & ~right.any_stuck
-    # A fixed point on the edge, but for rounding, does not push.
-    to_left, to_right = (
-        without_rounding(mode_acceleration(osc, m, x1, rest), x1) for m in (left, right)
-    )
-    is_focus = slips & (to_left > 0) & (to_right < 0)
-    is_saddle = slips & (to_left < 0) & (to_right > 0) & with_saddles
+    is_focus = slips & (a_left > 0) & (a_right < 0)
+    is_saddle = slips & (a_left < 0) & (a_right > 0) & with_saddles
     exists = (is_focus | is_saddle) & has_possible_numbers(osc)
     # A belt at rest brakes on the way out and on the way back: each loop takes off a fraction of
     # the velocity that does not go to 0 with it, so infinitely many loops take a finite time.
-    rubs = capacity(osc, on_left) + capacity(osc, on_right) > 0
+    rubs = sum(capacity(osc, contact_beside(osc, x1, rest, rightward=s)) for s in (False, True)) > 0
     rate = jnp.where(is_focus, jnp.where(rubs, -jnp.inf, focus.rate), jnp.nan)
     neutral = exists & is_focus & ~rubs & is_centre(osc, left) & is_centre(osc, right)
     x1 = jnp.where(exists, x1, jnp.nan)
