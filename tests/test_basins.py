@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.cli import app
-from jaxbelt.sweeps.basins import _labels
+from jaxbelt.sweeps.basins import _labels, rest_reached
 
 # One belt, zeta = 0.1, mu(r) = 0.5 (1 + exp(-r/0.5)); starts uniform in this box. Fraction of
 # them that comes to rest: bSTAB and pyBasin, from 5,000 starts each.
@@ -195,3 +195,9 @@ def test_command_writes_a_picture_and_a_table(tmp_path):
     assert rows[0] == "x1,x2,label" and len(rows) == 26 and "0.5,0.25,1" in rows
     run = CliRunner().invoke(app, [*words.replace("--points 5", "--points 1").split()])
     assert run.exit_code == 2 and "points must be at least 2, got 1" in run.output
+
+
+def test_a_rest_that_is_not_near_is_not_the_one_that_a_run_has_come_to():
+    """One is known, at 0.8; a run that stands elsewhere is told to be there."""
+    rest, _, _ = rest_reached(jb.presets.class_a(0.1), np.array([0.805, 0.3]))
+    assert rest == pytest.approx([0.8, 0.3], abs=1e-12)
