@@ -4,7 +4,7 @@ Along random paths, those of the campaign `paths`, `scan` finds points. From eit
 several distances, `refine` is asked for its condition, as a user would. It is right where it gives
 the point, or another one of that kind that is no farther from the guess: one between the two, or
 one that is nearer on the other side of the guess. Whether something happens there `scan` has to
-say, too, on a short path across it.
+say, too, on a short path across it; what happens to an unstable cycle alone, `bifurcation_diagram`.
 
 The mirror image of the oscillator is asked the same: x1 and x2 with other signs, and the belts in
 reverse order. It has to answer alike.
@@ -84,12 +84,16 @@ def _verdict(case: paths.Case, point, guess: float, found) -> str:
         return "found"
     if abs(value - guess) > abs(at - guess):
         return "wrong"
-    # `scan` has to know it, too; by another name, where two things happen at once.
-    osc, ends = package.oscillator(case.at(guess)), (value - 2e-3, value + 1.9e-3)
-    beside = jb.scan(osc, case.where, ends, resolution=16)
-    if not any(p.status == Status.OK and abs(p.value - value) < SAME for p in beside):
+    # Another call has to know it, too; by another name, where two things happen at once.
+    path = package.oscillator(case.at(guess)), case.where, (value - 2e-3, value + 1.9e-3)
+    calls = jb.scan, lambda *path, **options: jb.bifurcation_diagram(*path, **options).points
+    if not any(_is_among(value, call(*path, resolution=16)) for call in calls):
         return "wrong"
     return "between" if (value - guess) * (at - guess) > 0 else "nearer"
+
+
+def _is_among(value: float, points) -> bool:
+    return any(p.status == Status.OK and abs(p.value - value) < SAME for p in points)
 
 
 # --- mirror images --------------------------------------------------------------------------------
