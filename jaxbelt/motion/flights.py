@@ -39,15 +39,15 @@ LENGTH = 0.3
 GROUPS = (8, 32, 16, 4)
 MOST_STEPS = math.prod(GROUPS)
 #: Arcs that are flown side by side, at most.
-FLOWN_AT_ONCE = SideBySide(on_cpu=64, elsewhere=2**14)
+FLOWN_AT_ONCE = SideBySide(on_cpu=64, elsewhere=2**16)
 #: Runs, at most, and arcs of each, that are sorted by their numbers of steps together; and how many
 #: arcs these are, at most: with `MOST_STEPS` each still a whole number of 32 bits, for sorting.
 RUNS, ROWS = SideBySide(on_cpu=128, elsewhere=2**14), 128
 MOST_FLIGHTS = SideBySide(on_cpu=2**11, elsewhere=2**16)
 #: Arcs whose steps are found at once.
-LOOKED_AT = SideBySide(on_cpu=128, elsewhere=2**14)
+LOOKED_AT = SideBySide(on_cpu=128, elsewhere=2**16)
 #: Groups into which these are divided, at least.
-LEAST_GROUPS = SideBySide(on_cpu=16, elsewhere=4)
+LEAST_GROUPS = SideBySide(on_cpu=16, elsewhere=1)
 #: Largest density of steps, so that all numbers stay finite.
 DENSEST = 1e4
 #: Along an arc the steps vary by the ratio of the densities at its ends to this power: between the

@@ -248,7 +248,7 @@ def axes_of(flags):
 
 
 #: Lanes of a group.
-GROUP = SideBySide(on_cpu=64, elsewhere=2**10)
+GROUP = SideBySide(on_cpu=64, elsewhere=2**15)
 
 
 def in_groups(function: Callable) -> Callable:
