@@ -5,6 +5,7 @@ parameters, forward and reverse, and works on batches under `jax.vmap`. All quan
 dimensionless: times in units of 1/omega, energies in units of k L^2 where L is the unit of length.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -96,6 +97,20 @@ def energy_fed(cycle: Cycle) -> Array:
 def energy_dissipated(cycle: Cycle) -> Array:
     """Energy that damping and slipping contacts turn into heat in one loop."""
     return _energies(_checked_cycle(cycle))[1]
+
+
+#: What each functional is measured in: the name of one of `Units`, its `coordinate`, or a number.
+MEASURED_IN: dict[Callable[..., Array], str] = {
+    period: "time",
+    stick_duration: "time",
+    slip_duration: "time",
+    stick_fraction: "number",
+    amplitude: "coordinate",
+    peak: "coordinate",
+    gap: "velocity",
+    energy_fed: "energy",
+    energy_dissipated: "energy",
+}
 
 
 def _checked_cycle(cycle: Any) -> Cycle:

@@ -18,17 +18,7 @@ from matplotlib.transforms import Affine2D, Bbox, Transform
 
 from ..bifurcations.diagrams import BifurcationDiagram
 from ..checks import require
-from ..cycles.functionals import (
-    amplitude,
-    energy_dissipated,
-    energy_fed,
-    gap,
-    peak,
-    period,
-    slip_duration,
-    stick_duration,
-    stick_fraction,
-)
+from ..cycles.functionals import MEASURED_IN
 from ..model.machine import Units
 from ..si import SYMBOLS, AlongParameter, check_machine, rest_in_m, units_along, units_of
 from .draw import draw_result
@@ -48,14 +38,6 @@ SI_PARAMETERS = {
     "damping": "damping $c$",
     "velocity": "belt velocity $V_%$",
     "load": "normal force $N_%$",
-}
-#: What the functionals of this package are; "": the coordinate tells, None: a pure number.
-FUNCTIONALS: dict[Any, str | None] = {
-    **dict.fromkeys((period, stick_duration, slip_duration), "time"),
-    **dict.fromkeys((energy_fed, energy_dissipated), "energy"),
-    **dict.fromkeys((amplitude, peak), ""),
-    gap: "velocity",
-    stick_fraction: None,
 }
 
 
@@ -186,11 +168,12 @@ def _convert_functional(
         coordinate = functional.keywords.get("coordinate", coordinate)
         functional = functional.func
     # One of somebody's own may have no hash.
-    known = [quantity for one, quantity in FUNCTIONALS.items() if one is functional]
+    known = [quantity for one, quantity in MEASURED_IN.items() if one is functional]
     if not known:
         ax.set_ylabel(f"{name} (dimensionless)")
-    elif known[0] is not None:
-        quantity = known[0] or {"x1": "length", "x2": "velocity"}[coordinate]
+    elif (quantity := known[0]) != "number":
+        if quantity == "coordinate":
+            quantity = {"x1": "length", "x2": "velocity"}[coordinate]
         unit, symbol = float(getattr(units, quantity)), in_fractions(SYMBOLS[quantity])
         _scale(ax, 1, unit, f"{name} ({symbol})", before)
 
