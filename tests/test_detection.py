@@ -623,3 +623,17 @@ def test_an_edge_that_stays_on_the_fixed_point_is_no_point(damping):
         return jb.Oscillator(damping, belts)
 
     assert jb.scan(make, span=(0.5, 1.5), resolution=16) == ()
+
+
+def test_a_belt_at_rest_that_holds_nothing_hides_no_hopf_point():
+    """Without a load it is no obstacle, though the fixed point lies on its boundary."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(nu):
+        return jb.Oscillator(2.0, (jb.Belt(0.0, law, 0.0), jb.Belt(nu, law)))
+
+    for at in (0.0414, -0.0414):
+        point = jb.refine(jb.Hopf(), make, at=at)
+        assert int(point.status) == Status.OK and point.type == "subcritical"
+        # 0.4 * 10 / (1 + 10 nu)^2 = damping
+        assert abs(float(point.value)) == pytest.approx((np.sqrt(2) - 1) / 10, abs=1e-14)

@@ -199,7 +199,9 @@ class HopfSystem(RestSystem):
         # On an edge, too, where the fixed point may lie all along a path: the part of a loop on its
         # side grows on one side of the point and shrinks on the other.
         slips = jnp.stack(boundary_guards(osc, mode_of(self.codes), jnp.zeros(()))) > 0
-        return jnp.all(slips) & (self._nearest_edge(osc, x) >= -edge_rounding(x[0]))
+        # A belt at rest that can hold nothing is no obstacle.
+        holds = jnp.stack([belt.load * belt.friction.static > 0 for belt in osc.belts])
+        return jnp.all(slips | ~holds) & (self._nearest_edge(osc, x) >= -edge_rounding(x[0]))
 
     def _nearest_edge(self, osc, x):
         return jnp.min(jnp.stack(edge_guards(osc, mode_of(self.codes), x[0])))

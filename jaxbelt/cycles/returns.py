@@ -290,7 +290,9 @@ class Returns:
             tops[changes], tops[changes + 1], rise[changes], rise[changes + 1], strict=True
         ):
             # Where the map is flat, the cycle is where it leads.
-            at = a + (b - a) * np.clip(before / (before - after), 0.01, 0.99)
+            change = before - after
+            share = before / change if np.isfinite(change) and change else 0.5
+            at = a + (b - a) * np.clip(share, 0.01, 0.99)
             cycle = self._cycle_at(float(at), float(a), float(b))
             if cycle is not None and (float(cycle.multiplier) > 1) == (after > before):
                 found.append(cycle)
