@@ -469,3 +469,16 @@ def test_rounding_beside_a_pseudo_focus_is_no_gap():
     )
     told = jb.portrait(jb.Oscillator(0.077586547912, belts))
     assert told.status == jb.Status.OK and not len(told.gaps)
+
+
+def test_separatrices_come_from_out_of_reach_where_loops_hardly_grow():
+    """A loop passes a dozen edges and boundaries, and grows by a seventh."""
+    belts = (
+        jb.Belt(0.9, jb.Conti(1.2, 0.9, 6.0), 0.4, lower=-0.1, upper=-0.09),
+        jb.Belt(-1.0, jb.Conti(0.9, 0.5, 5.0), 0.4, upper=0.2),
+    )
+    told = jb.portrait(jb.Oscillator(0.05, belts))
+    stable = [one for one in told.separatrices if one.stable]
+    assert len(stable) == 2 and int(told.status) == jb.Status.OK
+    for one in stable:
+        assert one.end == "outside" and np.max(np.abs(np.asarray(one.ys))) >= told.reach

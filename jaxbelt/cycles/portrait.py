@@ -59,7 +59,7 @@ class Portrait(eqx.Module):
       (reach, inf) where there is a cycle farther out.
     - status: OK, or INCOMPLETE where there is a gap, or where an equilibrium on a contact edge is a
       stable node: the orbit that comes to it in its fast direction is a separatrix, too, and is not
-      given; or where a stable separatrix is unsettled.
+      given; or where a stable separatrix is unsettled, or was left within reach.
 
     Starts tell which basin they are in by where they lie: see `table` for all numbers, `plot` for
     the picture.
@@ -172,8 +172,8 @@ def portrait(osc: Oscillator) -> Portrait:
     separatrices = tuple(
         _named(branch, map_, points, unstable if branch.stable else cycles) for branch in found
     )
-    unsettled = any(one.stable and one.end == "unsettled" for one in separatrices)
-    told = not len(gaps) and not _has_node_on_edge(osc, points) and not unsettled
+    short = any(one.stable and _falls_short(one, reach) for one in separatrices)
+    told = not len(gaps) and not _has_node_on_edge(osc, points) and not short
     status = Status.OK if told else Status.INCOMPLETE
     return Portrait(
         oscillator=osc,
@@ -186,6 +186,12 @@ def portrait(osc: Oscillator) -> Portrait:
         gaps=jax.device_put(gaps),
         status=jnp.asarray(np.array(status.value)),
     )
+
+
+def _falls_short(one: Separatrix, reach: float) -> bool:
+    """Whether a separatrix was left before it came to where it is from or leads to."""
+    is_inside = bool(jnp.max(jnp.abs(one.ys)) < reach)
+    return one.end == "unsettled" or (one.end == "outside" and is_inside)
 
 
 def _has_node_on_edge(osc: Oscillator, points: Equilibria) -> bool:

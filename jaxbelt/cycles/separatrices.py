@@ -54,14 +54,17 @@ from ..tables import table_of
 from .backwards import reversed_in_time
 from .chains import Loop
 from .creeping import arc_samples
-from .orbits import follow_finely, place_of_rest
+from .orbits import Orbit, follow_finely, place_of_rest
 from .shooting import trace_of
 
 if TYPE_CHECKING:
     import pandas
 
-#: Arcs for which a separatrix is followed: some 40 loops.
-SEPARATRIX_ARCS = 256
+#: Arcs for which a separatrix is followed, some 40 loops; and a stable one that still grows then,
+#: as where damping is weak and loops pass many edges.
+SEPARATRIX_ARCS, MORE_ARCS = 256, 2048
+#: Tops that move on by less, relative to the distance from the origin, are settling.
+SETTLING = 1e-6
 #: Samples of each arc.
 ARC_SAMPLES = 32
 
@@ -287,14 +290,14 @@ def _at_rest(
 
 
 @jit
-def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array):
+def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array, budget: int):
     """The orbit from a state in a mode, where it comes to rest, and of each of its arcs times since
     its entry, [arcs, samples], and states there."""
-    orbit = follow_finely(osc, mode_of(codes), y, SEPARATRIX_ARCS, reach)
+    orbit = follow_finely(osc, mode_of(codes), y, budget, reach)
     rest = place_of_rest(osc, orbit)
-    used = jnp.arange(SEPARATRIX_ARCS) < orbit.count
+    used = jnp.arange(budget) < orbit.count
     durations = jnp.where(used & jnp.isfinite(orbit.durations), orbit.durations, 0.0)
-    last = (jnp.arange(SEPARATRIX_ARCS) == orbit.count - 1)[:, None]
+    last = (jnp.arange(budget) == orbit.count - 1)[:, None]
     exits = jnp.where(last, orbit.y, jnp.roll(orbit.entries, -1, axis=0))
 
     def samples(codes, entry, exit_, duration):
@@ -306,6 +309,14 @@ def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array):
 @jit
 def _is_held(osc: Oscillator, ys: Array) -> Array:
     return mode_of_state(osc, ys[:, 0], ys[:, 1]).any_stuck
+
+
+def _still_grows(orbit: Orbit) -> bool:
+    """Whether an orbit was left while its loops grew."""
+    tops = np.asarray(orbit.tops)[: int(orbit.count)]
+    tops = tops[~np.isnan(tops)]
+    is_left = int(orbit.status) == Status.NOT_SETTLED and tops.size > 1
+    return bool(is_left and tops[-1] - tops[-2] > SETTLING * (1 + abs(tops[-1])))
 
 
 def _branch(
@@ -320,7 +331,10 @@ def _branch(
     way = np.array([1.0, -1.0 if stable else 1.0])
     start = np.array(point) * way, np.where(np.abs(codes) == 1, codes * way[1], codes)
     moving = reversed_in_time(osc) if stable else osc
-    found = _orbit_from(moving, *jax.device_put(start), *_as_arrays(reach))
+    given = moving, *jax.device_put(start), *_as_arrays(reach)
+    found = _orbit_from(*given, SEPARATRIX_ARCS)
+    if stable and _still_grows(found[0]):
+        found = _orbit_from(*given, MORE_ARCS)
     orbit, rest, since, states = jax.tree.map(np.asarray, found)
     count, was_cut, y = int(orbit.count), False, orbit.y
     if stable:

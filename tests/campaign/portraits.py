@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbelt as jb
-from jaxbelt.cycles.separatrices import SEPARATRIX_ARCS
 
 from . import engine, package
 from .cases import PAPER, random_case, rational_case, special_positions, structures
@@ -128,8 +127,7 @@ def differences(osc: engine.Oscillator, told: jb.Portrait) -> tuple[list[str], C
         for one in told.separatrices
         if one.end == "outside"
         and np.max(np.abs(np.asarray(one.ys))) < told.reach
-        # Of one that was followed as long as any is, loops grow.
-        and one.arcs.ends.size < SEPARATRIX_ARCS
+        and int(told.status) == jb.Status.OK
     ]
     ids = np.full((SIDE, SIDE), -1)
     x1s, x2s = (np.linspace(*ends, SIDE) for ends in WINDOW)
