@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
 from jaxbelt.cycles.outlines import outline_of_separatrix
+from jaxbelt.cycles.returns import _next_tops
 from tests.campaign import engine, package, portraits
 from tests.campaign.cases import PAPER
 
@@ -482,3 +483,26 @@ def test_separatrices_come_from_out_of_reach_where_loops_hardly_grow():
     assert len(stable) == 2 and int(told.status) == jb.Status.OK
     for one in stable:
         assert one.end == "outside" and np.max(np.abs(np.asarray(one.ys))) >= told.reach
+
+
+def test_a_belt_at_rest_without_load_changes_nothing():
+    """Its boundary lies where x1 is extremal: which of the two ends an arc is not left to rounding,
+    by which lowest points of x1 were taken for the highest ones."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+    lone = jb.portrait(jb.Oscillator(2.0, (jb.Belt(0.0404213, law),)))
+    told = jb.portrait(jb.Oscillator(2.0, (jb.Belt(0.0, law, 0.0), jb.Belt(0.0404213, law))))
+    assert int(told.status) == jb.Status.OK
+    assert len(told.cycles) == len(lone.cycles) == 1 and not told.unstable and not lone.unstable
+    period = pytest.approx(float(lone.cycles[0].period), abs=1e-12)
+    assert float(told.cycles[0].period) == period
+
+
+def test_tops_beside_a_belt_at_rest_follow_one_another():
+    law = jb.Conti(1.0, 0.6, 10.0)
+    at_rest, away = (
+        jb.Oscillator(2.0, (jb.Belt(nu, law, 0.0), jb.Belt(0.0404213, law))) for nu in (0.0, 5.0)
+    )
+    low = float(jb.equilibria(away).x1[0])
+    starts = np.column_stack([low + np.geomspace(1e-8, 0.1, 64), np.zeros(64)])
+    tops = [np.asarray(_next_tops(osc, jnp.asarray(starts))[0]) for osc in (at_rest, away)]
+    np.testing.assert_allclose(tops[0] - low, tops[1] - low, rtol=1e-6, atol=1e-15)
