@@ -497,12 +497,13 @@ def test_a_belt_at_rest_without_load_changes_nothing():
     assert float(told.cycles[0].period) == period
 
 
-def test_tops_beside_a_belt_at_rest_follow_one_another():
+@pytest.mark.parametrize("nu", [0.0, 1e-17, -1e-17, 0.3 - (0.1 + 0.2), -1e-16])
+def test_tops_beside_a_belt_at_rest_follow_one_another(nu):
     law = jb.Conti(1.0, 0.6, 10.0)
     at_rest, away = (
-        jb.Oscillator(2.0, (jb.Belt(nu, law, 0.0), jb.Belt(0.0404213, law))) for nu in (0.0, 5.0)
+        jb.Oscillator(2.0, (jb.Belt(one, law, 0.0), jb.Belt(0.0404213, law))) for one in (nu, 5.0)
     )
     low = float(jb.equilibria(away).x1[0])
-    starts = np.column_stack([low + np.geomspace(1e-8, 0.1, 64), np.zeros(64)])
+    starts = np.column_stack([low + np.geomspace(1e-8, 0.1, 512), np.zeros(512)])
     tops = [np.asarray(_next_tops(osc, jnp.asarray(starts))[0]) for osc in (at_rest, away)]
     np.testing.assert_allclose(tops[0] - low, tops[1] - low, rtol=1e-6, atol=1e-15)

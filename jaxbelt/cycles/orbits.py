@@ -104,8 +104,10 @@ def _next_arc(
     y_end = jnp.stack(end.y)
     code = jnp.stack([jnp.asarray(c, dtype=orbit.y.dtype) for c in end.mode.codes])
 
-    # Whatever ends the arc: at the boundary of a belt at rest it is not the guard of extrema.
+    # Whatever ends the arc: at the boundary of a belt at rest it is not the guard of extrema. Where
+    # that belt creeps x2 is set back to its velocity, and may change its sign without falling.
     is_top = ~stuck & (orbit.signs[1] > 0) & ~end.mode.any_stuck & (end.signs[1] < 0)
+    is_top = is_top & (end.signs[0] < 0)
     top = jnp.where(is_top, y_end[0], jnp.nan)
     amplitude = top - orbit.low
 

@@ -98,8 +98,7 @@ def _that_count(
 
     A boundary or edge from which the orbit moves away until its next extremum does not; nor, unless
     every extremum is to end an arc, does an extremum while what it protects is out of reach of one
-    step; nor does an extremum of x1 at the boundary of a belt at rest, which is the same place: of
-    two guards the first one would be chosen by rounding.
+    step.
     """
     n = len(osc.belts)
     boundary, edge, extrema = guards[:n], guards[n : 3 * n], guards[3 * n :]
@@ -108,9 +107,6 @@ def _that_count(
         distances = jnp.stack([jnp.min(boundary) / osc.omega, jnp.min(edge)])
         extrema = jnp.maximum(extrema, distances - reach)
     nears_boundary = signs[0] * jnp.stack(mode.codes) > 0
-    at_rest = jnp.stack([belt.velocity == 0 for belt in osc.belts])
-    is_boundary = jnp.any(at_rest & nears_boundary & jnp.isfinite(boundary))
-    extrema = jnp.where(is_boundary & (jnp.arange(2) == 1), jnp.inf, extrema)
     rightward, leftward = jnp.stack(bounds_rightward(mode)), jnp.stack(bounds_leftward(mode))
     nears_edge = jnp.where(signs[1] > 0, rightward, leftward)
     nears = jnp.concatenate([nears_boundary, nears_edge])

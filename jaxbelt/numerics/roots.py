@@ -35,8 +35,11 @@ def first_root(
     is_extremum = numbers >= numbers.size - extrema
 
     def passed(state):
-        _, (values, _), _, known = state
-        return (values < 0) & ~known
+        _, (values, slopes), _, known = state
+        # Negative by rounding and rising: the orbit is about to leave it, as where a boundary lies
+        # so near to an extremum that the one was found before the other by rounding.
+        leaves = (values > -JUST_LEFT) & (slopes > 0)
+        return (values < 0) & ~leaves & ~known
 
     def earlier(state):
         end, at_end, _, known = state
