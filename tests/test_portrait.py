@@ -16,6 +16,7 @@ from scipy.integrate import solve_ivp
 import jaxbelt as jb
 from jaxbelt.cycles.outlines import outline_of_separatrix
 from jaxbelt.cycles.returns import _next_tops
+from jaxbelt.motion.arcs import Ends
 from tests.campaign import engine, package, portraits
 from tests.campaign.cases import PAPER
 
@@ -505,5 +506,8 @@ def test_tops_beside_a_belt_at_rest_follow_one_another(nu):
     )
     low = float(jb.equilibria(away).x1[0])
     starts = np.column_stack([low + np.geomspace(1e-8, 0.1, 512), np.zeros(512)])
-    tops = [np.asarray(_next_tops(osc, jnp.asarray(starts))[0]) for osc in (at_rest, away)]
-    np.testing.assert_allclose(tops[0] - low, tops[1] - low, rtol=1e-6, atol=1e-15)
+    (tops, loops), (expected, _) = (_next_tops(osc, jnp.asarray(starts)) for osc in (at_rest, away))
+    np.testing.assert_allclose(tops - low, expected - low, rtol=1e-6, atol=1e-15)
+    # Nor does an extremum of x1 follow right after another one.
+    extremal = np.asarray(loops.ends) == Ends(2).extremum_x1
+    assert np.any(extremal) and not np.any(extremal[:, 1:] & extremal[:, :-1])
