@@ -121,7 +121,7 @@ def test_picture(diagram):
             "2b",
             "nonsmooth fold, belt 1",
             "grazing, belt 0",
-            "belt 0 at rest",
+            "sudden sliding, belt 0",
         } <= texts
         assert ax.get_xlabel() == r"belt velocity $\nu_0$"
     expected = "quantity must be one of amplitude, x1, x2, period, or a function of a cycle, got"

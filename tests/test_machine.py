@@ -640,6 +640,14 @@ def test_a_quantity_of_a_diagram_in_si(quantity, unit, label):
     plt.close("all")
 
 
+def test_the_title_of_a_point_in_si_has_no_value_without_a_unit():
+    m = machine()
+    point = jb.refine(jb.Hopf(), m.oscillator, where=lambda o: o.damping)
+    ax = jb.plot_in_si(point, m.units)
+    assert ax.get_title() == "Hopf" and ax.get_xlabel() == "displacement $X$ (m)"
+    assert point.plot().get_title().startswith("Hopf at ")
+
+
 def test_a_parameter_of_a_function_stays_as_the_function_takes_it():
     for one in along("N", True):
         ours, table = jb.in_si(one, lambda N: machine(0.02, 10 * N)), one.table()

@@ -377,8 +377,6 @@ class _RestingBeltCondition(AbstractRestCondition):
     belt: int | Array
 
     family: ClassVar[str] = "rest"
-    line: ClassVar[Line] = Line("belt at rest", "black", (0, (1, 1.2)))
-    caption: ClassVar[str] = "belt {belt} at rest"
     joins: ClassVar[bool] = False
 
     @classmethod
@@ -399,6 +397,8 @@ class SuddenSliding(_RestingBeltCondition):
     """A belt comes to rest: the time that the mass sticks to it in each loop goes to infinity."""
 
     no_cycle: ClassVar[Status] = Status.STUCK_FOREVER
+    line: ClassVar[Line] = Line("sudden sliding", "black", (0, (4, 1.2)))
+    caption: ClassVar[str] = "sudden sliding, belt {belt}"
 
     def guess(self, osc, size):
         return orbit_after_stick(osc, self.belt)
@@ -424,6 +424,9 @@ class BeltAtRest(_RestingBeltCondition):
     pseudo-focus on an edge stays, but one of another stability: it repels on one side at least, and
     attracts where the belt is at rest, so a cycle around it shrinks to it; or there is none.
     """
+
+    line: ClassVar[Line] = Line("belt at rest", "black", (0, (1, 1.2)))
+    caption: ClassVar[str] = "belt {belt} at rest"
 
     def guess(self, osc, size):
         return candidates(osc)

@@ -16,6 +16,7 @@ from matplotlib.text import Annotation, Text
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D, Bbox, Transform
 
+from ..bifurcations.base import BifurcationPoint
 from ..bifurcations.diagrams import BifurcationDiagram
 from ..checks import require
 from ..cycles.functionals import MEASURED_IN
@@ -58,7 +59,8 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     takes it, whose unit only you know: `ax.set_xlabel("belt velocity $V$ (m/s)")`. Its `quantity`
     is in SI units where that is a functional of this package, such as `energy_fed`, also in
     `functools.partial`; what a function of your own gives stays as it is, and the label says
-    "(dimensionless)". Other axes that show something else, or tell their unit, stay as they are.
+    "(dimensionless)". Other axes that show something else, or tell their unit, stay as they are. The
+    title of a `BifurcationPoint` tells its kind alone, as its value has no unit that is known here.
     `ValueError` where no axis can be converted, as in the picture of a sweep (draw what `in_si`
     returns instead), where the units vary along the parameter, and for a wrong argument.
     """
@@ -81,6 +83,9 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
             _convert_functional(axes, quantity, units, before)
         if parameter is not None:
             _scale(axes, 0, *parameter, before)
+        if isinstance(result, BifurcationPoint):
+            # Its value has no unit here: a point does not tell of which parameter it is.
+            axes.title.set_text(result.condition.words)
     finally:
         if before is not None:
             before.join()
