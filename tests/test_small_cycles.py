@@ -130,3 +130,53 @@ def test_a_scan_ends_where_a_fold_of_cycles_explains_what_differs_beside_it():
     assert all(point.status == Status.OK for point in points)
     (fold,) = (point for point in points if point.kind == "FoldOfCycles")
     assert fold.value == pytest.approx(-0.159462417136, abs=1e-9)
+
+
+#: Of Conti's law with these numbers: mu at the relative speed 19/20, and where x2' loses its damping.
+REST, HOPF = 0.6 / 10.5 + 0.4, 0.6 * 10.0 / 10.5**2
+
+
+def with_an_edge_at_its_fixed_point(damping):
+    """The belt touches to the right of where its friction is as large as the spring's force."""
+    return jb.Oscillator(damping, (jb.Belt(-0.95, jb.Conti(1.0, 0.4, 10.0), lower=-REST),))
+
+
+def test_around_a_fixed_point_on_an_edge_a_cycle_grows_in_proportion():
+    """Loops a twentieth wider and narrower than it, followed by another program, come nearer."""
+    belt = engine.Belt(-0.95, ("conti", 1.0, 0.4, 10.0, 0.0), 1.0, lower=-REST)
+    widths = []
+    for short in (2e-4, 1e-4):
+        cycle = jb.find_cycle(with_an_edge_at_its_fixed_point(HOPF - short), (0.01 - REST, 0.0))
+        told = jb.portrait(with_an_edge_at_its_fixed_point(HOPF - short))
+        small = told.cycles[0]
+        assert told.status == Status.OK and small.stable
+        # From far off orbits take tens of thousands of loops.
+        assert cycle.status == Status.NOT_SETTLED
+        widths.append(float(small.x1_max) + REST)
+        for part in (0.95, 1.05):
+            start = part * widths[-1]
+            osc = engine.Oscillator(HOPF - short, (belt,))
+            run = engine.simulate(osc, (start - REST, 0.0), 400.0, turns=True)
+            tops = run.y[(run.kind == engine.TURN) & (run.belt == 0), 0] + REST
+            assert (tops[-1] - start) * (part - 1) < 0
+    assert widths[0] == pytest.approx(2 * widths[1], rel=0.01)
+
+
+@pytest.mark.parametrize("short", [1e-7, 0.0, -1e-7])
+def test_loops_that_return_up_to_rounding_are_no_cycles(short):
+    """A thousandth as far as above its width would be rounding: x1 at the edge is known to 5e-17,
+    so x2 there, 1e-6, to 2e-11. Such loops were told as 33 cycles, or one."""
+    osc = with_an_edge_at_its_fixed_point(HOPF - short)
+    assert jb.find_cycle(osc, (1e-5 - REST, 0.0)).status != Status.OK
+    told = jb.portrait(osc)
+    assert told.status == Status.INCOMPLETE
+    # Beside the gap the large cycles are there.
+    assert all(float(cycle.x1_max) > 0 for cycle in (*told.cycles, *told.unstable))
+    assert len(told.cycles) == len(told.unstable) == 1
+    assert all(low - 1e-7 < -REST + 1e-4 and high < -REST + 1e-2 for low, high in told.gaps)
+
+
+def test_a_hopf_point_on_an_edge_explains_the_loss_of_its_small_cycle():
+    points = jb.scan(with_an_edge_at_its_fixed_point, span=(0.05, 0.06), resolution=6)
+    assert [(point.kind, point.type) for point in points] == [("Hopf", "degenerate")]
+    assert float(points[0].value) == pytest.approx(HOPF, abs=1e-14)

@@ -143,6 +143,10 @@ class AbstractCondition(eqx.Module):
         """What a point that was sought is."""
         return self
 
+    def is_slow_at(self, point: "BifurcationPoint") -> bool:
+        """Whether orbits beside this point are slow to settle."""
+        return self.slow
+
     def covers(self, point: "BifurcationPoint") -> bool:
         """Whether a point that has a name is one of this condition."""
         other = point.condition

@@ -60,9 +60,6 @@ CLOSE = 1e-6
 #: The fraction of a step along the path by which the derivative of a cycle is taken; but no less
 #: than CLOSE: one that hardly attracts is known to 1e-5 of its size only.
 DIFFERENCE = 1e-3
-#: A solution known to this part of its size is a cycle: where it is on its way to the equilibrium,
-#: which is a double root, half of the size is left.
-TOLD_APART = 0.1
 #: A cycle is where it is expected if it is no further from there, relative to its size, or than
 #: a third of the way that it is expected to go. Nearer to a square root, intervals get smaller.
 EXPECTED = 1e-3
@@ -359,14 +356,11 @@ class ParameterPath:
 
 
 def _is_off_rest(cycle: Cycle) -> bool:
-    """Whether a solution is a cycle and not the equilibrium, which solves the equations, too.
+    """Whether a cycle is no equilibrium, to which it may shrink.
 
-    A cycle may shrink to that. Around a pseudo-focus its width is like its velocity squared: the
-    larger of them is its size. It is known to the error of its equations over their slope, 1 - m.
+    Around a pseudo-focus its width is like its velocity squared: the larger of them is its size.
     """
-    size = float(np.max(np.ptp(np.asarray(cycle.unknowns)[:, :2], axis=0)))
-    away = float(cycle.residual) / abs(1 - float(cycle.multiplier))
-    return size > AT_REST and away < TOLD_APART * size
+    return float(np.max(np.ptp(np.asarray(cycle.unknowns)[:, :2], axis=0))) > AT_REST
 
 
 def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> int | None:

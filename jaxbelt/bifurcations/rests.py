@@ -238,6 +238,11 @@ class Hopf(AbstractRestOfSeveral):
     def between(cls, before, after, edged):
         return [cls()] if before.equilibria != after.equilibria else []
 
+    def is_slow_at(self, point):
+        # Around a fixed point on an edge cycles are as wide as the distance from here, and hardly
+        # attract.
+        return self.type_of(point) == "degenerate"
+
     def type_of(self, point):
         return criticality(*_hopf_growth(*self.followed(point), point.oscillator))
 

@@ -219,7 +219,7 @@ def _settled_by(
     settled, or all of that, if it is narrow: labels so near to it are not to be relied on.
     """
     value = float(point.value)
-    before, after = path.beside(value, slow=point.condition.slow)
+    before, after = path.beside(value, slow=point.condition.is_slow_at(point))
     is_narrow, middle = b - a <= after - before, 0.5 * (a + b)
     if value > b:
         before = min(before, a if is_narrow else middle)

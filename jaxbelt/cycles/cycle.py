@@ -62,6 +62,9 @@ FINE_STEPS, EXACT = 32, 1e-11
 #: And these, for long arcs that creep along a strongly damped oscillator's slow direction, where
 #: nothing is traced.
 FINER_STEPS = (128, 512)
+#: A solution that is known to this part of its size is a cycle: on the way to an equilibrium, which
+#: is a double root, each of Newton's steps is half of what is left.
+TOLD_APART = 1e-2
 #: Speeds that differ by less than this part of them are one.
 SAME_SPEED = 1e-9
 
@@ -432,9 +435,11 @@ def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[C
     # Where there is no loop nothing is solved for: a step that is not finite is the last one, and
     # the other lanes of a batch need not wait.
     guess = jnp.where(status == Status.OK, guess, jnp.nan)
-    z, iterations = solve_closed(osc, chain, guess)
+    z, iterations, off = solve_closed(osc, chain, guess)
     error, _ = closure(*lax.stop_gradient((osc, chain.halved, z)))
-    status = _first_failure(status, error < HOLDS, Status.NO_CONVERGENCE)
+    # Near a fixed point that hardly attracts or repels all small loops nearly close.
+    is_told = off < TOLD_APART * jnp.max(jnp.ptp(z[:, :2], axis=0))
+    status = _first_failure(status, (error < HOLDS) & is_told, Status.NO_CONVERGENCE)
     return cycle_of(osc, chain, z, iterations, status)[0], error
 
 

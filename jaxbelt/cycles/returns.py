@@ -64,6 +64,11 @@ RETURNED = 1e-8
 #: A bracket is divided into 64, at most so often; if it then is one of a jump, the map changes
 #: by more than this there.
 DIVISIONS, JUMP = 6, 1e-6
+#: Where loops grow by less than this fraction the errors of the map are looked at, at so many tops
+#: on either side, which differ by this fraction.
+HARDLY_GROWS, BESIDE_EACH, BESIDE = 1e-2, 4, 1e-6
+#: Values of a function within so many standard deviations of its errors are rounding.
+ROUNDING = 5.0
 #: The error of the map, relative to the top; by so much over 1 - multiplier is a fixed point off.
 MAP_ERROR = 3e-7
 #: Cycles with a multiplier as near to 1 are parts of a continuum of closed orbits.
@@ -250,6 +255,7 @@ class Returns:
         """Take the changes of sign, the tops that return to themselves, and what is not known."""
         rise = returns - tops
         zero = np.abs(rise) <= np.maximum(RETURNED * np.minimum(1.0, tops - low), RETURNED**2)
+        zero = self._with_rounding(tops, rise, zero, low)
         many = zero[:-2] & zero[1:-1] & zero[2:] if tops.size > 2 else np.zeros(0, bool)
         closed = np.zeros(tops.size, bool)
         for i in np.flatnonzero(many):
@@ -266,6 +272,24 @@ class Returns:
         for i in np.flatnonzero(np.diff(signs)):
             if not np.any(closed & (where[i] < tops) & (tops < where[i + 1])):
                 self._brackets.append(Bracket(float(where[i]), float(where[i + 1])))
+
+    def _with_rounding(self, tops: np.ndarray, rise: np.ndarray, zero: np.ndarray, low: float):
+        """Whether rises of the map are zero, or as small as its errors where they change their
+        sign, as tops beside tell these: near an edge that pulls back, x1 there is known to its
+        rounding, and x2 to that over itself."""
+        zero, asked = zero.copy(), np.abs(rise) > HARDLY_GROWS * (tops - low)
+        while True:
+            told = np.flatnonzero(~zero & ~np.isnan(rise))
+            changes = np.flatnonzero(np.diff(np.sign(rise[told])))
+            new = np.unique([told[changes], told[changes + 1]])
+            new = new[~asked[new]]
+            if not new.size:
+                return zero
+            steps = BESIDE * np.arange(-BESIDE_EACH, BESIDE_EACH + 1)
+            beside = tops[new, None] + (tops[new, None] - low) * steps
+            around = self(beside.ravel()).reshape(beside.shape) - beside
+            zero[new] = np.abs(rise[new]) <= ROUNDING * np.array([_error_of(one) for one in around])
+            asked[new] = True
 
     # --- solving --------------------------------------------------------------------------------
 
@@ -284,11 +308,9 @@ class Returns:
         rise = self(tops) - tops
         told = ~np.isnan(rise)
         tops, rise = tops[told], rise[told]
-        changes = np.flatnonzero(np.sign(rise[:-1]) * np.sign(rise[1:]) <= 0)
         found: list[Cycle] = []
-        for a, b, before, after in zip(
-            tops[changes], tops[changes + 1], rise[changes], rise[changes + 1], strict=True
-        ):
+        for i, j, is_rounding in _changes_of_sign(rise):
+            a, b, before, after = tops[i], tops[j], rise[i], rise[j]
             # Where the map is flat, the cycle is where it leads.
             change = before - after
             share = before / change if np.isfinite(change) and change else 0.5
@@ -296,11 +318,11 @@ class Returns:
             cycle = self._cycle_at(float(at), float(a), float(b))
             if cycle is not None and (float(cycle.multiplier) > 1) == (after > before):
                 found.append(cycle)
-            elif divisions > 1 and tops.size > 2:
+            elif divisions > 1 and tops.size > 2 and not is_rounding:
                 found += self._solved_between(Bracket(float(a), float(b)), divisions - 1)
             elif after > before and (behind := self._cycle_behind(float(a), float(b))) is not None:
                 found.append(behind)
-            elif not abs(after - before) > JUMP:
+            elif is_rounding or not abs(after - before) > JUMP:
                 self.gaps.append((float(a), float(b)))
         return found
 
@@ -332,6 +354,34 @@ def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
     growth = min(abs(float(cycle.multiplier) - 1), 1.0)
     margin = width + MAP_ERROR * (1 + abs(top)) / max(growth, NEUTRAL)
     return cycle if abs(float(cycle.x1_max) - top) < margin and growth > NEUTRAL else None
+
+
+def _changes_of_sign(rise: np.ndarray) -> list[tuple[int, int, bool]]:
+    """Between which of its values at even steps a function changes its sign, and whether these are
+    rounding.
+
+    Changes next to one another of which all values are rounding are told as one.
+    """
+    signs = np.flatnonzero(np.sign(rise[:-1]) * np.sign(rise[1:]) <= 0)
+    small = np.abs(rise) <= ROUNDING * _error_of(rise)
+    found: list[tuple[int, int, bool]] = []
+    for i in signs.tolist():
+        is_rounding = bool(small[i] and small[i + 1])
+        if is_rounding and found and found[-1][2] and np.all(small[found[-1][1] : i + 1]):
+            found[-1] = (found[-1][0], i + 1, True)
+        else:
+            found.append((i, i + 1, is_rounding))
+    return found
+
+
+def _error_of(values: np.ndarray) -> float:
+    """The standard deviation of errors in the values of a function at even steps.
+
+    Little is left of a smooth function in its fourth differences; the median of their sizes is 5.6
+    times that of independent errors.
+    """
+    left = np.abs(np.diff(values[np.isfinite(values)], 4))
+    return float(np.median(left)) / 5.6 if left.size else 0.0
 
 
 def _positions(osc: Oscillator, rests: Equilibria) -> list[Array]:

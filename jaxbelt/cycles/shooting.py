@@ -399,9 +399,11 @@ class ClosedChain(Equations):
         return change.reshape(-1), jacobian(blocks[:, :3, :3], self.backwards)
 
 
-def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Array]:
+def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Array, Array]:
     """The unknowns of a closed chain near a guess of them, [N, 3], differentiable with respect to
-    the oscillator, and the number of Newton steps.
+    the oscillator; the number of Newton steps; and how far off the states may be, by the last steps
+    and by rounding: not at all in a chain that sticks, which begins at slip onset, known from the
+    parameters (durations that wander do not move it).
 
     An arc that magnifies is followed backwards from the state in which it ends, which is then its
     unknown: forwards its rounding would be larger than what equations may leave.
@@ -410,7 +412,10 @@ def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Ar
     backwards = _magnifying(osc, chain, guess)
     start = _with_ends(backwards, guess)
     solved = solve(ClosedChain(chain, backwards), osc, start)
-    return _with_entries(osc, chain, backwards, solved.z), solved.iterations
+    z = _with_entries(osc, chain, backwards, solved.z)
+    sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
+    off = jnp.maximum(solved.unsettled, jnp.max(solved.rounding.reshape(-1, 3)[:, :2]))
+    return z, solved.iterations, jnp.where(sticks, 0.0, off)
 
 
 def closed(osc: Oscillator, chain: Chain, z: Array) -> Array:

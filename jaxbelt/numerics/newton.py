@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -29,6 +30,8 @@ LONGEST_NEWTON_STEP = 0.5
 HOLDS = 1e-9
 #: Steps of this length are rounding: unknowns are of size one.
 STEP_ROUNDING = 1e-13
+#: Steps that tell how far unknowns move that do not settle.
+LAST = 4
 #: Larger unknowns are of another size, such as the time stuck to a belt that hardly moves: steps
 #: are measured in parts of them.
 LARGE = 100.0
@@ -39,7 +42,8 @@ class Newton(eqx.Module):
 
     z: the unknowns; residual: the largest one before the last step; iterations: steps made;
     lengths: how long each was, [NEWTON_STEPS], NaN where there was none, of unknowns beyond LARGE
-    in units of |z| / LARGE; matrix: of the last one.
+    in units of |z| / LARGE; matrix: of the last one; rounding: how far errors of rounding in the
+    equations move each unknown, [n].
     """
 
     z: Any
@@ -47,6 +51,17 @@ class Newton(eqx.Module):
     iterations: Array
     lengths: Array
     matrix: Array
+    rounding: Array
+
+    @property
+    def unsettled(self) -> Array:
+        """How far the unknowns still move: the longest of the LAST steps, or zero where the next
+        one would be rounding."""
+        steps = jnp.arange(len(self.lengths))
+        last = (self.iterations - LAST <= steps) & (steps < self.iterations)
+        before = self.lengths[jnp.maximum(self.iterations - 2, 0)]
+        settled = is_settled(self.lengths[self.iterations - 1], before)
+        return jnp.where(settled, 0.0, jnp.max(jnp.where(last, self.lengths, 0.0)))
 
 
 def is_settled(last: Array, before: Array, bound: float = STEP_ROUNDING) -> Array:
@@ -81,14 +96,18 @@ def newton(
 
     def improve(n):
         value, matrix = linearized(unravel(n.z))
-        change = jnp.linalg.solve(matrix, -value)
+        changes = jnp.linalg.solve(matrix, jnp.stack([-value, errors], axis=1))
+        change, rounding = changes[:, 0], jnp.abs(changes[:, 1])
         length = jnp.max(jnp.abs(change) / jnp.maximum(1.0, jnp.abs(n.z) / LARGE))
         z = n.z + jnp.minimum(1.0, longest / length) * change
         lengths = n.lengths.at[n.iterations].set(length)
-        return Newton(z, jnp.max(jnp.abs(value)), n.iterations + 1, lengths, matrix)
+        largest = jnp.max(jnp.abs(value))
+        return Newton(z, largest, n.iterations + 1, lengths, matrix, rounding)
 
+    # One error of rounding in each equation, of any size and sign.
+    errors = jnp.asarray(np.finfo(float).eps * np.cos(np.arange(flat.size)))
     none, matrix = jnp.full(steps, jnp.nan), jnp.zeros((flat.size, flat.size))
-    first = Newton(flat, jnp.zeros(()), jnp.asarray(0), none, matrix)
+    first = Newton(flat, jnp.zeros(()), jnp.asarray(0), none, matrix, jnp.zeros(flat.size))
     solved = lax.while_loop(unfinished, improve, first)
     return eqx.tree_at(lambda n: n.z, solved, unravel(solved.z))
 
