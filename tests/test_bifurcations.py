@@ -400,3 +400,28 @@ def test_the_nearer_of_two_folds_of_cycles_from_both_mirror_images(guess):
     values = [float(jb.refine(jb.FoldOfCycles(), one, at=guess).value) for one in (make, image)]
     assert values[0] == pytest.approx(values[1], abs=1e-10)
     assert values[0] == pytest.approx(0.96163983088, abs=1e-10)
+
+
+@pytest.mark.parametrize("belt", [0, 1])
+def test_grazing_of_either_of_two_belts_of_one_velocity(belt):
+    """The search beside a guess tells the first of them; Newton's method alone went from the second
+    to a point twenty times as far."""
+    paper = jb.Conti(1.0, 0.6, 10.0)
+    mirrored = belt == 1
+
+    def make(residual):
+        law = jb.Conti(1.0, residual, 10.0)
+        belts = (
+            jb.Belt(-1.0, law, upper=0.65),
+            jb.Belt(-1.0, paper, lower=-0.85),
+            jb.Belt(0.55, paper, 2.0, lower=-0.85, upper=0.65),
+        )
+        if mirrored:
+            belts = tuple(
+                jb.Belt(-b.velocity, b.friction, b.load, lower=-b.upper, upper=-b.lower)
+                for b in reversed(belts)
+            )
+        return jb.Oscillator(0.2, belts)
+
+    point = jb.refine(jb.GrazingSliding(2 if mirrored else 0), make, at=0.705676900485494)
+    assert float(point.value) == pytest.approx(0.695676900485494, abs=1e-10)

@@ -109,14 +109,14 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         # From farther off, too, than in `scan`: these paths are short.
         found = search(path, INTERVALS, near=1.0)
         found = [one for one in found if int(one.status) == Status.OK]
-        if condition.has_several:
-            # What attracts may tell a point as one of another kind, too; or two are so near to each
-            # other that the search tells one of them.
-            values = [float(one.value) for one in found]
-            values += [beside for value in values for beside in path.beside(value)]
-            within = (value for value in values if first <= value <= last)
-            also = (condition.found_from(variation, value) for value in within)
-            found += [one for one in also if one is not None]
+        # What attracts may tell a point as one of another kind, too; or two are so near to each other
+        # that the search tells one of them; or it is one of two belts of one velocity.
+        kinds = object if condition.has_several else type(condition)
+        values = [float(one.value) for one in found if isinstance(one.condition, kinds)]
+        values += [beside for value in values for beside in path.beside(value)]
+        within = (value for value in values if first <= value <= last)
+        also = (condition.found_from(variation, value) for value in within)
+        found += [one for one in also if one is not None]
         # Any of these may have led to one that is farther away than others beyond the reach.
         of_kind = [one for one in found if condition.covers(one) and _away(one, guess) <= reach]
         if of_kind:

@@ -63,7 +63,12 @@ def bisected(osc: engine.Oscillator, told: jb.FatalShock, end: int) -> float:
     the corner as distances are compared, where runs do not lead to the attractor.
     """
     start, shock = (np.asarray(one, float) for one in (told.start, told.shock))
-    inside, outside = 1 - 1e-4, 1 + 1e-4
+    # The basin beyond may be a thin strip there.
+    beside = [10.0**-n for n in range(4, 10)]
+    outside = 1 + next(
+        (b for b in beside if label(osc, told.portrait, start + (1 + b) * shock) != end), beside[0]
+    )
+    inside = 2 - outside
     if label(osc, told.portrait, start + outside * shock) == end and told.direction == "both":
         angles = np.radians(np.arange(360))
         ways = np.column_stack([np.cos(angles), np.sin(angles)])
