@@ -109,8 +109,8 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         # From farther off, too, than in `scan`: these paths are short.
         found = search(path, INTERVALS, near=1.0)
         found = [one for one in found if int(one.status) == Status.OK]
-        # What attracts may tell a point as one of another kind, too; or two are so near to each other
-        # that the search tells one of them; or it is one of two belts of one velocity.
+        # What attracts may tell a point as one of another kind, too; or two are so near to each
+        # other that the search tells one of them; or it is of one of two belts of one velocity.
         kinds = object if condition.has_several else type(condition)
         values = [float(one.value) for one in found if isinstance(one.condition, kinds)]
         values += [beside for value in values for beside in path.beside(value)]

@@ -59,10 +59,10 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     takes it, whose unit only you know: `ax.set_xlabel("belt velocity $V$ (m/s)")`. Its `quantity`
     is in SI units where that is a functional of this package, such as `energy_fed`, also in
     `functools.partial`; what a function of your own gives stays as it is, and the label says
-    "(dimensionless)". Other axes that show something else, or tell their unit, stay as they are. The
-    title of a `BifurcationPoint` tells its kind alone, as its value has no unit that is known here.
-    `ValueError` where no axis can be converted, as in the picture of a sweep (draw what `in_si`
-    returns instead), where the units vary along the parameter, and for a wrong argument.
+    "(dimensionless)". Other axes that show something else, or tell their unit, stay as they are.
+    The title of a `BifurcationPoint` tells its kind alone, as its value has no unit that is known
+    here. `ValueError` where no axis can be converted, as in the picture of a sweep (draw what
+    `in_si` returns instead), where the units vary along the parameter, and for a wrong argument.
     """
     require_axes(ax)
     units, parameter = _units_of_picture(result, machine)
