@@ -132,7 +132,7 @@ def test_a_scan_ends_where_a_fold_of_cycles_explains_what_differs_beside_it():
     assert fold.value == pytest.approx(-0.159462417136, abs=1e-9)
 
 
-#: Of Conti's law with these numbers at the relative speed 0.95: mu, and its slope with another sign.
+#: Of Conti's law with these numbers, at the relative speed 0.95: mu, and minus its slope.
 REST, HOPF = 0.6 / 10.5 + 0.4, 0.6 * 10.0 / 10.5**2
 
 
