@@ -511,3 +511,12 @@ def test_tops_beside_a_belt_at_rest_follow_one_another(nu):
     # Nor does an extremum of x1 follow right after another one.
     extremal = np.asarray(loops.ends) == Ends(2).extremum_x1
     assert np.any(extremal) and not np.any(extremal[:, 1:] & extremal[:, :-1])
+
+
+def test_a_jump_of_the_map_of_tops_is_no_gap():
+    """Over the separatrix that leads to the saddle, between two neighbours among the floats."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+    belts = jb.Belt(-0.35, law, 2.0), jb.Belt(1.15, law, 2.0, lower=-0.7, upper=-0.2)
+    told = jb.portrait(jb.Oscillator(0.5, belts, omega=2.0))
+    assert told.status == jb.Status.OK and not len(told.gaps)
+    assert len(told.cycles) == 1 and not told.unstable

@@ -66,7 +66,7 @@ RETURNED = 1e-8
 DIVISIONS, JUMP = 6, 1e-6
 #: Where loops grow by less than this fraction the errors of the map are looked at, at so many tops
 #: on either side, which differ by this fraction.
-HARDLY_GROWS, BESIDE_EACH, BESIDE = 1e-2, 4, 1e-6
+HARDLY_GROWS, BESIDE_EACH, BESIDE = 1e-2, 8, 1e-6
 #: Values of a function within so many standard deviations of its errors are rounding.
 ROUNDING = 5.0
 #: The error of the map, relative to the top; by so much over 1 - multiplier is a fixed point off.
@@ -375,13 +375,14 @@ def _changes_of_sign(rise: np.ndarray) -> list[tuple[int, int, bool]]:
 
 
 def _error_of(values: np.ndarray) -> float:
-    """The standard deviation of errors in the values of a function at even steps.
+    """The standard deviation of errors in the values of a function at even steps, zero of fewer
+    values than tell it.
 
     Little is left of a smooth function in its fourth differences; the median of their sizes is 5.6
-    times that of independent errors.
+    times that of independent errors. A jump is in four of them.
     """
     left = np.abs(np.diff(values[np.isfinite(values)], 4))
-    return float(np.median(left)) / 5.6 if left.size else 0.0
+    return float(np.median(left)) / 5.6 if left.size > 2 * 4 else 0.0
 
 
 def _positions(osc: Oscillator, rests: Equilibria) -> list[Array]:
