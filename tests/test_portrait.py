@@ -513,10 +513,30 @@ def test_tops_beside_a_belt_at_rest_follow_one_another(nu):
     assert np.any(extremal) and not np.any(extremal[:, 1:] & extremal[:, :-1])
 
 
-def test_a_jump_of_the_map_of_tops_is_no_gap():
-    """Over the separatrix that leads to the saddle, between two neighbours among the floats."""
-    law = jb.Conti(1.0, 0.6, 10.0)
-    belts = jb.Belt(-0.35, law, 2.0), jb.Belt(1.15, law, 2.0, lower=-0.7, upper=-0.2)
-    told = jb.portrait(jb.Oscillator(0.5, belts, omega=2.0))
+@pytest.mark.parametrize(
+    ("law", "damping", "omega", "belts"),
+    [
+        (jb.Conti(1.0, 0.6, 10.0), 0.5, 2.0, [(-0.35, 2.0), (1.15, 2.0, -0.7, -0.2)]),
+        (jb.Coulomb(1.2, 0.6), 0.05, 1.0, [(0.15, 1.0, -np.inf, 0.2), (-0.15, 1.0, -0.9, 0.65)]),
+    ],
+    ids=["to a saddle", "to a boundary"],
+)
+def test_a_jump_of_the_map_of_tops_is_no_gap(law, damping, omega, belts):
+    """Over an orbit that bounds basins, between neighbours among the floats."""
+    told = jb.portrait(
+        jb.Oscillator(damping, [jb.Belt(v, law, *rest) for v, *rest in belts], omega)
+    )
     assert told.status == jb.Status.OK and not len(told.gaps)
+    assert len(told.cycles) == 1 and not told.unstable
+
+
+def test_loops_around_a_fixed_point_on_an_edge_grow_as_its_rate_says():
+    """Next to it, where their growth is rounding: an excursion over the edge, 4e-15, is twenty floats
+    long."""
+    law, end = jb.Conti(1.0, 0.4, 1.0), -0.6 * 2 / 1.05 - 0.8
+    belts = jb.Belt(-0.3, law, 2.0, lower=-0.35, upper=0.29), jb.Belt(-0.05, law, 2.0, lower=end)
+    told = jb.portrait(jb.Oscillator(0.5, belts, omega=0.5))
+    assert told.status == jb.Status.OK and not len(told.gaps)
+    (rest,) = told.equilibria
+    assert float(rest.x1) == end and not rest.stable
     assert len(told.cycles) == 1 and not told.unstable

@@ -162,18 +162,19 @@ def test_around_a_fixed_point_on_an_edge_a_cycle_grows_in_proportion():
     assert widths[0] == pytest.approx(2 * widths[1], rel=0.01)
 
 
-@pytest.mark.parametrize("short", [1e-7, 0.0, -1e-7])
+@pytest.mark.parametrize("short", [1e-6, 1e-7, 0.0, -1e-7])
 def test_loops_that_return_up_to_rounding_are_no_cycles(short):
     """A thousandth as far as above its width would be rounding: x1 at the edge is known to 5e-17,
     so x2 there, 1e-6, to 2e-11. Such loops were told as 33 cycles, or one."""
     osc = with_an_edge_at_its_fixed_point(HOPF - short)
     assert jb.find_cycle(osc, (1e-5 - REST, 0.0)).status != Status.OK
     told = jb.portrait(osc)
-    assert told.status == Status.INCOMPLETE
+    # Beyond them loops shrink. So do smaller ones where the fixed point attracts: there is no cycle.
+    assert told.status == (Status.OK if short < 0 else Status.INCOMPLETE)
     # Beside the gap the large cycles are there.
     assert all(float(cycle.x1_max) > 0 for cycle in (*told.cycles, *told.unstable))
     assert len(told.cycles) == len(told.unstable) == 1
-    assert all(low - 1e-7 < -REST + 1e-4 and high < -REST + 1e-2 for low, high in told.gaps)
+    assert all(high < -REST + 1e-3 for _, high in told.gaps)
 
 
 def test_a_hopf_point_on_an_edge_explains_the_loss_of_its_small_cycle():

@@ -64,11 +64,12 @@ RETURNED = 1e-8
 #: A bracket is divided into 64, at most so often; if it then is one of a jump, the map changes
 #: by more than this there.
 DIVISIONS, JUMP = 6, 1e-6
-#: Where loops grow by less than this fraction the errors of the map are looked at, at so many tops
-#: on either side, which differ by this fraction.
-HARDLY_GROWS, BESIDE_EACH, BESIDE = 1e-2, 8, 1e-6
+#: Where loops grow by less than the first fraction the errors of the map are looked at, at so many
+#: tops on either side, which differ by the second fraction: nearer to one another they have the
+#: same errors. Beside an edge these count up to the last distance, in units of 1 + |x1|.
+HARDLY_GROWS, EACH_WAY, SIDEWAYS, UNRESOLVED = 0.1, 8, 1e-2, 1e-4
 #: Values of a function within so many standard deviations of its errors are rounding.
-ROUNDING = 5.0
+CERTAIN = 5.0
 #: The error of the map, relative to the top; by so much over 1 - multiplier is a fixed point off.
 MAP_ERROR = 3e-7
 #: Cycles with a multiplier as near to 1 are parts of a continuum of closed orbits.
@@ -173,6 +174,8 @@ class Returns:
         at_end = high in self._edges and high - gap[1] < narrow
         if at_end or (low in self._edges and away < AT_FOCUS):
             return True
+        if away < UNRESOLVED * (1 + abs(low)) and self._grow_as_at_rest(low, high, away, rests):
+            return True
         beside = np.array([gap[0] - AROUND * away, gap[1] + AROUND * away])
         if not (gap[1] - gap[0] < narrow and beside[1] < high):
             return False
@@ -182,6 +185,27 @@ class Returns:
             # That close to it the map is rounding, but its stability is known.
             within = -1.0 if np.any(here & np.asarray(rests.stable)) else 1.0
         return bool(within * outside > 0)
+
+    def _grow_as_at_rest(self, low: float, high: float, away: float, rests: Equilibria) -> bool:
+        """Whether loops around a fixed point, at which an interval begins, grow or shrink from a
+        distance on as its rate says: the first of them that are more than rounding."""
+        near = np.abs(np.asarray(rests.x1) - low) < NARROWEST * (1 + abs(low))
+        near &= np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT
+        rate = np.asarray(rests.rate)[near & ~np.asarray(rests.neutral)]
+        beyond = low + away * np.geomspace(1.0, 1e3, TOPS_AT_ONCE)[1:]
+        beyond = beyond[beyond < high]
+        if not (rate.size and beyond.size):
+            return False
+        rise = self(beyond) - beyond
+        told = np.flatnonzero(np.abs(rise) > CERTAIN * self._errors_at(beyond, low))
+        return bool(told.size) and bool(rise[told[0]] * rate[0] > 0)
+
+    def _errors_at(self, tops: np.ndarray, low: float) -> np.ndarray:
+        """The errors of the map, as tops beside tell them."""
+        steps = SIDEWAYS * np.arange(-EACH_WAY, EACH_WAY + 1)
+        beside = tops[:, None] + (tops[:, None] - low) * steps
+        around = self(beside.ravel()).reshape(beside.shape) - beside
+        return np.minimum([_error_of(one) for one in around], JUMP)
 
     def _intervals_of_tops(self, rests: Equilibria) -> list[tuple[float, float]]:
         """The intervals of the axis in which a mass at rest is pulled to the left."""
@@ -285,10 +309,7 @@ class Returns:
             new = new[~asked[new]]
             if not new.size:
                 return zero
-            steps = BESIDE * np.arange(-BESIDE_EACH, BESIDE_EACH + 1)
-            beside = tops[new, None] + (tops[new, None] - low) * steps
-            around = self(beside.ravel()).reshape(beside.shape) - beside
-            zero[new] = np.abs(rise[new]) <= ROUNDING * np.array([_error_of(one) for one in around])
+            zero[new] = np.abs(rise[new]) <= CERTAIN * self._errors_at(tops[new], low)
             asked[new] = True
 
     # --- solving --------------------------------------------------------------------------------
@@ -363,7 +384,7 @@ def _changes_of_sign(rise: np.ndarray) -> list[tuple[int, int, bool]]:
     Changes next to one another of which all values are rounding are told as one.
     """
     signs = np.flatnonzero(np.sign(rise[:-1]) * np.sign(rise[1:]) <= 0)
-    small = np.abs(rise) <= ROUNDING * _error_of(rise)
+    small = np.abs(rise) <= CERTAIN * min(_error_of(rise), JUMP)
     found: list[tuple[int, int, bool]] = []
     for i in signs.tolist():
         is_rounding = bool(small[i] and small[i + 1])

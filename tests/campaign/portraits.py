@@ -246,8 +246,9 @@ def _jumps(told: jb.Portrait) -> list[float]:
 
 
 def _crossings(curve: np.ndarray, axis: int, level: float) -> np.ndarray:
-    """Where a curve crosses a line of the grid; ends of it on the line count."""
+    """Where a curve crosses a line of the grid; ends of it on the line, up to rounding, count."""
     other = curve[:, 1 - axis] - level
+    other = np.where(np.abs(other) < AT_ROUNDING, 0.0, other)
     i = np.flatnonzero(other[1:] * other[:-1] <= 0)
     share = other[i] / np.where(other[i] == other[i + 1], 1.0, other[i] - other[i + 1])
     return curve[i, axis] + share * (curve[i + 1, axis] - curve[i, axis])
