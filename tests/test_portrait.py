@@ -531,8 +531,8 @@ def test_a_jump_of_the_map_of_tops_is_no_gap(law, damping, omega, belts):
 
 
 def test_loops_around_a_fixed_point_on_an_edge_grow_as_its_rate_says():
-    """Next to it, where their growth is rounding: an excursion over the edge, 4e-15, is twenty floats
-    long."""
+    """Next to it, where their growth is rounding: an excursion over the edge, of 4e-15, is twenty
+    floats long."""
     law, end = jb.Conti(1.0, 0.4, 1.0), -0.6 * 2 / 1.05 - 0.8
     belts = jb.Belt(-0.3, law, 2.0, lower=-0.35, upper=0.29), jb.Belt(-0.05, law, 2.0, lower=end)
     told = jb.portrait(jb.Oscillator(0.5, belts, omega=0.5))

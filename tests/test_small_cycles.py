@@ -169,7 +169,7 @@ def test_loops_that_return_up_to_rounding_are_no_cycles(short):
     osc = with_an_edge_at_its_fixed_point(HOPF - short)
     assert jb.find_cycle(osc, (1e-5 - REST, 0.0)).status != Status.OK
     told = jb.portrait(osc)
-    # Beyond them loops shrink. So do smaller ones where the fixed point attracts: there is no cycle.
+    # Beyond them loops shrink; so do smaller ones where the fixed point attracts.
     assert told.status == (Status.OK if short < 0 else Status.INCOMPLETE)
     # Beside the gap the large cycles are there.
     assert all(float(cycle.x1_max) > 0 for cycle in (*told.cycles, *told.unstable))
