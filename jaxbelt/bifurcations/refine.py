@@ -111,8 +111,12 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         found = [one for one in found if int(one.status) == Status.OK]
         # What attracts may tell a point as one of another kind, too; or two are so near to each
         # other that the search tells one of them; or it is of one of two belts of one velocity.
-        kinds = object if condition.has_several else type(condition)
-        values = [float(one.value) for one in found if isinstance(one.condition, kinds)]
+        values = [
+            float(one.value)
+            for one in found
+            if condition.has_several
+            or (isinstance(one.condition, type(condition)) and not condition.covers(one))
+        ]
         values += [beside for value in values for beside in path.beside(value)]
         within = (value for value in values if first <= value <= last)
         also = (condition.found_from(variation, value) for value in within)

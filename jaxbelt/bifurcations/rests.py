@@ -239,8 +239,7 @@ class Hopf(AbstractRestOfSeveral):
         return [cls()] if before.equilibria != after.equilibria else []
 
     def is_slow_at(self, point):
-        # Around a fixed point on an edge cycles are as wide as the distance from here, and hardly
-        # attract.
+        # The cycle beside it hardly attracts, or repels.
         return self.type_of(point) == "degenerate"
 
     def type_of(self, point):

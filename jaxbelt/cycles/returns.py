@@ -166,8 +166,9 @@ class Returns:
     def _is_rounding(self, gap: tuple[float, float], rests: Equilibria) -> bool:
         """Whether no cycle passes a gap: the map changes its sign there by rounding.
 
-        So it is next to the edge from which an interval begins; at the edge where one ends; and
-        where a gap is as narrow as rounding, but loops grow within it as they do outside.
+        So it is next to the edge from which an interval begins; at the edge where one ends; nearer
+        to a fixed point on an edge than loops of which it is known that they grow as its rate says;
+        and where a gap is as narrow as rounding, but loops grow within it as they do outside.
         """
         (low, high), *_ = [*(i for i in self.intervals if i[0] <= gap[0] < i[1]), (np.nan, np.nan)]
         away, narrow = gap[1] - low, NARROWEST * (1 + abs(gap[1]))
@@ -205,7 +206,7 @@ class Returns:
         steps = SIDEWAYS * np.arange(-EACH_WAY, EACH_WAY + 1)
         beside = tops[:, None] + (tops[:, None] - low) * steps
         around = self(beside.ravel()).reshape(beside.shape) - beside
-        return np.minimum([_error_of(one) for one in around], JUMP)
+        return np.array([_error_of(one) for one in around])
 
     def _intervals_of_tops(self, rests: Equilibria) -> list[tuple[float, float]]:
         """The intervals of the axis in which a mass at rest is pulled to the left."""
@@ -297,10 +298,15 @@ class Returns:
             if not np.any(closed & (where[i] < tops) & (tops < where[i + 1])):
                 self._brackets.append(Bracket(float(where[i]), float(where[i + 1])))
 
-    def _with_rounding(self, tops: np.ndarray, rise: np.ndarray, zero: np.ndarray, low: float):
-        """Whether rises of the map are zero, or as small as its errors where they change their
-        sign, as tops beside tell these: near an edge that pulls back, x1 there is known to its
-        rounding, and x2 to that over itself."""
+    def _with_rounding(
+        self, tops: np.ndarray, rise: np.ndarray, zero: np.ndarray, low: float
+    ) -> np.ndarray:
+        """Which rises of the map are zero, those added that are no larger than its errors beside a
+        change of their sign.
+
+        Near an edge that pushes the mass back these errors are large: x1 there is known to its
+        rounding, and so x2 only to that rounding times the push, divided by x2.
+        """
         zero, asked = zero.copy(), np.abs(rise) > HARDLY_GROWS * (tops - low)
         while True:
             told = np.flatnonzero(~zero & ~np.isnan(rise))
@@ -384,7 +390,7 @@ def _changes_of_sign(rise: np.ndarray) -> list[tuple[int, int, bool]]:
     Changes next to one another of which all values are rounding are told as one.
     """
     signs = np.flatnonzero(np.sign(rise[:-1]) * np.sign(rise[1:]) <= 0)
-    small = np.abs(rise) <= CERTAIN * min(_error_of(rise), JUMP)
+    small = np.abs(rise) <= CERTAIN * _error_of(rise)
     found: list[tuple[int, int, bool]] = []
     for i in signs.tolist():
         is_rounding = bool(small[i] and small[i + 1])
@@ -397,13 +403,13 @@ def _changes_of_sign(rise: np.ndarray) -> list[tuple[int, int, bool]]:
 
 def _error_of(values: np.ndarray) -> float:
     """The standard deviation of errors in the values of a function at even steps, zero of fewer
-    values than tell it.
+    values than tell it; JUMP at most: what is larger is no error.
 
     Little is left of a smooth function in its fourth differences; the median of their sizes is 5.6
     times that of independent errors. A jump is in four of them.
     """
     left = np.abs(np.diff(values[np.isfinite(values)], 4))
-    return float(np.median(left)) / 5.6 if left.size > 2 * 4 else 0.0
+    return min(float(np.median(left)) / 5.6, JUMP) if left.size > 2 * 4 else 0.0
 
 
 def _positions(osc: Oscillator, rests: Equilibria) -> list[Array]:

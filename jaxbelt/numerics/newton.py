@@ -54,14 +54,19 @@ class Newton(eqx.Module):
     rounding: Array
 
     @property
+    def last_two(self) -> tuple[Array, Array]:
+        """The length of the last step and that of the one before; of the only one twice."""
+        before = jnp.maximum(self.iterations - 2, 0)
+        return self.lengths[self.iterations - 1], self.lengths[before]
+
+    @property
     def unsettled(self) -> Array:
         """How far the unknowns still move: the longest of the LAST steps, or zero where the next
         one would be rounding."""
         steps = jnp.arange(len(self.lengths))
         last = (self.iterations - LAST <= steps) & (steps < self.iterations)
-        before = self.lengths[jnp.maximum(self.iterations - 2, 0)]
-        settled = is_settled(self.lengths[self.iterations - 1], before)
-        return jnp.where(settled, 0.0, jnp.max(jnp.where(last, self.lengths, 0.0)))
+        longest = jnp.max(jnp.where(last, self.lengths, 0.0))
+        return jnp.where(is_settled(*self.last_two), 0.0, longest)
 
 
 def is_settled(last: Array, before: Array, bound: float = STEP_ROUNDING) -> Array:
@@ -89,8 +94,7 @@ def newton(
     flat, unravel = jax.flatten_util.ravel_pytree(start)
 
     def unfinished(n):
-        last = n.lengths[n.iterations - 1]
-        before = n.lengths[jnp.maximum(n.iterations - 2, 0)]
+        last, before = n.last_two
         going = (n.iterations < steps) & ~settled(last, before) & jnp.isfinite(last)
         return going | (n.iterations == 0)
 
