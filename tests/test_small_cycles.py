@@ -164,8 +164,9 @@ def test_around_a_fixed_point_on_an_edge_a_cycle_grows_in_proportion():
 
 @pytest.mark.parametrize("short", [1e-6, 1e-7, 0.0, -1e-7])
 def test_loops_that_return_up_to_rounding_are_no_cycles(short):
-    """A thousandth as far as above its width would be rounding: x1 at the edge is known to 5e-17,
-    so x2 there, 1e-6, to 2e-11. Such loops were told as 33 cycles, or one."""
+    """Within 1e-6 of the Hopf point a cycle would be 2e-5 wide, or less. Where a loop passes the
+    edge with an x2 of 1e-6, the rounding of x1 there, 5e-17, is one of 2e-11 in x2, which is more
+    than the loop grows or shrinks by."""
     osc = with_an_edge_at_its_fixed_point(HOPF - short)
     assert jb.find_cycle(osc, (1e-5 - REST, 0.0)).status != Status.OK
     told = jb.portrait(osc)
