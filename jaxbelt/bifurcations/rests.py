@@ -239,8 +239,9 @@ class Hopf(AbstractRestOfSeveral):
         return [cls()] if before.equilibria != after.equilibria else []
 
     def is_slow_at(self, point):
-        # The cycle beside it hardly attracts, or repels.
-        return self.type_of(point) == "degenerate"
+        # Around a fixed point on an edge the cycle beside it hardly attracts, or repels.
+        away = jnp.abs(jnp.stack(edges(point.oscillator)) - point.x1)
+        return bool(jnp.any(away <= edge_rounding(point.x1)))
 
     def type_of(self, point):
         return criticality(*_hopf_growth(*self.followed(point), point.oscillator))
