@@ -153,6 +153,17 @@ def test_phase_portrait_draws_boundaries_over_their_contact_intervals():
     assert {r"$\sigma_{0}$", r"$\sigma_{1}$"} <= names
 
 
+def test_names_of_edges_do_not_touch():
+    close = jb.presets.class_d(0.2, -0.3, -0.02, 0.02)
+    ax = jb.plot_phase_portrait(close, xlim=(-2.0, 2.0), ylim=(-1.0, 1.0))
+    ax.figure.canvas.draw()
+    first, second = (
+        next(t for t in ax.texts if t.get_text() == name).get_window_extent()
+        for name in (r"$\sigma_{0}$", r"$\sigma_{1}$")
+    )
+    assert not first.overlaps(second)
+
+
 def test_the_sliding_set_is_where_the_contact_holds():
     nu0 = 0.2
     ax = jb.plot_phase_portrait(jb.presets.class_a(nu0), xlim=(-3.0, 3.0))

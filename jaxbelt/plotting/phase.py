@@ -326,18 +326,7 @@ def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
         # In no belt's colour, for the key: it stands for the sets of all.
         ax.plot([], [], color="black", label="sliding set", **SLIDING_SET)
     _name_boundaries_outside(ax, outside)
-    for edge in {float(e) for b in osc.belts for e in (b.lower, b.upper)}:
-        if left < edge < right:
-            ax.axvline(edge, color="0.25", linewidth=0.8, linestyle=":", zorder=1.4)
-            ax.annotate(
-                _edge_name(osc, edge),
-                (edge, 0.0),
-                xycoords=ax.get_xaxis_transform(),
-                xytext=(3, 4),
-                textcoords="offset points",
-                path_effects=[withStroke(linewidth=2.5, foreground="white")],
-                zorder=6,
-            )
+    _draw_edges(ax, osc)
     return ax
 
 
@@ -346,12 +335,34 @@ def _sliding_set(osc, x1, x2, belt):
     return jnp.stack(mode_of_state(osc, x1, x2).stuck)[belt]
 
 
-def _edge_name(osc: Oscillator, edge: float) -> str:
-    """sigma where all intervals end at one edge, else the paper's sigma0, sigma1 in order."""
+def _draw_edges(ax: Axes, osc: Oscillator) -> None:
+    """Finite contact edges in the window: sigma for a single one, else sigma0, sigma1 in order.
+
+    A name that would touch the one on its left stands a line of text higher.
+    """
     edges = sorted(
         {float(e) for b in osc.belts for e in (b.lower, b.upper) if np.isfinite(float(e))}
     )
-    return r"$\sigma$" if len(edges) == 1 else rf"$\sigma_{{{edges.index(edge)}}}$"
+    left, right = ax.get_xlim()
+    size = matplotlib.rcParams["font.size"]
+    width = ax.get_window_extent().width * 72 / figure_of(ax).dpi
+    end, line = -np.inf, 0
+    for number, edge in enumerate(edges):
+        if not left < edge < right:
+            continue
+        at = (edge - left) / (right - left) * width
+        line = line + 1 if at < end else 0
+        end = at + 1.6 * size
+        ax.axvline(edge, color="0.25", linewidth=0.8, linestyle=":", zorder=1.4)
+        ax.annotate(
+            r"$\sigma$" if len(edges) == 1 else rf"$\sigma_{{{number}}}$",
+            (edge, 0.0),
+            xycoords=ax.get_xaxis_transform(),
+            xytext=(3, 4 + 1.25 * size * line),
+            textcoords="offset points",
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
+            zorder=6,
+        )
 
 
 def _name_boundary(ax: Axes, belt: int, xy, offset, ha: str, va: str, xycoords: Any = "data"):
