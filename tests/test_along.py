@@ -312,6 +312,7 @@ def test_a_smooth_motion_has_integrals():
     np.testing.assert_allclose(found.fed - found.lost, found.gained, **CLOSE)
 
 
+@pytest.mark.slow(first=True)
 def test_rest_and_a_mass_that_is_stuck_for_ever_are_integrated():
     held = jb.sweep(jb.presets.class_a, {"nu0": [0.0]}, y0=(0.25, 0.0), t1=3.0, observe=Energy())
     assert held.status == jb.Status.STUCK_FOREVER

@@ -276,6 +276,7 @@ def test_convergence_is_quadratic():
     assert np.all(fast[1:] <= np.maximum(20 * fast[:-1] ** 2, 1e-12))
 
 
+@pytest.mark.slow(first=True)
 def test_a_batch_of_hopf_points_and_the_slope_of_their_curve():
     """Of class (a), 1 + p3 nu = sqrt(p3 (mus - p1)/zeta). With more damping than friction can undo
     there is none: NaN, and so is its derivative."""
@@ -340,6 +341,7 @@ def test_the_nearer_of_two_to_which_a_cycle_grazes():
         assert jb.refine(near.condition, make, at=guess).value == pytest.approx(float(near.value))
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("offset", [-0.03, -1e-3, 1e-3, 0.03])
 @pytest.mark.parametrize(("steepness", "damping"), [(30.0, 0.5), (100.0, 0.3), (100.0, 0.5)])
 def test_grazing_beside_a_belt_that_hardly_moves(steepness, damping, offset):
@@ -402,6 +404,7 @@ def test_the_nearer_of_two_folds_of_cycles_from_both_mirror_images(guess):
     assert values[0] == pytest.approx(0.96163983088, abs=1e-10)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_grazing_of_either_of_two_belts_of_one_velocity(mirrored):
     """The search beside a guess tells the first of them, and is asked for the second in the mirror

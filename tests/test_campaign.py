@@ -202,6 +202,7 @@ def test_a_corner_has_the_answers_of_its_neighbours():
     assert compare.judge(case, stuck, 1e-8)[0].startswith("corner: ")
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("velocity", [0.4, 0.41, 0.5])
 def test_a_mode_that_does_not_last_is_none(velocity):
     """Slip onset, needed = capacity at x1 = 0.3 + 0.1 * 0.175 - 2 * 0.5, lies on the edge."""

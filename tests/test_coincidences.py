@@ -183,6 +183,7 @@ def test_every_case_is_run():
     assert sum(len(wanted(structure)) for structure in STRUCTURES) == len(CASES)
 
 
+@pytest.mark.slow(first=True)
 @structures
 def test_runs_on_round_numbers(structure):
     cases = wanted(structure)
@@ -194,6 +195,7 @@ def test_runs_on_round_numbers(structure):
         assert verdict in compare.GOOD, (verdict, package.as_code(case), mine)
 
 
+@pytest.mark.slow(first=True)
 @structures
 def test_labels_of_round_numbers(structure):
     cases = wanted(structure)
@@ -350,6 +352,7 @@ def test_a_stick_phase_that_ends_on_an_edge_and_by_slip_onset():
         assert itinerary(cycle.oscillator, cycle) == ((-2, -1), (-1, -1), (0, 0))
 
 
+@pytest.mark.slow(first=True)
 def test_a_cycle_ends_just_beside_where_two_belts_run_together():
     """It is told apart where no pseudo-focus is about, around which loops are lost in rounding."""
 

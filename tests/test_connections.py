@@ -241,6 +241,7 @@ def test_no_saddle_where_a_fixed_point_lies_on_the_edge():
     assert not rests.stable[1] and jb.scan(make, span=(0.35, 0.6), resolution=8) == ()
 
 
+@pytest.mark.slow(first=True)
 def test_no_saddle_no_connection():
     # A pseudo-focus on the edge.
     point = jb.refine(jb.SaddleConnection(0), lambda n: jb.presets.class_c(n, -0.3, 0.0), at=0.3)

@@ -268,6 +268,7 @@ def test_the_passage_of_an_edge_becomes_tangent():
         assert point.residual < 1e-12 and point.error < 1e-11
 
 
+@pytest.mark.slow(first=True)
 def test_a_belt_at_rest_that_no_cycle_sticks_to():
     """To the left of nu1 = 0 its pull, -1, would be balanced where it does not touch."""
     points = jb.scan(jb.presets.class_d(-0.47, 0.16, 0.14, 1.18), nu1, (-0.6, 0.6))
@@ -337,6 +338,7 @@ def test_what_fits_no_such_point_is_told_so():
             jb.refine(condition, jb.presets.class_a(0.2), where=nu0)
 
 
+@pytest.mark.slow(first=True)
 def test_one_edge_of_two_on_which_something_rests_whatever_the_parameter():
     """At 0.25 belt 0 alone holds on the right of the edge at any load of belt 1; on the edge at 0
     the two balance where the loads are equal."""
@@ -375,6 +377,7 @@ def test_the_nearest_of_what_comes_to_either_edge_from_either_side(guess, value,
     assert point.type == kind
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("mirror", [1, -1])
 def test_a_fixed_point_comes_to_an_edge_on_which_a_segment_ends_all_along(mirror):
     """On the other side belt 1 at rest stops the mass by kinetic friction up to the edge, whatever
@@ -519,6 +522,7 @@ def test_curves_that_meet_in_a_hopf_point_on_an_edge(diagram):
     np.testing.assert_allclose(point.values, expected[1], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_a_segment_of_no_length_at_an_edge_does_not_hold():
     """A belt at rest touches on the left of x1 = -1, where it holds just what it can: loops shrink
     to the circle through that point, faster than geometrically, and go on along it."""
@@ -678,6 +682,7 @@ def test_a_fold_where_slip_onset_lies_on_the_edge(offset, side, guess):
     assert farthest == pytest.approx(farthest_after_onset(), abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_a_fold_where_slip_onset_lies_on_the_edge_is_told_once():
     points = jb.scan(with_onset_on_its_edge, span=(0.3, 0.9))
     # Beside the fold the mass comes to rest on the edge, where mu(0.4) = r + (1 - r)/5 is 0.8.

@@ -271,6 +271,7 @@ def test_curves_have_the_symmetries_of_the_plane(points, fold):
     assert double.values == pytest.approx(fold.special[0].values, abs=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_an_exchange_ends_where_the_cycle_does(points):
     curve = jb.bifurcation_curve(points[6], (nu0, nu1), PLANE, step=0.05)
     assert np.allclose(curve.values[:, 0], curve.values[:, 1], rtol=0, atol=1e-13)
@@ -322,6 +323,7 @@ def test_nothing_departs_from_a_belt_at_rest_in_a_focus():
     assert y[1] < 0 and (y[0] - rest) / y[1] == pytest.approx(1 / strong, rel=1e-3)
 
 
+@pytest.mark.slow(first=True)
 def test_a_curve_ends_where_its_cycle_shrinks_to_a_point():
     # A cycle around the edge x1 = 0 that touches the boundary of belt 0 there is as small as that
     # velocity. With both belts at rest it is a point, in which its equations are singular.
@@ -371,6 +373,7 @@ def class_d(p, q):
     return jb.presets.class_d(p, q, sigma0=0.2, sigma1=0.9)
 
 
+@pytest.mark.slow(first=True)
 def test_belts_of_two_velocities_do_not_hold_the_mass_together():
     """From a guess where they are equal: there is no corner on nu1 = 0.2, where the onset on belt 1
     alone is on the edge, as the mass sticks to the slower belt 0."""

@@ -228,6 +228,7 @@ def test_derivatives_beside_a_belt_that_hardly_moves():
         np.testing.assert_allclose(1e-8 * slopes, (8 * near - far) / 0.12, rtol=1e-9)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("nu", [2.8e-17, 1e-14, 1e-12])
 def test_a_belt_that_creeps_brings_the_mass_to_no_rest(nu):
     """Slip begins at a fixed point that repels, up to rounding: for any nu > 0 there is a cycle."""
@@ -270,6 +271,7 @@ def test_circles_around_a_centre_are_no_cycle(name):
     assert run.kind == "undecided" and run.status == "neutral" and np.isnan(run.period)
 
 
+@pytest.mark.slow(first=True)
 def test_beside_circles_a_cycle_that_sticks_is_one():
     """Static friction beyond the kinetic one: it sticks from x1 = 0.2 to 0.8, on a circle around
     0.5 of radius sqrt(1.09), and then slips along the rest of it."""

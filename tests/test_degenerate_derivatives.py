@@ -36,6 +36,7 @@ def at_rest(damping):
     return jb.Oscillator(damping, (jb.Belt(0.5, jb.Conti(1.0, 0.6, 10.0)),))
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_of_a_mass_at_rest_by_sweep():
     """Any step keeps the state there, and so says nothing of the error in its derivatives."""
     rest, _ = linearised(0.0)

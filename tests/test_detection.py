@@ -388,6 +388,7 @@ def test_a_change_that_no_condition_explains_is_reported():
     assert "Simulate on both sides" in repr(point)
 
 
+@pytest.mark.slow(first=True)
 def test_what_kinetic_friction_stops_comes_to_the_edge_of_a_segment():
     """Belt 0 at rest holds the mass up to 1, but slipping on it takes 0.7 only: the part of the
     segment of equilibria below -0.7 holds but attracts nothing."""

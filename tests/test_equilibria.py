@@ -694,7 +694,11 @@ CENTRES = {
 }
 
 
-@pytest.mark.parametrize("name", CENTRES)
+@pytest.mark.parametrize(
+    "name",
+    # The others take a program each.
+    ["constant", *(pytest.param(n, marks=pytest.mark.slow(first=True)) for n in list(CENTRES)[1:])],
+)
 def test_a_centre_is_neutral_and_closes(name):
     damping, *belts = CENTRES[name]
     osc = jb.Oscillator(damping, tuple(belts))

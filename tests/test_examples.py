@@ -34,7 +34,7 @@ distance_to distance_to_basin_boundary find_cycle fit minimal_fatal_shock orbit_
 portrait region_map scan
 """.split()
 #: Long, and the only examples of what they show.
-FIRST = "Arcs", "explore", "simulate"
+FIRST = "Arcs", "explore", "laws", "simulate"
 
 
 def examples(path: Path) -> str:

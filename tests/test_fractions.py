@@ -126,6 +126,7 @@ class Rayleigh(jb.AbstractFriction):
         return 1.0 + 0.3 * (0.98 * v - 8 / 3 * v**3)
 
 
+@pytest.mark.slow(first=True)
 def test_of_many_cycles_that_to_which_most_runs_lead_is_looked_into(monkeypatch):
     """What is left beyond the limit is undecided; a continuum of closed orbits may come first."""
     monkeypatch.setattr(fractions, "MOST_CYCLES", 3)
@@ -170,6 +171,7 @@ def test_a_steep_branch_is_one_and_a_jump_is_two():
     assert jump.attractors == ("cycle 0", "cycle 1")
 
 
+@pytest.mark.slow(first=True)
 def test_where_there_is_no_oscillator_nothing_is_decided():
     def make(s):
         return jb.presets.class_b(jnp.sqrt(s**2 - 0.01), NU1)

@@ -236,6 +236,7 @@ def test_slopes_of_a_sweep_are_those_of_their_side(kind):
         check_slopes(swept_slopes, *case)
 
 
+@pytest.mark.slow(first=True)
 def test_no_edge_where_an_orbit_turns_before_it():
     """It loops 2e-9 before the edge: a search on the smallest of all guards met the edge."""
     edge = -0.6037118870579379

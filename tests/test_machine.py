@@ -77,6 +77,7 @@ def test_friction_force(run):
     assert np.allclose(ours.force[~stuck], force[~stuck], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_the_force_at_an_event_is_that_after_it():
     m = machine()
     ours = jb.in_si(jb.simulate(m.oscillator, m.start(0.003, 0.0), m.tau(0.1)), m)
@@ -640,6 +641,7 @@ def test_a_quantity_of_a_diagram_in_si(quantity, unit, label):
     plt.close("all")
 
 
+@pytest.mark.slow(first=True)
 def test_the_title_of_a_point_in_si_has_no_value_without_a_unit():
     m = machine()
     point = jb.refine(jb.Hopf(), m.oscillator, where=lambda o: o.damping)

@@ -58,6 +58,7 @@ def test_a_cycle_passes_and_the_pseudo_focus_loses_its_stability():
         assert np.min(branch.values) < 0.399 and np.max(branch.values) == span[1]
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("guess", [0.39975, 0.4, 0.4005, 0.41])
 def test_an_exchange_from_either_side(guess):
     """The corner at 0.3946 is beside it; at the guess 0.4 itself there is one edge."""
@@ -176,6 +177,7 @@ def test_their_curves():
     assert at.cycle.period == pytest.approx(expected.period, abs=1e-10)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("span", [(0.4, 0.42), (0.38, 0.4)])
 def test_edges_that_meet_at_an_end_of_the_span(span):
     """What is told inside of a span is told at its ends."""

@@ -140,6 +140,7 @@ def test_friction_that_grows_holds_a_cycle_far_out():
     assert oracle.simulate(other, (60.0, 0.0), float(far.period)).y_end[0] < 59.0
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("damping", "quadratic", "lower"), [(-0.1, 1e-6, 1.0), (-1e-5, 0.0, -np.inf)], ids=["in", "out"]
 )
@@ -317,6 +318,7 @@ def test_a_separatrix_that_creeps_to_a_node_comes_from_there():
     assert np.max(np.abs(np.asarray(one.ys)[::-1] - run.sol(ts).T)) < 1e-9
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("damping", "numbers", "load", "at"),
     [(1.0, (1.0, 0.6, 10.0), 2.0, 1.4), (0.7, (1.05, 0.63, 14.5), 1.5, 1.45)],
@@ -369,6 +371,7 @@ def test_rounding_beside_an_equilibrium_on_an_edge_is_no_gap():
     assert not found.unstable and bool(cycle.x1_min < -0.76 < cycle.x1_max)
 
 
+@pytest.mark.slow(first=True)
 def test_a_separatrix_goes_on_outside_where_nothing_ends_its_last_arc():
     """Backwards an overdamped oscillator that no belt touches runs away without another extremum.
 
@@ -396,6 +399,7 @@ def test_a_separatrix_goes_on_outside_where_nothing_ends_its_last_arc():
                 assert ys[i] == pytest.approx(exact, rel=1e-9)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("beyond", [-1e-9, -1e-15, 0.0, 1e-15, 1e-9])
 def test_a_saddle_that_has_met_a_fixed_point_is_none(beyond):
     """They meet on the edge, where rounding has no say; either way one cycle attracts."""
@@ -409,6 +413,7 @@ def test_a_saddle_that_has_met_a_fixed_point_is_none(beyond):
     assert len(told.separatrices) == 4 * has_saddle
 
 
+@pytest.mark.slow(first=True)
 def test_a_cycle_with_its_top_on_a_belt_at_rest_has_its_multiplier():
     """There the friction of the belt changes its sign, and x2' by a factor."""
     law = ("conti", 0.5, 0.25, 2.0, 0.0)
@@ -498,6 +503,7 @@ def test_a_belt_at_rest_without_load_changes_nothing():
     assert float(told.cycles[0].period) == period
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("nu", [0.0, 1e-17, -1e-17, 0.3 - (0.1 + 0.2), -1e-16])
 def test_tops_beside_a_belt_at_rest_follow_one_another(nu):
     law = jb.Conti(1.0, 0.6, 10.0)
@@ -513,6 +519,7 @@ def test_tops_beside_a_belt_at_rest_follow_one_another(nu):
     assert np.any(extremal) and not np.any(extremal[:, 1:] & extremal[:, :-1])
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("law", "damping", "omega", "belts"),
     [

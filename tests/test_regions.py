@@ -125,6 +125,7 @@ def test_a_fold_ends_where_its_cycle_touches_an_edge():
     assert end.values[1] == pytest.approx(1 - 0.5 * end.values[0], abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_pseudo_hopf_points_are_pseudo_foci():
     """Their curve once went on beyond a belt at rest, where there is a fixed point."""
     point = jb.refine(jb.PseudoHopf(0), lambda nu0: over_sigma(nu0, 0.73), at=0.12)

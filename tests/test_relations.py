@@ -185,7 +185,16 @@ IMAGES = {
     "idle at rest": with_idle_belt_at_rest,
     "split": split,
 }
-of_images = pytest.mark.parametrize("image_of", IMAGES.values(), ids=IMAGES.keys())
+#: What a belt that presses with nothing compiles, nothing else needs.
+of_images = pytest.mark.parametrize(
+    "image_of",
+    [
+        pytest.param(
+            image_of, id=name, marks=pytest.mark.slow(first=True) if name.startswith("idle") else []
+        )
+        for name, image_of in IMAGES.items()
+    ],
+)
 #: More of the same at night.
 seeds = pytest.mark.parametrize(
     "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 9))]

@@ -151,6 +151,7 @@ def _bisected(osc: engine.Oscillator, x1: float, outer: float) -> float:
     return abs(outer)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("numbers", "outer"),
     [pytest.param(NODE, -1.5, marks=pytest.mark.slow(first=True)), (ON_AN_EDGE, 1.5)],

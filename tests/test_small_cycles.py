@@ -50,6 +50,7 @@ def test_a_cycle_as_small_as_a_belt_is_slow(nu1):
     assert float(cycle.x2_max) == pytest.approx(abs(nu1) / 1.15, rel=0.02)
 
 
+@pytest.mark.slow(first=True)
 def test_it_shrinks_to_the_focus_where_the_belt_is_at_rest():
     (point,) = jb.scan(around_an_edge, span=(-0.01, 0.01), resolution=6)
     assert point.condition == AT_REST and point.status == Status.OK
@@ -78,6 +79,7 @@ def test_a_focus_that_attracts_on_both_sides():
     assert jb.refine(AT_REST, make, at=0.001).status == Status.NOT_TOUCHED
 
 
+@pytest.mark.slow(first=True)
 def test_a_corner_that_the_error_of_an_orbit_moves():
     """Beyond it the stick phase lasts 1/36 of the way from it, so 1e-8 of the orbit are 1e-6."""
 
@@ -141,6 +143,7 @@ def with_an_edge_at_its_fixed_point(damping):
     return jb.Oscillator(damping, (jb.Belt(-0.95, jb.Conti(1.0, 0.4, 10.0), lower=-REST),))
 
 
+@pytest.mark.slow(first=True)
 def test_around_a_fixed_point_on_an_edge_a_cycle_grows_in_proportion():
     """Loops a twentieth wider and narrower than it, followed by another program, come nearer."""
     belt = engine.Belt(-0.95, ("conti", 1.0, 0.4, 10.0, 0.0), 1.0, lower=-REST)
@@ -162,6 +165,7 @@ def test_around_a_fixed_point_on_an_edge_a_cycle_grows_in_proportion():
     assert widths[0] == pytest.approx(2 * widths[1], rel=0.01)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("short", [1e-6, 1e-7, 0.0, -1e-7])
 def test_loops_that_return_up_to_rounding_are_no_cycles(short):
     """Within 1e-6 of the Hopf point a cycle would be 2e-5 wide, or less. Where a loop passes the
@@ -178,6 +182,7 @@ def test_loops_that_return_up_to_rounding_are_no_cycles(short):
     assert all(high < -REST + 1e-3 for _, high in told.gaps)
 
 
+@pytest.mark.slow(first=True)
 def test_a_hopf_point_on_an_edge_explains_the_loss_of_its_small_cycle():
     points = jb.scan(with_an_edge_at_its_fixed_point, span=(0.05, 0.06), resolution=6)
     assert [(point.kind, point.type) for point in points] == [("Hopf", "degenerate")]

@@ -192,6 +192,7 @@ def on_table(velocity):
     return machine(velocity).oscillator
 
 
+@pytest.mark.slow(first=True)
 def test_cycles_that_slip_faster_than_the_table_goes_are_told_of():
     within, beyond = machine(0.12), machine(0.3)
     jb.find_cycle(within.oscillator, within.start(0.0, 0.0))

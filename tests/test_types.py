@@ -26,6 +26,7 @@ def beside_rest(nu):
 FIXED, SEGMENT, FOCUS, SADDLE = (kind.value for kind in EquilibriumKind)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("make", "at", "below", "above", "expected"),
     [
@@ -107,6 +108,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(("make", "pulls", "guess", "expected"), CASES)
 def test_the_cycle_that_is_born_at_a_pseudo_hopf_point(make, pulls, guess, expected):
     point = jb.refine(jb.PseudoHopf(0), make, at=guess)

@@ -176,6 +176,7 @@ def sequential(sigma):
     return jb.presets.class_c(0.35, -0.25, sigma)
 
 
+@pytest.mark.slow(first=True)
 def test_both_edges_of_sequential_belts_at_once():
     points = jb.scan(sequential, span=(-1.0, 1.0))
     sigmas = {}
@@ -202,6 +203,7 @@ def test_both_edges_of_sequential_belts_at_once():
     assert again.value == pytest.approx(expected[-1][1], abs=1e-13)
 
 
+@pytest.mark.slow(first=True)
 def test_a_path_that_is_not_linear_has_the_points_of_the_straight_one():
     span = (0.2, 0.7)
     straight = jb.scan(jb.presets.class_b(0.3, 0.35), nu0, span, resolution=24)
