@@ -338,6 +338,23 @@ def test_a_corner_at_a_value_that_the_search_looks_at():
     assert points[1].value == pytest.approx(-0.45, abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
+def test_an_arc_that_vanishes_as_a_square_is_told_by_its_corner():
+    """Where slip sets in just before the edge, belt 1 holds again just beyond it: what lies between
+    takes 1e-13 where the belt runs 8e-6 slower than at the corner."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+    onset = -2.0 + 0.25 * 0.225 + float(law.mu(1.25))
+
+    def make(velocity):
+        belts = (jb.Belt(velocity, law, lower=onset), jb.Belt(-0.45, law, 2.0))
+        return jb.Oscillator(0.25, belts, 2.0)
+
+    for span in ((0.75, 0.85), (0.7, 0.9)):
+        (corner,) = jb.scan(make, span=span)
+        assert corner.condition == jb.CornerCollision(0)
+        assert corner.value == pytest.approx(0.8, abs=1e-12)
+
+
 def test_a_stick_phase_that_ends_on_an_edge_and_by_slip_onset():
     """Which comes first is rounding, and no mode of a cycle: it repeats at the same values."""
     law = jb.Conti(1.0, 0.6, 10.0)

@@ -26,6 +26,7 @@ from jaxtyping import ArrayLike
 
 from ..checks import is_concrete, require
 from ..cycles.attractors import (
+    LEAST_MOMENT,
     SOLVED,
     Itinerary,
     apart,
@@ -172,6 +173,7 @@ class ParameterPath:
             own = np.array([v for v in new if self._is_fine(v) == (stride == FINE_STRIDE)])
             for batch in (own[i : i + BATCH] for i in range(0, own.size, BATCH)):
                 self._look_at(batch, stride)
+        self._agree_on_moments()
         self._share()
 
     def look_finely(self, value: float, away: float) -> None:
@@ -264,6 +266,23 @@ class ParameterPath:
                     loop = jax.tree.map(np.asarray, as_loop(cycle, ROOM))
                     return AttractingCycle(itinerary(osc, loop), loop)
         return None
+
+    def _agree_on_moments(self) -> None:
+        """Let an arc of a cycle that takes hardly any time count where it does at the value beside.
+
+        It vanishes at a point that may be some way off, not where it comes to take a `MOMENT`.
+        """
+        values = sorted(self.labels)
+        for pairs in (pairwise(values), pairwise(values[::-1])):
+            for a, b in pairs:
+                known = {one.path for one in self.cycles[a]}
+                others = self.cycles[b]
+                for i, one in enumerate(others):
+                    if one.path and one.path not in known:
+                        path = itinerary(self.at(b), one.loop, LEAST_MOMENT)
+                        if path in known:
+                            others[i] = one._replace(path=path)
+                            self._name(b, self.labels[b].equilibria, self.labels[b].courses)
 
     def _share(self) -> None:
         """Let values know cycles that attract at the ones beside them.
