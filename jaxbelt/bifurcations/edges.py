@@ -72,9 +72,21 @@ class EdgeContact(CycleSystem):
         return status, jnp.asarray(jnp.nan)
 
     def watch(self, osc, z, slope):
-        tests = arrival_tests(osc, self.chain, z, self.row)
-        tests["EdgeTouch", ()] = nearest_edge(osc, self.chain, z, self.row)
+        own = self._ends_there(z)
+        tests = arrival_tests(osc, self.chain, z, self.row, own)
+        tests["EdgeTouch", ()] = nearest_edge(osc, self.chain, z, own)
         return tests, True, jnp.nan
+
+    def _ends_there(self, z: Array) -> Array:
+        """The arcs that end where that of the row does, [arcs]: it, and one beside it that ends in
+        the other one of the two at once."""
+        rows, count = jnp.arange(self.chain.ends.size), jnp.sum(self.chain.used)
+        before, after = (self.row - 1) % count, (self.row + 1) % count
+        is_there = rows == self.row
+        for arc, between in ((before, self.row), (after, after)):
+            at_once = (self.chain.ends[arc] == self.end) & (jnp.abs(z[between, 2]) < HOLDS)
+            is_there = is_there | (rows == arc) & at_once
+        return is_there
 
 
 class AbstractEdgeTouch(AbstractCycleCondition):

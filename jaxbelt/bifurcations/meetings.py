@@ -97,7 +97,8 @@ class EdgesPassed(CycleSystem):
         return self.pair.gap(osc)
 
     def watch(self, osc, z, slope):
-        return arrival_tests(osc, self.chain, z, self.row), True, jnp.nan
+        own = jnp.arange(self.chain.ends.size) == self.row
+        return arrival_tests(osc, self.chain, z, self.row, own), True, jnp.nan
 
 
 class EdgeExchange(AbstractCycleCondition, _BetweenEdges):

@@ -272,21 +272,21 @@ def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
 
 
 def nearest_contacts(
-    osc: Oscillator, chain: Chain, z: Array, sticks: Array, without: int | Array = -1
+    osc: Oscillator, chain: Chain, z: Array, sticks: Array, without: bool | Array = False
 ) -> tuple[Array, Array]:
     """How near a cycle is to another signature at each belt, and whether it sticks there, [belts].
 
     The shortest of its stick phases, among the arcs `sticks`; where there is none, the distance of
     its nearest extremum of x2 from the boundary. Or, if less, that of x2 from the boundary where
     the cycle passes a contact edge slipping, as it meets both at once then. inf where there is
-    nothing of these. without: an arc whose end is not asked.
+    nothing of these. without: arcs whose ends are not asked, [arcs].
     """
     n = len(osc.belts)
     following = jnp.roll(z, -1, axis=0)
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
     following = jnp.where(last[:, None], z[0], following)
     extrema = chain.used & (chain.ends == Ends(n).extremum_x2)
-    passes = (chain.ends >= n) & (chain.ends < 3 * n) & (jnp.arange(chain.ends.size) != without)
+    passes = (chain.ends >= n) & (chain.ends < 3 * n) & ~jnp.asarray(without)
     # Beyond a point to which the cycle shrinks the equations go on, on the other side of the edge.
     passes = passes & jax.vmap(functools.partial(_is_within, osc))(chain.codes, z[:, 0])
     after = following_codes(chain)
@@ -318,11 +318,11 @@ def contact_tests(name: str, nearest: Array, watched: Array) -> Tests:
     return {(name, (belt,)): known[belt] for belt in range(nearest.size)}
 
 
-def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: int | Array = -1) -> Array:
+def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: bool | Array = False) -> Array:
     """How near a cycle is to passing a contact edge otherwise, NaN where there is none: the least
     distance of an extremum of x1, of a place where it is tangent to a boundary, or of a slip onset,
     from an edge of its mode; or by how much the force exceeds what would hold the mass where an
-    edge tears it off. without: an arc whose end is not asked."""
+    edge tears it off. without: arcs whose ends are not asked, [arcs]."""
     n = chain.codes.shape[-1]
     kinds = Ends(n)
     following = jnp.roll(z, -1, axis=0)
@@ -339,7 +339,7 @@ def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: int | Array =
         return jnp.where(told, gap, jnp.where(tears, excess, jnp.inf))
 
     columns = chain.codes, chain.ends, following_codes(chain), following
-    asked = chain.used & (jnp.arange(chain.ends.size) != without)
+    asked = chain.used & ~jnp.asarray(without)
     nearest = jnp.min(jnp.where(asked, jax.vmap(distance)(*columns), jnp.inf))
     return jnp.where(jnp.isfinite(nearest), nearest, jnp.nan)
 

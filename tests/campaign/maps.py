@@ -2,9 +2,10 @@
 
 Of each map are counted: neighbouring cells that have different motions with no curve within one
 cell; curves that bound nothing, that is, beside no row of which motions differ; ends of curves
-without a name; rows with a residual that is not small; and rows of which the mirror image is no
-point of the mirrored oscillator: x1 to -x1 exchanges (nu0, nu1) with (-nu1, -nu0) and (sigma0,
-sigma1) with (-sigma1, -sigma0), where both belts are alike.
+without a name; rows, and special points on the way, with a residual that is not small; and rows of
+which the mirror image is no point of the mirrored oscillator: x1 to -x1 exchanges (nu0, nu1) with
+(-nu1, -nu0) and (sigma0, sigma1) with (-sigma1, -sigma0), where both belts are alike. Special
+points of a map that is its own mirror image have theirs among them.
 """
 
 import time
@@ -28,6 +29,8 @@ CELLS = 64, 65
 ROWS, BESIDE = 7, 2e-3
 #: Residuals of rows, and how far an image may be from a point that is refined there.
 SMALL, SAME = 1e-8, 1e-9
+#: The same of special points in which a curve ends, where it may be extrapolated.
+END = 1e-2
 #: How far from a row, at most, its image is looked for.
 ASIDE = 1e-4
 
@@ -84,6 +87,8 @@ def differences(plane: Plane, told: jb.RegionMap) -> tuple[Counter, list[str]]:
         if not _bounds_something(plane, told, curve):
             wrong.append(f"bounds nothing: {curve}")
         wrong += _not_mirrored(plane, curve, counts)
+        wrong += _not_solved(curve)
+    wrong += _without_image(plane, told)
     return counts, wrong
 
 
@@ -132,6 +137,35 @@ def _not_mirrored(plane: Plane, curve: jb.BifurcationCurve, counts: Counter) -> 
                 break
         else:
             wrong.append(f"not mirrored: {curve} at {curve.values[row]}: {said}")
+    return wrong
+
+
+def _not_solved(curve: jb.BifurcationCurve) -> list[str]:
+    """Special points that no solution of equations is."""
+    wrong = []
+    for i, point in enumerate(curve.special):
+        ends = [-j for j, one in ((0, 0), (1, len(curve.special) - 1)) if one == i]
+        largest = END if any(curve.is_named(end) for end in ends) else SMALL
+        if not point.residual < largest:
+            wrong.append(f"no special point: {point} of {curve}")
+    return wrong
+
+
+def _without_image(plane: Plane, told: jb.RegionMap) -> list[str]:
+    """Special points of a map that is its own mirror image, of which the image is none of it."""
+    p, q = (axis[len(axis) // 3] for axis in told.values)
+    numbers = plane.numbers(p, q)
+    if numbers[2:] != (-numbers[3], -numbers[2]) or [*told.names] != ["nu0", "nu1"]:
+        return []
+    points = [point for curve in told.curves for point in curve.special]
+    at = np.array([point.values for point in points])
+    wrong = []
+    for point, image in zip(points, -at[:, ::-1]):
+        away = np.max(np.abs(image - at), axis=1)
+        alike = [i for i, other in enumerate(points) if other.kind == point.kind]
+        errors = np.array([max(point.residual, points[i].residual, SMALL) for i in alike])
+        if not np.any(away[alike] < 10 * errors):
+            wrong.append(f"no mirror image among the special points: {point}")
     return wrong
 
 
