@@ -351,12 +351,32 @@ def test_a_curve_ends_where_its_cycle_shrinks_to_a_point():
     ids=["smooth", "steep", "jump", "rounding"],
 )
 def test_what_jumps_over_zero_or_is_zero_all_along_is_no_special_point(watched, values):
+    found = special_along({("Special", ()): watched})
+    assert [point.values[0] for point in found] == pytest.approx(values, abs=1e-12)
+
+
+@pytest.mark.parametrize(("away", "told"), [(1e-7, 1), (0.1, 2)])
+def test_what_vanishes_where_a_belt_comes_to_rest_is_no_second_contact(away, told):
+    """Beside a belt at rest nothing is solved for, so that point is extrapolated."""
+    watched = {
+        ("BeltAtRest", (1,)): lambda nu: np.nan if abs(nu - 0.3) < 0.02 else np.sinh(nu - 0.3),
+        ("DoubleSliding", (1,)): lambda nu: nu - 0.3 - away,
+    }
+    found = special_along(watched)
+    rest = next(point for point in found if point.kind == "BeltAtRest")
+    assert rest.residual > 2e-7 and rest.values[0] == pytest.approx(0.3, abs=rest.residual)
+    assert len(found) == told
+
+
+def special_along(watched):
+    """The special points where functions of nu, by their names, are watched from 0 to 1."""
+
     class Straight(Track):
         def corrected(self, u, tangent, length):
             return Corrected(np.asarray(u) + length * np.asarray(tangent), tangent, 1, 1.0, True)
 
         def look(self, u):
-            return Seen({("Special", ()): watched(u[-2])}, True, np.nan, 0.0)
+            return Seen({name: one(u[-2]) for name, one in watched.items()}, True, np.nan, 0.0)
 
     nothing: Any = None
     track, tangent = Straight(nothing, nothing, nothing), np.array([1.0, 0.0])
@@ -364,9 +384,7 @@ def test_what_jumps_over_zero_or_is_zero_all_along_is_no_special_point(watched, 
         (CurvePoint(np.array([nu, 0.1]), tangent, 1, None, 1.0), track.look([nu, 0.1]))
         for nu in (0.0, 1.0)
     ]
-    limits = np.array([[-1.0, 1.0], [-1.0, 1.0]])
-    found = special_between(track, limits, *ends)
-    assert [point.values[0] for point in found] == pytest.approx(values, abs=1e-12)
+    return special_between(track, np.array([[-1.0, 1.0], [-1.0, 1.0]]), *ends)
 
 
 def class_d(p, q):
@@ -416,6 +434,19 @@ def test_a_curve_of_corners_ends_where_its_cycle_shrinks_with_a_belt_to_a_pseudo
     # Its rows from nu0 = 0.013 to 0.006 lead there; polynomials of degrees 3 and 4 differ by 6e-4.
     p, q = curve.values[np.argsort(curve.values[:, 0])[:9]].T
     assert np.polyval(np.polyfit(p, q, 4), 0.0) == pytest.approx(-0.5, abs=6e-4)
+
+
+@pytest.mark.slow(first=True)
+def test_a_corner_is_no_second_contact_of_its_own():
+    """Seen from one side, the cycle passes the edge and meets the boundary at once: what lies
+    between takes no time, up to rounding. `scan` comes from both sides."""
+    osc = jb.presets.class_d(0.09, -0.0009, -1.0, 0.2)
+    points = jb.scan(osc, nu0, (0.09, 0.095), resolution=8)
+    for corner in [point for point in points if point.condition == jb.CornerCollision(0)]:
+        spans = (0.09, 0.0935), (-0.005, 0.001)
+        curve = jb.bifurcation_curve(corner, (nu0, nu1), spans, step=0.005)
+        (rest,) = curve.special
+        assert (rest.kind, rest.belts) == ("BeltAtRest", (1,)) and rest.residual < 1e-8
 
 
 @pytest.mark.slow(first=True)

@@ -151,7 +151,17 @@ def special_between(
         if np.all((limits[:, 0] <= values) & (values <= limits[:, 1])):
             pair = float(values[0]), float(values[1])
             found.append((special.part, SpecialPoint(name[0], name[1], pair, special.residual)))
-    return [point for _, point in sorted(found, key=lambda item: item[0])]
+    points = [point for _, point in sorted(found, key=lambda item: item[0])]
+    return [one for one in points if not _vanishes_at_rest(one, points)]
+
+
+def _vanishes_at_rest(point: SpecialPoint, points: list[SpecialPoint]) -> bool:
+    """Whether it is where a belt comes to rest, one of these points, as far as that is known:
+    distances of a cycle from others vanish with its velocity."""
+    if point.kind not in ("DoubleSliding", "EdgeTouch"):
+        return False
+    at_rest = [one for one in points if one.kind == "BeltAtRest"]
+    return any(np.hypot(*np.subtract(one.values, point.values)) <= one.residual for one in at_rest)
 
 
 class _Probe(NamedTuple):
