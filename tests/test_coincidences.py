@@ -236,6 +236,7 @@ TIES = {
 }
 
 
+@pytest.mark.slow(first=True)
 def test_onset_on_an_edge_is_the_same_in_every_engine():
     """At the edge: which of the two comes first is decided once, not by the rounding of each."""
     cases = [Case(osc, (3.0, 0.0), 50.0, "rational") for osc in TIES.values()]

@@ -54,6 +54,7 @@ def exact():
     return brentq(lambda nu: its_cycle(nu).period - 8.0, 0.09, 0.11, xtol=1e-13)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("offset", [-0.02, 0.1])
 def test_it_is_refined(exact, offset):
     point = jb.refine(PeriodIs(8.0), jb.presets.class_a(exact + offset), where=nu0)

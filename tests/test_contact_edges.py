@@ -183,6 +183,7 @@ def test_an_edge_that_pushes_away_ends_the_cycle():
     assert points[5].value == pytest.approx(expected, abs=1e-11)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("condition", "number", "offset"),
     [

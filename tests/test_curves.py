@@ -401,6 +401,7 @@ def test_belts_of_two_velocities_do_not_hold_the_mass_together():
     assert cycle.x2_max == 0.195 and float(cycle.stick_durations[1]) == 0
 
 
+@pytest.mark.slow(first=True)
 def test_a_curve_turns_where_a_slip_onset_comes_to_an_edge():
     """The edge tears the mass off belt 0. Where it would still hold, the cycle is another one."""
     point = jb.refine(jb.CornerCollision(1), lambda q: class_d(0.3798, q), at=-0.4225)

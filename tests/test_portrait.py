@@ -437,6 +437,7 @@ def test_a_cycle_with_its_top_on_a_belt_at_rest_has_its_multiplier():
     assert float(found.multiplier) == pytest.approx(float(cycle.multiplier), rel=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_an_unstable_cycle_with_its_top_on_a_belt_at_rest_has_its_multiplier():
     law = ("conti", 0.5, 0.25, 2.0, 0.0)
     belts = engine.Belt(0.65, law), engine.Belt(0.0, law, 0.05, 0.55)
@@ -455,6 +456,7 @@ def test_an_unstable_cycle_with_its_top_on_a_belt_at_rest_has_its_multiplier():
     assert float(cycle.multiplier) == pytest.approx(slope, rel=1e-5) and slope > 1.1
 
 
+@pytest.mark.slow(first=True)
 def test_one_top_is_not_two_where_two_belts_at_rest_touch():
     """Rounding made two arcs end in it, of which the second was taken for a loop that repeats."""
     law = jb.Conti(1.0, 0.6, 10.0)

@@ -185,12 +185,14 @@ IMAGES = {
     "idle at rest": with_idle_belt_at_rest,
     "split": split,
 }
-#: What a belt that presses with nothing compiles, nothing else needs.
+#: What a third belt, or one that presses with nothing, compiles nothing else needs.
 of_images = pytest.mark.parametrize(
     "image_of",
     [
         pytest.param(
-            image_of, id=name, marks=pytest.mark.slow(first=True) if name.startswith("idle") else []
+            image_of,
+            id=name,
+            marks=pytest.mark.slow(first=True) if name in ("idle", "idle at rest", "split") else [],
         )
         for name, image_of in IMAGES.items()
     ],

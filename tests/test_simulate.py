@@ -589,6 +589,7 @@ def test_grazing_a_boundary_from_both_sides():
     assert sticks(grazing - 1e-7) == {1}
 
 
+@pytest.mark.slow(first=True)
 def test_three_belts_and_mixed_laws():
     here = jb.Oscillator(
         0.2,
