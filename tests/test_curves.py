@@ -443,11 +443,23 @@ def test_a_corner_is_no_second_contact_of_its_own():
     between takes no time, up to rounding. `scan` comes from both sides."""
     osc = jb.presets.class_d(0.09, -0.0009, -1.0, 0.2)
     points = jb.scan(osc, nu0, (0.09, 0.095), resolution=8)
-    for corner in [point for point in points if point.condition == jb.CornerCollision(0)]:
+    corners = [point for point in points if point.condition == jb.CornerCollision(0)]
+    assert corners
+    for corner in corners:
         spans = (0.09, 0.0935), (-0.005, 0.001)
         curve = jb.bifurcation_curve(corner, (nu0, nu1), spans, step=0.005)
         (rest,) = curve.special
         assert (rest.kind, rest.belts) == ("BeltAtRest", (1,)) and rest.residual < 1e-8
+
+
+@pytest.mark.slow(first=True)
+def test_the_boundary_of_another_belt_may_come_to_a_corner():
+    """Where both belts have one velocity."""
+    point = jb.refine(jb.CornerCollision(0), lambda q: class_d(0.3, q), at=0.325)
+    curve = jb.bifurcation_curve(point, class_d, ((0.25, 0.4), (0.25, 0.4)))
+    assert {one.kind for one in curve.special} == {"EqualVelocities", "DoubleSliding"}
+    for one in curve.special:
+        assert one.values[0] == pytest.approx(one.values[1], abs=1e-12) and one.residual < 1e-12
 
 
 @pytest.mark.slow(first=True)

@@ -185,21 +185,20 @@ IMAGES = {
     "idle at rest": with_idle_belt_at_rest,
     "split": split,
 }
-#: What a third belt, or one that presses with nothing, compiles nothing else needs.
-of_images = pytest.mark.parametrize(
-    "image_of",
-    [
-        pytest.param(
-            image_of,
-            id=name,
-            marks=pytest.mark.slow(first=True) if name in ("idle", "idle at rest", "split") else [],
-        )
-        for name, image_of in IMAGES.items()
-    ],
-)
 #: More of the same at night.
 seeds = pytest.mark.parametrize(
     "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 9))]
+)
+#: What a third belt, or one that presses with nothing, compiles nothing else needs.
+OF_THEIR_OWN = "idle", "idle at rest", "split"
+images_and_seeds = pytest.mark.parametrize(
+    ("image_of", "seed"),
+    [
+        pytest.param(image_of, seed, id=f"{name}-{seed}", marks=slow)
+        for name, image_of in IMAGES.items()
+        for seed in range(9)
+        for slow in [pytest.mark.slow(first=seed == 0) if seed or name in OF_THEIR_OWN else []]
+    ],
 )
 
 
@@ -297,8 +296,7 @@ def rests_on_an_edge(osc: jb.Oscillator, y0: np.ndarray) -> bool:
     return y0[1] == 0 and y0[0] in edges
 
 
-@seeds
-@of_images
+@images_and_seeds
 def test_an_image_moves_as_it_does(image_of, seed):
     for number, (osc, y0) in enumerate(cases(seed)):
         if image_of is reflected and rests_on_an_edge(osc, y0):

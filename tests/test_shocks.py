@@ -152,10 +152,7 @@ def _bisected(osc: engine.Oscillator, x1: float, outer: float) -> float:
 
 
 @pytest.mark.slow(first=True)
-@pytest.mark.parametrize(
-    ("numbers", "outer"),
-    [pytest.param(NODE, -1.5, marks=pytest.mark.slow(first=True)), (ON_AN_EDGE, 1.5)],
-)
+@pytest.mark.parametrize(("numbers", "outer"), [(NODE, -1.5), (ON_AN_EDGE, 1.5)])
 def test_shocks_where_separatrices_creep_and_where_attractors_lie_on_edges(numbers, outer):
     """Against bisection with the engine, and the derivative against differences of that."""
     osc = package.oscillator(numbers)

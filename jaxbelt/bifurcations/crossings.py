@@ -58,19 +58,19 @@ class StickLimit(CycleSystem):
         return x1 - stick_limit(osc, mode_of(self.codes), self.side)
 
     def watch(self, osc, z, slope):
-        own = jnp.arange(self.chain.ends.size) == self.row
-        return arrival_tests(osc, self.chain, z, self.row, own), True, jnp.nan
+        return arrival_tests(osc, self.chain, z, self.row), True, jnp.nan
 
 
-def arrival_tests(osc: Oscillator, chain: Chain, z: Array, row: Array, own: Array):
-    """What to watch of a cycle of which something happens at the end of the arc `row`; own: the
-    arcs that end there, [arcs].
+def arrival_tests(osc: Oscillator, chain: Chain, z: Array, row: Array, own: bool | Array = False):
+    """What to watch of a cycle of which something happens at the end of the arc `row`.
 
-    A stick phase that begins or ends there may have no duration.
+    A stick phase that begins or ends there may have no duration. own: at the ends of which other
+    arcs the boundaries of which belts are part of what happens, [arcs, belts].
     """
     others = chain.used & ~stick_phase_from(osc, chain, (row + 1) % jnp.sum(chain.used))
-    others = others & (jnp.arange(others.size) != row) & jnp.any(chain.codes == 0, axis=-1)
-    nearest, _ = nearest_contacts(osc, chain, z, others, own)
+    here = jnp.arange(others.size) == row
+    others = others & ~here & jnp.any(chain.codes == 0, axis=-1)
+    nearest, _ = nearest_contacts(osc, chain, z, others, here[:, None] | own)
     return contact_tests("DoubleSliding", nearest, jnp.ones(nearest.shape, bool))
 
 

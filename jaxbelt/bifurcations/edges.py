@@ -73,13 +73,16 @@ class EdgeContact(CycleSystem):
 
     def watch(self, osc, z, slope):
         own = self._ends_there(z)
-        tests = arrival_tests(osc, self.chain, z, self.row, own)
+        # The corner's own boundary; that of another belt may come there, too.
+        belts = jnp.arange(len(osc.belts))
+        belts = (belts == self.chain.ends[self.row]) | (belts == self.end)
+        tests = arrival_tests(osc, self.chain, z, self.row, own[:, None] & belts[None])
         tests["EdgeTouch", ()] = nearest_edge(osc, self.chain, z, own)
         return tests, True, jnp.nan
 
     def _ends_there(self, z: Array) -> Array:
-        """The arcs that end where that of the row does, [arcs]: it, and one beside it that ends in
-        the other one of the two at once."""
+        """The arcs that end where and when that of the row does, [arcs]: it, and the one before or
+        after it that ends in the other one of the two, with no time between them."""
         rows, count = jnp.arange(self.chain.ends.size), jnp.sum(self.chain.used)
         before, after = (self.row - 1) % count, (self.row + 1) % count
         is_there = rows == self.row

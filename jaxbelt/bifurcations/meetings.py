@@ -97,8 +97,7 @@ class EdgesPassed(CycleSystem):
         return self.pair.gap(osc)
 
     def watch(self, osc, z, slope):
-        own = jnp.arange(self.chain.ends.size) == self.row
-        return arrival_tests(osc, self.chain, z, self.row, own), True, jnp.nan
+        return arrival_tests(osc, self.chain, z, self.row), True, jnp.nan
 
 
 class EdgeExchange(AbstractCycleCondition, _BetweenEdges):

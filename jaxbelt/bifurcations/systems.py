@@ -279,14 +279,15 @@ def nearest_contacts(
     The shortest of its stick phases, among the arcs `sticks`; where there is none, the distance of
     its nearest extremum of x2 from the boundary. Or, if less, that of x2 from the boundary where
     the cycle passes a contact edge slipping, as it meets both at once then. inf where there is
-    nothing of these. without: arcs whose ends are not asked, [arcs].
+    nothing of these. without: at the ends of which arcs, where they pass an edge, which belts are
+    not asked, [arcs, belts].
     """
-    n = len(osc.belts)
+    n, without = len(osc.belts), jnp.broadcast_to(without, chain.codes.shape)
     following = jnp.roll(z, -1, axis=0)
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
     following = jnp.where(last[:, None], z[0], following)
     extrema = chain.used & (chain.ends == Ends(n).extremum_x2)
-    passes = (chain.ends >= n) & (chain.ends < 3 * n) & ~jnp.asarray(without)
+    passes = (chain.ends >= n) & (chain.ends < 3 * n)
     # Beyond a point to which the cycle shrinks the equations go on, on the other side of the edge.
     passes = passes & jax.vmap(functools.partial(_is_within, osc))(chain.codes, z[:, 0])
     after = following_codes(chain)
@@ -301,6 +302,7 @@ def nearest_contacts(
         # Where it sticks before or after the edge it is on the boundary anyway.
         sign = jnp.where(slips, signs, signs_after)
         moves = passes & (signs != 0) & (signs_after != 0) & (jnp.abs(sign) == 1)
+        moves = moves & ~without[:, belt]
         at_edge = jnp.min(jnp.where(moves, sign * r, jnp.inf))
         stuck.append(jnp.any(own))
         nearest.append(jnp.minimum(jnp.where(stuck[-1], shortest, gap), at_edge))

@@ -33,8 +33,8 @@ Itinerary = tuple[tuple[int, ...], ...]
 #: An arc that takes no longer is there by rounding: those between two events at one place take
 #: 1e-26, and where a bifurcation is narrowed to 1e-9 of a span some 1e-9.
 MOMENT = 1e-13
-#: One that vanishes as the square of a distance may take more than MOMENT at one value and less at
-#: the next; it is there at both if it takes no less than this.
+#: An arc that vanishes as the square of a distance may take more than MOMENT at one value of a
+#: parameter and less at the next one; it counts at both if it takes longer than this.
 LEAST_MOMENT = 1e-16
 #: Places of one cycle that shooting solved for differ by less, relative to its size: its equations
 #: hold to 1e-9, and beside a fold a cycle moves by ten thousand times that.
@@ -46,8 +46,8 @@ APART = 1e-2
 
 
 def itinerary(osc: Oscillator, loop: Cycle | Loop, moment: float = MOMENT) -> Itinerary:
-    """The modes of one loop in order, wherever it was begun, but for those that take no time: where
-    slip onset lies on an edge rounding tells which comes first."""
+    """The modes of one loop in order, wherever it was begun, but for those that last no longer than
+    `moment`: where slip onset lies on an edge rounding tells which comes first."""
     chain, rows = arcs_of(loop)
     modes, lasts = modes_of(chain), rows[:, 2] > moment
     modes = without_idle(osc, modes[lasts] if np.any(lasts) else modes)

@@ -142,13 +142,13 @@ def _not_mirrored(plane: Plane, curve: jb.BifurcationCurve, counts: Counter) -> 
 
 def _not_solved(curve: jb.BifurcationCurve) -> list[str]:
     """Special points that no solution of equations is."""
-    wrong = []
-    for i, point in enumerate(curve.special):
-        ends = [-j for j, one in ((0, 0), (1, len(curve.special) - 1)) if one == i]
-        largest = END if any(curve.is_named(end) for end in ends) else SMALL
-        if not point.residual < largest:
-            wrong.append(f"no special point: {point} of {curve}")
-    return wrong
+    order = curve.in_order()
+    ends = order[0], order[-1]
+    return [
+        f"no special point: {point} of {curve}"
+        for point in curve.special
+        if not point.residual < (END if any(point is end for end in ends) else SMALL)
+    ]
 
 
 def _without_image(plane: Plane, told: jb.RegionMap) -> list[str]:
