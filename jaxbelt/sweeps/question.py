@@ -183,7 +183,7 @@ def _observer(observe: Any) -> Observer:
 
 @functools.cache
 def _versions() -> str:
-    """Of all that has a say in the numbers; each is read from a file, in a third of a millisecond."""
+    """Of all that has a say in the numbers; to read one takes a third of a millisecond."""
     packages = ("jaxbelt", "jax", "jaxlib", "diffrax", "equinox", "numpy", "xarray")
     return ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
 
