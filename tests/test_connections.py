@@ -303,3 +303,32 @@ def test_mirror_images_answer_alike(away):
         # Of the connections the other one may be nearer.
         assert points[0].value == pytest.approx(float(points[1].value), abs=1e-11)
         assert abs(points[0].value - (value + away)) <= abs(away) + 1e-9
+
+
+@pytest.mark.slow(first=True)
+def test_a_cycle_between_a_connection_and_a_fold_is_seen_by_mirror_images_alike():
+    """It attracts, sticks to nothing, and is there along 6e-5 of the load: from starts on one side
+    of an equilibrium only one of the two images found it."""
+    law = jb.Conti(1.2, 0.6, 5.0)
+
+    def make(load):
+        belts = (jb.Belt(0.5, law, load, lower=0.4), jb.Belt(0.5, law, 0.5, upper=0.6))
+        return jb.Oscillator(0.25, belts, 0.5)
+
+    def image(load):
+        belts = (jb.Belt(-0.5, law, load, upper=-0.4), jb.Belt(-0.5, law, 0.5, lower=-0.6))
+        return jb.Oscillator(0.25, belts, 0.5)
+
+    told = [jb.scan(one, span=(1.385, 1.395)) for one in (make, image)]
+    for points in told:
+        kinds = ["SaddleConnection", "SaddleConnection", "FoldOfCycles"]
+        assert [point.kind for point in points] == kinds
+    assert [float(a.value) for a in told[0]] == pytest.approx(
+        [float(b.value) for b in told[1]], abs=1e-11
+    )
+    # One that sticks is always there. In the connection itself rounding makes several of one.
+    _, born, ends = [float(point.value) for point in told[0]]
+    values = [born - 1e-9, born + 1e-9, 0.5 * (born + ends), ends - 1e-9, ends + 1e-9]
+    assert [len(jb.portrait(make(v)).cycles) for v in values] == [1, 2, 2, 2, 1]
+    for away in (-1e-12, -1e-13, -1e-14, 0.0, 1e-14, 1e-13, 1e-12):
+        assert len(jb.portrait(make(born + away)).cycles) in (1, 2)

@@ -158,6 +158,38 @@ def test_points_of_sequential_belts():
     assert oracle_cycles.sticking_cycle(make(corner + 1e-7), T=400.0) is None
 
 
+@pytest.mark.parametrize("idle", [0.0, 0.7])
+def test_a_belt_at_rest_without_load_brakes_nothing_at_a_pseudo_focus(idle):
+    """Left of the edge x2' is 0.2 + (0.25 - damping) x2, to first order, right of it -0.5 - damping
+    x2: loops neither grow nor shrink where 0.2 damping = 0.5 (0.25 - damping)."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(damping):
+        return jb.Oscillator(damping, (jb.Belt(0.3, law, upper=0.5), jb.Belt(idle, law, 0.0)))
+
+    point = jb.refine(jb.PseudoHopf(0), make, at=0.15)
+    assert point.status == Status.OK and point.value == pytest.approx(0.125 / 0.7, abs=1e-14)
+
+
+@pytest.mark.slow(first=True)
+def test_the_boundary_of_a_belt_at_rest_without_load_is_no_corner():
+    """It is where x1 is extreme, and the cycle grazes the edge as it would without that belt."""
+    law = jb.Conti(1.0, 0.5, 5.0)
+
+    def make(velocity, *idle):
+        belts = (jb.Belt(velocity, law, upper=0.05), jb.Belt(-0.7, law, lower=-0.45))
+        return jb.Oscillator(0.1, (*belts, *idle))
+
+    def with_idle(velocity):
+        return make(velocity, jb.Belt(0.0, law, 0.0))
+
+    told = [jb.scan(one, span=(-0.06, -0.04)) for one in (make, with_idle)]
+    for points in told:
+        assert [point.kind for point in points] == ["CornerCollision", "GrazingEdge"]
+    values = [[float(point.value) for point in points] for points in told]
+    assert values[0] == pytest.approx(values[1], abs=1e-11)
+
+
 @pytest.mark.slow(first=True)
 def test_an_edge_that_pushes_away_ends_the_cycle():
     """It touches the lower edge of belt 1; from beyond, the mass goes to another equilibrium."""

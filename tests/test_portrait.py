@@ -505,6 +505,17 @@ def test_a_belt_at_rest_without_load_changes_nothing():
     assert float(told.cycles[0].period) == period
 
 
+@pytest.mark.parametrize("edges", [(0.3, 0.3), (0.3, 0.1 + 0.2), (0.1 + 0.2, 0.3)])
+def test_a_saddle_on_edges_that_are_one_up_to_rounding_is_one(edges):
+    law, (upper, lower) = jb.Conti(1.0, 0.6, 10.0), edges
+    belts = (jb.Belt(-0.5, law, upper=upper), jb.Belt(0.5, law, lower=lower))
+    told = jb.portrait(jb.Oscillator(0.5, belts))
+    kinds = [jb.EquilibriumKind(int(row.kind)).name for row in told.equilibria]
+    assert kinds.count("SADDLE") == 1
+    sides = [(one.side, one.stable) for one in told.separatrices]
+    assert len(sides) == len(set(sides)) == 4
+
+
 @pytest.mark.slow(first=True)
 @pytest.mark.parametrize("nu", [0.0, 1e-17, -1e-17, 0.3 - (0.1 + 0.2), -1e-16])
 def test_tops_beside_a_belt_at_rest_follow_one_another(nu):

@@ -41,8 +41,8 @@ from ..cycles.cycle import cycle_of
 from ..cycles.orbits import Orbit, follow_from, place_of_rest
 from ..cycles.separatrices import mode_onward
 from ..cycles.shooting import admissible, flow, meshed
-from ..model.equilibria import side_pulls
-from ..model.modes import edges, mode_acceleration, mode_of
+from ..model.equilibria import pushes_away, saddles
+from ..model.modes import distinct_places, edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
@@ -129,7 +129,7 @@ class Connection(CycleSystem):
         nearest, _ = nearest_contacts(osc, self.chain, x, sticks)
         tests = velocity_tests(osc) | contact_tests("DoubleSliding", nearest, jnp.isfinite(nearest))
         # The weakest push away from either saddle.
-        away = jnp.stack(_pushes_away(osc))[:, jnp.stack([self.leaves, self.arrives])]
+        away = jnp.stack(pushes_away(osc))[:, jnp.stack([self.leaves, self.arrives])]
         tests["BoundaryEquilibrium", ()] = jnp.min(away)
         leaves, arrives = jnp.stack(edges(osc))[jnp.stack([self.leaves, self.arrives])]
         tests["MeetingEdges", ()] = jnp.where(leaves == arrives, jnp.nan, leaves - arrives)
@@ -286,21 +286,6 @@ def _states_along(osc: Oscillator, system: Connection, x: Array) -> Array:
 
 
 @jit
-def saddles(osc: Oscillator) -> Array:
-    """Whether both sides push away from the point (sigma, 0) of each edge, [edges]."""
-    left, right = _pushes_away(osc)
-    return (left > 0) & (right > 0)
-
-
-def _pushes_away(osc: Oscillator) -> tuple[Array, Array]:
-    """How hard both sides push away from the point (sigma, 0) of each edge, [edges] each."""
-    positions = jnp.stack(edges(osc))
-    left, right = side_pulls(osc, jnp.where(jnp.isfinite(positions), positions, 0.0))
-    none = jnp.full_like(positions, jnp.nan)
-    exists = jnp.isfinite(positions)
-    return jnp.where(exists, -left, none), jnp.where(exists, right, none)
-
-
 def _departing(osc: Oscillator, edge: Array, rightward: Array, parts: Array, budget: int) -> Orbit:
     """The orbit that leaves the saddle of an edge to one side; parts: whether there is one."""
     x1 = jnp.where(parts, jnp.stack(edges(osc))[edge], 0.0)
@@ -431,8 +416,8 @@ def courses_of(oscs: Oscillator) -> list[tuple[SaddleCourse, ...]]:
 
 
 def _courses_at(seen: _Courses) -> tuple[SaddleCourse, ...]:
-    at, rows = np.unique(np.where(seen.leaves, seen.positions, np.nan), return_index=True)
-    rows, at = rows[~np.isnan(at)], at[~np.isnan(at)]
+    rows = distinct_places(np.where(seen.leaves, seen.positions, np.nan))
+    at = seen.positions[rows]
     return tuple(
         _course(at, *(one[row, side] for one in (seen.extrema, seen.repeats, seen.rest)))
         for row in rows
@@ -440,7 +425,7 @@ def _courses_at(seen: _Courses) -> tuple[SaddleCourse, ...]:
     )
 
 
-def _course(at: np.ndarray, extrema: Any, repeats: Any, rest: Any) -> SaddleCourse:
+def _course(at: Any, extrema: Any, repeats: Any, rest: Any) -> SaddleCourse:
     """A course between saddles at these x1."""
     known = ~np.isnan(extrema)
     letters = np.searchsorted(at, extrema[known]).tolist()

@@ -107,9 +107,9 @@ class EdgeRest(_EdgeSystem):
 
     def meets_hopf(self, osc):
         # There is none for the end of a segment.
-        mode = mode_of(self.codes)
-        _, trace, *_ = field_at_rest(osc, mode, jnp.stack(edges(osc))[self.edge])
-        return jnp.where(mode.any_stuck, jnp.nan, trace)
+        at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
+        trace = field_at_rest(osc, _where_nothing_holds(osc, mode, at), at)[1]
+        return jnp.where(capacity(osc, mode) > 0, jnp.nan, trace)
 
     def type_tests(self, osc):
         push, persists = self.across(osc)
@@ -148,9 +148,15 @@ class EdgeBalance(_EdgeSystem):
     left: Mode
     right: Mode
 
-    def _sides(self, osc: Oscillator):
+    def _slipping(self, osc: Oscillator) -> tuple[Array, Mode, Mode]:
+        """The place of the edge, and the slip modes beside it."""
         at = jnp.stack(edges(osc))[self.edge]
-        return field_at_rest(osc, self.left, at)[:2], field_at_rest(osc, self.right, at)[:2]
+        left, right = (_where_nothing_holds(osc, mode, at) for mode in (self.left, self.right))
+        return at, left, right
+
+    def _sides(self, osc: Oscillator):
+        at, left, right = self._slipping(osc)
+        return field_at_rest(osc, left, at)[:2], field_at_rest(osc, right, at)[:2]
 
     def balance(self, osc):
         # The rate of `edge_focus` but for factors: regular where one of the pushes is 0.
@@ -158,15 +164,15 @@ class EdgeBalance(_EdgeSystem):
         return trace_right * a_left - trace_left * a_right
 
     def exists(self, osc, x):
-        # Whether there is a pseudo-focus between these contacts, and no belt at rest touches.
+        # Whether there is a pseudo-focus between these contacts, and no belt at rest brakes.
         same = [
             jnp.all(jnp.stack(here.codes) == jnp.stack(mode.codes))
             for here, mode in zip(
                 _beside_edge(osc, jnp.stack(edges(osc))[self.edge]), (self.left, self.right)
             )
         ]
-        moves = ~self.left.any_stuck & ~self.right.any_stuck
-        return (self.meets_hopf(osc) > 0) & moves & same[0] & same[1]
+        brakes = sum(capacity(osc, mode) for mode in (self.left, self.right)) > 0
+        return (self.meets_hopf(osc) > 0) & ~brakes & same[0] & same[1]
 
     def meets_hopf(self, osc):
         # The weaker of the two pushes towards the edge, negative where one pushes away.
@@ -178,7 +184,8 @@ class EdgeBalance(_EdgeSystem):
 
     def growth(self, osc: Oscillator) -> tuple[Array, Array]:
         """The coefficient of third order, and the size of its terms; NaN without a pseudo-focus."""
-        focus = edge_focus(osc, self.left, self.right, jnp.stack(edges(osc))[self.edge])
+        at, left, right = self._slipping(osc)
+        focus = edge_focus(osc, left, right, at)
         known = functools.partial(jnp.where, focus.exists)
         return known(focus.coefficient, jnp.nan), known(focus.bend, jnp.nan)
 
@@ -350,6 +357,11 @@ def _beside_edge(osc: Oscillator, at: Array) -> tuple[Mode, Mode]:
     rest = jnp.zeros_like(at)
     left, right = (contact_beside(osc, at, rest, rightward=side) for side in (False, True))
     return left, right
+
+
+def _where_nothing_holds(osc: Oscillator, mode: Mode, at: Array) -> Mode:
+    """The contacts at rest on an edge as a slip mode, where belts at rest hold nothing."""
+    return settle(osc, mode, at, jnp.zeros_like(at))
 
 
 def _edge_rests(osc: Oscillator, belt: int | Array) -> tuple[EdgeRest, Array]:

@@ -304,6 +304,10 @@ def end_near_edge(
     positions = jnp.stack(edges(osc))
     lower, upper = positions[belt], positions[n + belt]
     following = following_codes(loop)
+    # The boundary of a belt at rest is where x1 is extreme; without a load it is nothing else.
+    idle = [(one.velocity == 0) & (one.load == 0) for one in osc.belts]
+    extreme = jnp.array([*range(n), names.extremum_x1])
+    extreme = jnp.where(jnp.stack([*idle, jnp.asarray(True)]), extreme, names.extremum_x1)
 
     def distances(codes, end, entry, after, at):
         """From every end that this arc might have as well; those of stick phases in two modes."""
@@ -313,7 +317,7 @@ def end_near_edge(
         on_edge = on_edge & ((edge == lower) | (edge == upper))
         stuck = jnp.any(codes == 0)
         # What ends it is something else: how far it is to an edge.
-        loops, meets = end == names.extremum_x1, (end < n) | (end == names.onset)
+        loops, meets = jnp.any(end == extreme), (end < n) | (end == names.onset)
         to_edges = [jnp.where(loops | meets, jnp.abs(x1 - e), jnp.inf) for e in (lower, upper)]
         # An edge ends it. If that pushes away to both sides: how much further on the orbit would
         # loop as it was.

@@ -15,8 +15,8 @@ from jaxtyping import Array
 
 from ..cycles.chains import Loop, following_codes
 from ..cycles.orbits import Orbit, before_stick_ends, follow, last_loop, loop_of
-from ..model.equilibria import Equilibria, EquilibriumKind, candidates
-from ..model.modes import STUCK, mode_acceleration, mode_of
+from ..model.equilibria import Equilibria, EquilibriumKind, candidates, saddles
+from ..model.modes import STUCK, edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..motion.integrators import STRIDE
@@ -35,12 +35,16 @@ ATTEMPTS = 6
 #: Where some of them start to the right of an equilibrium, so far from it; and where one more does
 #: if it repels: within an unstable cycle around it there may be one that attracts.
 DISTANCES, INNERMOST = (0.02, 0.3, 3.0), 4e-3
+#: How far beside a saddle some start: a cycle that attracts may pass it as closely, soon after a
+#: connection.
+BESIDE_SADDLE = 1e-9
 
 
 def starts(osc: Oscillator, rests: Equilibria) -> Array:
     """Where the orbits start that find the cycles, [starts, 2].
 
-    Where stick phases end, and at several distances from an equilibrium. NaN: no such start.
+    Where stick phases end, at several distances from an equilibrium, and just beside the saddles.
+    NaN: no such start.
     """
     exists = rests.kind > 0
     repels = exists & ~rests.stable
@@ -50,7 +54,11 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
     innermost = jnp.where(jnp.any(repels), _innermost(osc, rests, row), jnp.nan)
     distances = (innermost, *DISTANCES)
     others = [jnp.stack([centre + distance, jnp.zeros(())])[None] for distance in distances]
-    return jnp.concatenate([*ends, *others])
+    places = jnp.stack(edges(osc))
+    places = jnp.where(saddles(osc), places, jnp.nan)
+    away = BESIDE_SADDLE * (1 + jnp.abs(places))
+    beside = jnp.concatenate([places - away, places + away])
+    return jnp.concatenate([*ends, *others, jnp.stack([beside, jnp.zeros_like(beside)], axis=-1)])
 
 
 def _innermost(osc: Oscillator, rests: Equilibria, row: Array) -> Array:

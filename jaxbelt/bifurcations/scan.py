@@ -119,7 +119,7 @@ def search(
         for a, b in intervals:
             is_narrow = b - a <= NEAR * path.length
             point = _explained(path, a, b) if b - a <= near * path.length else None
-            if point is not None:
+            if point is not None and _is_settling(path, a, b, point):
                 # The interval on the other side of a fold may have led to it already.
                 for one in (point, *_beside_it(path, a, b, point)):
                     if not any(_is_same_point(one, other) for other in points):
@@ -127,7 +127,9 @@ def search(
                 before, after = _settled_by(path, a, b, point)
                 settled.append((before, after))
                 values += [max(a, before), min(b, after)]
-            elif b - a <= near * path.length and _is_degenerate(path, a, b, points):
+            elif (
+                b - a <= near * path.length and point is None and _is_degenerate(path, a, b, points)
+            ):
                 settled.append((a, b))
             elif b - a <= 1e-9 * path.length and not path.is_fine(a, b):
                 again.append(0.5 * (a + b))
@@ -228,6 +230,21 @@ def _settled_by(
     return before, after
 
 
+def _is_settling(path: ParameterPath, a: float, b: float, point: BifurcationPoint) -> bool:
+    """Whether a point that explains what differs between a and b is to be told for that.
+
+    One just outside is not as long as the interval can be narrowed: another one may be inside.
+    """
+    low, high = path.beside(0.5 * (a + b))
+    return b - a <= high - low or _is_inside(a, b, point)
+
+
+def _is_inside(a: float, b: float, point: BifurcationPoint) -> bool:
+    """Whether a point is in an interval, as far as is known: at a value that was looked at it lies,
+    up to rounding, on either side of that."""
+    return bool(a - point.error <= point.value <= b + point.error)
+
+
 def _explained(path: ParameterPath, a: float, b: float) -> BifurcationPoint | None:
     """A bifurcation point between two values that differ, or None."""
     marks = zip(path.conditions, path.label(a).marks, path.label(b).marks, strict=True)
@@ -272,23 +289,27 @@ def _is_another(point: BifurcationPoint, other: BifurcationPoint) -> bool:
 def _first_found(
     path: ParameterPath, a: float, b: float, conditions: Sequence[AbstractCondition]
 ) -> BifurcationPoint | None:
-    """The first of the conditions that holds within an interval."""
-    points = (one for condition in conditions for one in _all_found(path, a, b, condition))
-    return next(points, None)
+    """The first of the conditions that holds within an interval; else of those just beside it."""
+    beside = None
+    for condition in conditions:
+        for point in _all_found(path, a, b, condition):
+            if _is_inside(a, b, point):
+                return point
+            beside = beside or point
+    return beside
 
 
 def _all_found(
     path: ParameterPath, a: float, b: float, condition: AbstractCondition
 ) -> Iterator[BifurcationPoint]:
-    """Where a condition holds within an interval, from each of its beginnings; one point may come
-    from several."""
+    """Where a condition holds within an interval, a slow one just beside it, too, from each of its
+    beginnings; one point may come from several."""
     slow = condition.slow
     low, high = (path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]) if slow else (a, b)
     for value in condition.values(a, b):
         for one in condition.beginnings(path.at(value), path.cycles.get(value, [])):
             point = condition.found_from(path.variation, value, one)
-            # At a value that was looked at it lies, up to rounding, on either side of that.
-            if point is not None and low - point.error <= point.value <= high + point.error:
+            if point is not None and _is_inside(low, high, point):
                 yield point
 
 

@@ -17,6 +17,7 @@ a state (x1, 0) at which the mass is pulled to the left; the map leads from a to
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import equinox as eqx
@@ -76,6 +77,8 @@ MAP_ERROR = 3e-7
 NEUTRAL = 1e-9
 #: Intervals of tops as short as this, relative to where they are, are rounding.
 NARROWEST = 1e-12
+#: Tops that differ by less, relative to where they are, are one but for rounding of the map.
+ONE_TOP = 1e-11
 #: The largest distance from the origin that is looked at, where no bound is known.
 FARTHEST = 1e4
 #: The growth of loops is as it is far out if it is off by less than this fraction.
@@ -326,7 +329,7 @@ class Returns:
         for bracket in self._brackets:
             found += self._solved_between(bracket, DIVISIONS)
         cycles = distinct([cycle for cycle in found if cycle is not None])
-        return sorted(cycles, key=lambda cycle: float(cycle.x1_max))
+        return _with_tops_apart(sorted(cycles, key=lambda cycle: float(cycle.x1_max)))
 
     def _solved_between(self, bracket: Bracket, divisions: int) -> list[Cycle]:
         low, high = bracket
@@ -381,6 +384,23 @@ def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
     growth = min(abs(float(cycle.multiplier) - 1), 1.0)
     margin = width + MAP_ERROR * (1 + abs(top)) / max(growth, NEUTRAL)
     return cycle if abs(float(cycle.x1_max) - top) < margin and growth > NEUTRAL else None
+
+
+def _with_tops_apart(cycles: Sequence[Cycle]) -> list[Cycle]:
+    """Of cycles in order of their tops, of which several next to one another attract, or do not,
+    with one top up to rounding, the first: between two fixed points of that sort is another one.
+
+    Where a saddle's orbit returns to it, rounding of the map, which rises there like a square root,
+    makes several of one.
+    """
+    kept = list(cycles[:1])
+    for before, cycle in pairwise(cycles):
+        attract = [float(one.multiplier) < 1 for one in (before, cycle)]
+        top = float(cycle.x1_max)
+        near = top - float(before.x1_max) < ONE_TOP * (1 + abs(top))
+        if not (near and attract[0] == attract[1]):
+            kept.append(cycle)
+    return kept
 
 
 def _changes_of_sign(rise: np.ndarray) -> list[tuple[int, int, bool]]:

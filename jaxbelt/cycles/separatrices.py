@@ -39,6 +39,7 @@ from ..model.modes import (
     STUCK,
     Mode,
     capacity,
+    distinct_places,
     edges,
     force_rounding,
     mode_acceleration,
@@ -141,10 +142,10 @@ class TracedSeparatrix(NamedTuple):
 def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[TracedSeparatrix]:
     """All separatrices of an oscillator, followed as long as |x1| and |x2| are < reach; rests:
     where the mass can rest."""
-    positions = np.unique(np.asarray(jnp.stack(edges(osc))))
+    positions = np.asarray(jnp.stack(edges(osc)))
     found: list[TracedSeparatrix | None] = []
     parting: list[float] = []
-    for x1 in positions[np.isfinite(positions)].tolist():
+    for x1 in positions[distinct_places(positions)].tolist():
         if not _orbits_part(osc, jax.device_put(np.array([x1]))):
             continue
         parting.append(x1)
@@ -251,7 +252,8 @@ def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     slips = _slipping(inside, jnp.sign(v))
     pull = mode_acceleration(osc, inside, x1, v)
     kinetic = jnp.abs(mode_acceleration(osc, slips, x1, v) - pull)
-    exists = (jnp.stack(inside.codes)[belt] == STUCK) & (v != 0) & (lower < upper)
+    exists = (jnp.stack(inside.codes)[belt] == STUCK) & (v != 0)
+    exists = exists & (upper - lower > force_rounding(x1))
     exists = exists & jnp.isfinite(x1) & (jnp.abs(pull) - kinetic > force_rounding(x1))
     exists = exists & (capacity(osc, inside) - jnp.abs(pull) > force_rounding(x1))
     # It comes from the side to which the mass slips away; or, where it crosses there, from the

@@ -310,6 +310,21 @@ def side_pulls(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
     )
 
 
+def saddles(osc: Oscillator) -> Array:
+    """Whether both sides push away from the point (sigma, 0) of each edge, [edges]."""
+    left, right = pushes_away(osc)
+    return (left > 0) & (right > 0)
+
+
+def pushes_away(osc: Oscillator) -> tuple[Array, Array]:
+    """How hard both sides push away from the point (sigma, 0) of each edge, [edges] each."""
+    positions = jnp.stack(edges(osc))
+    left, right = side_pulls(osc, jnp.where(jnp.isfinite(positions), positions, 0.0))
+    none = jnp.full_like(positions, jnp.nan)
+    exists = jnp.isfinite(positions)
+    return jnp.where(exists, -left, none), jnp.where(exists, right, none)
+
+
 def _codes(mode: Mode, exists: Array) -> Array:
     codes = [jnp.where(exists, code, 0.0).astype(jnp.int8) for code in mode.codes]
     return jnp.stack(codes, axis=-1)

@@ -130,13 +130,22 @@ def _of_stuck(osc: Oscillator, mode: Mode, coefficients: Sequence[ArrayLike]) ->
     return total
 
 
-def force_rounding(x1: Array, scale: Array | float = 1.0) -> Array:
+def force_rounding(x1: Any, scale: Array | float = 1.0) -> Any:
     """A force, or x2', below this is 0 up to rounding, wherever that is asked.
 
     Forces at x1 are sums of terms of size `scale` and |x1|, each good to some 1e-16 of itself; but
     x1 and x2 may come from an integrated arc, whose end is found to about 1e-13.
     """
-    return 1e-12 * (scale + jnp.abs(x1))
+    return 1e-12 * (scale + abs(x1))
+
+
+def distinct_places(places: np.ndarray) -> np.ndarray:
+    """The numbers of those places that are finite, from left to right, of several that are one up
+    to rounding the first."""
+    order = np.argsort(places)
+    order = order[np.isfinite(places[order])]
+    known = places[order]
+    return order[np.diff(known, prepend=-np.inf) > force_rounding(known)]
 
 
 def without_rounding(a: Array, x1: Array) -> Array:
