@@ -220,7 +220,7 @@ CASES = {
     "NonsmoothFold": Case(jb.NonsmoothFold(0), jb.presets.class_a, r"\nu_0", 0.26, 0.25, 0.28),
     "GrazingSliding": Case(jb.GrazingSliding(0), both, r"\nu_0", -0.45, -0.40, -0.50),
     "CrossingSliding": Case(jb.CrossingSliding(1), weakly_held, "u_{01}", 0.3, 0.2, 0.4),
-    "SlidingExchange": Case(jb.SlidingExchange((0, 1)), both, r"\nu_0", 0.36, 0.42, 0.28),
+    "SlidingExchange": Case(jb.SlidingExchange((0, 1)), both, r"\nu_0", 0.36, 0.4, 0.28),
     "SuddenSliding": Case(jb.SuddenSliding(0), both, r"\nu_0", 0.02, 0.1, -0.05),
     "BeltAtRest": Case(
         jb.BeltAtRest(1),
@@ -240,7 +240,7 @@ CASES = {
     "EdgeExchange": Case(
         jb.EdgeExchange((0, 1)),
         lambda sigma1: beside(sigma1, 0.3, 0.1, 0.4, -0.3),
-        "s",
+        r"\sigma_1",
         0.31,
         0.26,
         0.34,
@@ -248,7 +248,7 @@ CASES = {
     "MeetingEdges": Case(
         jb.MeetingEdges((0, 1)),
         lambda sigma1: beside(sigma1, 0.75, 0.5, 0.35, 0.6),
-        "s",
+        r"\sigma_1",
         0.76,
         0.72,
         0.79,

@@ -7,7 +7,8 @@ docstring of a module.
 
 Docstrings are Markdown. What they say of arguments and fields in running text, as "osc: the
 oscillator; where: selects the parameter", becomes a list, and sentences on what comes back and on
-errors become paragraphs of their own; no word is changed. A name of the package in backticks, on
+errors become paragraphs of their own, with "Returns" as a heading; no other word is changed. A name
+of the package in backticks, on
 any page, becomes a link.
 """
 
@@ -187,7 +188,8 @@ def listed(paragraph: str, names: list[str]) -> Iterator[str]:
         term = rf"{begin}({several}(?:, \[[^]:]*\])*): "
     for piece in pieces:
         if heading := re.match(r"(Returns) (?=\S)|(?=`\w+Error`)", piece):
-            yield from ("**Returns**" if heading[1] else "**Errors**", f": {piece}", "")
+            what = piece[heading.end() :]
+            yield from ("**Returns**" if heading[1] else "**Errors**", f": {what}", "")
             continue
         parts = re.split(term, piece) if names else [piece]
         if parts[0]:

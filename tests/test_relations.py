@@ -479,6 +479,77 @@ def test_an_image_has_the_same_cycle(image_of, seed):
         np.testing.assert_allclose(found, expected, rtol=SHOT, atol=SHOT)
 
 
+# --- portraits and paths --------------------------------------------------------------------------
+
+
+class Row(NamedTuple):
+    """Something there is at an oscillator: what, and the numbers that an image has, too."""
+
+    what: tuple[str, ...]
+    numbers: tuple[float, ...]
+
+
+def rows_of(portrait: jb.Portrait, sign: float = 1.0) -> list[Row]:
+    """What a portrait tells, or that of an image in terms of what it is an image of."""
+    rows, segments = [], []
+    for rest in portrait.equilibria:
+        ends = sorted(sign * float(x) for x in (rest.x1_lower, rest.x1_upper))
+        kind = jb.EquilibriumKind(int(rest.kind)).name
+        if kind == "SEGMENT":
+            segments.append((*ends, bool(rest.stable)))
+        else:
+            stability = "stable" if rest.stable else "neutral" if rest.neutral else "unstable"
+            rows.append(Row((kind, stability), tuple(ends)))
+    # A segment is given in pieces, one between each two edges of any belt.
+    segments.sort()
+    whole: list[tuple[float, float, bool]] = []
+    for low, high, stable in segments:
+        if whole and abs(whole[-1][1] - low) < CLOSE:
+            whole[-1] = (whole[-1][0], high, whole[-1][2] or stable)
+        else:
+            whole.append((low, high, stable))
+    rows += [Row(("segment", str(stable)), (low, high)) for low, high, stable in whole]
+    for name in ("cycles", "unstable"):
+        for cycle in getattr(portrait, name):
+            x1, x2 = (cycle.x1_min, cycle.x1_max), (cycle.x2_min, cycle.x2_max)
+            extrema = [sign * float(v) for pair in (x1, x2) for v in pair[:: int(sign)]]
+            rows.append(Row((name,), (*extrema, float(cycle.period))))
+    for one in portrait.separatrices:
+        left = (one.side == "left") == (sign > 0)
+        x1, x2 = (sign * float(part) for part in one.point)
+        rows.append(Row(("separatrix", str(one.stable), str(left), one.end), (x1, x2)))
+    return sorted(rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("image_of", [*IMAGES.values()], ids=[*IMAGES])
+def test_an_image_has_the_same_portrait(image_of, seed):
+    for osc, _ in cases(seed, 12):
+        image = image_of(osc)
+        told, other = jb.portrait(osc), jb.portrait(image.osc)
+        assert int(told.status) == int(other.status)
+        expected, found = rows_of(told), rows_of(other, image.sign)
+        assert [row.what for row in found] == [row.what for row in expected]
+        for a, b in zip(expected, found, strict=True):
+            np.testing.assert_allclose(b.numbers, a.numbers, rtol=SHOT, atol=SHOT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("name", ["reflected", "exchanged", "scaled"])
+def test_an_image_changes_where_it_does(name, seed):
+    """Along a load; a point may have the names of all that happens there at once."""
+    for osc, _ in cases(seed, 4):
+
+        def make(load, osc=osc):
+            return changed(osc, (changed_belt(osc.belts[0], load=load), osc.belts[1]))
+
+        expected = [float(point.value) for point in jb.scan(make, span=(0.25, 1.5))]
+        found = jb.scan(lambda load: IMAGES[name](make(load)).osc, span=(0.25, 1.5))
+        np.testing.assert_allclose([float(point.value) for point in found], expected, atol=1e-8)
+
+
 # --- sweeps ---------------------------------------------------------------------------------------
 
 #: Starts of the sweeps, the same seen in a mirror.

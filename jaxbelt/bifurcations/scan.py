@@ -77,6 +77,8 @@ def scan(
     differentiate, such as `lambda s: jb.presets.class_c(-0.3, 0.3, sigma=s)`. span: its first and
     last value, dimensionless like itself; resolution: how many intervals are looked at first.
     Points of which one undoes what the other did are seen if one of these values lies between them.
+    Of points closer together than 2e-6 of the span and of the size of the parameter, or than 3e-5
+    beside a fold of cycles, one may be told only.
     conditions: of your own, which are looked for, too.
 
     Each point has `kind`, `value`, and the rest of a `BifurcationPoint`. What happens at contact

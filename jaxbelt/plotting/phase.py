@@ -336,18 +336,18 @@ def _sliding_set(osc, x1, x2, belt):
 
 
 def _draw_edges(ax: Axes, osc: Oscillator) -> None:
-    """Finite contact edges in the window: sigma for a single one, else sigma0, sigma1 in order.
+    """Finite contact edges in the window: sigma for a single one, else sigma0, sigma1, ...
 
     A name that would touch the one on its left stands a line of text higher.
     """
-    edges = sorted(
-        {float(e) for b in osc.belts for e in (b.lower, b.upper) if np.isfinite(float(e))}
-    )
+    # Lower edges first: so those of class (d) have the paper's numbers in whatever order they lie.
+    known = [float(e) for side in ("lower", "upper") for e in (getattr(b, side) for b in osc.belts)]
+    numbers = {edge: n for n, edge in enumerate(dict.fromkeys(filter(np.isfinite, known)))}
     left, right = ax.get_xlim()
     size = matplotlib.rcParams["font.size"]
     width = ax.get_window_extent().width * 72 / figure_of(ax).dpi
     end, line = -np.inf, 0
-    for number, edge in enumerate(edges):
+    for edge, number in sorted(numbers.items()):
         if not left < edge < right:
             continue
         at = (edge - left) / (right - left) * width
@@ -355,7 +355,7 @@ def _draw_edges(ax: Axes, osc: Oscillator) -> None:
         end = at + 1.6 * size
         ax.axvline(edge, color="0.25", linewidth=0.8, linestyle=":", zorder=1.4)
         ax.annotate(
-            r"$\sigma$" if len(edges) == 1 else rf"$\sigma_{{{number}}}$",
+            r"$\sigma$" if len(numbers) == 1 else rf"$\sigma_{{{number}}}$",
             (edge, 0.0),
             xycoords=ax.get_xaxis_transform(),
             xytext=(3, 4 + 1.25 * size * line),
