@@ -225,6 +225,13 @@ def function_signature(function: Any, bound: bool = False) -> str:
         tree.args.args = tree.args.args[1:]
     for argument in [*tree.args.args, *tree.args.kwonlyargs]:
         argument.annotation = _unquoted(argument.annotation)
+    known = inspect.unwrap(function).__globals__
+    for defaults in (tree.args.defaults, tree.args.kw_defaults):
+        # A constant of the module by its value.
+        defaults[:] = [
+            ast.Constant(known[one.id]) if isinstance(one, ast.Name) and one.id.isupper() else one
+            for one in defaults
+        ]
     returns = f" -> {ast.unparse(_unquoted(tree.returns))}" if tree.returns else ""
     return f"({ast.unparse(tree.args)}){returns}"
 

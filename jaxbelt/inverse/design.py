@@ -48,8 +48,9 @@ class Design(eqx.Module):
 
     oscillator: the one designed; cycle: its cycle; names, values, [p]: of the parameters in the
     order of `where`; achieved, targets, [targets]: the functionals, and what they were to be (the
-    nearer end of an interval, or the value itself inside of it); iterations; status: OK,
-    UNREACHABLE, where the nearest that was found is given, or why there is no cycle to begin with.
+    nearer end of an interval, or the value itself inside of it); iterations: the steps taken;
+    status: OK, UNREACHABLE, where the nearest that was found is given, or why there is no cycle to
+    begin with.
     """
 
     oscillator: Oscillator

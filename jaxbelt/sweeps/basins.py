@@ -63,11 +63,11 @@ class BasinEntropy(NamedTuple):
 class Basins(eqx.Module):
     """What `basins` returns.
 
-    oscillator; dataset: `xarray.Dataset` over x1 and x2 with everything that
-    `sweep(..., observe="attractor")` tells of each start, and `label`, the number of its attractor,
-    from 0, the most frequent first (-1: undecided); attractors: a few words for each label; cycles:
-    those of the attractors that are cycles, in the same order; boundary: the unstable cycle, with
-    the status NO_UNSTABLE_CYCLE where there is none.
+    oscillator: whose basins these are; dataset: `xarray.Dataset` over x1 and x2 with everything
+    that `sweep(..., observe="attractor")` tells of each start, and `label`, the number of its
+    attractor, from 0, the most frequent first (-1: undecided); attractors: a few words for each
+    label; cycles: those of the attractors that are cycles, in the same order; boundary: the
+    unstable cycle, with the status NO_UNSTABLE_CYCLE where there is none.
     """
 
     oscillator: Oscillator
