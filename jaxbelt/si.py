@@ -198,7 +198,7 @@ def check_machine(result: Any, machine: Any) -> None:
     """Raise a `ValueError` where a result keeps its oscillator, and that of the machine is another.
 
     What was fitted, or varied along a path, may be; of a function the one at the first value is
-    compared. Of units alone nothing is.
+    compared; of a trajectory, which keeps none, the belts. Of units alone nothing is.
     """
     free: set[str] = set()
     match result:
@@ -215,6 +215,9 @@ def check_machine(result: Any, machine: Any) -> None:
             osc = result.oscillator
         case FatalShock():
             osc = result.portrait.oscillator
+        case Trajectory():
+            _check_belts(result, machine)
+            return
         case _:
             return
     if not isinstance(machine, Machine):
@@ -277,10 +280,7 @@ def _trajectory(run: Trajectory, machine: Machine | Units) -> "xarray.Dataset":
 
     units, belts = units_of(machine), run.modes.shape[-1]
     require(run.ts.ndim == 1, "result", "one trajectory, not a batch", repr(run))
-    if isinstance(machine, Machine):
-        own = len(machine.belts)
-        require(belts == own, "result", f"of a machine of {own} belts", repr(run))
-        _check_sticking(run, machine.oscillator)
+    check_machine(run, machine)
 
     def variable(dims, values, name, long_name):
         return _variable(dims, values, name, units, long_name)
@@ -308,9 +308,15 @@ def _trajectory(run: Trajectory, machine: Machine | Units) -> "xarray.Dataset":
     return xarray.Dataset(found, {"t": time, "belt": np.arange(belts)}, attrs)
 
 
-def _check_sticking(run: Trajectory, osc: Oscillator) -> None:
-    """Raise where a trajectory, which keeps no oscillator, sticks at another belt's velocity."""
-    if not run.arcs.t.size:
+def _check_belts(run: Trajectory, machine: Any) -> None:
+    """Raise where a trajectory, which keeps no oscillator, has another number of belts than a
+    machine, or sticks at another belt's velocity."""
+    if not isinstance(machine, Machine):
+        return
+    osc, own = machine.oscillator, len(machine.belts)
+    fits = np.asarray(run.modes).shape[-1] == own
+    require(fits, "result", f"of a machine of {own} belts", repr(run))
+    if run.ts.ndim != 1 or not run.arcs.t.size:
         return
     stuck = np.asarray(run.modes) == STUCK
     for belt, held in enumerate(stuck.T):

@@ -91,8 +91,9 @@ def test_the_force_at_an_event_is_that_after_it():
 
 
 def test_a_trajectory_of_another_machine(run):
-    with pytest.raises(ValueError, match=r"its belt 0 at velocity 0\.189.*sticks .* at 0\.126"):
-        jb.in_si(run, machine(0.03))
+    for bring in (jb.in_si, jb.plot_in_si):
+        with pytest.raises(ValueError, match=r"its belt 0 at velocity 0\.189.*sticks .* at 0\.126"):
+            bring(run, machine(0.03))
     alone, whole = jb.in_si(run, machine(0.03).units), jb.in_si(run, machine())
     assert alone.identical(whole.drop_vars("force"))
 

@@ -11,7 +11,7 @@ import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.cycles.shooting import ARC_STEPS
 from jaxbelt.model import friction
-from jaxbelt.model.friction import kink_of
+from jaxbelt.model.friction import jump_and_kink
 from jaxbelt.sweeps.question import Question
 
 SPEEDS = np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0])
@@ -96,12 +96,29 @@ class Smooth(jb.AbstractFriction):
         return 0.4 + 0.2 * jnp.exp(-jnp.maximum(speed / 1e-3, -1.0)) + 0.1 * jnp.tanh(40 * speed)
 
 
+class Step(jb.AbstractFriction):
+    static: float
+
+    def mu(self, speed):
+        return jnp.where(speed < 0.3, self.static, 0.5 * self.static)
+
+
 def test_kinks_are_found_where_they_are_and_nowhere_else():
-    speed, before, after = kink_of(Corner(0.6))
-    assert (speed, before, after) == (pytest.approx(0.2, rel=1e-6), -0.5, 0.0)
-    assert kink_of(Lines(0.6))[0] == pytest.approx(0.1, rel=1e-6)
-    assert kink_of(Smooth(0.6)) is None
-    assert kink_of(jb.Tabulated(SPEEDS, MEASURED)) is None
+    jump, kink = jump_and_kink(Corner(0.6))
+    assert jump is None and kink == (pytest.approx(0.2, rel=1e-6), -0.5, 0.0)
+    jump, kink = jump_and_kink(Lines(0.6))
+    assert jump is None and kink[0] == pytest.approx(0.1, rel=1e-6)
+    assert jump_and_kink(Smooth(0.6)) == (None, None)
+    assert jump_and_kink(jb.Tabulated(SPEEDS, MEASURED)) == (None, None)
+    assert jump_and_kink(Step(0.6))[0] == (pytest.approx(0.3, rel=1e-6), 0.6, 0.3)
+
+
+def test_a_law_that_jumps_is_told_of_once():
+    """Motions past that speed were off by 1e-3, with status OK and without a word."""
+    friction._asked_of_kinks.discard(Step)
+    with pytest.warns(UserWarning, match=r"mu of Step jumps at the speed 0\.3, from 0\.6 to 0\.3"):
+        jb.Belt(0.2, Step(0.6))
+    jb.Belt(0.2, Step(0.6))  # warnings are errors here
 
 
 def test_a_law_of_straight_lines_is_told_of_once():

@@ -30,7 +30,7 @@ from ..checks import (
 )
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, most_equilibria
 from ..model.events import Signature, signature_name
-from ..model.friction import kink_of
+from ..model.friction import jump_and_kink
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.rest import is_neutral
@@ -322,7 +322,7 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
             change = float(_mesh_error(osc, loop, coarser))
             # With the order two that is left across a kink.
             finest = change * (coarser / FINER_STEPS[-1]) ** 2
-            if change < EXACT or (finest > HOLDS and _slips_across_kink(osc, loop)):
+            if change < EXACT or (finest > HOLDS and _slips_across_change(osc, loop)):
                 break  # not for its steps, or more of them do not help
         coarser = steps
         finer, remaining = _polished(osc, loop, status, steps)
@@ -332,14 +332,15 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
     return cycle
 
 
-def _slips_across_kink(osc: Oscillator, loop: Loop) -> bool:
+def _slips_across_change(osc: Oscillator, loop: Loop) -> bool:
     """Whether the mass slips, on a known loop, at the speed at which a law of one's own has its
-    largest kink."""
+    largest jump or kink."""
     slips = _slip_speeds(osc, modes_of(loop), np.asarray(loop.entries)[:, 1])
     for belt, speeds in zip(osc.belts, slips, strict=True):
-        kink = kink_of(belt.friction) if speeds.size else None
-        if kink is not None:
-            inside = (np.min(speeds, axis=0) < kink[0]) & (kink[0] < np.max(speeds, axis=0))
+        for change in jump_and_kink(belt.friction) if speeds.size else ():
+            if change is None:
+                continue
+            inside = (np.min(speeds, axis=0) < change[0]) & (change[0] < np.max(speeds, axis=0))
             if np.any(inside):
                 return True
     return False

@@ -3,10 +3,8 @@
 A record of stick-slip motion is hard to fit from afar: a guess with a wrong period
 slips by whole loops against the record, and the sum of squares has a minimum for each of them. So
 
-1. *search*: the record is cut into windows shorter than half a loop, over which no phase is lost.
-   Each starts from the record itself, from a local polynomial. The misfit of the smooth formulation
-   (tanh for sgn, a fixed step) is minimised by Adam (optax) from several starts under `vmap`. Its
-   answer is biased, by the smoothing and by the starts, but near.
+1. *search*: where to begin, see `search`: the record is cut into windows shorter than half a loop,
+   over which no phase is lost.
 2. *windows*: the same windows in the exact, event-driven motion, and each with an unknown start
    (multiple shooting). A damped Gauss-Newton (Levenberg-Marquardt) iteration for
 
@@ -15,7 +13,8 @@ slips by whole loops against the record, and the sum of squares has a minimum fo
 
    whose matrix is an arrow: the starts are eliminated window by window.
 3. *joining*: three neighbouring windows become one, again and again, until one is left: the whole
-   record as one motion from one unknown start. Its Gauss-Newton matrix gives the standard errors.
+   record as one motion from one unknown start, followed down its valley until the sum of squares
+   has nothing left to gain. Its Gauss-Newton matrix gives the standard errors.
 
 All derivatives of 2 and 3 are those of `simulate`, through every stick, slip and crossing.
 """
@@ -29,18 +28,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, outside_of_traces, require, require_value
 from ..model.oscillator import Oscillator, check_oscillator
 from ..motion.simulate import simulate
-from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
 from ..results import Status, describe, draw
 from ..tables import table_of
 from .record import OVERESTIMATED, WINDOW, Record, Verdict, record_of, verdict_on
+from .search import first_guesses
 from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of, told_to
 
 if TYPE_CHECKING:
@@ -48,105 +46,19 @@ if TYPE_CHECKING:
 
 #: Each stage joins so many neighbouring windows.
 JOIN = 3
-#: Steps of the search, and its learning rate in units of a parameter's size.
-SEARCH_STEPS, LEARNING_RATE = 60, 0.1
 #: A start whose windows are further off than this (chi^2 per datum) is not followed further.
 HOPELESS = 6.0
 TOLERANCE = 1e-8
+#: The last stage takes so many times as many steps, until a Gauss-Newton step promises to lower
+#: chi^2 by less than the first number, which is the square of an error in standard errors. It has
+#: not converged where that promises more than the second.
+LONGER, GAIN_ENOUGH, GAIN_LEFT = 10, 1e-3, 1e-1
+#: Factors by which the damping shrinks and grows: along a bent valley a large one is refused at
+#: every other step.
+LESS_DAMPED, MORE_DAMPED = 3.0, 4.0
 #: Parameters nearer to zero than this may have errors of this size; and those whose error in a
 #: direction that is not told is this many of their sizes have a share in it.
 SMALLEST, LEAST_PART = 0.1, 0.3
-
-
-# --- 1: the search --------------------------------------------------------------------------------
-
-
-def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
-    """Misfit of the smooth formulation over all windows, of size one where it is off by `scale`."""
-    u, shift = unknown
-    osc = selection.put(osc, selection.values(u))
-    h = record.times[:, -1] / steps
-
-    def field(y):
-        return smooth_field(osc, y, eps)
-
-    def advance(y, _):
-        def ahead(slope, fraction):
-            return tuple(a + fraction * h * b for a, b in zip(y, slope, strict=True))
-
-        k1 = field(y)
-        k2 = field(ahead(k1, 0.5))
-        k3 = field(ahead(k2, 0.5))
-        k4 = field(ahead(k3, 1.0))
-        slope = tuple((a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4))
-        new = ahead(slope, 1.0)
-        return new, jnp.stack(new, axis=-1)
-
-    start = (record.starts[:, 0] + shift * record.lacks, record.starts[:, 1])
-    _, path = lax.scan(advance, start, None, length=steps)
-    path = jnp.concatenate([jnp.stack(start, axis=-1)[None], path])
-    # To the times of the data: linear between steps is good enough here.
-    at = jnp.clip(record.times[:, :-1] / h[:, None], 0.0, steps)
-    before = jnp.minimum(at.astype(int), steps - 1)
-    piece = jnp.arange(h.size)[:, None]
-    rest = (at - before.astype(float))[..., None]
-    predicted = (1 - rest) * path[before, piece] + rest * path[before + 1, piece]
-    scale = jnp.broadcast_to(0.02 * record.scale, predicted.shape)
-    off = jnp.where(record.weights > 0, (predicted - record.values) / scale, 0.0)
-    # Grows like |off|: windows that are hopeless from here do not outvote the others.
-    return jnp.mean(jnp.sqrt(1 + off**2) - 1)
-
-
-@jit
-def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
-    """Adam from many starts, (u [starts, p], shift [starts]): where each ends, and its misfit."""
-    import optax  # a quarter of a second that only this search needs
-
-    optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, SEARCH_STEPS))
-
-    def misfit(unknown):
-        return _smooth_misfit(unknown, selection, osc, record, eps, steps)
-
-    @jax.vmap
-    def slopes(unknown):
-        # Forwards: a handful of unknowns, and backwards every step would have to be kept.
-        numbers, unravel = ravel_pytree(unknown)
-        return unravel(jax.jacfwd(lambda numbers: misfit(unravel(numbers)))(numbers))
-
-    def improve(state, _):
-        unknown, memory = state
-        slope = slopes(unknown)
-        # Optax multiplies its integer counts with floats.
-        with jax.numpy_dtype_promotion("standard"):
-            change, memory = optimizer.update(slope, memory)
-        return (optax.apply_updates(unknown, change), memory), None
-
-    state = (starts, optimizer.init(starts))
-    (unknown, _), _ = lax.scan(improve, state, None, length=SEARCH_STEPS)
-    return unknown, jax.vmap(misfit)(unknown)
-
-
-def _first_guesses(selection, u, osc, record: Record, starts: int):
-    """The ends of the search, best first, each with its window starts; near ones count once."""
-    # The velocity over which tanh changes its sign. Steps of the scheme are stable up to 2.8 over
-    # the slope of the friction there; two belts of one velocity double it.
-    # A record of one velocity, of a mass that sticks throughout, gives none: its length has to do.
-    eps = 0.1 * max(float(record.scale[1]), 0.1 * float(record.scale[0]))
-    slope = max(float(b.load * b.friction.static * osc.omega) for b in osc.belts) / eps
-    steps = 16 * int(np.ceil(float(jnp.max(record.times)) * max(20.0, slope / 1.3) / 16))
-    rng = np.random.default_rng(0)
-    spread = rng.standard_normal((starts, u.size + 1))
-    spread[0] = 0.0
-    first = (jnp.asarray(u + 0.3 * spread[:, :-1]), jnp.asarray(spread[:, -1]))
-    found: Any = _adam(first, selection, osc, record, jnp.asarray(eps), steps)
-    ends, shifts, misfits = map(np.asarray, jax.tree.leaves(found))
-    chosen: list[int] = []
-    for i in np.argsort(misfits):
-        near = any(np.max(np.abs(ends[i] - ends[j])) < 0.1 for j in chosen)
-        if np.isfinite(misfits[i]) and not near:
-            chosen.append(int(i))
-    shift = np.array([float(record.lacks), 0.0])
-    return [(ends[i], np.asarray(record.starts) + shifts[i] * shift, misfits[i]) for i in chosen]
 
 
 # --- 2 and 3: windows of the exact motion ---------------------------------------------------------
@@ -220,7 +132,8 @@ class _Point(eqx.Module):
 
 
 def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float) -> _Point:
-    """Levenberg-Marquardt for one division into windows, until chi^2 falls by less than that."""
+    """Levenberg-Marquardt for one division into windows, until chi^2 falls by less than that part;
+    for the whole record, until nothing is left to gain."""
     window = np.cumsum(fresh) - 1
 
     def at(u, starts, evaluations):
@@ -231,9 +144,11 @@ def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float) -> _
         return _Point(u, starts, np.asarray(ys), blocks, chi2, evaluations)
 
     point = at(u, starts, 1)
-    damping = 1e-2
-    for _ in range(ITERATIONS):
+    damping, is_last = 1e-2, np.sum(fresh) == 1
+    for _ in range(LONGER * ITERATIONS if is_last else ITERATIONS):
         if not np.isfinite(point.chi2) or damping > 1e5:
+            break
+        if is_last and _gain_left(point.blocks[0]) < GAIN_ENOUGH:
             break
         du, dstarts = _damped_step(point.blocks, damping)
         shorter = min(1.0, LONGEST_CHANGE / max(np.max(np.abs(du)), 1e-300))
@@ -242,13 +157,21 @@ def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float) -> _
         trial = at(point.u + shorter * du, moved, point.evaluations + 1)
         if trial.chi2 < point.chi2:
             gain = point.chi2 - trial.chi2
-            point, damping = trial, max(damping / 10, 1e-9)
-            if gain < max(1e-2, relative * point.chi2):
+            point, damping = trial, max(damping / LESS_DAMPED, 1e-9)
+            if not is_last and gain < max(1e-2, relative * point.chi2):
                 break
         else:
             point = eqx.tree_at(lambda q: q.evaluations, point, trial.evaluations)
-            damping *= 10
+            damping *= MORE_DAMPED
     return point
+
+
+def _gain_left(block: np.ndarray) -> float:
+    """By how much a Gauss-Newton step would lower chi^2, of a whole record, as far as that is
+    linear."""
+    scale, values, vectors = _told_directions(block[:-1, :-1])
+    slopes = vectors.T @ (block[:-1, -1] / scale)
+    return float(np.sum(slopes**2 / values))
 
 
 # --- fit ------------------------------------------------------------------------------------------
@@ -270,7 +193,8 @@ class Fit(eqx.Module):
     candidates: how many starts were followed; evaluations: of the motion and its Jacobian; status:
     OK, NOT_IDENTIFIED (a standard error that is infinite, or larger than its parameter and than
     0.1), MISFIT (plausibility below 1e-6, or, where the noise was estimated, residuals of its size
-    with an autocorrelation that noise has not), NO_CONVERGENCE or NOT_FINITE. Standard errors are
+    with an autocorrelation that noise has not), NO_CONVERGENCE (a step would still move it by a
+    third of a standard error) or NOT_FINITE. Standard errors are
     those of the linearised problem: right where the model is and the errors are small. With a
     MISFIT they mean nothing, and `table` and the text leave them out. noise_was_estimated: whether
     it was, of a column at least.
@@ -451,9 +375,10 @@ def fit(
         return verdict_on(off, point.chi2, freedom, estimated)
 
     best, count, evaluations = None, 0, 0
-    for guess, states, misfit in _first_guesses(selection, u, oscillator, record, starts):
+    for guess, states, misfit in first_guesses(selection, u, oscillator, record, starts):
         count += 1
-        tell(f"candidate {count}: misfit {misfit:.3g} of the smooth formulation")
+        came = "the guess" if np.isnan(misfit) else f"misfit {misfit:.3g} of the smooth formulation"
+        tell(f"candidate {count}: {came}")
         point, joined = _follow_up(linearized, guess, states, data, tell)
         evaluations += point.evaluations
         if joined and (best is None or point.chi2 < best.chi2):
@@ -557,6 +482,8 @@ def _result(
     # Of a misfit finite errors mean nothing.
     most = _sizes(estimates) if status == Status.OK else np.finfo(float).max
     status = status if np.all(errors[:p] <= most) else Status.NOT_IDENTIFIED
+    if status == Status.OK and not _gain_left(point.blocks[0]) < GAIN_LEFT:
+        status = Status.NO_CONVERGENCE
     status = status if np.isfinite(point.chi2) else Status.NOT_FINITE
     with np.errstate(divide="ignore"):
         noise = 1 / np.max(weights, axis=0)
@@ -584,13 +511,19 @@ def _result(
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
     """The inverse of a Gauss-Newton matrix; infinite for what the record does not tell."""
-    size = np.sqrt(np.diag(matrix))
-    seen = size > 0
-    scale = np.where(seen, size, 1.0)
-    values, vectors = np.linalg.eigh(np.nan_to_num(matrix / scale[:, None] / scale))
-    blind = values < 1e-12 * np.max(values, initial=0.0)
-    inverse = (vectors[:, ~blind] / values[~blind]) @ vectors[:, ~blind].T
-    inverse = inverse / scale[:, None] / scale
-    lost = np.any(np.abs(vectors[:, blind]) > 1e-4, axis=1) | ~seen
+    scale, values, vectors = _told_directions(matrix)
+    inverse = (vectors / values) @ vectors.T / scale[:, None] / scale
+    told = np.sum(vectors**2, axis=1)
+    lost = (1 - told > 1e-8) | (np.diag(matrix) == 0)
     inverse[lost, lost] = np.inf
     return inverse
+
+
+def _told_directions(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The sizes of the unknowns of a Gauss-Newton matrix, [n], and of the matrix in these units the
+    eigenvalues, and eigenvectors as columns, along which the record tells something."""
+    size = np.sqrt(np.diag(matrix))
+    scale = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(np.nan_to_num(matrix / scale[:, None] / scale))
+    told = values > 1e-12 * np.max(values, initial=0.0)
+    return scale, values[told], vectors[:, told]

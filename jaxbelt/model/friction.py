@@ -127,39 +127,45 @@ def check_law(law: AbstractFriction) -> None:
 
 
 def _warn_of_kink(law: AbstractFriction) -> None:
-    """Warn where a known law of one's own has a kink, once for each class."""
+    """Warn where a known law of one's own has a jump or a kink, once for each class."""
     kind = type(law)
     if kind in _asked_of_kinks or kind.__module__ == __name__ or not is_concrete(law):
         return
     _asked_of_kinks.add(kind)
-    if kink := kink_of(law):
-        warnings.warn(
+    jump, kink = jump_and_kink(law)
+    if jump is not None:
+        told = (
+            "mu of {} jumps at the speed {:.6g}, from {:.3g} to {:.3g}: motions that pass that "
+            "speed are off by far more than the tolerance, and most of their cycles are not found "
+            "(NO_CONVERGENCE). Let it change over a small range of speeds instead."
+        )
+        warnings.warn(told.format(kind.__name__, *jump), stacklevel=2)
+    elif kink is not None:
+        told = (
             "mu of {} has a kink at the speed {:.6g}, its slope goes from {:.3g} to {:.3g}: "
             "motions that slip at that speed are followed, but most of their cycles are not "
             "found (NO_CONVERGENCE). Of a table jb.Tabulated(speeds, coefficients) makes a "
-            "smooth law.".format(kind.__name__, *kink),
-            stacklevel=2,
+            "smooth law."
         )
+        warnings.warn(told.format(kind.__name__, *kink), stacklevel=2)
 
 
-#: Speeds between which kinks are looked for, and how often their intervals are halved.
+#: Speeds between which jumps and kinks are looked for, and how often their intervals are halved.
 SEARCHED, HALVINGS = np.logspace(-5, 3, 2049), 30
 #: A slope that jumps by less than this fraction, or by less than this fraction of mu / speed, has
-#: no kink that numbers tell from rounding.
-LEAST_KINK, LEAST_BEND = 1e-3, 1e-6
+#: no kink that numbers tell from rounding; mu itself no jump by less than the last fraction.
+LEAST_KINK, LEAST_BEND, LEAST_JUMP = 1e-3, 1e-6, 1e-6
 
 
-def kink_of(law: AbstractFriction) -> tuple[float, float, float] | None:
-    """Where the slope of mu of a known law jumps most, and the slopes before and after; None where
-    it does not.
+#: A speed, and what is before and behind it.
+Change = tuple[float, float, float]
 
-    Every interval between two of many speeds is halved again and again, and the half kept over
-    which the slope changes more: without a kink it changes less and less.
-    """
 
+def jump_and_kink(law: AbstractFriction) -> tuple[Change | None, Change | None]:
+    """Where mu of a known law jumps most, and where its slope does; None where it does not."""
     own = law.law if isinstance(law, LawInUnits) else law
     if type(own).__module__ == __name__:
-        return None  # these are smooth
+        return None, None  # these are smooth
 
     @jax.jit
     def asked(speeds: Array) -> tuple[Array, Array]:
@@ -167,24 +173,47 @@ def kink_of(law: AbstractFriction) -> tuple[float, float, float] | None:
         return jax.vmap(lambda speed: jax.jvp(law.mu, (speed,), (one,)))(speeds)
 
     with jax.ensure_compile_time_eval():
-        values, slopes = map(np.asarray, asked(jnp.asarray(SEARCHED)))
-        low, high = SEARCHED[:-1], SEARCHED[1:]
-        before, after = slopes[:-1], slopes[1:]
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            # As many as before, so that nothing is compiled anew.
-            slope = np.asarray(asked(jnp.asarray(np.append(middle, 1.0)))[1])[:-1]
-            left = np.abs(slope - before) > np.abs(after - slope)
-            low, high = np.where(left, low, middle), np.where(left, middle, high)
-            before, after = np.where(left, before, slope), np.where(left, slope, after)
-    least = LEAST_KINK * np.maximum(np.abs(before), np.abs(after))
-    least = np.maximum(least, LEAST_BEND * np.abs(values[1:]) / high)
-    jumps = np.abs(after - before)
-    found = np.flatnonzero(jumps > least)
+        values = np.asarray(asked(jnp.asarray(SEARCHED))[0])
+        of_values, of_slopes = (_narrowed(lambda v, i=i: np.asarray(asked(v)[i])) for i in (0, 1))
+    sizes = [
+        np.maximum(np.abs(before), np.abs(after)) for _, before, after in (of_values, of_slopes)
+    ]
+    bend = LEAST_BEND * np.abs(values[1:]) / of_slopes[0]
+    jump = _largest(*of_values, LEAST_JUMP * sizes[0])
+    return jump, _largest(*of_slopes, np.maximum(LEAST_KINK * sizes[1], bend))
+
+
+def _narrowed(
+    function: Callable[[Array], np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where a function of the speed changes most between each two of many, and what it is before
+    and behind there.
+
+    Every interval is halved again and again, and the half kept over which the change is the larger
+    one: without a jump it becomes less and less.
+    """
+    found = function(jnp.asarray(SEARCHED))
+    (low, high), (before, after) = (SEARCHED[:-1], SEARCHED[1:]), (found[:-1], found[1:])
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        # As many as before, so that nothing is compiled anew.
+        between = function(jnp.asarray(np.append(middle, 1.0)))[:-1]
+        left = np.abs(between - before) > np.abs(after - between)
+        low, high = np.where(left, low, middle), np.where(left, middle, high)
+        before, after = np.where(left, before, between), np.where(left, between, after)
+    return high, before, after
+
+
+def _largest(
+    at: np.ndarray, before: np.ndarray, after: np.ndarray, least: np.ndarray
+) -> Change | None:
+    """The largest change that is no less than the least, where it is, and from what to what."""
+    changes = np.abs(after - before)
+    found = np.flatnonzero(changes > least)
     if not len(found):
         return None
-    most = found[np.argmax(jumps[found])]
-    return float(high[most]), float(before[most]), float(after[most])
+    most = found[np.argmax(changes[found])]
+    return float(at[most]), float(before[most]), float(after[most])
 
 
 def as_friction(law: Any) -> AbstractFriction:

@@ -1,0 +1,119 @@
+"""Where `fit` begins: guesses from which the exact motion is followed.
+
+The record is cut into windows shorter than half a loop, over which no phase is lost. Each starts
+from the record itself, from a local polynomial. The guess itself is tried first. Where that does
+not lead to the record, the misfit of the smooth formulation (tanh for sgn, a fixed step) is
+minimised by Adam (optax) from several starts under `vmap`. Its answer is biased, by the smoothing
+and by the starts, but near; less so where a friction law changes faster than the smoothing.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+
+from ..model.oscillator import Oscillator
+from ..motion.smoothing import smooth_field
+from ..numerics.compiling import jit
+from .record import Record
+from .selection import Selection
+
+#: Steps of the search, and its learning rate in units of a parameter's size.
+SEARCH_STEPS, LEARNING_RATE = 60, 0.1
+
+
+def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
+    """Misfit of the smooth formulation over all windows, of size one where it is off by `scale`."""
+    u, shift = unknown
+    osc = selection.put(osc, selection.values(u))
+    h = record.times[:, -1] / steps
+
+    def field(y):
+        return smooth_field(osc, y, eps)
+
+    def advance(y, _):
+        def ahead(slope, fraction):
+            return tuple(a + fraction * h * b for a, b in zip(y, slope, strict=True))
+
+        k1 = field(y)
+        k2 = field(ahead(k1, 0.5))
+        k3 = field(ahead(k2, 0.5))
+        k4 = field(ahead(k3, 1.0))
+        slope = tuple((a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4))
+        new = ahead(slope, 1.0)
+        return new, jnp.stack(new, axis=-1)
+
+    start = (record.starts[:, 0] + shift * record.lacks, record.starts[:, 1])
+    _, path = lax.scan(advance, start, None, length=steps)
+    path = jnp.concatenate([jnp.stack(start, axis=-1)[None], path])
+    # To the times of the data: linear between steps is good enough here.
+    at = jnp.clip(record.times[:, :-1] / h[:, None], 0.0, steps)
+    before = jnp.minimum(at.astype(int), steps - 1)
+    piece = jnp.arange(h.size)[:, None]
+    rest = (at - before.astype(float))[..., None]
+    predicted = (1 - rest) * path[before, piece] + rest * path[before + 1, piece]
+    scale = jnp.broadcast_to(0.02 * record.scale, predicted.shape)
+    off = jnp.where(record.weights > 0, (predicted - record.values) / scale, 0.0)
+    # Grows like |off|: windows that are hopeless from here do not outvote the others.
+    return jnp.mean(jnp.sqrt(1 + off**2) - 1)
+
+
+@jit
+def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
+    """Adam from many starts, (u [starts, p], shift [starts]): where each ends, and its misfit."""
+    import optax  # a quarter of a second that only this search needs
+
+    optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, SEARCH_STEPS))
+
+    def misfit(unknown):
+        return _smooth_misfit(unknown, selection, osc, record, eps, steps)
+
+    @jax.vmap
+    def slopes(unknown):
+        # Forwards: a handful of unknowns, and backwards every step would have to be kept.
+        numbers, unravel = ravel_pytree(unknown)
+        return unravel(jax.jacfwd(lambda numbers: misfit(unravel(numbers)))(numbers))
+
+    def improve(state, _):
+        unknown, memory = state
+        slope = slopes(unknown)
+        # Optax multiplies its integer counts with floats.
+        with jax.numpy_dtype_promotion("standard"):
+            change, memory = optimizer.update(slope, memory)
+        return (optax.apply_updates(unknown, change), memory), None
+
+    state = (starts, optimizer.init(starts))
+    (unknown, _), _ = lax.scan(improve, state, None, length=SEARCH_STEPS)
+    return unknown, jax.vmap(misfit)(unknown)
+
+
+def first_guesses(
+    selection: Selection, u, osc: Oscillator, record: Record, starts: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
+    """The guess, and then the ends of the search, best first, each with its window starts and its
+    misfit, NaN of the guess; near ones count once."""
+    yield np.asarray(u), np.asarray(record.starts), np.nan
+    # The velocity over which tanh changes its sign. Steps of the scheme are stable up to 2.8 over
+    # the slope of the friction there; two belts of one velocity double it.
+    # A record of one velocity, of a mass that sticks throughout, gives none: its length has to do.
+    eps = 0.1 * max(float(record.scale[1]), 0.1 * float(record.scale[0]))
+    slope = max(float(b.load * b.friction.static * osc.omega) for b in osc.belts) / eps
+    steps = 16 * int(np.ceil(float(jnp.max(record.times)) * max(20.0, slope / 1.3) / 16))
+    rng = np.random.default_rng(0)
+    spread = rng.standard_normal((starts, u.size + 1))
+    spread[0] = 0.0
+    first = (jnp.asarray(u + 0.3 * spread[:, :-1]), jnp.asarray(spread[:, -1]))
+    found: Any = _adam(first, selection, osc, record, jnp.asarray(eps), steps)
+    ends, shifts, misfits = map(np.asarray, jax.tree.leaves(found))
+    chosen: list[int] = []
+    for i in np.argsort(misfits):
+        near = any(np.max(np.abs(ends[i] - ends[j])) < 0.1 for j in chosen)
+        if np.isfinite(misfits[i]) and not near:
+            chosen.append(int(i))
+    shift = np.array([float(record.lacks), 0.0])
+    for i in chosen:
+        yield ends[i], np.asarray(record.starts) + shifts[i] * shift, misfits[i]
