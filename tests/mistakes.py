@@ -67,7 +67,7 @@ MISTAKES = [
     ("jb.Belt(None, law)", "velocity must be a number, got None"),
     ("jb.Belt(math.inf, law)", "velocity of belt must be finite, got inf"),
     ("jb.Belt(0.3, law, load=-1)", r"load of belt must be >= 0, got -1\.0"),
-    ("jb.Belt(0.3, law, lower=1.0, upper=0.0)", r"lower of belt must be < 0\.0, got 1\.0"),
+    ("jb.Belt(0.3, law, lower=1.0, upper=0.0)", r"lower of belt must be < upper = 0\.0, got 1\.0"),
     ("jb.Oscillator(0.5, jb.Belt(0.3, law))", r"belts must be a tuple of belts.*, got Belt\("),
     ("jb.Oscillator(0.5, [0.3, 0.4])", r"belts\[0\] must be a Belt, got 0\.3"),
     ("jb.Oscillator(0.5, ())", "belts must be at least one Belt, got none"),
@@ -93,7 +93,7 @@ MISTAKES = [
     ),
     ("jb.Conti(1.0, math.nan, 10.0)", "residual of Conti must be finite, got nan"),
     ("jb.Belt(0.3, law, load='1')", "load must be a number, got '1'"),
-    ("jb.Belt(0.3, law, lower=1.0, upper=1.0)", r"lower of belt must be < 1\.0, got 1\.0"),
+    ("jb.Belt(0.3, law, lower=1.0, upper=1.0)", r"lower of belt must be < upper = 1\.0, got 1\.0"),
     ("jb.Oscillator(0.5, (belt, None))", r"belts\[1\] must be a Belt, got None"),
     ("jb.Oscillator(0.5, (physical,))", r"belts\[0\] must be a Belt, got PhysicalBelt\("),
     # --- machines
@@ -589,7 +589,10 @@ MISTAKES = [
     ("jaxbelt simulate --belt 1,law=conty", "law of belt .* got conty .did you mean 'conti'"),
     ("jaxbelt simulate --belt 0.3,load=-1", r"load of belt '0\.3,load=-1' must be >= 0, got -1\.0"),
     ("jaxbelt simulate --belt nan", "velocity of belt 'nan' must be finite, got nan"),
-    ("jaxbelt simulate --belt 1,lower=2,upper=1", r"lower of belt .* must be < 1\.0, got 2\.0"),
+    (
+        "jaxbelt simulate --belt 1,lower=2,upper=1",
+        r"lower of belt .* must be < upper = 1\.0, got 2\.0",
+    ),
     ("jaxbelt simulate --belt 1,quadratic=inf", "quadratic of belt .* must be finite, got inf"),
     (
         "jaxbelt simulate --belt 1,law=coulomb,static=0.5,kinetic=0.8",

@@ -669,7 +669,10 @@ OSC = ("class_b", (0.3, 0.35))
         (lambda: jb.Coulomb(0.5, 0.6), "kinetic of Coulomb must be <= static"),
         (lambda: jb.Stribeck(1.0, 0.6, 0.0), "velocity of Stribeck must be > 0, got 0"),
         (lambda: jb.Belt(0.1, jb.Coulomb(1, 1), load=-1), "load of .*belt.* must be >= 0, got -1"),
-        (lambda: jb.Belt(0.1, jb.Coulomb(1, 1), lower=2, upper=1), "lower of .* must be < 1"),
+        (
+            lambda: jb.Belt(0.1, jb.Coulomb(1, 1), lower=2, upper=1),
+            "lower of .* must be < upper = 1",
+        ),
         (lambda: jb.Belt(0.1, 0.5), "friction must be a law such as"),
         (lambda: jb.presets.class_d(0.1, 0.2, 1.0, 0.0), "sigma0 must be <= sigma1 = 0"),
         (lambda: jb.Oscillator(0.5, ()), "belts must be at least one Belt, got none"),

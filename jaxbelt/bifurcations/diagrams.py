@@ -22,6 +22,7 @@ import numpy as np
 
 from ..activity import announced, tell
 from ..checks import as_whole, outside_of_traces, require
+from ..cycles.attractors import MOMENT
 from ..cycles.chains import Loop, cut
 from ..cycles.cycle import Cycle, exactly, polish, warn_of_fast_loops
 from ..model.equilibria import candidates
@@ -238,6 +239,7 @@ def bifurcation_diagram(
 def _row_of_point(point: BifurcationPoint) -> dict[str, Any]:
     row, none = point.row(), [np.nan] * len(point.oscillator.belts)
     known = int(point.cycle.status) == Status.OK
+    sticks = np.asarray(point.cycle.stick_durations)
     names = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
     return {
         "branch": None,
@@ -246,7 +248,7 @@ def _row_of_point(point: BifurcationPoint) -> dict[str, Any]:
         "neutral": None,
         **{name: row[name] for name in names},
         "amplitude": 0.5 * (row["x1_max"] - row["x1_min"]),
-        **per_belt("stick_duration", point.cycle.stick_durations if known else none),
+        **per_belt("stick_duration", np.where(sticks > MOMENT, sticks, np.nan) if known else none),
         "signature": signature_name(point.cycle.signature) if known else "",
     }
 

@@ -117,7 +117,7 @@ class Belt(eqx.Module):
         interval = [
             Rule("lower", (self.lower, self.lower), operator.eq, "a number"),
             Rule("upper", (self.upper, self.upper), operator.eq, "a number"),
-            Rule("lower", (self.lower, self.upper), operator.lt, "< {1}"),
+            Rule("lower", (self.lower, self.upper), operator.lt, "< upper = {1}"),
         ]
         return [
             *be_finite("velocity", self.velocity),
