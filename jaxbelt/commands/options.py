@@ -330,7 +330,7 @@ def _check_numbers(text: str, friction: dict[str, float], numbers: dict[str, flo
         fits(name, math.isfinite(value), "finite", value)
     for name, value in (("load", own["load"]), *friction.items()):
         fits(name, value >= 0 or name == "quadratic", ">= 0", value)
-    fits("lower", ends["lower"] < ends["upper"], f"< {ends['upper']}", ends["lower"])
+    fits("lower", ends["lower"] < ends["upper"], f"< upper = {ends['upper']}", ends["lower"])
     if "kinetic" in friction:
         kinetic, static = friction["kinetic"], friction["static"]
         fits("kinetic", kinetic <= static, f"<= static = {static}", kinetic)

@@ -232,8 +232,8 @@ class Memory:
         """What becomes of the results of an interrupted sweep."""
         return (
             f"interrupted after {self.done():,} of {self.runs:,} runs, which are not kept; a sweep "
-            'with a store (store="results.zarr", `jaxbelt sweep ... --out results.zarr`) keeps them, '
-            "and the same call goes on from there"
+            'with a store (store="results.zarr", `jaxbelt sweep ... --out results.zarr`) keeps '
+            "them, and the same call goes on from there"
         )
 
     def dataset(self, attributes: dict[str, Any]) -> "xarray.Dataset":
