@@ -56,7 +56,8 @@ def _try(name: str, trial: Callable[[], bool]) -> None:
     except Exception as error:
         _works[name] = False
         reason = f"{type(error).__name__}: {error}"
-    if not _works[name]:
+    # As the process ends nothing can be tried any more, and nobody waits for it.
+    if not _works[name] and threading.main_thread().is_alive():
         warnings.warn(
             f"jaxbelt goes on without {name}, which does not work with JAX {jax.__version__} here "
             f"({reason}): results are the same, some take longer. JAXBELT_PLAIN=1 in the "
