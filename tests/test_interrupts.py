@@ -117,7 +117,7 @@ def test_an_interrupt_ends_the_command(tmp_path):
     [
         (Question, "of", False, "before the first run"),
         (Question, "identity", True, "before the first run"),
-        (Memory, "dataset", False, "after 3 of 3 runs, which are not kept; with a store"),
+        (Memory, "dataset", False, "after 3 of 3 runs, which are not kept; a sweep with a store"),
         (store.Store, "finish", True, "3 of 3 runs are in .*; the same call goes on from there"),
     ],
 )
