@@ -43,8 +43,8 @@ BESIDE_SADDLE = 1e-9
 def starts(osc: Oscillator, rests: Equilibria) -> Array:
     """Where the orbits start that find the cycles, [starts, 2].
 
-    Where stick phases end, at several distances from an equilibrium, and just beside the saddles.
-    NaN: no such start.
+    Where stick phases end, just beside the saddles, and at several distances from an equilibrium,
+    the farthest one last. NaN: no such start.
     """
     exists = rests.kind > 0
     repels = exists & ~rests.stable
@@ -58,7 +58,7 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
     places = jnp.where(saddles(osc), places, jnp.nan)
     away = BESIDE_SADDLE * (1 + jnp.abs(places))
     beside = jnp.concatenate([places - away, places + away])
-    return jnp.concatenate([*ends, *others, jnp.stack([beside, jnp.zeros_like(beside)], axis=-1)])
+    return jnp.concatenate([*ends, jnp.stack([beside, jnp.zeros_like(beside)], axis=-1), *others])
 
 
 def _innermost(osc: Oscillator, rests: Equilibria, row: Array) -> Array:
