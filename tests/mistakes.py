@@ -591,7 +591,7 @@ MISTAKES = [
     ("jaxbelt simulate --belt nan", "velocity of belt 'nan' must be finite, got nan"),
     (
         "jaxbelt simulate --belt 1,lower=2,upper=1",
-        r"lower of belt .* < upper = 1\.0, got 2\.0",
+        r"lower of belt .* must be < upper = 1\.0, got 2\.0",
     ),
     ("jaxbelt simulate --belt 1,quadratic=inf", "quadratic of belt .* must be finite, got inf"),
     (

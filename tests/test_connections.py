@@ -326,6 +326,10 @@ def test_a_cycle_between_a_connection_and_a_fold_is_seen_by_mirror_images_alike(
     assert [float(a.value) for a in told[0]] == pytest.approx(
         [float(b.value) for b in told[1]], abs=1e-11
     )
+    # The fold lies so near to an interval with a connection in it that it was told for that, too,
+    # and both connections were lost.
+    wide = [(point.kind, float(point.value)) for point in jb.scan(make, span=(1.0, 1.5))][-3:]
+    assert wide == [(one.kind, pytest.approx(float(one.value), abs=1e-11)) for one in told[0]]
     # One that sticks is always there. In the connection itself rounding makes several of one.
     _, born, ends = [float(point.value) for point in told[0]]
     values = [born - 1e-9, born + 1e-9, 0.5 * (born + ends), ends - 1e-9, ends + 1e-9]

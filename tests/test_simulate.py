@@ -671,7 +671,7 @@ OSC = ("class_b", (0.3, 0.35))
         (lambda: jb.Belt(0.1, jb.Coulomb(1, 1), load=-1), "load of .*belt.* must be >= 0, got -1"),
         (
             lambda: jb.Belt(0.1, jb.Coulomb(1, 1), lower=2, upper=1),
-            "lower of .* < upper = 1",
+            "lower of .* must be < upper = 1",
         ),
         (lambda: jb.Belt(0.1, 0.5), "friction must be a law such as"),
         (lambda: jb.presets.class_d(0.1, 0.2, 1.0, 0.0), "sigma0 must be <= sigma1 = 0"),

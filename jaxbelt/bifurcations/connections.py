@@ -285,7 +285,6 @@ def _states_along(osc: Oscillator, system: Connection, x: Array) -> Array:
     return lax.map(arc, (system.chain.codes, system.chain.mesh, x))
 
 
-@jit
 def _departing(osc: Oscillator, edge: Array, rightward: Array, parts: Array, budget: int) -> Orbit:
     """The orbit that leaves the saddle of an edge to one side; parts: whether there is one."""
     x1 = jnp.where(parts, jnp.stack(edges(osc))[edge], 0.0)

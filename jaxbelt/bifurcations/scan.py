@@ -119,9 +119,9 @@ def search(
         values: list[float] = []
         again: list[float] = []
         for a, b in intervals:
-            is_narrow = b - a <= NEAR * path.length
-            point = _explained(path, a, b) if b - a <= near * path.length else None
-            if point is not None and _is_settling(path, a, b, point):
+            is_narrow, is_near = b - a <= NEAR * path.length, b - a <= near * path.length
+            point = _explained(path, a, b) if is_near else None
+            if point is not None and _is_told_there(path, a, b, point):
                 # The interval on the other side of a fold may have led to it already.
                 for one in (point, *_beside_it(path, a, b, point)):
                     if not any(_is_same_point(one, other) for other in points):
@@ -129,9 +129,7 @@ def search(
                 before, after = _settled_by(path, a, b, point)
                 settled.append((before, after))
                 values += [max(a, before), min(b, after)]
-            elif (
-                b - a <= near * path.length and point is None and _is_degenerate(path, a, b, points)
-            ):
+            elif is_near and point is None and _is_degenerate(path, a, b, points):
                 settled.append((a, b))
             elif b - a <= 1e-9 * path.length and not path.is_fine(a, b):
                 again.append(0.5 * (a + b))
@@ -232,10 +230,11 @@ def _settled_by(
     return before, after
 
 
-def _is_settling(path: ParameterPath, a: float, b: float, point: BifurcationPoint) -> bool:
-    """Whether a point that explains what differs between a and b is to be told for that.
+def _is_told_there(path: ParameterPath, a: float, b: float, point: BifurcationPoint) -> bool:
+    """Whether a point that explains what differs between a and b is told for that.
 
-    One just outside is not as long as the interval can be narrowed: another one may be inside.
+    One just outside of the interval is not as long as that can be narrowed: another point may be
+    inside.
     """
     low, high = path.beside(0.5 * (a + b))
     return b - a <= high - low or _is_inside(a, b, point)
@@ -292,13 +291,13 @@ def _first_found(
     path: ParameterPath, a: float, b: float, conditions: Sequence[AbstractCondition]
 ) -> BifurcationPoint | None:
     """The first of the conditions that holds within an interval; else of those just beside it."""
-    beside = None
+    outside = None
     for condition in conditions:
         for point in _all_found(path, a, b, condition):
             if _is_inside(a, b, point):
                 return point
-            beside = beside or point
-    return beside
+            outside = outside or point
+    return outside
 
 
 def _all_found(

@@ -193,11 +193,11 @@ class Fit(eqx.Module):
     candidates: how many starts were followed; evaluations: of the motion and its Jacobian; status:
     OK, NOT_IDENTIFIED (a standard error that is infinite, or larger than its parameter and than
     0.1), MISFIT (plausibility below 1e-6, or, where the noise was estimated, residuals of its size
-    with an autocorrelation that noise has not), NO_CONVERGENCE (a step would still move it by a
-    third of a standard error) or NOT_FINITE. Standard errors are
-    those of the linearised problem: right where the model is and the errors are small. With a
-    MISFIT they mean nothing, and `table` and the text leave them out. noise_was_estimated: whether
-    it was, of a column at least.
+    with an autocorrelation that noise has not), NO_CONVERGENCE (a further step would move the
+    estimates by a third of a standard error) or NOT_FINITE. Standard errors are those of the
+    linearised problem: right where the model is and the errors are small. With a MISFIT they mean
+    nothing, and `table` and the text leave them out. noise_was_estimated: whether it was, of a
+    column at least.
     """
 
     oscillator: Oscillator

@@ -310,6 +310,7 @@ def side_pulls(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
     )
 
 
+@jit
 def saddles(osc: Oscillator) -> Array:
     """Whether both sides push away from the point (sigma, 0) of each edge, [edges]."""
     left, right = pushes_away(osc)

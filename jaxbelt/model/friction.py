@@ -168,40 +168,33 @@ def jump_and_kink(law: AbstractFriction) -> tuple[Change | None, Change | None]:
         return None, None  # these are smooth
 
     @jax.jit
-    def asked(speeds: Array) -> tuple[Array, Array]:
-        one = jnp.ones(())
-        return jax.vmap(lambda speed: jax.jvp(law.mu, (speed,), (one,)))(speeds)
+    def asked(speeds: Array) -> Array:
+        """mu at the first row of speeds, its slope at the second."""
+        values, slopes = jax.vmap(lambda speed: jax.jvp(law.mu, (speed,), (jnp.ones(()),)))(
+            speeds.reshape(-1)
+        )
+        half = speeds.shape[1]
+        return jnp.stack([values[:half], slopes[half:]])
 
+    # Every interval is halved again and again, and the half kept over which the change is the
+    # larger one: without a jump it becomes less and less.
     with jax.ensure_compile_time_eval():
-        values = np.asarray(asked(jnp.asarray(SEARCHED))[0])
-        of_values, of_slopes = (_narrowed(lambda v, i=i: np.asarray(asked(v)[i])) for i in (0, 1))
-    sizes = [
-        np.maximum(np.abs(before), np.abs(after)) for _, before, after in (of_values, of_slopes)
-    ]
-    bend = LEAST_BEND * np.abs(values[1:]) / of_slopes[0]
-    jump = _largest(*of_values, LEAST_JUMP * sizes[0])
-    return jump, _largest(*of_slopes, np.maximum(LEAST_KINK * sizes[1], bend))
-
-
-def _narrowed(
-    function: Callable[[Array], np.ndarray],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where a function of the speed changes most between each two of many, and what it is before
-    and behind there.
-
-    Every interval is halved again and again, and the half kept over which the change is the larger
-    one: without a jump it becomes less and less.
-    """
-    found = function(jnp.asarray(SEARCHED))
-    (low, high), (before, after) = (SEARCHED[:-1], SEARCHED[1:]), (found[:-1], found[1:])
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        # As many as before, so that nothing is compiled anew.
-        between = function(jnp.asarray(np.append(middle, 1.0)))[:-1]
-        left = np.abs(between - before) > np.abs(after - between)
-        low, high = np.where(left, low, middle), np.where(left, middle, high)
-        before, after = np.where(left, before, between), np.where(left, between, after)
-    return high, before, after
+        speeds = np.stack([SEARCHED, SEARCHED])
+        found = np.asarray(asked(jnp.asarray(speeds)))
+        (low, high), (before, after) = ((x[:, :-1], x[:, 1:]) for x in (speeds, found))
+        mu = after[0]
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            # As many as before, so that nothing is compiled anew.
+            filled = np.append(middle, np.ones((2, 1)), axis=1)
+            between = np.asarray(asked(jnp.asarray(filled)))[:, :-1]
+            left = np.abs(between - before) > np.abs(after - between)
+            low, high = np.where(left, low, middle), np.where(left, middle, high)
+            before, after = np.where(left, before, between), np.where(left, between, after)
+    least = np.array([[LEAST_JUMP], [LEAST_KINK]]) * np.maximum(np.abs(before), np.abs(after))
+    least[1] = np.maximum(least[1], LEAST_BEND * np.abs(mu) / high[1])
+    jump, kink = map(_largest, high, before, after, least)
+    return jump, kink
 
 
 def _largest(
