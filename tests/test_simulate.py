@@ -642,6 +642,8 @@ def test_a_used_up_budget_gives_what_there_is():
     assert "max_segments" in jb.describe(run.status)
     assert np.all(np.isfinite(run.ys[run.ts < run.arcs.t[-1]]))
     assert np.all(np.isnan(run.ys[-1]))
+    known = run.ts[np.isfinite(run.ys[:, 0])][-1]
+    assert f"t 0 to 100000, known up to {known:.6g}, " in repr(run)
 
 
 def test_samples_stay_increasing_and_show_every_arc():

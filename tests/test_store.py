@@ -217,6 +217,13 @@ class Count:
             r"which differs in axis nu1: \S+ there, \S+ here and \d+ more",
         ),
         (dict(axes={**AXES, "x1": [1.0]}), r"which differs in axes"),
+        (
+            dict(
+                make=lambda nu, nu1: jb.presets.class_b(nu, nu1),
+                axes={"nu": AXES["nu0"], "nu1": AXES["nu1"]},
+            ),
+            r"which differs in axes: nu0 \(\d+\), nu1 .* there, nu \(\d+\), nu1 .* here",
+        ),
         (dict(axes={**AXES, "nu1": AXES["nu1"][:1]}), r"axis nu1: \d+ entries there, 1 here"),
         (dict(make=lambda nu0, nu1: jb.presets.class_b(nu0, nu1 * 2)), r"which differs in "),
         (dict(derivatives="nu0"), r"which differs in derivatives"),
