@@ -390,6 +390,8 @@ def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> i
     """
     place = place_of(cycle.loop)
     for number, other in enumerate(among):
+        if not other.path:  # only taken to be there
+            continue
         if other.path == cycle.path and sticks(cycle.path):
             return number
         if apart(place, place_of(other.loop)) < SOLVED:
