@@ -10,7 +10,7 @@ import jaxbelt
 from .commands.basins import basins
 from .commands.diagram import diagram
 from .commands.map import region_map
-from .commands.options import CLASSES
+from .commands.options import CLASSES, plain_errors
 from .commands.reproduce import reproduce
 from .commands.simulate import simulate
 from .commands.sweep import sweep
@@ -24,7 +24,7 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         given = list(args)
         try:
-            return super().parse_args(ctx, args)
+            rest = super().parse_args(ctx, args)
         except Exception as error:
             # Whose class it is depends on the version of typer.
             if type(error).__name__ == "NoSuchOption":
@@ -33,6 +33,12 @@ class Command(TyperCommand):
                 words = [name] if name.startswith("--") else [one for one in given if name in one]
                 error.__dict__["possibilities"] = self._meant(words[0] if words else name)
             raise
+        source = ctx.get_parameter_source("system")
+        if ctx.params.get("belt") and source is not None and source.name == "COMMANDLINE":
+            with plain_errors():
+                system = ctx.params["system"]
+                raise ValueError(f"with --belt no class must be described, got --class {system}")
+        return rest
 
     def _meant(self, word: str) -> list[str]:
         """By the letters behind the dashes: every option has these."""

@@ -171,6 +171,7 @@ def test_sweep_of_belts_of_ones_own(tmp_path):
         ("--class b --sigma 1", "class b must have only nu0, nu1, got sigma"),
         ("--class a --nu0 nan", "velocity of belt must be finite, got nan"),
         ("--belt 0.3 --nu0 1", "with --belt no class must be described, got nu0"),
+        ("--belt 0.3 --class c", "with --belt no class must be described, got --class c"),
         ("--belt fast", "velocity of belt 'fast' must be a number, got 'fast'"),
         (
             "--belt 0.3,static",

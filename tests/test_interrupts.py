@@ -11,6 +11,7 @@ import kills
 import pytest
 
 import jaxbelt as jb
+from jaxbelt.commands.options import GRACE
 from jaxbelt.sweeps import store
 from jaxbelt.sweeps.datasets import Memory
 from jaxbelt.sweeps.question import Question
@@ -109,6 +110,17 @@ def test_an_interrupt_ends_the_command(tmp_path):
     seconds, code, errors = interrupted(command, 10.0, ready=False, cache=True)
     assert code == 130 and "interrupted after " in errors and "Traceback" not in errors
     assert seconds < SOON
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.slow(first=True)
+def test_an_interrupt_ends_a_command_that_compiles(tmp_path):
+    out = ["--out", str(tmp_path / "map")]
+    command = [sys.executable, "-c", HEARS + COMMAND, "map", *out]
+    seconds, code, errors = interrupted(command, 8.0, ready=False, cache=False)
+    assert code == 130 and errors.endswith("interrupted\n") and "Traceback" not in errors
+    assert seconds < SOON + GRACE
     assert not list(tmp_path.iterdir())
 
 

@@ -8,8 +8,12 @@ import functools
 import json
 import math
 import os
+import signal
+import socket
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,7 +46,8 @@ def plain_errors() -> Iterator[None]:
     """What a user did wrong is told in its one sentence, with exit code 2; an interrupt, with the
     shells' 130."""
     try:
-        yield
+        with _interrupts_that_count():
+            yield
     except KeyboardInterrupt as error:
         typer.secho(str(error) or "interrupted", err=True, fg=typer.colors.RED)
         # At once: an exit by an exception would wait for a compilation under way.
@@ -51,6 +56,39 @@ def plain_errors() -> Iterator[None]:
     except (ValueError, OSError) as error:
         typer.secho(f"Error: {error}", err=True, fg=typer.colors.RED)
         raise typer.Exit(2) from None
+
+
+#: Seconds that what computes has to end, and to tell what became of it, after an interrupt.
+GRACE = 2.0
+
+
+@contextmanager
+def _interrupts_that_count() -> Iterator[None]:
+    """Ends the process after an interrupt that Python does not hear of, as it does not while the
+    main thread compiles."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # which hears of no signals
+        return
+    hears, told = socket.socketpair()
+    told.setblocking(False)
+    before = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while number := hears.recv(1):
+            if number[0] == signal.SIGINT:
+                time.sleep(GRACE)
+                print("interrupted", file=sys.stderr, flush=True)
+                os._exit(130)
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        told.close()  # which ends what watches
+        watcher.join(GRACE / 10)
+        hears.close()
 
 
 def turn_on_float64() -> None:
