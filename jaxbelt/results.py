@@ -63,7 +63,8 @@ ADVICE = {
     ),
     Status.TOO_MANY_STEPS: (
         "The integrator used up its steps within one segment; what was computed until then is "
-        "given. Loosen rtol and atol, or check the size of the parameters."
+        "given. Loosen rtol and atol, or check the size of the parameters, and that a law of your "
+        "own is finite and smooth at all speeds that are met."
     ),
     Status.NOT_FINITE: (
         "A parameter, the start or the solution is not a finite number, or a parameter is "
