@@ -112,7 +112,8 @@ def described(name: str) -> Iterator[str]:
     doc = inspect.getdoc(thing) or ""
     yield from markdown(doc, names)
     result = re.search(r"-> (\w+)$", signature)
-    if result and result[1] in jaxbelt.__all__ and "Returns " not in doc:
+    is_told = "Returns " in doc or "for what comes back" in doc
+    if result and result[1] in jaxbelt.__all__ and not is_told:
         yield from ("**Returns**", f": a `{result[1]}`.", "")
     if isinstance(thing, type):
         yield from members(name, thing)
@@ -271,10 +272,32 @@ class LinkNames(SphinxPostTransform):
             link += literal
 
 
+class KeepNumbers(SphinxPostTransform):
+    """Marks numbers with a minus in them, such as 1e-9, which a browser would break there."""
+
+    default_priority = 900  # after references are resolved
+
+    def run(self, **kwargs: Any) -> None:
+        of_code = (nodes.literal, nodes.literal_block, nodes.raw, nodes.math, nodes.math_block)
+        for text in list(self.document.findall(nodes.Text)):
+            parts = re.split(r"(?<!\w)(-?\d[\d.,]*e-\d+|-\d[\d.,]*\d|-\d)(?!\w)", text.astext())
+            within = isinstance(text.parent, (*of_code, nodes.TextElement))
+            if len(parts) == 1 or isinstance(text.parent, of_code) or not within:
+                continue
+            numbers = [nodes.inline("", one, classes=["number"]) for one in parts[1::2]]
+            words = [nodes.Text(one) for one in parts[::2]]
+            new: list[nodes.Node] = [*words]
+            for i, one in enumerate(numbers):
+                new.insert(2 * i + 1, one)
+            at = text.parent.index(text)
+            text.parent[at : at + 1] = [one for one in new if one.astext()]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """The directives, and the links."""
     app.add_directive("public", Public)
     app.add_directive("family", Family)
     app.add_directive("summary", Summary)
     app.add_post_transform(LinkNames)
+    app.add_post_transform(KeepNumbers)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
