@@ -229,20 +229,16 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     pull = mode_acceleration(osc, mode, rest, rest)
 
     possible = has_possible_numbers(osc) & (upper - lower > force_rounding(pull))
-    places = (jnp.where(jnp.isfinite(edge), edge, 0.0) for edge in (lower, upper))
-    (below, pull_below), (above, pull_above) = (
-        at_rest_beside(osc, x1, rightward=side)
-        for x1, side in zip(places, (False, True), strict=True)
-    )
-    up_from_below = jnp.where(below.any_stuck, 0.0, pull_below)
-    down_from_above = jnp.where(above.any_stuck, 0.0, -pull_above)
+    _, up_from_below = _beyond(osc, lower, rightward=False)
+    held_above, up_from_above = _beyond(osc, upper, rightward=True)
+    down_from_above = -up_from_above
 
     rounding = edge_rounding(pull, 1.0 + held)
     is_fixed = possible & (held == 0) & (lower - rounding < pull) & (pull < upper + rounding)
     on_lower, on_upper = (jnp.abs(pull - edge) < rounding for edge in (lower, upper))
     # On an edge beyond which belts at rest hold the mass it is the end of that segment; and what
     # lies there for either side is listed with the left one.
-    is_fixed &= ~(on_lower & (up_from_below == 0)) & ~(on_upper & above.any_stuck)
+    is_fixed &= ~(on_lower & (up_from_below == 0)) & ~(on_upper & held_above)
     first, last = jnp.maximum(pull - held, lower), jnp.minimum(pull + held, upper)
     at_first, at_last = first - lower < rounding, upper - last < rounding
     # A segment of one point, an edge, is one if the other side pushes back to it.
@@ -280,6 +276,12 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
         stable=jnp.where(is_segment, attracts, is_fixed & (rate < 0) & ~neutral & stays) & exists,
         neutral=neutral,
     )
+
+
+def _beyond(osc: Oscillator, edge: Array, *, rightward: bool) -> tuple[Array, Array]:
+    """Whether the mass is held just beyond an edge, and x2' there, 0 where it is."""
+    mode, pull = at_rest_beside(osc, jnp.where(jnp.isfinite(edge), edge, 0.0), rightward=rightward)
+    return mode.any_stuck, jnp.where(mode.any_stuck, 0.0, pull)
 
 
 def edge_rounding(x1: Array, scale: Array | float = 1.0) -> Array:
