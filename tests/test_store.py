@@ -16,7 +16,7 @@ import zarr
 
 import jaxbelt as jb
 from jaxbelt.sweeps import store as stores
-from jaxbelt.sweeps.grid import Blocks
+from jaxbelt.sweeps.grid import Blocks, Grid
 from jaxbelt.sweeps.locks import locked
 from jaxbelt.sweeps.question import Question
 from jaxbelt.sweeps.store import CHECKSUM
@@ -91,12 +91,22 @@ def test_blocks_are_boxes_that_hold_every_run_once(shape, size, box):
 
 
 @pytest.mark.parametrize(
-    ("shape", "count"), [((RUNS_OF_BLOCK,), 1), ((256, 512), 1), ((RUNS_OF_BLOCK + 1,), 2)]
+    ("shape", "count"),
+    [((64,), 1), ((65,), 2), ((1000,), 8), ((256, 512), 8), ((1024, 1024), 8), ((4096, 1024), 32)],
 )
-def test_the_docs_tell_how_many_runs_a_block_has(shape, count):
-    assert len(Blocks(shape, RUNS_OF_BLOCK)) == count
+def test_a_store_has_eight_blocks_or_more_unless_it_has_few_runs(monkeypatch, shape, count):
+    monkeypatch.setattr(stores, "BLOCK_RUNS", RUNS_OF_BLOCK)
+    axes = dict(zip(("nu0", "nu1"), map(np.linspace, (-0.7, -0.6), (0.7, 0.6), shape)))
+    make = jb.presets.class_b if len(shape) == 2 else jb.presets.class_a
+    assert len(stores.blocks_of(Grid(make, axes, (3.0, 0.0)))) == count
+
+
+def test_the_docs_tell_how_many_runs_a_block_has():
     pages = [(TESTS.parent / page).read_text("utf-8") for page in ("README.md", "docs/clusters.md")]
-    assert all(f"{RUNS_OF_BLOCK:,} runs" in page for page in [*pages, jb.sweep.__doc__])
+    for page in [*pages, jb.sweep.__doc__]:
+        words = " ".join(page.split())
+        assert "an eighth of the runs" in words and f"{RUNS_OF_BLOCK:,} at most" in words
+    assert stores.FEW_BLOCKS == 8
 
 
 def test_a_store_is_what_the_sweep_gives(path, whole):

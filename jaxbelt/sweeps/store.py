@@ -15,6 +15,7 @@ The attributes of the group say what was asked; a sweep that asks anything else 
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import threading
@@ -43,17 +44,23 @@ if TYPE_CHECKING:
 
 #: Version of the layout described above.
 SCHEMA = 2
-#: Runs in a block: enough that writing them takes little beside doing them, and few enough that not
-#: much is lost with one.
+#: Runs in a block, at most: few enough that not much is lost with one.
 BLOCK_RUNS = 2**17
+#: Blocks of a smaller sweep, whose runs may be long ones (each takes some 40 ms to write), and how
+#: many runs they have at least.
+FEW_BLOCKS, LEAST_RUNS = 8, 64
 #: The columns of the ledger, and the states of a block.
 STATE, CHECKSUM, TIMES_DONE, SECONDS = range(4)
 TO_DO, DONE = 0, 1
 
 
 def blocks_of(grid: Grid) -> Blocks:
-    """The blocks of a grid in a store."""
-    return Blocks(grid.shape, BLOCK_RUNS)
+    """The blocks of a grid in a store that is new."""
+    return Blocks(grid.shape, _block_runs(grid))
+
+
+def _block_runs(grid: Grid) -> int:
+    return min(BLOCK_RUNS, max(math.ceil(grid.runs / FEW_BLOCKS), LEAST_RUNS))
 
 
 @dataclass
@@ -346,7 +353,7 @@ def _create(path: Path, question: Question) -> None:
             "variables": list(table.shapes),
             "numbered": numbered,
             "shape": grid.shape,
-            "block": BLOCK_RUNS,
+            "block": _block_runs(grid),
             "finished": False,
         }
     )
@@ -372,7 +379,8 @@ def _identity(question: Question, blocks: Blocks) -> dict[str, str]:
 def _check_question(path: Path, root: Any, question: Question) -> None:
     """Raise unless the store is of this very sweep, and name what differs."""
     there = json.loads(root.attrs["jaxbelt_question"])
-    here = _identity(question, blocks_of(question.grid))
+    # A store keeps the blocks that it was made with.
+    here = _identity(question, Blocks(question.grid.shape, root["ledger"].attrs["block"]))
     for name in dict.fromkeys([*there, *here]):
         axis = name.removeprefix("axis ")
         if axis != name and not (name in there and name in here):

@@ -96,10 +96,10 @@ def sweep(
 
     derivatives: names of axes. Adds `d_<variable>_d_<axis>` for every variable that is a float, by
     forward mode; NaN where the variable is not finite. store: a folder for the results as they come
-    in, a Zarr group that `xarray.open_zarr` opens; it has blocks of up to 131,072 runs, each
-    written when it is whole, so of a sweep of no more runs than that nothing is kept where it is
-    interrupted; the same call with the same store goes on where one was interrupted, and returns at
-    once what is finished. executor: a `dask.distributed.Client`, whose workers then do the blocks
+    in, a Zarr group that `xarray.open_zarr` opens; it has blocks of an eighth of the runs (64 at
+    least, 131,072 at most), each written when it is whole; the same call with the same store goes
+    on where one was interrupted, at the first block that is not, and returns at once what is
+    finished. executor: a `dask.distributed.Client`, whose workers then do the blocks
     of the store, in a folder that all of them see; a worker that dies costs the block that it was
     at. blocks: (first, last), which blocks of the store to do, `last` not among them, for processes
     that share one store, such as those of a job array; who ends last finishes the store, in which
