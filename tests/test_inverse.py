@@ -263,6 +263,33 @@ def test_local_cubics_are_exact_for_cubics():
 
 
 @pytest.mark.slow(first=True)
+def test_windows_that_are_far_off_lead_to_the_record_if_no_others_do():
+    """From ten per cent off none of the candidates came near in windows of half a loop; joined,
+    the first of them does. And what is far off is a misfit, whatever its errors are."""
+
+    def machine(static, kinetic, velocity):
+        law = jb.Stribeck(static, kinetic, velocity)
+        return jb.Machine(0.8, 320.0, 0.9, (jb.PhysicalBelt(0.12, law, 15.0),))
+
+    def numbers(osc):
+        law = osc.belts[0].friction
+        return law.static, law.kinetic, law.velocity
+
+    truth, times = np.array([0.62, 0.36, 0.04]), np.arange(1000) * 0.005
+    true, guess = machine(*truth), machine(0.682, 0.324, 0.044)
+    run = jb.simulate(true.oscillator, (0.0, 0.0), true.tau(5.0), ts=true.tau(times))
+    noise = 2e-4 * np.random.default_rng(3).standard_normal(times.size)
+    record, length = np.asarray(run.ys[:, 0] * true.units.length) + noise, guess.units.length
+    given = dict(where=numbers, noise=2e-4 / length)
+    result = jb.fit(guess.oscillator, guess.tau(times), record / length, **given)
+    assert result.status == Status.OK and result.reduced_chi_squared < 1.1
+    units = np.array([1.0, 1.0, guess.units.velocity])
+    assert np.all(np.abs(result.estimates * units - truth) < 4 * result.standard_errors * units)
+    wrong = jb.fit(guess.oscillator, guess.tau(times), record, where=numbers, noise=2e-4)
+    assert wrong.status == Status.MISFIT and wrong.plausibility == 0
+
+
+@pytest.mark.slow(first=True)
 def test_a_record_in_seconds_and_metres_is_a_misfit():
     """Sampled so coarsely, taken for dimensionless, the motion itself is taken for noise."""
     speeds, mus = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4), (0.55, 0.48, 0.41, 0.36, 0.34, 0.35)

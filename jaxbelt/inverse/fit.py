@@ -12,15 +12,15 @@ slips by whole loops against the record, and the sum of squares has a minimum fo
        N equations       one a datum, weighted with its noise
 
    whose matrix is an arrow: the starts are eliminated window by window.
-3. *joining*: three neighbouring windows become one, again and again, until one is left: the whole
+3. *joining*: three neighbouring windows become one, again and again, until one is left (of
+   candidates that are far off in windows, where no other one leads to the record): the whole
    record as one motion from one unknown start, followed down its valley until the sum of squares
    has nothing left to gain. Its Gauss-Newton matrix gives the standard errors.
 
 All derivatives of 2 and 3 are those of `simulate`, through every stick, slip and crossing.
 """
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -46,13 +46,14 @@ if TYPE_CHECKING:
 
 #: Each stage joins so many neighbouring windows.
 JOIN = 3
-#: A start whose windows are further off than this (chi^2 per datum) is not followed further.
-HOPELESS = 6.0
+#: A candidate whose windows are further off than this (chi^2 per datum) is far: it is followed
+#: where no other one leads to the record.
+FAR = 6.0
 TOLERANCE = 1e-8
 #: The last stage takes so many times as many steps, until a Gauss-Newton step promises to lower
 #: chi^2 by less than the first number, which is the square of an error in standard errors. It has
 #: not converged where that promises more than the second.
-LONGER, GAIN_ENOUGH, GAIN_LEFT = 10, 1e-3, 1e-1
+LONGER, GAIN_ENOUGH, GAIN_LEFT = 10, 1e-5, 1e-1
 #: Factors by which the damping shrinks and grows: along a bent valley a large one is refused at
 #: every other step.
 LESS_DAMPED, MORE_DAMPED = 3.0, 4.0
@@ -121,32 +122,33 @@ def _damped_step(blocks: np.ndarray, damping: float) -> tuple[np.ndarray, np.nda
 
 
 class _Point(eqx.Module):
-    """Where the iteration stands: unknowns, motion, blocks of the windows, chi^2, evaluations."""
+    """Where the iteration stands: unknowns, motion, blocks of the windows, chi^2."""
 
     u: np.ndarray
     starts: np.ndarray
     ys: np.ndarray
     blocks: np.ndarray
     chi2: float
-    evaluations: int
 
 
-def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float) -> _Point:
+def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float, far: float) -> _Point:
     """Levenberg-Marquardt for one division into windows, until chi^2 falls by less than that part;
-    for the whole record, until nothing is left to gain."""
+    for the whole record, until nothing is left to gain, or chi^2 stays beyond `far`."""
     window = np.cumsum(fresh) - 1
 
-    def at(u, starts, evaluations):
+    def at(u, starts):
         ys, pieces = linearized(jnp.asarray(u), jnp.asarray(starts), jnp.asarray(fresh))
         blocks = np.zeros((window[-1] + 1, *pieces.shape[1:]))
         np.add.at(blocks, window, np.asarray(pieces))
         chi2 = float(np.sum(blocks[:, -1, -1]))
-        return _Point(u, starts, np.asarray(ys), blocks, chi2, evaluations)
+        return _Point(u, starts, np.asarray(ys), blocks, chi2)
 
-    point = at(u, starts, 1)
+    point = at(u, starts)
     damping, is_last = 1e-2, np.sum(fresh) == 1
-    for _ in range(LONGER * ITERATIONS if is_last else ITERATIONS):
+    for number in range(LONGER * ITERATIONS if is_last else ITERATIONS):
         if not np.isfinite(point.chi2) or damping > 1e5:
+            break
+        if number >= ITERATIONS and point.chi2 > far:
             break
         if is_last and _gain_left(point.blocks[0]) < GAIN_ENOUGH:
             break
@@ -154,14 +156,13 @@ def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float) -> _
         shorter = min(1.0, LONGEST_CHANGE / max(np.max(np.abs(du)), 1e-300))
         moved = point.starts.copy()
         moved[fresh] += np.clip(shorter * dstarts, -0.5, 0.5)
-        trial = at(point.u + shorter * du, moved, point.evaluations + 1)
+        trial = at(point.u + shorter * du, moved)
         if trial.chi2 < point.chi2:
             gain = point.chi2 - trial.chi2
             point, damping = trial, max(damping / LESS_DAMPED, 1e-9)
             if not is_last and gain < max(1e-2, relative * point.chi2):
                 break
         else:
-            point = eqx.tree_at(lambda q: q.evaluations, point, trial.evaluations)
             damping *= MORE_DAMPED
     return point
 
@@ -191,9 +192,9 @@ class Fit(eqx.Module):
     lag one, about 0 +- 1/sqrt(data): what is left has a shape where it is larger.
 
     candidates: how many starts were followed; evaluations: of the motion and its Jacobian; status:
-    OK, NOT_IDENTIFIED (a standard error that is infinite, or larger than its parameter and than
-    0.1), MISFIT (plausibility below 1e-6, or, where the noise was estimated, residuals of its size
-    with an autocorrelation that noise has not), NO_CONVERGENCE (a further step would move the
+    OK, MISFIT (plausibility below 1e-6, or, where the noise was estimated, residuals of its size
+    with an autocorrelation that noise has not), NOT_IDENTIFIED (no misfit, and a standard error
+    that is infinite, or larger than its parameter and than 0.1), NO_CONVERGENCE (a further step would move the
     estimates by a third of a standard error) or NOT_FINITE. Standard errors are those of the
     linearised problem: right where the model is and the errors are small. With a MISFIT they mean
     nothing, and `table` and the text leave them out. noise_was_estimated: whether it was, of a
@@ -360,7 +361,13 @@ def fit(
     selection, u = selection_of(oscillator, where, bounds)
 
     record = record_of(times, values, sigmas)
-    linearized = functools.partial(_linearized, selection, oscillator, record)
+    evaluations = 0
+
+    def linearized(u, starts, fresh):
+        nonlocal evaluations
+        evaluations += 1
+        return _linearized(selection, oscillator, record, u, starts, fresh)
+
     data = int(np.sum(np.isfinite(values)))
     freedom = data - u.size - 2
     require(freedom > 0, "ts", f"more data than the {u.size + 2} unknowns", data)
@@ -374,25 +381,21 @@ def fit(
         off = (values - _motion_of(point, values)) * _weights_of(record, values)
         return verdict_on(off, point.chi2, freedom, estimated)
 
-    best, count, evaluations = None, 0, 0
-    for guess, states, misfit in first_guesses(selection, u, oscillator, record, starts):
-        count += 1
-        came = "the guess" if np.isnan(misfit) else f"misfit {misfit:.3g} of the smooth formulation"
-        tell(f"candidate {count}: {came}")
-        point, joined = _follow_up(linearized, guess, states, data, tell)
-        evaluations += point.evaluations
-        if joined and (best is None or point.chi2 < best.chi2):
-            best = point
-            if judged(point).is_noise:
-                break
-    if best is None:
-        # Nothing came near: what the guess itself gives, with a status that says so.
+    guesses = first_guesses(selection, u, oscillator, record, starts)
+    followed: list[_Point] = []
+    for point in _followed(linearized, guesses, data, tell):
+        followed.append(point)
+        if judged(point).is_noise:
+            break
+    else:
+        tell("the guess, in one piece")
         whole = np.arange(len(record.starts)) == 0
-        best = _fit_windows(linearized, np.asarray(u), np.asarray(record.starts), whole, 0.0)
-        evaluations += best.evaluations
+        starts_there = np.asarray(record.starts)
+        followed.append(_fit_windows(linearized, np.asarray(u), starts_there, whole, 0.0, np.inf))
+    best = min(followed, key=_rank)
     verdict = judged(best), estimated
     result = _result(
-        oscillator, selection, record, times, values, best, *verdict, count, evaluations
+        oscillator, selection, record, times, values, best, *verdict, len(followed), evaluations
     )
     tell(repr(result).splitlines()[0])
     return result
@@ -430,24 +433,48 @@ def _checked_record(ts, x1, x2, noise):
     return times, np.stack(columns, axis=1), sigmas
 
 
-def _follow_up(linearized, u, starts, data: int, tell) -> tuple[_Point, bool]:
-    """Windows, joined until one is left; ended early, and False, where that is hopeless."""
-    pieces, every, spent = len(starts), 1, 0
+def _followed(linearized, guesses, data: int, tell) -> Iterator[_Point]:
+    """Where the guesses lead; first those whose windows come near the record."""
+    far = []
+    for number, (u, starts, misfit) in enumerate(guesses, 1):
+        came = "the guess" if np.isnan(misfit) else f"misfit {misfit:.3g} of the smooth formulation"
+        tell(f"candidate {number}: {came}")
+        point = _in_windows(linearized, u, starts, data, tell)
+        if point.chi2 < FAR * data:
+            yield _joined(linearized, point, data, tell)
+        else:
+            far.append((number, point))
+    for number, point in sorted(far, key=lambda one: _rank(one[1])):
+        tell(f"candidate {number}, from afar")
+        yield _joined(linearized, point, data, tell)
+
+
+def _rank(point: _Point) -> float:
+    """The smaller, the nearer to the record."""
+    return float(np.nan_to_num(point.chi2, nan=np.inf))
+
+
+def _in_windows(linearized, u, starts, data: int, tell) -> _Point:
+    """All windows by themselves."""
+    fresh = np.full(len(starts), True)
+    point = _fit_windows(linearized, u, starts, fresh, 3e-3, FAR * data)
+    if not point.chi2 < FAR * data:
+        # It may but creep along a valley.
+        point = _fit_windows(linearized, point.u, point.starts, fresh, 0.0, FAR * data)
+    tell(f"  {len(starts)} windows: chi^2 per datum {point.chi2 / data:.3f}")
+    return point
+
+
+def _joined(linearized, point: _Point, data: int, tell) -> _Point:
+    """Windows joined until one is left."""
+    pieces, every = len(point.starts), 1
     while True:
-        fresh = np.arange(pieces) % every == 0
-        last = every >= pieces
-        point = _fit_windows(linearized, u, starts, fresh, 0.0 if last else 3e-3)
-        spent += point.evaluations
-        if every == 1 and not point.chi2 < HOPELESS * data:
-            # It may but creep along a valley.
-            point = _fit_windows(linearized, point.u, point.starts, fresh, 0.0)
-            spent += point.evaluations
+        every = min(JOIN * every, pieces)
+        fresh, relative = np.arange(pieces) % every == 0, 0.0 if every == pieces else 3e-3
+        point = _fit_windows(linearized, point.u, point.starts, fresh, relative, FAR * data)
         tell(f"  {np.sum(fresh)} windows: chi^2 per datum {point.chi2 / data:.3f}")
-        hopeless = not point.chi2 < HOPELESS * data
-        if last or (every == 1 and hopeless):
-            point = eqx.tree_at(lambda q: q.evaluations, point, spent)
-            return point, last and bool(np.isfinite(point.chi2))
-        u, starts, every = point.u, point.starts, min(JOIN * every, pieces)
+        if every == pieces:
+            return point
 
 
 def _motion_of(point: _Point, values: np.ndarray) -> np.ndarray:
@@ -479,11 +506,11 @@ def _result(
     errors = np.sqrt(np.diag(covariance))
     ys, weights = _motion_of(point, values), _weights_of(record, values)
     status = Status.OK if verdict.is_noise else Status.MISFIT
-    # Of a misfit finite errors mean nothing.
-    most = _sizes(estimates) if status == Status.OK else np.finfo(float).max
-    status = status if np.all(errors[:p] <= most) else Status.NOT_IDENTIFIED
-    if status == Status.OK and not _gain_left(point.blocks[0]) < GAIN_LEFT:
-        status = Status.NO_CONVERGENCE
+    if status == Status.OK:  # of a misfit errors mean nothing
+        if not np.all(errors[:p] <= _sizes(estimates)):
+            status = Status.NOT_IDENTIFIED
+        elif not _gain_left(point.blocks[0]) < GAIN_LEFT:
+            status = Status.NO_CONVERGENCE
     status = status if np.isfinite(point.chi2) else Status.NOT_FINITE
     with np.errstate(divide="ignore"):
         noise = 1 / np.max(weights, axis=0)

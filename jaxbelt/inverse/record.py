@@ -113,6 +113,8 @@ def verdict_on(off: np.ndarray, chi2: float, freedom: int, estimated: bool) -> V
 
     chi2: the sum of their squares; estimated: whether the noise was, of a column at least.
     """
+    if not np.isfinite(chi2):
+        return Verdict(np.nan, np.nan, np.nan, False)
     plausibility = float(gammaincc(0.5 * freedom, 0.5 * chi2))
     correlation = _autocorrelation(off)
     # Noise that was taken from the record is no witness: it may be the motion's own.
