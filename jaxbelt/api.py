@@ -28,7 +28,7 @@ from .bifurcations.rests import BeltAtRest, Hopf, SuddenSliding
 from .bifurcations.scan import scan
 from .bifurcations.special import SpecialPoint
 from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
-from .cycles.cycle import Cycle, find_cycle, unstable_cycle
+from .cycles.cycle import Cycle, find_cycle
 from .cycles.functionals import (
     amplitude,
     energy_dissipated,
@@ -43,6 +43,7 @@ from .cycles.functionals import (
 from .cycles.portrait import Portrait, portrait
 from .cycles.separatrices import Separatrix
 from .cycles.shocks import FatalShock, minimal_fatal_shock
+from .cycles.unstable import unstable_cycle
 from .inverse.design import Design, design, distance_to
 from .inverse.fit import Fit, fit
 from .inverse.margins import distance_to_basin_boundary

@@ -23,7 +23,8 @@ from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
 from .bifurcations.regions import RegionMap, region_map
 from .bifurcations.rests import Hopf, SuddenSliding
 from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
-from .cycles.cycle import Cycle, unstable_cycle
+from .cycles.cycle import Cycle
+from .cycles.unstable import from_starts
 from .model.equilibria import Equilibria, equilibria
 from .model.oscillator import Belt, Oscillator
 from .model.variations import varied
@@ -265,7 +266,7 @@ def _transient(trajectory: Trajectory, cycle: SimulatedCycle | None) -> Trajecto
 
 def find_unstable_cycles(panels: Sequence[Panel]) -> list[Cycle]:
     """The unstable cycle of every panel, with the status of none where there is none."""
-    return [unstable_cycle(_with_two_belts(panel.oscillator)) for panel in panels]
+    return [from_starts(_with_two_belts(panel.oscillator)) for panel in panels]
 
 
 def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> Figure:

@@ -5,6 +5,17 @@ from typing import Any
 
 #: Digits, and the letters that they are written for.
 LOOK_ALIKES = str.maketrans("01", "ol")
+#: What other packages call the arguments of this one.
+NAMES_ELSEWHERE = {
+    **dict.fromkeys(("start", "initial", "state", "state0", "x0", "y", "init"), "y0"),
+    **dict.fromkeys(("t_end", "tend", "tmax", "t_max", "t_final", "duration"), "t1"),
+    **dict.fromkeys(("t", "times", "t_eval", "saveat"), "ts"),
+    **dict.fromkeys(("tol", "tolerance"), "rtol"),
+    **dict.fromkeys(("parameter", "param"), "where"),
+    **dict.fromkeys(("range", "interval", "limits"), "span"),
+    **dict.fromkeys(("grid", "params", "parameters", "values"), "axes"),
+    **dict.fromkeys(("observable", "output"), "observe"),
+}
 
 
 def did_you_mean(word: Any, names: Iterable[str]) -> str:
@@ -14,14 +25,14 @@ def did_you_mean(word: Any, names: Iterable[str]) -> str:
 
 
 def refuse_other_names(
-    of: str, names: Iterable[str], given: Iterable[str], others: Mapping[str, str] | None = None
+    of: str, names: Iterable[str], given: Iterable[str], others: Mapping[str, str] = NAMES_ELSEWHERE
 ) -> None:
     """`TypeError` where an argument has a name that is not among those taken; it tells these, and
     which was meant. of: who takes them; others: what arguments are sometimes called."""
     names = list(names)
 
     def told(name):
-        meant = [(others or {}).get(name.lower(), ""), *near(name, names)]
+        meant = [others.get(name.lower(), ""), *near(name, names)]
         return ", ".join([*[one for one in meant if one in names][:1], f"not {name}"])
 
     if wrong := [name for name in given if name not in names]:
@@ -32,11 +43,12 @@ def refuse_other_names(
 
 def near(word: Any, names: Iterable[str]) -> list[str]:
     """The names that a word is nearly, the nearest first; what is taken for another letter at a
-    glance counts as that."""
+    glance counts as that, and a capital as its small letter."""
     import difflib  # late, for mistakes only
 
     if not isinstance(word, str):
         return []
-    alike = {name: name.translate(LOOK_ALIKES) for name in names}
-    told = difflib.get_close_matches(word.translate(LOOK_ALIKES), list(set(alike.values())))
+    alike = {name: name.lower().translate(LOOK_ALIKES) for name in names}
+    like = word.lower().translate(LOOK_ALIKES)
+    told = difflib.get_close_matches(like, list(set(alike.values())))
     return [name for one in told for name in alike if alike[name] == one]

@@ -131,6 +131,8 @@ MISTAKES = [
     ("jb.simulate((3.0, 0.0), osc, 10.0)", OSC + r"\(3\.0, 0\.0\)"),
     ("jb.simulate(jb.presets.class_b, (3.0, 0.0), 10.0)", OSC + "the function class_b"),
     ("jb.simulate(osc, (3.0, 0.0))", "missing 1 required positional argument: 't1'"),
+    ("jb.simulate(osc, start=(3.0, 0.0), t1=10.0)", "max_events: y0, not start"),
+    ("jb.simulate(osc, (3.0, 0.0), tmax=10.0)", "max_events: t1, not tmax"),
     ("jb.simulate(osc, (3.0, 0.0, 1.0), 10.0)", r"y0 must be of shape \(2\), got shape \(3,\)"),
     (
         "jb.simulate(machine, (3.0, 0.0), 10.0)",
@@ -168,7 +170,10 @@ MISTAKES = [
         "jb.simulate(osc, (3.0, 0.0), 10.0, tol=1e-8)",
         r"^simulate\(\) takes osc, y0, t1, t0, .* and max_events: [ra]tol, not tol$",
     ),
-    ("jb.simulate(osc, (1.0, 0.0), t_end=5.0)", r"simulate\(\) takes osc, y0, t1, .*: not t_end$"),
+    (
+        "jb.simulate(osc, (1.0, 0.0), t_end=5.0)",
+        r"simulate\(\) takes osc, y0, t1, .*: t1, not t_end$",
+    ),
     ("jb.find_cycle(osc, y_0=(3.0, 0.0))", r"find_cycle\(\) takes osc, y0 and .*: y0, not y_0$"),
     ("jb.simulate(osc, (3.0, 0.0), 9.0, formulation='exact')", "formulation must be .*got 'exact'"),
     ("jb.simulate(osc, (3.0, 0.0), 9.0, max_segments=1e3)", f"max_segments {WHOLE}1000.0"),
@@ -194,6 +199,7 @@ MISTAKES = [
     ("jb.stick_duration(cycle, belt=5)", "belt must be 0 to 1, got 5"),
     ("jb.stick_duration(of_one, belt=1)", "belt must be 0: there is one belt, got 1"),
     ("jb.refine(jb.NonsmoothFold(1), one, where=nu0)", "belt must be 0: there is one belt, got 1"),
+    ("jb.refine(jb.Hopf(), one, where=lambda osc: 0.5)", r"got 0\.5, a number that is no par"),
     ("jb.refine(jb.Hopf(), one, where=0)", "parameter of an oscillator with one belt, 0, unch"),
     ("jb.refine(jb.SaddleConnection(0, 1), one, where=nu0)", "to must be 0, or None: there is one"),
     ("jb.stick_duration(cycle, belt=True)", "belt must be 0 to 1, got True"),

@@ -22,9 +22,9 @@ from jaxtyping import Array
 
 from ..checks import is_concrete, require_value
 from ..cycles.chains import SIZES, Chain, Loop, following_codes
-from ..cycles.cycle import separating_loop
 from ..cycles.settling import AT_REST
 from ..cycles.shooting import end_guard, meshed
+from ..cycles.unstable import separating_loop
 from ..model.modes import edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.transitions import onset_position

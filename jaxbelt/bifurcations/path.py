@@ -36,9 +36,10 @@ from ..cycles.attractors import (
     without_idle,
 )
 from ..cycles.chains import SIZES, Loop, cut
-from ..cycles.cycle import Cycle, as_loop, cycle_from, polish, unstable_cycle
+from ..cycles.cycle import Cycle, as_loop, cycle_from, polish
 from ..cycles.orbits import FINE_STRIDE
 from ..cycles.settling import AT_REST
+from ..cycles.unstable import from_starts
 from ..model.equilibria import EquilibriumKind, candidates
 from ..model.far_out import is_bounded
 from ..model.oscillator import Oscillator
@@ -122,7 +123,7 @@ class ParameterPath:
     def unstable(self, value: float, around: int) -> Cycle:
         """The unstable cycle there around an equilibrium, or why there is none; computed once."""
         if (value, around) not in self.unstable_cycles:
-            self.unstable_cycles[value, around] = unstable_cycle(self.at(value), around=around)
+            self.unstable_cycles[value, around] = from_starts(self.at(value), around=around)
         return self.unstable_cycles[value, around]
 
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:

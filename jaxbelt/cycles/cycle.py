@@ -7,7 +7,6 @@ guess from which `shooting` solves for the cycle.
 import functools
 import warnings
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -26,21 +25,19 @@ from ..checks import (
     number,
     pick,
     require,
-    require_value,
 )
-from ..model.equilibria import Equilibria, EquilibriumKind, candidates, most_equilibria
 from ..model.events import Signature, signature_name
 from ..model.friction import jump_and_kink
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.rest import is_neutral
 from ..motion.simulate import Arcs
-from ..numerics.compiling import any_lane, each, in_groups, jit
+from ..numerics.compiling import any_lane, in_groups, jit
 from ..numerics.newton import HOLDS
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Chain, Loop, loop_events, modes_of, room_of
-from .orbits import MOST_ARCS, first_loop, follow, last_loop, loop_of
+from .orbits import MOST_ARCS, follow, last_loop, loop_of
 from .shooting import (
     ARC_STEPS,
     Ends,
@@ -492,87 +489,3 @@ def cycle_from(osc: Oscillator, y0: ArrayLike | tuple, max_arcs: int | None = No
     elif max_arcs is None:
         loop, status = pick(loop, slice(SIZES[0])), _if_it_fits(status, count, SIZES[0])
     return exactly(osc, loop, status)
-
-
-#: Loops that are compared in one batch, and how often the interval between two of them is refined:
-#: 31^3 parts of the way from 1e-4 to 10 tell the guess to a two-thousandth of itself.
-LOOPS_TRIED, REFINEMENTS = 32, 3
-
-
-@announced("unstable_cycle")
-def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = None) -> Cycle:
-    """The unstable cycle around a stable equilibrium, that touches no boundary (no sliding).
-
-    It separates the starts that come to rest from those that go on to the motion outside of it. It
-    may pass contact edges. osc: `Oscillator`; around: the number of the equilibrium, counted from
-    the left among the stable ones but for segments; max_arcs as for `find_cycle`. Differentiable
-    like any `Cycle`. Where there is none, or none of this sort, the status is NO_UNSTABLE_CYCLE.
-    `ValueError` names an impossible argument.
-
-    Starts to the right of the equilibrium at different distances are followed for one loop. The
-    first one that does not come nearer, or that touches a boundary, lies outside of the cycle;
-    between it and its neighbour the search is repeated, and Newton's method does the rest.
-    """
-    check_oscillator(osc)
-    last = most_equilibria(osc) - 1
-    is_number = isinstance(around, int | np.integer) and not isinstance(around, bool)
-    among = f"0 to {last}" if last else "0"
-    expected = f"the number of an equilibrium, {among}"
-    require_value(is_number and 0 <= around <= last, "around", expected, around)
-    room = SIZES[0] if max_arcs is None else as_whole(max_arcs, "max_arcs")
-    loop, status, distance = separating_loop(osc, room, around)
-    return _if_meant(exactly(osc, loop, status), loop, distance)
-
-
-def separating_loop(osc: Oscillator, size: int, around: int = 0) -> tuple[Loop, Array, Array]:
-    """A loop near the unstable cycle, a status, and how far from the equilibrium it begins."""
-    return _separating_loop(osc, candidates(osc), jnp.asarray(np.array(around)), size)
-
-
-@jit
-def _separating_loop(osc: Oscillator, rests: Equilibria, around: Array, size: int):
-    still, rests = lax.stop_gradient((osc, rests))
-    eligible = rests.stable & (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
-    meant = eligible & (jnp.cumsum(eligible) - 1 == around)
-    exists = jnp.any(meant)
-    x1 = jnp.where(exists, rests.x1[jnp.argmax(meant)], 0.0)
-
-    def loop(distance):
-        orbit, touches, top = first_loop(still, x1, distance, size)
-        rests = (orbit.status == Status.PSEUDO_FOCUS) | (orbit.status == Status.EQUILIBRIUM)
-        inside = ~touches & jnp.where(jnp.isnan(top), rests, top - x1 < distance)
-        return orbit, inside
-
-    def narrow(bracket, _):
-        distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), LOOPS_TRIED))
-        orbits, inside = each(loop)(distances)
-        first = jnp.argmin(inside)
-        bounded = ~inside[-1] & (first > 0)
-        low, high = distances[jnp.maximum(first - 1, 0)], distances[first]
-        bracket = jnp.where(bounded, jnp.stack([low, high]), bracket)
-        innermost = jax.tree.map(lambda leaf: leaf[jnp.maximum(first - 1, 0)], orbits)
-        return bracket, (inside[0] & ~jnp.all(inside), innermost)
-
-    bracket, (found, orbits) = lax.scan(narrow, jnp.array([1e-4, 10.0]), None, length=REFINEMENTS)
-    orbit = jax.tree.map(lambda leaf: leaf[-1], orbits)
-    status = jnp.where(exists & found[0], Status.OK.value, Status.NO_UNSTABLE_CYCLE.value)
-    return loop_of(orbit, size, len(osc.belts)), status, bracket[0]
-
-
-@jit
-def _if_meant(cycle: Cycle, loop: Loop, distance: Array) -> Cycle:
-    """The cycle, if it repels and begins near the loop; one found elsewhere by Newton's method, or
-    that has shrunk to the equilibrium, is not the one meant."""
-    near = jnp.abs(cycle.unknowns[0, 0] - loop.entries[0, 0]) < 0.1 * distance
-    same = near & (cycle.multiplier > 1)
-    missing = (cycle.status == Status.OK) & ~same | (cycle.status == Status.NOT_ADMISSIBLE)
-    missing = missing | (cycle.status == Status.NO_CONVERGENCE)
-    status = jnp.where(missing, Status.NO_UNSTABLE_CYCLE.value, cycle.status)
-    known = functools.partial(jnp.where, status == Status.OK)
-    return replace(
-        cycle,
-        unknowns=known(cycle.unknowns, jnp.nan),
-        multiplier=known(cycle.multiplier, jnp.nan),
-        residual=known(cycle.residual, jnp.nan),
-        status=status,
-    )

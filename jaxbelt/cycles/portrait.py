@@ -161,10 +161,9 @@ def portrait(osc: Oscillator) -> Portrait:
     decides what is computed. `ValueError` names an argument that is impossible, or traced.
     """
     check_oscillator(osc)
-    points, reach = equilibria(osc), reach_of(osc)
-    rests = pick(points, np.asarray(points.kind) != EquilibriumKind.SADDLE)
-    found = branches(osc, rests, TRACED * reach)
-    map_ = Returns(osc, rests, reach, [top for branch in found for top in branch.tops[:2].tolist()])
+    points = equilibria(osc)
+    found, map_ = branches_and_returns(osc, points)
+    reach = map_.reach
     cycles = tuple(cycle for cycle in map_.cycles if abs(float(cycle.multiplier)) < 1)
     unstable = tuple(cycle for cycle in map_.cycles if float(cycle.multiplier) > 1)
     warn_of_extrapolation((*cycles, *unstable), depth=5)
@@ -186,6 +185,17 @@ def portrait(osc: Oscillator) -> Portrait:
         gaps=jax.device_put(gaps),
         status=jnp.asarray(np.array(status.value)),
     )
+
+
+def branches_and_returns(
+    osc: Oscillator, points: Equilibria
+) -> tuple[list[TracedSeparatrix], Returns]:
+    """The separatrices of an oscillator, and the return map with all of its cycles."""
+    reach = reach_of(osc)
+    rests = pick(points, np.asarray(points.kind) != EquilibriumKind.SADDLE)
+    found = branches(osc, rests, TRACED * reach)
+    tops = [top for branch in found for top in branch.tops[:2].tolist()]
+    return found, Returns(osc, rests, reach, tops)
 
 
 def _falls_short(one: Separatrix, reach: float) -> bool:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 JOIN = 3
 #: A candidate whose windows are further off than this (chi^2 per datum) is far: it is followed
 #: where no other one leads to the record.
-FAR = 6.0
+FAR_OFF = 6.0
 TOLERANCE = 1e-8
 #: The last stage takes so many times as many steps, until a Gauss-Newton step promises to lower
 #: chi^2 by less than the first number, which is the square of an error in standard errors. It has
@@ -194,11 +194,11 @@ class Fit(eqx.Module):
     candidates: how many starts were followed; evaluations: of the motion and its Jacobian; status:
     OK, MISFIT (plausibility below 1e-6, or, where the noise was estimated, residuals of its size
     with an autocorrelation that noise has not), NOT_IDENTIFIED (no misfit, and a standard error
-    that is infinite, or larger than its parameter and than 0.1), NO_CONVERGENCE (a further step would move the
-    estimates by a third of a standard error) or NOT_FINITE. Standard errors are those of the
-    linearised problem: right where the model is and the errors are small. With a MISFIT they mean
-    nothing, and `table` and the text leave them out. noise_was_estimated: whether it was, of a
-    column at least.
+    that is infinite, or larger than its parameter and than 0.1), NO_CONVERGENCE (a further step
+    would move the estimates by a third of a standard error) or NOT_FINITE. Standard errors are
+    those of the linearised problem: right where the model is and the errors are small. With a
+    MISFIT they mean nothing, and `table` and the text leave them out. noise_was_estimated: whether
+    it was, of a column at least.
     """
 
     oscillator: Oscillator
@@ -383,7 +383,7 @@ def fit(
 
     guesses = first_guesses(selection, u, oscillator, record, starts)
     followed: list[_Point] = []
-    for point in _followed(linearized, guesses, data, tell):
+    for point in _led_to(linearized, guesses, data, tell):
         followed.append(point)
         if judged(point).is_noise:
             break
@@ -392,7 +392,7 @@ def fit(
         whole = np.arange(len(record.starts)) == 0
         starts_there = np.asarray(record.starts)
         followed.append(_fit_windows(linearized, np.asarray(u), starts_there, whole, 0.0, np.inf))
-    best = min(followed, key=_rank)
+    best = min(followed, key=_misfit_of)
     verdict = judged(best), estimated
     result = _result(
         oscillator, selection, record, times, values, best, *verdict, len(followed), evaluations
@@ -433,23 +433,23 @@ def _checked_record(ts, x1, x2, noise):
     return times, np.stack(columns, axis=1), sigmas
 
 
-def _followed(linearized, guesses, data: int, tell) -> Iterator[_Point]:
+def _led_to(linearized, guesses, data: int, tell) -> Iterator[_Point]:
     """Where the guesses lead; first those whose windows come near the record."""
     far = []
     for number, (u, starts, misfit) in enumerate(guesses, 1):
         came = "the guess" if np.isnan(misfit) else f"misfit {misfit:.3g} of the smooth formulation"
         tell(f"candidate {number}: {came}")
         point = _in_windows(linearized, u, starts, data, tell)
-        if point.chi2 < FAR * data:
-            yield _joined(linearized, point, data, tell)
+        if point.chi2 < FAR_OFF * data:
+            yield _as_one_motion(linearized, point, data, tell)
         else:
             far.append((number, point))
-    for number, point in sorted(far, key=lambda one: _rank(one[1])):
+    for number, point in sorted(far, key=lambda one: _misfit_of(one[1])):
         tell(f"candidate {number}, from afar")
-        yield _joined(linearized, point, data, tell)
+        yield _as_one_motion(linearized, point, data, tell)
 
 
-def _rank(point: _Point) -> float:
+def _misfit_of(point: _Point) -> float:
     """The smaller, the nearer to the record."""
     return float(np.nan_to_num(point.chi2, nan=np.inf))
 
@@ -457,21 +457,21 @@ def _rank(point: _Point) -> float:
 def _in_windows(linearized, u, starts, data: int, tell) -> _Point:
     """All windows by themselves."""
     fresh = np.full(len(starts), True)
-    point = _fit_windows(linearized, u, starts, fresh, 3e-3, FAR * data)
-    if not point.chi2 < FAR * data:
+    point = _fit_windows(linearized, u, starts, fresh, 3e-3, FAR_OFF * data)
+    if not point.chi2 < FAR_OFF * data:
         # It may but creep along a valley.
-        point = _fit_windows(linearized, point.u, point.starts, fresh, 0.0, FAR * data)
+        point = _fit_windows(linearized, point.u, point.starts, fresh, 0.0, FAR_OFF * data)
     tell(f"  {len(starts)} windows: chi^2 per datum {point.chi2 / data:.3f}")
     return point
 
 
-def _joined(linearized, point: _Point, data: int, tell) -> _Point:
+def _as_one_motion(linearized, point: _Point, data: int, tell) -> _Point:
     """Windows joined until one is left."""
     pieces, every = len(point.starts), 1
     while True:
         every = min(JOIN * every, pieces)
         fresh, relative = np.arange(pieces) % every == 0, 0.0 if every == pieces else 3e-3
-        point = _fit_windows(linearized, point.u, point.starts, fresh, relative, FAR * data)
+        point = _fit_windows(linearized, point.u, point.starts, fresh, relative, FAR_OFF * data)
         tell(f"  {np.sum(fresh)} windows: chi^2 per datum {point.chi2 / data:.3f}")
         if every == pieces:
             return point

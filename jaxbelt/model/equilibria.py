@@ -229,8 +229,8 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     pull = mode_acceleration(osc, mode, rest, rest)
 
     possible = has_possible_numbers(osc) & (upper - lower > force_rounding(pull))
-    _, up_from_below = _beyond(osc, lower, rightward=False)
-    held_above, up_from_above = _beyond(osc, upper, rightward=True)
+    _, up_from_below = _outside_of(osc, lower, rightward=False)
+    held_above, up_from_above = _outside_of(osc, upper, rightward=True)
     down_from_above = -up_from_above
 
     rounding = edge_rounding(pull, 1.0 + held)
@@ -278,7 +278,7 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     )
 
 
-def _beyond(osc: Oscillator, edge: Array, *, rightward: bool) -> tuple[Array, Array]:
+def _outside_of(osc: Oscillator, edge: Array, *, rightward: bool) -> tuple[Array, Array]:
     """Whether the mass is held just beyond an edge, and x2' there, 0 where it is."""
     mode, pull = at_rest_beside(osc, jnp.where(jnp.isfinite(edge), edge, 0.0), rightward=rightward)
     return mode.any_stuck, jnp.where(mode.any_stuck, 0.0, pull)

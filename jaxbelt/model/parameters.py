@@ -118,7 +118,10 @@ def _told(chosen: Any) -> str:
     """What came, in words; numbers are not known here, so modules do not print."""
     if isinstance(chosen, tuple | list):
         return f"({', '.join(map(_told, chosen))})"
-    return f"a whole {type(chosen).__name__}" if isinstance(chosen, eqx.Module) else repr(chosen)
+    if isinstance(chosen, eqx.Module):
+        return f"a whole {type(chosen).__name__}"
+    fixed = isinstance(chosen, float)
+    return f"{chosen!r}, a number that is no parameter" if fixed else repr(chosen)
 
 
 def vary(osc: Oscillator, index: int, p: Array) -> Oscillator:

@@ -19,6 +19,7 @@ from ..bifurcations.special import SpecialPoint
 from ..checks import require
 from ..cycles.cycle import Cycle
 from ..cycles.functionals import amplitude, period
+from ..spelling import did_you_mean
 from .style import figure_of, make_room, new_axes, parameter_label, spread
 
 UNSTABLE_COLOUR = "0.6"
@@ -51,7 +52,8 @@ def plot_diagram(
     quantity = _default_quantity(diagram) if quantity is None else quantity
     if isinstance(quantity, str) or not callable(quantity):
         expected = f"one of {', '.join(QUANTITIES)}, or a function of a cycle"
-        require(quantity in list(QUANTITIES), "quantity", expected, repr(quantity))
+        came = repr(quantity) + did_you_mean(quantity, QUANTITIES)
+        require(quantity in list(QUANTITIES), "quantity", expected, came)
     # What has a name is known of equilibria, too.
     named = ((amplitude, "amplitude"), (period, "period"))
     quantity = next((name for one, name in named if quantity is one), quantity)

@@ -30,7 +30,7 @@ LABELS = {
     r"time $\tau$": ("time", "time $t$ (s)"),
     "period $T$": ("time", "period (s)"),
     "displacement $x_1$": ("length", "displacement $X$ (m)"),
-    "amplitude of $x_1$": ("length", "amplitude (m)"),
+    "amplitude of $x_1$": ("length", "amplitude of $X$ (m)"),
     "velocity $x_2$": ("velocity", r"velocity $\dot X$ (m/s)"),
     r"relative velocity $\nu_{\mathrm{R}}$": ("velocity", r"relative velocity $R$ (m/s)"),
 }

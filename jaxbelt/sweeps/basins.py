@@ -32,7 +32,8 @@ from ..checks import (
     require_wish,
 )
 from ..cycles.attractors import Runs, is_same
-from ..cycles.cycle import Cycle, cycle_from, unstable_cycle
+from ..cycles.cycle import Cycle, cycle_from
+from ..cycles.unstable import from_starts, unstable_cycle
 from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator, check_oscillator
@@ -279,7 +280,8 @@ def basins(
         )
         tell("telling the attractors apart")
         labels, attractors, cycles = _labels(oscillator, dataset)
-        boundary = unstable_cycle(oscillator)
+        # With one attractor there is hardly one, and to look among all cycles takes its time.
+        boundary = (unstable_cycle if len(attractors) > 1 else from_starts)(oscillator)
     dataset["label"] = (
         ("x1", "x2"),
         labels,

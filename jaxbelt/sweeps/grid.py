@@ -31,7 +31,7 @@ class Grid:
     """The points of a sweep and the oscillators there."""
 
     def __init__(self, make: Callable[..., Oscillator], axes: Mapping[str, Any], y0: Any):
-        returns = "a function that returns an Oscillator"
+        returns = "a function that returns an Oscillator, such as jb.presets.class_b"
         require_callable(make, "make", returns)
         require_value(
             isinstance(axes, Mapping) and len(axes) > 0,
