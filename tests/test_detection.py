@@ -638,3 +638,15 @@ def test_a_belt_at_rest_that_holds_nothing_hides_no_hopf_point():
         assert int(point.status) == Status.OK and point.type == "subcritical"
         # 0.4 * 10 / (1 + 10 nu)^2 = damping
         assert abs(float(point.value)) == pytest.approx((np.sqrt(2) - 1) / 10, abs=1e-14)
+
+
+@pytest.mark.slow(first=True)
+def test_the_edges_of_a_belt_without_load_do_not_cut_what_a_belt_at_rest_holds():
+    """Two belts at rest share an edge, which moves past those of a third one, without load."""
+    law = jb.Conti(1.0, 0.6, 5.0)
+
+    def make(edge):
+        held = jb.Belt(0.0, law, 2.0, upper=edge), jb.Belt(0.0, law, 2.0, lower=edge)
+        return jb.Oscillator(0.1, (*held, jb.Belt(0.0, law, 0.0, -0.4, 0.3)), 0.5)
+
+    assert jb.scan(make, span=(-0.8, 0.8)) == ()

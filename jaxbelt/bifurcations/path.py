@@ -223,10 +223,15 @@ class ParameterPath:
         # Which way the belts rub at a pseudo-focus makes no difference to what it is.
         is_focus = seen.kind[exists, None] == EquilibriumKind.PSEUDO_FOCUS
         codes = np.where(is_focus & (codes == -1), 1, codes)
-        modes = map(tuple, codes.tolist())
-        rests = tuple(
-            zip(seen.kind[exists].tolist(), seen.stable[exists].tolist(), modes, strict=True)
-        )
+        rests: list[tuple[int, bool, tuple[int, ...]]] = []
+        end, columns = np.nan, (seen.kind, seen.stable, seen.x1_lower, seen.x1_upper)
+        for *row, code in zip(*(x[exists].tolist() for x in columns), codes.tolist(), strict=True):
+            kind, stable, low, high = row
+            # At the edge of a belt without load a segment only seems to end.
+            if kind == EquilibriumKind.SEGMENT and low == end and rests[-1][2] == tuple(code):
+                stable |= rests.pop()[1]
+            rests.append((kind, stable, tuple(code)))
+            end = high if kind == EquilibriumKind.SEGMENT else np.nan
         found: list[AttractingCycle] = []
         loops = [jax.tree.map(lambda x, i=i: x[i], seen.loop) for i in range(len(seen.status))]
         for loop, status in zip(loops, seen.status.tolist(), strict=True):
@@ -239,7 +244,7 @@ class ParameterPath:
                 self._settled(value, loops[-1], closes=False) or AttractingCycle((), loops[-1])
             )
         self.cycles[value] = found
-        self._name(value, rests, courses)
+        self._name(value, tuple(rests), courses)
 
     def _name(self, value: float, rests, courses: tuple[Hashable, ...]) -> None:
         cycles = sorted(self.cycles[value], key=lambda one: one.path)
@@ -411,6 +416,8 @@ class _Motions(NamedTuple):
     kind: Any
     stable: Any
     modes: Any
+    x1_lower: Any
+    x1_upper: Any
     status: Any
     loop: Any
 
@@ -420,6 +427,7 @@ def _motions(oscs: Oscillator, stride: ArrayLike) -> _Motions:
     def at(osc: Oscillator) -> _Motions:
         rests = candidates(osc)
         loop, status = settled_loops(osc, rests, ROOM, stride)
-        return _Motions(rests.kind, rests.stable, rests.modes, status, loop)
+        known = (rests.kind, rests.stable, rests.modes, rests.x1_lower, rests.x1_upper)
+        return _Motions(*known, status, loop)
 
     return each(at)(oscs)
