@@ -369,10 +369,11 @@ class Tabulated(AbstractFriction):
     is faster rests on that: in a stick-slip cycle speeds reach about twice the belt's velocity.
 
     Arguments: speeds (increasing, >= 0, two or more) and coefficients (>= 0, as many), known
-    numbers, which are no parameters; static, a scalar (None: mu(0), what the curve has there).
-    `ValueError` for anything else, and where static is less than mu(0). What scatters in the table
-    is followed, too: smooth it before. See R. L. Hardy, Multiquadric equations of topography and
-    other irregular surfaces, J. Geophys. Res. 76 (1971) 1905-1915.
+    numbers, which are no parameters, so that another table compiles anew; static, a scalar (None:
+    mu(0), what the curve has there). `ValueError` for anything else, and where static is less than
+    mu(0). What scatters in the table is followed, too: smooth it before. See R. L. Hardy,
+    Multiquadric equations of topography and other irregular surfaces, J. Geophys. Res. 76 (1971)
+    1905-1915.
     """
 
     static: Float[Array, ""]

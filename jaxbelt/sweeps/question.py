@@ -106,7 +106,7 @@ class Question:
             "observe": observe if isinstance(observe, str) else type(observe).__name__,
             "derivatives": ", ".join(self.derivatives) or "none",
             "versions": _versions(),
-            "units": "all quantities are dimensionless; time is tau = omega t",
+            "units": "all results are dimensionless; time is tau = omega t",
         }
 
     def _only_one_start(self) -> str:
