@@ -450,3 +450,19 @@ def test_a_stick_phase_that_vanishes_has_no_negative_duration():
     told = branch.columns()
     assert told["stick_duration_0"].tolist() == [0.0, 0.3]
     assert np.all(np.isnan(told["stick_duration_1"]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_innermost_unstable_cycle_is_followed_past_a_second_one(sign):
+    """Around a pseudo-focus two unstable cycles with one that attracts between them. Where the
+    inner two are close together starts passed over them, and the jump to the outer one was told as
+    `Unexplained`, at another value in the mirror image."""
+    belts = [(-0.9, jb.Conti(1.2, 0.6, 5.0), 1.0, -np.inf, -0.3)]
+    belts += [(-0.9, jb.Conti(1.0, 0.6, 10.0), 0.5, -0.8, np.inf)]
+    if sign < 0:
+        belts = [(-v, law, load, -upper, -lower) for v, law, load, lower, upper in belts]
+    osc = jb.Oscillator(0.1, tuple(jb.Belt(*belt) for belt in belts), 0.5)
+    diagram = jb.bifurcation_diagram(osc, lambda osc: osc.damping, (0.052, 0.06))
+    kinds = [point.kind for point in diagram.points]
+    assert kinds == ["PseudoHopf", "GrazingEdge"]

@@ -22,10 +22,9 @@ import numpy as np
 
 from ..activity import announced, tell
 from ..checks import as_whole, outside_of_traces, require
-from ..cycles.attractors import MOMENT, apart, place_of
-from ..cycles.chains import SIZES, Loop, cut
-from ..cycles.cycle import Cycle, as_loop, exactly, polish, warn_of_fast_loops
-from ..cycles.unstable import among_all
+from ..cycles.attractors import MOMENT
+from ..cycles.chains import Loop, cut
+from ..cycles.cycle import Cycle, exactly, polish, warn_of_fast_loops
 from ..model.equilibria import candidates
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator
@@ -43,8 +42,6 @@ if TYPE_CHECKING:
 
 #: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
 SAME = 1e-2
-#: An unstable cycle goes on to one at the next value that is no farther off, relative to its size.
-NEXT_ROW = 0.3
 
 
 class Branch(eqx.Module):
@@ -330,7 +327,7 @@ def _cycle_pieces(
     both = _separated(labels)
     if both:
         groups = [nodes[stretch] for stretch, _ in both]
-        found = [_repelling(path, nodes[stretch], around) for stretch, around in both]
+        found = [path.unstable_along(nodes[stretch], around) for stretch, around in both]
         cycles = [cycle for group in found for cycle in group]
         pieces += _as_pieces(cycles, groups, [stretch for stretch, _ in both])
     return pieces
@@ -410,34 +407,6 @@ def _attracting(path: ParameterPath, values: np.ndarray, loops: Sequence[Loop]) 
 
     pairs = zip(values, cut(loops), strict=True)
     return [solved(path.at(value), loop) for value, loop in pairs]
-
-
-def _repelling(path: ParameterPath, values: np.ndarray, around: int) -> list[Cycle]:
-    """The unstable cycles around an equilibrium; where starts near it do not lead to one, those
-    that go on from the values beside."""
-    cycles = [path.unstable(value, around) for value in values.tolist()]
-    if not any(map(_is_found, cycles)):
-        middle = len(values) // 2
-        cycles[middle] = among_all(path.at(values[middle]), around) or cycles[middle]
-    for order in (range(1, len(values)), range(len(values) - 2, -1, -1)):
-        for i in order:
-            beside = cycles[i - order.step]
-            if _is_found(beside) and not _is_found(cycles[i]):
-                cycles[i] = _gone_on(path.at(values[i]), beside) or cycles[i]
-    return cycles
-
-
-def _is_found(cycle: Cycle) -> bool:
-    return int(cycle.status) == Status.OK
-
-
-def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
-    """What an unstable cycle at the value beside goes on to."""
-    loop = jax.tree.map(np.asarray, as_loop(beside, SIZES[-1]))
-    cycle = polish(osc, cut([loop])[0], jnp.asarray(Status.OK.value))
-    if not _is_found(cycle) or not float(cycle.multiplier) > 1:
-        return None
-    return cycle if apart(place_of(cycle), place_of(beside)) < NEXT_ROW else None
 
 
 # --- from pieces to branches ----------------------------------------------------------------------

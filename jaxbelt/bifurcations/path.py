@@ -39,7 +39,7 @@ from ..cycles.chains import SIZES, Loop, cut
 from ..cycles.cycle import Cycle, as_loop, cycle_from, polish
 from ..cycles.orbits import FINE_STRIDE
 from ..cycles.settling import AT_REST
-from ..cycles.unstable import from_starts
+from ..cycles.unstable import among_all, from_starts
 from ..model.equilibria import EquilibriumKind, candidates
 from ..model.far_out import is_bounded
 from ..model.oscillator import Oscillator
@@ -65,6 +65,8 @@ DIFFERENCE = 1e-3
 #: A cycle is where it is expected if it is no further from there, relative to its size, or than
 #: a third of the way that it is expected to go. Nearer to a square root, intervals get smaller.
 EXPECTED = 1e-3
+#: An unstable cycle goes on to one at the next value that is no farther off, relative to its size.
+BESIDE_ONE_ANOTHER = 0.3
 
 
 class ParameterPath:
@@ -125,6 +127,23 @@ class ParameterPath:
         if (value, around) not in self.unstable_cycles:
             self.unstable_cycles[value, around] = from_starts(self.at(value), around=around)
         return self.unstable_cycles[value, around]
+
+    def unstable_along(self, values: Sequence[float] | np.ndarray, around: int) -> list[Cycle]:
+        """The same at values in order; where starts near the equilibrium do not lead to one, or
+        pass over it to one farther out, what those at the values beside go on to."""
+        known = {value: self.unstable(value, around) for value in map(float, values)}
+        if known and not any(map(_is_found, known.values())):
+            middle = list(known)[len(known) // 2]
+            found = among_all(self.at(middle), around)
+            known[middle] = known[middle] if found is None else found
+        for order in (list(known), list(known)[::-1]):
+            for beside, value in pairwise(order):
+                if _is_found(known[beside]) and not _is_beside(known[beside], known[value]):
+                    found = _gone_on(self.at(value), known[beside])
+                    if found is not None and not _width(known[value]) < _width(found):
+                        known[value] = found
+        self.unstable_cycles |= {(value, around): cycle for value, cycle in known.items()}
+        return list(known.values())
 
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
         """The values just below and just above; farther off where motions are slow to settle."""
@@ -378,6 +397,26 @@ class ParameterPath:
     def label(self, value: float) -> Label:
         """The label there, which `look` has found."""
         return self.labels[float(value)]
+
+
+def _is_found(cycle: Cycle) -> bool:
+    return int(cycle.status) == Status.OK
+
+
+def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
+    """What an unstable cycle at a value beside goes on to."""
+    loop = jax.tree.map(np.asarray, as_loop(beside, ROOM))
+    cycle = polish(osc, cut([loop])[0], jnp.asarray(Status.OK.value))
+    return cycle if _is_beside(beside, cycle) and float(cycle.multiplier) > 1 else None
+
+
+def _is_beside(cycle: Cycle, other: Cycle) -> bool:
+    """Whether another cycle is found, and so near that one goes on to the other."""
+    return _is_found(other) and apart(place_of(cycle), place_of(other)) < BESIDE_ONE_ANOTHER
+
+
+def _width(cycle: Cycle) -> float:
+    return float(cycle.x1_max - cycle.x1_min)  # NaN where none is found
 
 
 def _is_off_rest(cycle: Cycle) -> bool:

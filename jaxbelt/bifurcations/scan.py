@@ -172,6 +172,8 @@ def edges_touched(
     values: in order, in a stretch in which nothing else happens. Those at which no such cycle is
     found are passed over. around: the number of the equilibrium, see `unstable_cycle`.
     """
+    if path.edged:
+        path.unstable_along(values, around)
 
     def unstable(value):
         return path.unstable(value, around)
@@ -201,11 +203,16 @@ def edges_touched(
             path.unstable_cycles[float(point.value), around] = point.cycle
             before, after = path.beside(float(point.value))
             intervals += changes([a, max(a, before)]) + changes([min(b, after), b])
-        elif unstable(middle).status == Status.OK and b - a > 1e-9 * path.length:
+        elif _has_unstable(path, (a, middle, b), around) and b - a > 1e-9 * path.length:
             intervals += changes([a, middle, b])
         else:
             points.append(_told_point(path, middle, b - a))
     return by_value(points)
+
+
+def _has_unstable(path: ParameterPath, values: Sequence[float], around: int) -> bool:
+    """Whether unstable cycles are found at all of these values."""
+    return all(int(one.status) == Status.OK for one in path.unstable_along(values, around))
 
 
 # --- what makes the difference between two values -------------------------------------------------
