@@ -466,3 +466,20 @@ def test_the_innermost_unstable_cycle_is_followed_past_a_second_one(sign):
     diagram = jb.bifurcation_diagram(osc, lambda osc: osc.damping, (0.052, 0.06))
     kinds = [point.kind for point in diagram.points]
     assert kinds == ["PseudoHopf", "GrazingEdge"]
+
+
+@pytest.mark.slow(first=True)
+def test_the_unstable_branch_begins_at_its_fold():
+    """Its multipliers there are ten thousand; it began 0.05 beside the fold, in the mirror image at
+    another place."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(load):
+        return jb.Oscillator(0.5, (jb.Belt(0.7, law, load), jb.Belt(0.7, law, 0.5)), 2.0)
+
+    diagram = jb.bifurcation_diagram(make, span=(1.0, 1.2), rows=40)
+    (fold,) = diagram.points
+    rows = diagram.table()
+    unstable = rows[(rows.kind == "cycle") & (rows.stable == False)]  # noqa: E712
+    assert fold.kind == "NonsmoothFold"
+    assert abs(unstable.value.min() - float(fold.value)) < 1e-4 and unstable.value.max() == 1.2
