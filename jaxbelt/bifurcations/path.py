@@ -163,13 +163,15 @@ class ParameterPath:
 
     @property
     def edged(self) -> list[int]:
-        """Belts with a finite contact edge; one for each place if they share their edges, that of
-        one's own conditions if it is among them."""
+        """Belts with a finite contact edge, but for those without load, at whose edges nothing
+        happens; one for each place if they share their edges, that of one's own conditions if it is
+        among them."""
         own_first = [belt for one in self.conditions for belt in one.belts_concerned]
         belts: list[int] = []
         known: set[float] = set()
         all_belts = self.at(0.5 * (self.first + self.last)).belts
-        for number in dict.fromkeys([*own_first, *range(len(all_belts))]):
+        pressed = [i for i, belt in enumerate(all_belts) if float(belt.load) != 0]
+        for number in dict.fromkeys([*own_first, *pressed]):
             belt = all_belts[number]
             own = {float(edge) for edge in (belt.lower, belt.upper) if np.isfinite(edge)}
             if own - known:
