@@ -650,3 +650,18 @@ def test_the_edges_of_a_belt_without_load_do_not_cut_what_a_belt_at_rest_holds()
         return jb.Oscillator(0.1, (*held, jb.Belt(0.0, law, 0.0, -0.4, 0.3)), 0.5)
 
     assert jb.scan(make, span=(-0.8, 0.8)) == ()
+
+
+@pytest.mark.slow
+def test_no_cycle_has_a_corner_at_the_edge_of_a_belt_without_load():
+    """Just behind a nonsmooth fold such a corner explained what the fold did."""
+    laws = [jb.Conti(1.2811147144765658, 0.472216266800267, 10.917368501350285, 0.034743528)]
+    laws += [jb.Conti(0.834101590979167, 0.4631886527969489, 3.8869198626736416, 0.003869525)]
+    belts = (
+        jb.Belt(0.23652667037415237, laws[0], 0.512709939622697, lower=-0.9319060589307261),
+        jb.Belt(-0.7681793591458714, laws[1], 0.8449201209243598, upper=-0.49536973697455766),
+        jb.Belt(-0.7681793591458714, laws[1], 0.0, -0.4, 0.3),
+    )
+    osc = jb.Oscillator(0.6225516228351654, belts, 1.8185890197174717)
+    points = jb.scan(osc, lambda osc: osc.belts[0].load, (0.25, 1.5))
+    assert [point.kind for point in points] == ["NonsmoothFold", "Hopf"]
