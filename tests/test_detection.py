@@ -665,3 +665,24 @@ def test_no_cycle_has_a_corner_at_the_edge_of_a_belt_without_load():
     osc = jb.Oscillator(0.6225516228351654, belts, 1.8185890197174717)
     points = jb.scan(osc, lambda osc: osc.belts[0].load, (0.25, 1.5))
     assert [point.kind for point in points] == ["NonsmoothFold", "Hopf"]
+
+
+@pytest.mark.slow(first=True)
+def test_a_belt_whose_load_is_zero_in_the_middle_of_the_path_has_its_edges():
+    """Both sides of that are images of one another, and as a path of one side tells them."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(s):
+        belts = jb.Belt(0.3, law), jb.Belt(-0.2, law, jnp.abs(s), upper=0.8)
+        return jb.Oscillator(0.3, belts)
+
+    def told(first, last):
+        points = jb.scan(make, span=(first, last))
+        return [(one.kind, float(one.value)) for one in points if abs(float(one.value)) > 0.4]
+
+    one_side = told(0.4, 0.55)
+    assert [kind for kind, _ in one_side] == ["CornerCollision", "GrazingEdge"]
+    both = told(-0.55, 0.55)
+    expected = [(kind, -value) for kind, value in reversed(one_side)] + one_side
+    assert [kind for kind, _ in both] == [kind for kind, _ in expected]
+    assert [value for _, value in both] == pytest.approx([v for _, v in expected], abs=1e-9)

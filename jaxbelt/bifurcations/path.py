@@ -14,7 +14,8 @@ to one at the other. One that sticks does so if they have one itinerary. Of thos
 several may have it: each is followed to where its derivative by the parameter leads.
 """
 
-from collections.abc import Hashable, Sequence
+import functools
+from collections.abc import Hashable, Iterable, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -99,6 +100,7 @@ class ParameterPath:
         self.labels: dict[float, Label] = {}
         self.cycles: dict[float, list[AttractingCycle]] = {}
         self.unstable_cycles: dict[tuple[float, int], Cycle] = {}
+        self._searched: set[tuple[float, int]] = set()
         # From which value to which other one, from which cycle to which, of those that do not
         # stick; None where there is none.
         self._goes_on: dict[tuple[float, float], dict[int, int | None]] = {}
@@ -131,19 +133,21 @@ class ParameterPath:
     def unstable_along(self, values: Sequence[float] | np.ndarray, around: int) -> list[Cycle]:
         """The same at values in order; where starts near the equilibrium do not lead to one, or
         pass over it to one farther out, what those at the values beside go on to."""
-        known = {value: self.unstable(value, around) for value in map(float, values)}
-        if known and not any(map(_is_found, known.values())):
-            middle = list(known)[len(known) // 2]
-            found = among_all(self.at(middle), around)
-            known[middle] = known[middle] if found is None else found
-        for order in (list(known), list(known)[::-1]):
-            for beside, value in pairwise(order):
-                if _is_found(known[beside]) and not _is_beside(known[beside], known[value]):
-                    found = _gone_on(self.at(value), known[beside])
-                    if found is not None and not _width(known[value]) < _width(found):
-                        known[value] = found
-        self.unstable_cycles |= {(value, around): cycle for value, cycle in known.items()}
-        return list(known.values())
+        order = [float(value) for value in values]
+        known = self.unstable_cycles
+        if not any(_is_found(self.unstable(value, around)) for value in order):
+            middle = order[len(order) // 2]
+            if (middle, around) not in self._searched:
+                self._searched.add((middle, around))
+                found = among_all(self.at(middle), around)
+                known[middle, around] = known[middle, around] if found is None else found
+        for before, value in (*pairwise(order), *pairwise(order[::-1])):
+            one, beside = self.unstable(value, around), self.unstable(before, around)
+            if _is_found(beside) and not _is_beside(beside, one):
+                found = _gone_on(self.at(value), beside)
+                if found is not None and _width(found) <= _width(one):
+                    known[value, around] = found
+        return [known[value, around] for value in order]
 
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
         """The values just below and just above; farther off where motions are slow to settle."""
@@ -161,7 +165,7 @@ class ParameterPath:
             self._pseudo_foci[value] = EquilibriumKind.PSEUDO_FOCUS in np.asarray(kinds)
         return self._pseudo_foci[value]
 
-    @property
+    @functools.cached_property
     def edged(self) -> list[int]:
         """Belts with a finite contact edge, but for those without load, at whose edges nothing
         happens; one for each place if they share their edges, that of one's own conditions if it is
@@ -170,7 +174,10 @@ class ParameterPath:
         belts: list[int] = []
         known: set[float] = set()
         all_belts = self.at(0.5 * (self.first + self.last)).belts
-        pressed = [i for i, belt in enumerate(all_belts) if float(belt.load) != 0]
+        # A load that varies may be zero at an end, or in the middle.
+        spread = [self.first + part * self.length for part in (0.0, 0.29, 0.61, 1.0)]
+        loads = np.array([[float(belt.load) for belt in self.at(v).belts] for v in spread])
+        pressed = np.flatnonzero(np.any(loads != 0, axis=0)).tolist()
         for number in dict.fromkeys([*own_first, *pressed]):
             belt = all_belts[number]
             own = {float(edge) for edge in (belt.lower, belt.upper) if np.isfinite(edge)}
@@ -244,15 +251,9 @@ class ParameterPath:
         # Which way the belts rub at a pseudo-focus makes no difference to what it is.
         is_focus = seen.kind[exists, None] == EquilibriumKind.PSEUDO_FOCUS
         codes = np.where(is_focus & (codes == -1), 1, codes)
-        rests: list[tuple[int, bool, tuple[int, ...]]] = []
-        end, columns = np.nan, (seen.kind, seen.stable, seen.x1_lower, seen.x1_upper)
-        for *row, code in zip(*(x[exists].tolist() for x in columns), codes.tolist(), strict=True):
-            kind, stable, low, high = row
-            # At the edge of a belt without load a segment only seems to end.
-            if kind == EquilibriumKind.SEGMENT and low == end and rests[-1][2] == tuple(code):
-                stable |= rests.pop()[1]
-            rests.append((kind, stable, tuple(code)))
-            end = high if kind == EquilibriumKind.SEGMENT else np.nan
+        columns = (seen.kind, seen.stable, seen.x1_lower, seen.x1_upper)
+        rows = (x[exists].tolist() for x in columns)
+        rests = _joined_rests(zip(*rows, map(tuple, codes.tolist()), strict=True))
         found: list[AttractingCycle] = []
         loops = [jax.tree.map(lambda x, i=i: x[i], seen.loop) for i in range(len(seen.status))]
         for loop, status in zip(loops, seen.status.tolist(), strict=True):
@@ -265,7 +266,7 @@ class ParameterPath:
                 self._settled(value, loops[-1], closes=False) or AttractingCycle((), loops[-1])
             )
         self.cycles[value] = found
-        self._name(value, tuple(rests), courses)
+        self._name(value, rests, courses)
 
     def _name(self, value: float, rests, courses: tuple[Hashable, ...]) -> None:
         cycles = sorted(self.cycles[value], key=lambda one: one.path)
@@ -401,6 +402,22 @@ class ParameterPath:
         return self.labels[float(value)]
 
 
+def _joined_rests(rows: Iterable[tuple]) -> tuple[tuple, ...]:
+    """(kind, stable, codes) of every equilibrium, from left to right; a segment, which `equilibria`
+    gives in pieces, is one past the edge of a belt without load.
+
+    rows: (kind, stable, x1_lower, x1_upper, codes) of each.
+    """
+    rests: list[tuple] = []
+    end = np.nan  # of the last one, if that is a segment
+    for kind, attracts, low, high, code in rows:
+        if kind == EquilibriumKind.SEGMENT and low == end and rests[-1][2] == code:
+            attracts |= rests.pop()[1]
+        rests.append((kind, attracts, code))
+        end = high if kind == EquilibriumKind.SEGMENT else np.nan
+    return tuple(rests)
+
+
 def _is_found(cycle: Cycle) -> bool:
     return int(cycle.status) == Status.OK
 
@@ -418,7 +435,7 @@ def _is_beside(cycle: Cycle, other: Cycle) -> bool:
 
 
 def _width(cycle: Cycle) -> float:
-    return float(cycle.x1_max - cycle.x1_min)  # NaN where none is found
+    return float(cycle.x1_max - cycle.x1_min) if _is_found(cycle) else np.inf
 
 
 def _is_off_rest(cycle: Cycle) -> bool:

@@ -172,11 +172,15 @@ def edges_touched(
     values: in order, in a stretch in which nothing else happens. Those at which no such cycle is
     found are passed over. around: the number of the equilibrium, see `unstable_cycle`.
     """
-    if path.edged:
-        path.unstable_along(values, around)
+    if not path.edged:
+        return ()
+    path.unstable_along(values, around)
 
     def unstable(value):
         return path.unstable(value, around)
+
+    def found_at(*values):
+        return all(one.status == Status.OK for one in path.unstable_along(values, around))
 
     def modes(value):
         return itinerary(path.at(value), unstable(value))
@@ -185,7 +189,7 @@ def edges_touched(
         known = [v for v in map(float, values) if unstable(v).status == Status.OK]
         return [(a, b) for a, b in pairwise(known) if a < b and modes(a) != modes(b)]
 
-    points, intervals = [], changes(values) if path.edged else []
+    points, intervals = [], changes(values)
     while intervals:
         a, b = intervals.pop()
         solved = (
@@ -203,16 +207,11 @@ def edges_touched(
             path.unstable_cycles[float(point.value), around] = point.cycle
             before, after = path.beside(float(point.value))
             intervals += changes([a, max(a, before)]) + changes([min(b, after), b])
-        elif _has_unstable(path, (a, middle, b), around) and b - a > 1e-9 * path.length:
+        elif b - a > 1e-9 * path.length and found_at(a, middle, b):
             intervals += changes([a, middle, b])
         else:
             points.append(_told_point(path, middle, b - a))
     return by_value(points)
-
-
-def _has_unstable(path: ParameterPath, values: Sequence[float], around: int) -> bool:
-    """Whether unstable cycles are found at all of these values."""
-    return all(int(one.status) == Status.OK for one in path.unstable_along(values, around))
 
 
 # --- what makes the difference between two values -------------------------------------------------
