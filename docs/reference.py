@@ -280,17 +280,16 @@ class KeepNumbers(SphinxPostTransform):
     def run(self, **kwargs: Any) -> None:
         of_code = (nodes.literal, nodes.literal_block, nodes.raw, nodes.math, nodes.math_block)
         for text in list(self.document.findall(nodes.Text)):
-            parts = re.split(r"(?<!\w)(-?\d[\d.,]*e-\d+|-\d[\d.,]*\d|-\d)(?!\w)", text.astext())
-            within = isinstance(text.parent, (*of_code, nodes.TextElement))
-            if len(parts) == 1 or isinstance(text.parent, of_code) or not within:
+            if isinstance(text.parent, of_code) or not isinstance(text.parent, nodes.TextElement):
                 continue
-            numbers = [nodes.inline("", one, classes=["number"]) for one in parts[1::2]]
-            words = [nodes.Text(one) for one in parts[::2]]
-            new: list[nodes.Node] = [*words]
-            for i, one in enumerate(numbers):
-                new.insert(2 * i + 1, one)
-            at = text.parent.index(text)
-            text.parent[at : at + 1] = [one for one in new if one.astext()]
+            parts = re.split(r"(?<!\w)(-?\d[\d.,]*e-\d+|-\d[\d.,]*\d|-\d)(?!\w)", text.astext())
+            if len(parts) > 1:
+                # Every other one is a number.
+                marked = [
+                    nodes.inline("", part, classes=["number"]) if i % 2 else nodes.Text(part)
+                    for i, part in enumerate(parts)
+                ]
+                text.parent.replace(text, [one for one in marked if one.astext()])
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -475,31 +475,45 @@ def test_a_cycle_beside_circles_that_hardly_sticks():
     assert cycle.period == pytest.approx(2 * excess / nu + slips, rel=1e-12)
 
 
+def assert_repels(cycle, osc):
+    """SciPy's orbits from 1e-9 beside its top leave it to either side."""
+    assert cycle.status == Status.OK
+
+    def next_top(x1):
+        run = oracle_cycles.one_loop(osc, x1)
+        return np.inf if run is None else run.stopped_by.x1  # None: it touches a boundary, outside
+
+    inside, outside = float(cycle.x1_max) - 1e-9, float(cycle.x1_max) + 1e-9
+    assert next_top(inside) < inside and next_top(outside) > outside
+
+
 def test_unstable_cycles_that_repel_strongly_are_found():
-    """At a belt's load just above a nonsmooth fold, multipliers of ten thousand; one was found only
-    where they are below a thousand. They are those of the portrait, which finds all cycles."""
-    law = jb.Conti(1.0, 0.6, 10.0)
+    """At a belt's load just above a nonsmooth fold, multipliers of ten thousand; they were found
+    only where they are below a thousand."""
+    law, (mu, static) = jb.Conti(1.0, 0.6, 10.0), oracle.conti(1.0, 0.6, 10.0)
     for load in (1.031, 1.05):
         osc = jb.Oscillator(0.5, (jb.Belt(0.7, law, load), jb.Belt(0.7, law, 0.5)), 2.0)
+        belts = tuple(oracle.Belt(0.7, mu, static, one) for one in (load, 0.5))
         cycle = jb.unstable_cycle(osc)
-        assert cycle.status == Status.OK and cycle.multiplier > 1e4
+        assert cycle.multiplier > 1e4
+        assert_repels(cycle, oracle.Oscillator(0.5, belts, 2.0))
         (known,) = jb.portrait(osc).unstable
         np.testing.assert_allclose(cycle.x1_max, known.x1_max, rtol=1e-10)
-
-
-def close_to_one_that_attracts(sign: float) -> jb.Oscillator:
-    left = jb.Conti(0.9624, 0.593, 5.52, 0.0065)
-    right = jb.Conti(0.9576, 0.5185, 11.126, 0.0058)
-    sides = [(0.235, left, 0.4425, -0.2768, np.inf), (-0.4105, right, 0.5268, -np.inf, 0.2214)]
-    if sign < 0:
-        sides = [(-v, law, load, -upper, -lower) for v, law, load, lower, upper in sides]
-    return jb.Oscillator(0.4664, tuple(jb.Belt(*one) for one in sides), 1.4555)
 
 
 @pytest.mark.slow(first=True)
 def test_an_unstable_cycle_close_inside_one_that_attracts_is_found_from_either_side():
     """A way of 0.003 between the two: starts passed over it, but not in the mirror image."""
-    found = [jb.unstable_cycle(close_to_one_that_attracts(sign), around=1) for sign in (1, -1)]
+    laws = (0.9624, 0.593, 5.52, 0.0065), (0.9576, 0.5185, 11.126, 0.0058)
+    sides = [(0.235, 0.4425, -0.2768, np.inf), (-0.4105, 0.5268, -np.inf, 0.2214)]
+    images = [(-v, load, -upper, -lower) for v, load, lower, upper in sides]
+    found = []
+    for belts in (sides, images):
+        pairs = list(zip(belts, laws, strict=True))
+        ours = tuple(jb.Belt(v, jb.Conti(*law), *more) for (v, *more), law in pairs)
+        theirs = tuple(oracle.Belt(v, *oracle.conti(*law), *more) for (v, *more), law in pairs)
+        found.append(jb.unstable_cycle(jb.Oscillator(0.4664, ours, 1.4555), around=1))
+        assert_repels(found[-1], oracle.Oscillator(0.4664, theirs, 1.4555))
     assert all(cycle.status == Status.OK and cycle.multiplier > 1 for cycle in found)
     np.testing.assert_allclose(found[0].x1_min, -found[1].x1_max, rtol=1e-10)
     np.testing.assert_allclose(found[0].period, found[1].period, rtol=1e-10)

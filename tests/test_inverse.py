@@ -265,7 +265,7 @@ def test_local_cubics_are_exact_for_cubics():
 @pytest.mark.slow(first=True)
 def test_windows_that_are_far_off_lead_to_the_record_if_no_others_do():
     """From ten per cent off none of the candidates came near in windows of half a loop; joined,
-    the first of them does. And what is far off is a misfit, whatever its errors are."""
+    the nearest of them does. And what is far off is a misfit, whatever its errors are."""
 
     def machine(static, kinetic, velocity):
         law = jb.Stribeck(static, kinetic, velocity)

@@ -147,6 +147,15 @@ def test_a_finished_store_is_returned_at_once(path, whole, monkeypatch):
     assert again(path).equals(whole)
 
 
+def test_a_store_keeps_the_blocks_that_it_was_made_with(tmp_path, whole, monkeypatch):
+    unfinished = tmp_path / "a.zarr"
+    jb.sweep(jb.presets.class_b, AXES, **OPTIONS, store=unfinished, blocks=(0, 2))
+    blocks = len(jb.verify(unfinished).done) + len(jb.verify(unfinished).to_do)
+    monkeypatch.setattr(stores, "BLOCK_RUNS", 6)
+    assert again(unfinished).equals(whole)
+    assert len(jb.verify(unfinished).done) == blocks
+
+
 def test_only_what_is_not_done_is_done(path, whole):
     undone(path, 1, 3)
     mark = zarr.open_group(path, mode="r+", use_consolidated=False)["x1_min"]

@@ -48,13 +48,14 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
     `ValueError` names an impossible argument.
     """
     cycle = from_starts(osc, around=around, max_arcs=max_arcs)
-    if is_outermost(osc) and int(cycle.status) == Status.NO_UNSTABLE_CYCLE:
-        return among_all(osc, around) or cycle
-    return cycle
+    if not is_outermost(osc) or int(cycle.status) != Status.NO_UNSTABLE_CYCLE:
+        return cycle
+    found = among_all(osc, around)
+    return cycle if found is None else found
 
 
 def from_starts(osc: Oscillator, *, around: int = 0, max_arcs: int | None = None) -> Cycle:
-    """The same by one program, from starts at different distances; see there."""
+    """`unstable_cycle` by one program, as it is under `jit`: from starts near the equilibrium."""
     check_oscillator(osc)
     last = most_equilibria(osc) - 1
     is_number = isinstance(around, int | np.integer) and not isinstance(around, bool)
@@ -67,7 +68,7 @@ def from_starts(osc: Oscillator, *, around: int = 0, max_arcs: int | None = None
 
 
 def among_all(osc: Oscillator, around: int) -> Cycle | None:
-    """The same among all cycles of a known oscillator, the innermost one around the equilibrium."""
+    """The innermost such cycle around an equilibrium, among all cycles of a known oscillator."""
     points = equilibria(osc)
     meant = np.flatnonzero(_eligible(points))
     if around >= len(meant):

@@ -20,6 +20,7 @@ slips by whole loops against the record, and the sum of squares has a minimum fo
 All derivatives of 2 and 3 are those of `simulate`, through every stick, slip and crossing.
 """
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -387,11 +388,6 @@ def fit(
         followed.append(point)
         if judged(point).is_noise:
             break
-    else:
-        tell("the guess, in one piece")
-        whole = np.arange(len(record.starts)) == 0
-        starts_there = np.asarray(record.starts)
-        followed.append(_fit_windows(linearized, np.asarray(u), starts_there, whole, 0.0, np.inf))
     best = min(followed, key=_misfit_of)
     verdict = judged(best), estimated
     result = _result(
@@ -434,9 +430,10 @@ def _checked_record(ts, x1, x2, noise):
 
 
 def _led_to(linearized, guesses, data: int, tell) -> Iterator[_Point]:
-    """Where the guesses lead; first those whose windows come near the record."""
-    far = []
-    for number, (u, starts, misfit) in enumerate(guesses, 1):
+    """Where the guesses lead: those whose windows come near the record, then the others, and at
+    last the first guess without windows."""
+    guess, far = next(guesses), []
+    for number, (u, starts, misfit) in enumerate(itertools.chain([guess], guesses), 1):
         came = "the guess" if np.isnan(misfit) else f"misfit {misfit:.3g} of the smooth formulation"
         tell(f"candidate {number}: {came}")
         point = _in_windows(linearized, u, starts, data, tell)
@@ -447,10 +444,13 @@ def _led_to(linearized, guesses, data: int, tell) -> Iterator[_Point]:
     for number, point in sorted(far, key=lambda one: _misfit_of(one[1])):
         tell(f"candidate {number}, from afar")
         yield _as_one_motion(linearized, point, data, tell)
+    tell("the guess, in one piece")
+    u, starts, _ = guess
+    yield _fit_windows(linearized, u, starts, np.arange(len(starts)) == 0, 0.0, np.inf)
 
 
 def _misfit_of(point: _Point) -> float:
-    """The smaller, the nearer to the record."""
+    """chi^2, infinite where it is no number."""
     return float(np.nan_to_num(point.chi2, nan=np.inf))
 
 

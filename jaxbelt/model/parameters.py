@@ -120,8 +120,7 @@ def _told(chosen: Any) -> str:
         return f"({', '.join(map(_told, chosen))})"
     if isinstance(chosen, eqx.Module):
         return f"a whole {type(chosen).__name__}"
-    fixed = isinstance(chosen, float)
-    return f"{chosen!r}, a number that is no parameter" if fixed else repr(chosen)
+    return repr(chosen) + ", a number that is no parameter" * isinstance(chosen, float)
 
 
 def vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
