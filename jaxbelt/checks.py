@@ -283,6 +283,18 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
         return jnp.asarray(numbers, dtype=jnp.float64)
 
 
+def as_positive_number(value: Any, field: str) -> Array | np.ndarray:
+    """`value` as a number that is > 0 as far as it is known, see `as_numbers`."""
+    number = as_numbers(value, field)
+    check_positive(number, field)
+    return number
+
+
+def as_size(value: Any, field: str) -> Array | np.ndarray:
+    """The same of a size in the user's units; NaN in place of None: the oscillator's own."""
+    return np.asarray(np.nan) if value is None else as_positive_number(value, field)
+
+
 def as_positive(value: Any, field: str) -> float:
     """`value` as a finite number > 0, or a `ValueError`."""
     number = float(as_array(value, field))

@@ -14,9 +14,17 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import as_numbers, check_finite, check_positive, is_concrete, require
+from ..checks import (
+    as_numbers,
+    as_positive_number,
+    as_size,
+    check_finite,
+    is_concrete,
+    require,
+)
 from ..model.modes import has_edges, without_edges
 from ..model.oscillator import Oscillator, check_oscillator, has_possible_numbers
+from ..model.own_units import in_given_units, in_own_units, in_units, quantity
 from ..model.rest import start_at_focus
 from ..model.transitions import contact
 from ..numerics.compiling import jit, power_of_two
@@ -38,7 +46,7 @@ class Events(eqx.Module):
     """
 
     t: Array
-    y: Array
+    y: Array = quantity("length", "velocity")
     kind: Array
     belt: Array
 
@@ -71,7 +79,7 @@ class Arcs(eqx.Module):
     """
 
     t: Array
-    y: Array
+    y: Array = quantity("length", "velocity")
     mode: Array
     duration: Array
 
@@ -102,7 +110,7 @@ class Trajectory(eqx.Module):
     """
 
     ts: Array
-    ys: Array
+    ys: Array = quantity("length", "velocity")
     modes: Array
     events: Events
     arcs: Arcs
@@ -134,9 +142,18 @@ class Trajectory(eqx.Module):
         )
 
 
+#: The default tolerances of a step, and width of the band of the switch model and of the smooth
+#: one's tanh, in own units.
+TOLERANCE, WIDTH = 1e-10, 1e-3
+
+
 @jit
-def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution) -> Trajectory:
+def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution) -> Trajectory:
     """A trajectory of the switch or the smooth formulation: samples without events or arcs."""
+    osc = in_own_units(given)
+    y0 = y0 / osc.units.length
+    atol = in_units(atol, osc.units.length, TOLERANCE)
+    width = in_units(width, osc.units.velocity, WIDTH)
     if ts is None:
         ts = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)
     field = switch_field if formulation == "switch" else smooth_field
@@ -152,7 +169,7 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
     start_known = jnp.all(jnp.isfinite(y0)) & possible
     failure = jnp.where(start_known, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
     integers, states = jnp.zeros(0, dtype=int), jnp.zeros((0, 2))
-    return Trajectory(
+    found = Trajectory(
         ts,
         ys,
         jax.vmap(mode_at)(ys),
@@ -160,12 +177,16 @@ def _smoothed(osc, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution
         Arcs(jnp.zeros(0), states, jnp.zeros((0, len(osc.belts)), jnp.int8), jnp.zeros(0)),
         jnp.where(known, Status.OK.value, failure),
     )
+    return in_given_units(found, given, osc)
 
 
 @jit
 def _filippov(
-    osc, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution, ends_at_t1
+    given, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution, ends_at_t1
 ) -> Trajectory:
+    osc = in_own_units(given)
+    y0 = y0 / osc.units.length
+    atol = in_units(atol, osc.units.length, TOLERANCE)
     if ts is None:
         wanted_times = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)[:-1]
     else:
@@ -208,7 +229,7 @@ def _filippov(
         ends = t1, y1, mode1
         rows = jax.tree.map(lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, ends)
     ts, ys, modes = rows
-    return Trajectory(ts, ys, modes, events, arcs, status)
+    return in_given_units(Trajectory(ts, ys, modes, events, arcs, status), given, osc)
 
 
 def _merged(first: Array, second: Array) -> Array:
@@ -229,11 +250,11 @@ def simulate(
     *,
     t0: ArrayLike = 0.0,
     ts: ArrayLike | list | tuple | None = None,
-    rtol: ArrayLike = 1e-10,
-    atol: ArrayLike = 1e-10,
+    rtol: ArrayLike = TOLERANCE,
+    atol: ArrayLike | None = None,
     formulation: str = "filippov",
-    v_star: ArrayLike = 1e-3,
-    eps: ArrayLike = 1e-3,
+    v_star: ArrayLike | None = None,
+    eps: ArrayLike | None = None,
     max_segments: int | None = None,
     max_events: int | None = None,
 ) -> Trajectory:
@@ -243,11 +264,13 @@ def simulate(
     tau = omega t). ts: the times wanted, increasing, shape [n]; None gives an even grid with the
     ends of all arcs in it, and t1 last. For the reverse mode of a function of the final state alone
     give ts=[t1]: else it makes the derivatives of every sample. rtol, atol: tolerances of the
-    integrator per step; in a batch the smallest ones hold for all.
+    integrator per step, atol a length (None: 1e-10 of the oscillator's own size, see
+    `own_units`); in a batch the smallest ones hold for all.
 
     formulation: "filippov", the exact event-driven motion; "switch", the paper's switch model,
     eqs. (21)-(23), with a band of half-width v_star around each boundary; "smooth", with
-    tanh(r/eps) in place of sgn(r). The last two have no events.
+    tanh(r/eps) in place of sgn(r); v_star and eps are velocities (None: 1e-3 of the oscillator's
+    own). The last two have no events.
 
     max_segments: budget of arcs; None chooses one from the time span. A run that uses it up
     returns what it has, with the status TOO_MANY_SEGMENTS. A loop behind a stick phase that repeats
@@ -273,9 +296,7 @@ def simulate(
     check_finite(t1, "t1")
     if is_concrete((t0, t1)) and not t1 > t0:
         require(False, "t1", f"> t0 = {t0}", t1)
-    rtol, atol = as_numbers(rtol, "rtol"), as_numbers(atol, "atol")
-    check_positive(rtol, "rtol")
-    check_positive(atol, "atol")
+    rtol, atol = as_positive_number(rtol, "rtol"), as_size(atol, "atol")
     if ts is not None:
         ts = _checked_times(ts, t0, t1)
     require(
@@ -289,8 +310,7 @@ def simulate(
     resolution = 0 if ts is not None else _room_for(10 * span, 512)
     if formulation != "filippov":
         name = "v_star" if formulation == "switch" else "eps"
-        width = as_numbers(v_star if formulation == "switch" else eps, name)
-        check_positive(width, name)
+        width = as_size(v_star if formulation == "switch" else eps, name)
         fixed = dict(formulation=formulation, resolution=resolution)
         return _smoothed(osc, *given, width=width, **fixed)
     padded = not is_concrete((osc, given))

@@ -1,0 +1,234 @@
+"""An oscillator's own units, in which everything is computed.
+
+Time is dimensionless already (tau = omega t), but lengths come in whatever unit the user has. The
+public functions bring an oscillator into its own unit of length, compute there, and bring the
+results back. So every tolerance is relative to the oscillator's own size, and no answer depends on
+the unit. With the unit of length L
+
+    x1 = L x1*,  x2 = L x2*,  nu = omega L nu*,  u0 = L u0*,  mu*(r*) = mu(omega L r*)
+
+and the frequency omega is 1 in own units. L is a power of two, so that a change of unit by a power
+of two changes no bit but exponents.
+
+A field of a result that is a quantity with a dimension is declared with `quantity`; `in_given_units`
+reads that.
+"""
+
+import dataclasses
+import functools
+import operator
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike
+
+from ..checks import is_concrete
+from .oscillator import Belt, Oscillator, scaled_edge
+
+#: Contact edges cut the motion off where a belt could pull the mass farther than this many times
+#: as far: then they and the velocities give its size, not the friction.
+HEAVY = 64.0
+
+
+class OwnUnits(eqx.Module):
+    """The units of an oscillator: length, of x1 and x2, a power of two; velocity, of belts."""
+
+    length: Array
+    velocity: Array
+
+    @property
+    def is_given(self) -> bool:
+        """Whether these are known, and those of the user."""
+        return is_concrete(self) and bool(np.all([self.length, self.velocity] == np.ones(2)))
+
+
+class OwnOscillator(Oscillator):
+    """An oscillator in units of its own, which it knows."""
+
+    units: OwnUnits = dataclasses.field(kw_only=True)
+
+
+def own_length(osc: Oscillator) -> ArrayLike:
+    """The own unit of length: the size of an oscillator, rounded down to a power of two.
+
+    The size is the largest friction force over the stiffness, u0 mu(0): the mass sticks within
+    that distance of the origin. A heavy belt whose contact ends earlier moves the mass no farther
+    than to the edge; there edges and velocities tell the size, and so they do without friction.
+    """
+    known = is_concrete(osc)
+    one: Any = np if known else jnp
+    number: Any = np.asarray if known else lax.stop_gradient
+    loads = [number(belt.load) for belt in osc.belts]
+    pulls = [load * number(belt.friction.static) for load, belt in zip(loads, osc.belts)]
+    force = functools.reduce(one.maximum, pulls)
+    edges = [
+        (load, number(edge))
+        for load, belt in zip(loads, osc.belts)
+        for edge in (belt.lower, belt.upper)
+        if edge is not None and not (is_concrete(edge) and np.isinf(edge))
+    ]
+    size = force
+    if edges or not is_concrete(force) or not force > 0:
+        # An edge at 0 has no length, and cuts all the same.
+        cuts = [(load > 0) & one.isfinite(edge) for load, edge in edges]
+        lengths = [
+            one.where(cut, one.abs(edge), 0.0) for cut, (_, edge) in zip(cuts, edges, strict=True)
+        ]
+        speeds = [
+            one.where(load > 0, one.abs(number(belt.velocity)) / number(osc.omega), 0.0)
+            for load, belt in zip(loads, osc.belts)
+        ]
+        inner = functools.reduce(one.maximum, [*lengths, *speeds])
+        is_cut = functools.reduce(operator.or_, cuts, np.asarray(False))
+        is_inner = (is_cut & (HEAVY * inner < force)) | ~(force > 0)
+        size = one.where((inner > 0) & is_inner, inner, force)
+    return power_of_two_below(size)
+
+
+#: The bits of the exponent of a float64.
+EXPONENT = np.int64(0x7FF0000000000000)
+
+
+def power_of_two_below(size: Any) -> Any:
+    """The largest power of two that is no larger, by the bits of its exponent; 1 for what is not
+    positive and finite."""
+    if is_concrete(size):
+        size = np.asarray(size, np.float64)
+        fine = bool(size > np.finfo(np.float64).tiny) and bool(np.isfinite(size))
+        return np.asarray(2.0 ** (np.frexp(size)[1] - 1) if fine else 1.0)
+    fine = (size > np.finfo(np.float64).tiny) & jnp.isfinite(size)
+    bits = lax.bitcast_convert_type(jnp.where(fine, size, 1.0), jnp.int64)
+    return lax.bitcast_convert_type(bits & EXPONENT, jnp.float64)
+
+
+def in_own_units(osc: Oscillator, length: ArrayLike | None = None) -> OwnOscillator:
+    """The oscillator in its own units, or in those with a given unit of length.
+
+    An oscillator that is in its own units already stays as it is.
+    """
+    if isinstance(osc, OwnOscillator):
+        return osc
+    length = own_length(osc) if length is None else length
+    known = is_concrete((osc.omega, length))
+    omega: Any = np.asarray(osc.omega) if known else osc.omega
+    units = OwnUnits(length, omega * length)
+    if known and length == 1 and omega == 1:
+        return _unchecked(OwnOscillator, **vars(osc), units=units)
+    fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=_ONE)
+    return _unchecked(OwnOscillator, **fields, units=units)
+
+
+_ONE = np.ones(())
+
+
+def in_units(value: Any, unit: Any, default: float) -> Any:
+    """A size in own units, which is given in the user's, or NaN where the default holds."""
+    return jnp.where(jnp.isnan(value), default, value / unit)
+
+
+def _scaled(belts: tuple[Belt, ...], units: OwnUnits) -> tuple[Belt, ...]:
+    def edge(value):
+        return None if value is None else scaled_edge(value, 1 / units.length)
+
+    return tuple(
+        _unchecked(
+            Belt,
+            velocity=belt.velocity / units.velocity,
+            friction=belt.friction.in_units_of(units.velocity),
+            load=belt.load / units.length,
+            lower=edge(belt.lower),
+            upper=edge(belt.upper),
+        )
+        for belt in belts
+    )
+
+
+def _unchecked(kind: type, /, **fields: Any) -> Any:
+    """A module without the checks of its numbers, which those of the user have passed."""
+    made = object.__new__(kind)
+    for name, value in fields.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+# --- results ------------------------------------------------------------------------------------
+
+
+def quantity(*dimensions: str, **settings: Any) -> Any:
+    """A field of a result that has a dimension: one of `POWERS`.
+
+    Several stand for the columns of an array's last axis.
+    """
+    return eqx.field(metadata={"dimensions": dimensions}, **settings)
+
+
+#: Dimensions, as powers of the unit of length; time has none.
+POWERS = {"time": 0, "length": 1, "velocity": 1, "energy": 2, "coefficient": -2}
+
+
+def in_given_units(result: Any, osc: Oscillator, own: OwnOscillator) -> Any:
+    """A result that was found for an oscillator in own units, in those of the oscillator given.
+
+    Other oscillators in it are given back as by `in_units_of_user`.
+    """
+    if own is osc:
+        return result
+    return rescaled(result, own.units.length, {id(own): osc})
+
+
+def rescaled(result: Any, length: Any, oscillators: dict[int, Oscillator] | None = None) -> Any:
+    """A result whose lengths are multiplied by a number, and whose oscillators are replaced.
+
+    oscillators: by `id` of those in the result; None, and others: such as are in own units are
+    given back in their user's.
+    """
+    known = oscillators or {}
+    is_one = is_concrete(length) and np.all(np.asarray(length) == 1)
+
+    def scaled(value: Any, dimensions: tuple[str, ...]) -> Any:
+        powers = [POWERS[name] for name in dimensions]
+        if is_one or value is None or not any(powers):
+            return value
+        if len(powers) == 1:
+            factor = length ** powers[0]
+            return float(factor) * value if isinstance(value, float) else value * factor
+        one: Any = np if isinstance(value, np.ndarray) else jnp
+        return value * one.stack([one.asarray(length**power) for power in powers])
+
+    def walked(value: Any) -> Any:
+        if id(value) in known:
+            return known[id(value)]
+        if isinstance(value, OwnOscillator):
+            return in_units_of_user(value)
+        if isinstance(value, Oscillator):
+            return value
+        if isinstance(value, eqx.Module):
+            new = {}
+            for field in dataclasses.fields(value):
+                old = getattr(value, field.name)
+                dimensions = field.metadata.get("dimensions")
+                changed = walked(old) if dimensions is None else scaled(old, dimensions)
+                if changed is not old:
+                    new[field.name] = changed
+            return _unchecked(type(value), **{**vars(value), **new}) if new else value
+        if type(value) in (tuple, list):
+            return type(value)(map(walked, value))
+        if type(value) is dict:
+            return {name: walked(one) for name, one in value.items()}
+        return value
+
+    return walked(result)
+
+
+def in_units_of_user(own: OwnOscillator) -> Oscillator:
+    """The oscillator as the user has it, but for rounding where omega is no power of two."""
+    units = own.units
+    if units.is_given:
+        fields = {name: value for name, value in vars(own).items() if name != "units"}
+        return _unchecked(Oscillator, **fields)
+    belts = _scaled(own.belts, OwnUnits(1 / units.length, 1 / units.velocity))
+    omega = units.velocity / units.length
+    return _unchecked(Oscillator, damping=own.damping, belts=belts, omega=omega)
