@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..model.events import Signature, events_of
+from ..model.own_units import quantity
 from ..motion.arcs import Ends
 
 #: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
@@ -46,7 +47,7 @@ class Loop(eqx.Module):
 
     codes: Array
     ends: Array
-    entries: Array
+    entries: Array = quantity("length", "velocity")
     durations: Array
 
     @property

@@ -30,6 +30,7 @@ from ..model.events import Signature, signature_name
 from ..model.friction import jump_and_kink
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator
+from ..model.own_units import in_given_units, in_own_units, quantity
 from ..model.rest import is_neutral
 from ..motion.simulate import Arcs
 from ..numerics.compiling import any_lane, in_groups, jit
@@ -83,7 +84,7 @@ class Cycle(eqx.Module):
 
     oscillator: Oscillator
     chain: Chain
-    unknowns: Array
+    unknowns: Array = quantity("length", "velocity", "time")
     multiplier: Array
     residual: Array
     iterations: Array
@@ -467,17 +468,19 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     an equilibrium, to one of a continuum of closed orbits, or nothing repeats, the status says so.
     `ValueError` names an argument that is impossible.
     """
-    cycle = cycle_from(osc, y0, max_arcs)
+    check_oscillator(osc)
+    y0 = as_array(y0, "y0", (2,))
+    check_finite(y0, "y0")
+    room = None if max_arcs is None else as_whole(max_arcs, "max_arcs")
+    own = in_own_units(osc)
+    cycle = in_given_units(cycle_from(own, y0 / own.units.length, room), osc, own)
     warn_of_extrapolation([cycle])
     return cycle
 
 
-def cycle_from(osc: Oscillator, y0: ArrayLike | tuple, max_arcs: int | None = None) -> Cycle:
-    """What `find_cycle` returns, without its warning."""
-    check_oscillator(osc)
-    y0 = as_array(y0, "y0", (2,))
-    check_finite(y0, "y0")
-    room = SIZES[-1] if max_arcs is None else as_whole(max_arcs, "max_arcs")
+def cycle_from(osc: Oscillator, y0: Array, max_arcs: int | None = None) -> Cycle:
+    """The cycle that a start leads to, of an oscillator in own units, without any warning."""
+    room = SIZES[-1] if max_arcs is None else max_arcs
     loop, count, status, y = _loop_reached(osc, y0, room)
     for _ in range(MORE_BUDGETS if is_concrete(status) else 0):
         if int(status) != Status.NOT_SETTLED:

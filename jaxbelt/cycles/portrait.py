@@ -22,6 +22,7 @@ from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.events import signature_name
 from ..model.modes import edges
 from ..model.oscillator import Oscillator, check_oscillator
+from ..model.own_units import OwnOscillator, in_given_units, in_own_units, quantity
 from ..results import Status, describe, draw
 from ..tables import table_of
 from .cycle import Cycle, warn_of_extrapolation
@@ -71,8 +72,8 @@ class Portrait(eqx.Module):
     unstable: tuple[Cycle, ...]
     separatrices: tuple[Separatrix, ...]
     escapes: bool = eqx.field(static=True)
-    reach: float = eqx.field(static=True)
-    gaps: Array
+    reach: float = quantity("length", static=True)
+    gaps: Array = quantity("length")
     status: Array
 
     def table(self) -> "pandas.DataFrame":
@@ -154,19 +155,26 @@ def portrait(osc: Oscillator) -> Portrait:
     """All equilibria, attracting and unstable cycles, and separatrices of an oscillator.
 
     osc: `Oscillator` with any friction laws, belts and contact intervals, of any damping. See
-    `Portrait` for what comes back. Cycles smaller than 1e-5, and those that go less than 1e-7 to
-    the right of a contact edge at which the mass can rest, are not told from equilibria.
+    `Portrait` for what comes back. Cycles smaller than 1e-5 of the oscillator's own size, and those
+    that go less than 1e-7 of it to the right of a contact edge at which the mass can rest, are not
+    told from equilibria.
 
     For one known oscillator, outside of `jax.jit`, `jax.vmap` and derivatives: how much there is
     decides what is computed. `ValueError` names an argument that is impossible, or traced.
     """
     check_oscillator(osc)
+    own = in_own_units(osc)
+    found = in_given_units(_portrait(own), osc, own)
+    warn_of_extrapolation((*found.cycles, *found.unstable), depth=5)
+    return found
+
+
+def _portrait(osc: OwnOscillator) -> Portrait:
     points = equilibria(osc)
     found, map_ = branches_and_returns(osc, points)
     reach = map_.reach
     cycles = tuple(cycle for cycle in map_.cycles if abs(float(cycle.multiplier)) < 1)
     unstable = tuple(cycle for cycle in map_.cycles if float(cycle.multiplier) > 1)
-    warn_of_extrapolation((*cycles, *unstable), depth=5)
     gaps = np.array(sorted(map_.gaps)).reshape(-1, 2)
     separatrices = tuple(
         _named(branch, map_, points, unstable if branch.stable else cycles) for branch in found

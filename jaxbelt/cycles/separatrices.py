@@ -47,6 +47,7 @@ from ..model.modes import (
     select,
 )
 from ..model.oscillator import Oscillator
+from ..model.own_units import quantity
 from ..model.transitions import contact, contact_beside, mode_of_state
 from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit
@@ -90,11 +91,11 @@ class Separatrix(eqx.Module):
       oscillator reversed in time. What ends the last one, if it was left there, is "unused".
     """
 
-    point: Array
+    point: Array = quantity("length", "velocity")
     side: str = eqx.field(static=True)
     stable: bool = eqx.field(static=True)
     ts: Array
-    ys: Array
+    ys: Array = quantity("length", "velocity")
     end: str = eqx.field(static=True)
     to: int = eqx.field(static=True)
     arcs: Loop

@@ -9,6 +9,7 @@ the way is shortest a change of its ends along the curves counts nothing, only t
 curves does.
 """
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -20,6 +21,7 @@ from jaxtyping import Array, ArrayLike
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, number, require, require_one_of
 from ..model.oscillator import Oscillator, check_oscillator
+from ..model.own_units import OwnOscillator, in_given_units, in_own_units, quantity, rescaled
 from ..results import Status, describe, draw
 from ..tables import table_of
 from .nearest import ShortestWay, end_of_way, sampled_curve, sampled_point, shortest_between
@@ -60,19 +62,20 @@ class FatalShock(eqx.Module):
     attractor: str = eqx.field(static=True)
     boundary: str = eqx.field(static=True)
     beyond: str = eqx.field(static=True)
-    distance: Array
-    start: Array
-    shock: Array
+    distance: Array = quantity("length")
+    start: Array = quantity("length", "velocity")
+    shock: Array = quantity("length", "velocity")
     status: Array
 
     def at_phases(self, n: int) -> "pandas.DataFrame":
         """The smallest fatal shock at each of n phases of the cycle, evenly spread over a period
         (of an equilibrium at its one state): t, the time since the first of them, x1, x2, distance,
         shock_x1, shock_x2; inf and NaN where there is no boundary in that direction."""
-        known, along_x2 = self.portrait.oscillator, self.direction == "x2"
+        known, along_x2 = in_own_units(self.portrait.oscillator), self.direction == "x2"
+        told, unit = _in_units_of(self.portrait, known), float(known.units.length)
         end = destination_of_name(self.attractor)
-        ts, states = _phases(self.portrait, end, as_whole(n, "n"))
-        beside = [bound for bound in bounds_of(self.portrait) if end in bound.sides]
+        ts, states = _phases(told, end, as_whole(n, "n"))
+        beside = [bound for bound in bounds_of(told) if end in bound.sides]
         curves = [sampled_curve(known, bound.outline) for bound in beside]
         rows = []
         for t, y in zip(ts, states, strict=True):
@@ -81,7 +84,7 @@ class FatalShock(eqx.Module):
                 length, meeting = shortest_between(known, point, curve, along_x2=along_x2)
                 if meeting is not None and not length >= best:
                     best, shock = length, end_of_way(known, curve, meeting) - y
-            rows.append((t, *y, best, *shock))
+            rows.append((t, *(unit * np.array([*y, best, *shock])).tolist()))
         columns = zip(*rows, strict=True)
         names = ("t", "x1", "x2", "distance", "shock_x1", "shock_x2")
         return table_of({name: list(column) for name, column in zip(names, columns, strict=True)})
@@ -139,16 +142,19 @@ def minimal_fatal_shock(
     decides what is computed, so not in `jax.jit` and `jax.vmap`. `ValueError` names an argument
     that is impossible.
     """
-    told = osc if isinstance(osc, Portrait) else None
+    shown = osc if isinstance(osc, Portrait) else None
     osc = osc.oscillator if isinstance(osc, Portrait) else osc
     check_oscillator(osc)
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     require_one_of(direction, DIRECTIONS, "direction")
+    given, osc = osc, in_own_units(osc)
+    y0 = y0 / osc.units.length
     known, start = lax.stop_gradient((osc, y0))
     concrete = is_concrete((known, start))
     require(concrete, "osc", "known: shocks are not for jit or vmap", "a traced one")
-    told = portrait(known) if told is None else told
+    shown = portrait(lax.stop_gradient(given)) if shown is None else shown
+    told = _in_units_of(shown, known)
     (end,) = leads_to(told, np.asarray(start)[None])
     way, bound, status = shortest_way_out(told, end, along_x2=direction == "x2")
     if bound is None or way is None:
@@ -159,8 +165,8 @@ def minimal_fatal_shock(
         from_, to = way.ends(osc)
         shock = to - from_
         distance = length_of(shock, direction)
-    return FatalShock(
-        portrait=told,
+    found = FatalShock(
+        portrait=shown,
         direction=direction,
         attractor=end.name,
         boundary="none" if bound is None else bound.name,
@@ -170,6 +176,12 @@ def minimal_fatal_shock(
         shock=shock,
         status=jnp.asarray(np.array(status.value)),
     )
+    return replace(in_given_units(found, given, osc), portrait=shown)
+
+
+def _in_units_of(told: Portrait, own: OwnOscillator) -> Portrait:
+    """A portrait, whose oscillator this is in own units, in these."""
+    return rescaled(told, 1 / own.units.length, lambda _: own)
 
 
 def length_of(shock: Array, direction: str) -> Array:

@@ -22,6 +22,7 @@ from ..checks import as_whole, require_value
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, equilibria, most_equilibria
 from ..model.modes import STUCK
 from ..model.oscillator import Oscillator, check_oscillator
+from ..model.own_units import in_given_units, in_own_units
 from ..numerics.compiling import each, is_outermost, jit
 from ..results import Status
 from .attractors import arcs_of, place_of
@@ -47,15 +48,6 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
     under `jit`, `vmap` and derivatives also where another cycle attracts close outside of it.
     `ValueError` names an impossible argument.
     """
-    cycle = from_starts(osc, around=around, max_arcs=max_arcs)
-    if not is_outermost(osc) or int(cycle.status) != Status.NO_UNSTABLE_CYCLE:
-        return cycle
-    found = among_all(osc, around)
-    return cycle if found is None else found
-
-
-def from_starts(osc: Oscillator, *, around: int = 0, max_arcs: int | None = None) -> Cycle:
-    """`unstable_cycle` by one program, as it is under `jit`: from starts near the equilibrium."""
     check_oscillator(osc)
     last = most_equilibria(osc) - 1
     is_number = isinstance(around, int | np.integer) and not isinstance(around, bool)
@@ -63,6 +55,16 @@ def from_starts(osc: Oscillator, *, around: int = 0, max_arcs: int | None = None
     expected = f"the number of an equilibrium, {among}"
     require_value(is_number and 0 <= around <= last, "around", expected, around)
     room = SIZES[0] if max_arcs is None else as_whole(max_arcs, "max_arcs")
+    own = in_own_units(osc)
+    cycle = from_starts(own, around=around, room=room)
+    if is_outermost(osc) and int(cycle.status) == Status.NO_UNSTABLE_CYCLE:
+        found = among_all(own, around)
+        cycle = cycle if found is None else found
+    return in_given_units(cycle, osc, own)
+
+
+def from_starts(osc: Oscillator, *, around: int = 0, room: int = SIZES[0]) -> Cycle:
+    """`unstable_cycle` by one program, as it is under `jit`: from starts near the equilibrium."""
     loop, status, distance = separating_loop(osc, room, around)
     return _if_meant(exactly(osc, loop, status), loop, distance)
 

@@ -13,6 +13,7 @@ from ..cycles.portrait import portrait
 from ..cycles.shocks import DIRECTIONS, length_of, minimal_fatal_shock, shortest_way_out
 from ..cycles.sides import leads_to
 from ..model.oscillator import Oscillator
+from ..model.own_units import in_own_units
 from ..results import Status
 
 
@@ -20,32 +21,37 @@ class BasinMargin(eqx.Module):
     """How far a cycle is from the boundary of its basin.
 
     direction: of the shock, see `minimal_fatal_shock`. Where the oscillator is known beforehand,
-    way: the shortest way there; or, where there is none, otherwise: inf, or NaN for one that is not
-    known.
+    way: the shortest way there, and the unit of length that it is told in; or, where there is none,
+    otherwise: inf, or NaN for one that is not known.
     """
 
     direction: str = eqx.field(static=True)
     way: ShortestWay | None = None
     otherwise: Array | None = None
+    length: Array | None = None
 
     def at(self, osc: Oscillator, y0: Array) -> "BasinMargin":
         """The margin of the cycle that a start of a known oscillator leads to.
 
         For oscillators beside that one it is a function that JAX can trace.
         """
-        told = portrait(osc)
-        (end,) = leads_to(told, np.asarray(y0)[None])
+        own = in_own_units(osc)
+        length = own.units.length
+        told = portrait(own)
+        (end,) = leads_to(told, np.asarray(y0 / length)[None])
         way, _, status = shortest_way_out(told, end, along_x2=self.direction == "x2")
         if status != Status.OK:
             way, value = None, np.nan
         else:
             value = np.inf
-        return BasinMargin(self.direction, way, jnp.asarray(np.array(value)))
+        return BasinMargin(self.direction, way, jnp.asarray(np.array(value)), jnp.asarray(length))
 
     def __call__(self, cycle: Cycle) -> Array:
         if self.way is not None:
-            begin, end = self.way.ends(cycle.oscillator)
-            return length_of(end - begin, self.direction)
+            own = in_own_units(cycle.oscillator, self.length)
+            begin, end = self.way.ends(own)
+            size = length_of(end - begin, self.direction)
+            return size if own is cycle.oscillator else size * own.units.length
         if self.otherwise is not None:
             return self.otherwise
         y0 = lax.stop_gradient(cycle.unknowns[0, :2])

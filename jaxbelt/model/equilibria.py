@@ -43,6 +43,7 @@ from .modes import (
     settle,
 )
 from .oscillator import Oscillator, check_oscillator, has_possible_numbers
+from .own_units import in_given_units, in_own_units, quantity
 from .pseudofocus import edge_focus
 from .rest import is_centre
 from .transitions import contact, contact_beside
@@ -91,9 +92,9 @@ class Equilibria(eqx.Module):
     """
 
     kind: Array
-    x1: Array
-    x1_lower: Array
-    x1_upper: Array
+    x1: Array = quantity("length")
+    x1_lower: Array = quantity("length")
+    x1_upper: Array = quantity("length")
     modes: Array
     jacobian: Array
     eigenvalues: Array
@@ -176,8 +177,9 @@ def equilibria(osc: Oscillator) -> Equilibria:
     stable where these are and the other side does not push away from it.
     """
     check_oscillator(osc)
-    found = _all_candidates(osc)
-    return _existing(found, found)
+    own = in_own_units(osc)
+    found = _all_candidates(own)
+    return in_given_units(_existing(found, found), osc, own)
 
 
 def _existing(rows, found: Equilibria):
@@ -422,8 +424,9 @@ def lyapunov_coefficient(osc: Oscillator) -> Array:
     vanishing ones only, and d^3 x2'/dx2^3: a = (d^3 x2'/dx2^3) / 16.
     """
     check_oscillator(osc)
-    found, coefficients = _lyapunov_coefficients(osc)
-    return _existing(coefficients, found)
+    own = in_own_units(osc)
+    found, coefficients = _lyapunov_coefficients(own)
+    return _existing(coefficients, found) / (1 if own is osc else own.units.length**2)
 
 
 @jit

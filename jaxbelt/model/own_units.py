@@ -17,6 +17,7 @@ reads that.
 import dataclasses
 import functools
 import operator
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -170,41 +171,33 @@ POWERS = {"time": 0, "length": 1, "velocity": 1, "energy": 2, "coefficient": -2}
 
 
 def in_given_units(result: Any, osc: Oscillator, own: OwnOscillator) -> Any:
-    """A result that was found for an oscillator in own units, in those of the oscillator given.
-
-    Other oscillators in it are given back as by `in_units_of_user`.
-    """
-    if own is osc:
-        return result
-    return rescaled(result, own.units.length, {id(own): osc})
+    """A result that was found for an oscillator in own units, in those of the oscillator given."""
+    return result if own is osc else rescaled(result, own.units.length, lambda _: osc)
 
 
-def rescaled(result: Any, length: Any, oscillators: dict[int, Oscillator] | None = None) -> Any:
+def rescaled(
+    result: Any, length: Any, oscillator: Callable[[Oscillator], Oscillator] | None = None
+) -> Any:
     """A result whose lengths are multiplied by a number, and whose oscillators are replaced.
 
-    oscillators: by `id` of those in the result; None, and others: such as are in own units are
-    given back in their user's.
+    oscillator: what to put in the place of one; None: those in own units as their user has them.
     """
-    known = oscillators or {}
+    put = in_units_of_user if oscillator is None else oscillator
     is_one = is_concrete(length) and np.all(np.asarray(length) == 1)
 
     def scaled(value: Any, dimensions: tuple[str, ...]) -> Any:
         powers = [POWERS[name] for name in dimensions]
         if is_one or value is None or not any(powers):
             return value
-        if len(powers) == 1:
-            factor = length ** powers[0]
-            return float(factor) * value if isinstance(value, float) else value * factor
+        factors = [length**power for power in powers]
+        if isinstance(value, float):
+            return value * float(factors[0])
         one: Any = np if isinstance(value, np.ndarray) else jnp
-        return value * one.stack([one.asarray(length**power) for power in powers])
+        return value * (one.stack(factors) if len(factors) > 1 else factors[0])
 
     def walked(value: Any) -> Any:
-        if id(value) in known:
-            return known[id(value)]
-        if isinstance(value, OwnOscillator):
-            return in_units_of_user(value)
         if isinstance(value, Oscillator):
-            return value
+            return put(value)
         if isinstance(value, eqx.Module):
             new = {}
             for field in dataclasses.fields(value):
@@ -223,8 +216,10 @@ def rescaled(result: Any, length: Any, oscillators: dict[int, Oscillator] | None
     return walked(result)
 
 
-def in_units_of_user(own: OwnOscillator) -> Oscillator:
-    """The oscillator as the user has it, but for rounding where omega is no power of two."""
+def in_units_of_user(own: Oscillator) -> Oscillator:
+    """An oscillator as the user has it, but for rounding where omega is no power of two."""
+    if not isinstance(own, OwnOscillator):
+        return own
     units = own.units
     if units.is_given:
         fields = {name: value for name, value in vars(own).items() if name != "units"}
