@@ -30,10 +30,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..checks import check_belt, is_concrete, number, require, require_value
-from ..cycles.attractors import place_of
+from ..cycles.attractors import PLACE_DIMENSIONS, place_of
 from ..cycles.chains import SIZES, Chain, Loop
 from ..cycles.cycle import Cycle
 from ..model.oscillator import Oscillator
+from ..model.own_units import in_own_units, quantity, rescaled
 from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
 from ..results import Status, describe, draw
@@ -348,11 +349,34 @@ class BifurcationPoint(eqx.Module):
     steps: Array
     error: Array
     multiplier: Array
-    x1: Array
+    x1: Array = quantity("length")
     oscillator: Oscillator
     cycle: Cycle
     status: Array
     member: ArrayLike = 0
+
+    def in_units_of(self, variation: Variation) -> "BifurcationPoint":
+        """A point that was found in own units, in those of whoever gave what is varied."""
+        if variation.units is None:
+            return self
+        given, length, (unit,) = variation.units
+        value = self.value * unit
+        osc = given.oscillator(np.asarray(value)[None] if is_concrete(value) else value[None])
+        found = rescaled(self, length, lambda _: osc)
+        return replace(found, value=value, error=self.error * unit)
+
+    @property
+    def _own(self) -> "BifurcationPoint":
+        """In own units, in which its condition knows it."""
+        own = in_own_units(self.oscillator)
+        if own is self.oscillator:
+            return self
+        return rescaled(self, 1 / own.units.length, lambda _: own)
+
+    def _back(self, value: Any, *dimensions: str) -> Any:
+        """What its condition says of `_own`, in the units of the point."""
+        own = in_own_units(self.oscillator)
+        return value if own is self.oscillator else own.units.back(value, *dimensions)
 
     @property
     def kind(self) -> str:
@@ -373,7 +397,7 @@ class BifurcationPoint(eqx.Module):
         `SaddleConnection`: it leads back to the same saddle or to another one.
         """
         require_single(self, self.value, 0)
-        return self.condition.type_of(self) if int(self.status) == Status.OK else ""
+        return self.condition.type_of(self._own) if int(self.status) == Status.OK else ""
 
     @property
     def coefficient(self) -> Array:
@@ -384,13 +408,19 @@ class BifurcationPoint(eqx.Module):
         a pseudo-focus, obeys r' = rate r + a r^3, with the `rate` of `Equilibria`. So near the
         point there is a cycle with r^2 = -rate/a, which attracts where a < 0.
         """
-        found = self.condition.coefficient(self)
+        found = self._back(self.condition.coefficient(self._own), "coefficient")
         return jnp.where(self.status == Status.OK, found, jnp.nan)
 
     @property
     def place(self) -> np.ndarray:
         """Where the motion is, see `place_of`; NaN where there is none."""
-        return self.condition.place(self)
+        return self._back(self.condition.place(self._own), *PLACE_DIMENSIONS)
+
+    @property
+    def orbit(self) -> np.ndarray | None:
+        """States of the motion at a point that is no cycle, [samples, 2]; None: there is none."""
+        states = self.condition.orbit(self._own)
+        return None if states is None else self._back(states, "length", "velocity")
 
     def row(self) -> dict[str, Any]:
         """What `table` tells of it."""

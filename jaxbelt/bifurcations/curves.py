@@ -10,6 +10,7 @@ beyond, and the curve goes on from there with the signature that is found.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -25,7 +26,9 @@ from ..checks import (
     require,
     require_value,
 )
+from ..cycles.attractors import PLACE_DIMENSIONS
 from ..model.oscillator import Oscillator
+from ..model.own_units import in_own_units, own_length, quantity, rescaled
 from ..model.parameters import leaf_index
 from ..model.variations import Variation
 from ..numerics.continuation import CurvePoint, Stop, continue_curve
@@ -63,13 +66,22 @@ class BifurcationCurve(eqx.Module):
     classes: tuple[type[AbstractCondition], ...] = eqx.field(static=True)
     multiplier: np.ndarray
     residual: np.ndarray
-    places: np.ndarray
+    places: np.ndarray = quantity(*PLACE_DIMENSIONS)
     special: tuple[SpecialPoint, ...] = eqx.field(static=True)
     ends: tuple[Stop, Stop] = eqx.field(static=True)
     names: tuple[str, str] = eqx.field(static=True)
 
     def __len__(self) -> int:
         return len(self.values)
+
+    def in_units_of(self, variation: Variation) -> "BifurcationCurve":
+        """A curve that was found in own units, in those of whoever gave what is varied."""
+        if variation.units is None:
+            return self
+        _, length, units = variation.units
+        special = tuple(one.measured_in(units) for one in self.special)
+        found = rescaled(self, length)
+        return replace(found, values=self.values * units, special=special)
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -180,16 +192,26 @@ def bifurcation_curve(
     step = as_positive(step, "step")
     max_points = as_whole(max_points, "max_points")
     near = None if at is None else np.asarray(as_array(at, "at", (2,)))
-    variation = _varied_by_two(point.oscillator, where, near, limits)
-    start = variation.values_of(point.oscillator, limits, near)
+    given = _varied_by_two(point.oscillator, where, near, limits)
+    length = own_length(point.oscillator)
+    own = in_own_units(point.oscillator, length)
+    point = rescaled(point, 1 / length, lambda _: own)
+    variation = given.in_units(length, np.mean(limits, axis=1) if near is None else near)
+    units = variation.units.parameters
+    start = variation.values_of(
+        own, limits / units[:, None], None if near is None else near / units
+    )
     if start is None:
         raise ValueError(
             "where must be a function that gives the oscillator of the point, got one that does so "
             f"at no values near those of the span {limits.tolist()}"
         )
-    inside = np.all((limits[:, 0] <= start) & (start <= limits[:, 1]))
-    require(inside, "span", f"around the point {start.tolist()}", limits.tolist())
-    return follow_point(variation, point, start, limits, step=step, max_points=max_points)
+    known = start * units
+    inside = np.all((limits[:, 0] <= known) & (known <= limits[:, 1]))
+    require(inside, "span", f"around the point {known.tolist()}", limits.tolist())
+    limits = limits / units[:, None]
+    curve = follow_point(variation, point, start, limits, step=step, max_points=max_points)
+    return curve.in_units_of(variation)
 
 
 def _varied_by_two(osc: Oscillator, where: Any, at: Any, limits: np.ndarray) -> Variation:
@@ -237,8 +259,7 @@ def follow_point(
         residual=np.array([row.residual for row in rows]),
         places=np.array([row.place for row in rows]),
         special=tuple(
-            one._replace(values=(one.values[0] * float(units[0]), one.values[1] * float(units[1])))
-            for one in (*reversed(behind.special), *ahead.special)
+            one.measured_in(units) for one in (*reversed(behind.special), *ahead.special)
         ),
         ends=(behind.end, ahead.end),
         names=(variation.names[0], variation.names[1]),

@@ -28,6 +28,7 @@ from ..cycles.cycle import Cycle, exactly, polish, warn_of_fast_loops
 from ..model.equilibria import candidates
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator
+from ..model.own_units import quantity, rescaled
 from ..numerics.compiling import jit
 from ..results import Status, draw
 from ..tables import per_belt, table_of
@@ -59,14 +60,14 @@ class Branch(eqx.Module):
     values: np.ndarray
     stable: np.ndarray
     neutral: np.ndarray
-    x1_min: np.ndarray
-    x1_max: np.ndarray
-    x2_min: np.ndarray
-    x2_max: np.ndarray
+    x1_min: np.ndarray = quantity("length")
+    x1_max: np.ndarray = quantity("length")
+    x2_min: np.ndarray = quantity("velocity")
+    x2_max: np.ndarray = quantity("velocity")
     period: np.ndarray
     multiplier: np.ndarray
     stick_durations: np.ndarray
-    stick_velocities: np.ndarray
+    stick_velocities: np.ndarray = quantity("velocity")
     cycles: tuple[Cycle, ...]
 
     @property
@@ -225,13 +226,19 @@ def bifurcation_diagram(
         warn_of_fast_loops(fast, depth=5)
     pieces = [*_equilibrium_pieces(path, nodes), *_cycle_pieces(path, nodes, labels)]
     names = [region_name(path.at(v), label) for v, label in zip(middles, labels, strict=True)]
+    given, length, (unit,) = path.variation.units
+    branches = rescaled(tuple(_joined(pieces, list(special.values()))), length)
+    at_ends = [given.oscillator(np.array([unit * v])) for v in (path.first, *middles, path.last)]
     return BifurcationDiagram(
-        points=points,
-        branches=tuple(_joined(pieces, list(special.values()))),
-        regions=tuple((a, b, name) for (a, b), name in zip(stretches, names, strict=True)),
+        points=tuple(point.in_units_of(path.variation) for point in points),
+        branches=tuple(replace(one, values=one.values * unit) for one in branches),
+        regions=tuple(
+            (a * float(unit), b * float(unit), name)
+            for (a, b), name in zip(stretches, names, strict=True)
+        ),
         oscillator=path.osc,
         name=path.name,
-        as_paper=in_plane_of_paper([path.at(v) for v in (path.first, *middles, path.last)]),
+        as_paper=in_plane_of_paper(at_ends),
         is_argument=not path.variation.varies_leaves,
     )
 

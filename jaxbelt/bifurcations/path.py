@@ -81,17 +81,23 @@ class ParameterPath:
         # `where` first: where it is left out, the span stands in its place.
         if isinstance(osc, Oscillator):
             leaf_index(osc, where)
-        self.first, self.last = as_span(span, where)
-        self.variation = varied(osc, where, (self.first,))
+        first, last = as_span(span, where)
+        given = varied(osc, where, (first,))
         known = "of known numbers: paths are not for jit, vmap or derivatives"
-        require(is_concrete(self.at(self.first)), "osc", known, "a traced one")
+        at_first = given.oscillator(np.array([first]))
+        require(is_concrete(at_first), "osc", known, "a traced one")
         conditions = check_conditions(conditions)
-        for value in (self.first, self.last):
-            self.variation.check(value)
+        for value in (first, last):
+            given.check(value)
         #: The one that was given, or that at the first value.
-        self.osc = osc if isinstance(osc, Oscillator) else self.at(self.first)
+        self.osc = osc if isinstance(osc, Oscillator) else at_first
         for condition in conditions:
             condition.check(self.osc)
+        #: In own units, the parameter too, as all that follows.
+        ends = np.array([[0.5 * (first + last)], [first], [last]])
+        self.variation = given.in_own_units(*ends)
+        measured = 1.0 if given.units is not None else float(self.variation.units.parameters[0])
+        self.first, self.last = first / measured, last / measured
         self.conditions = conditions
         self.length = self.last - self.first
         #: In which the parameter is measured.

@@ -11,11 +11,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, require, require_value
 from ..cycles.cycle import EXACT, warn_of_extrapolation
 from ..model.oscillator import Oscillator, check_oscillator
+from ..model.own_units import in_own_units
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
 from ..numerics.compiling import is_outermost
@@ -84,8 +86,8 @@ def refine(
     variation, near, value = _begun(condition, osc, where, at)
     point = condition.point(variation, near, value, room or condition.room)
     if not is_outermost(near, value, point):
-        return point
-    point = _bracketed(point, variation, value)
+        return point.in_units_of(variation)
+    point = _bracketed(point, variation, value).in_units_of(variation)
     warn_of_extrapolation([point.cycle])
     return point
 
@@ -167,14 +169,16 @@ def _possible(variation: Variation, guess: float, end: float) -> float:
 def _begun(
     condition: AbstractCondition, osc: Any, where: Any, at: Any
 ) -> tuple[Variation, Oscillator, Any]:
-    """What is varied, and the oscillator and the value, [1], to begin from."""
+    """What is varied, and the oscillator and the value, [1], to begin from, in own units."""
     if isinstance(osc, Oscillator) or not callable(osc):
         require_value(at is None, "at", "left out where osc is an Oscillator", at)
         check_oscillator(osc)
         number = leaf_index(osc, where)
         condition.check(osc)
-        value = jnp.asarray(jax.tree.leaves(osc)[number], dtype=jnp.float64)
-        return Variation.of_leaves(osc, [number]), osc, value.reshape(1)
+        value = jnp.asarray(jax.tree.leaves(osc)[number], dtype=jnp.float64).reshape(1)
+        variation = Variation.of_leaves(osc, [number]).in_own_units(lax.stop_gradient(value))
+        own = in_own_units(osc, variation.units.length)
+        return variation, own, value / variation.units.parameters
     require(at is not None, "at", "the value of the parameter to begin from", "None")
     at = as_array(at, "at")
     check_finite(at, "at")
@@ -182,6 +186,7 @@ def _begun(
     if is_concrete(at):
         variation.check(float(at))
     value = at.reshape(1)
-    near = variation.oscillator(value)
-    condition.check(near)
-    return variation, near, value
+    condition.check(variation.oscillator(value))
+    variation = variation.in_own_units(lax.stop_gradient(value))
+    value = value / variation.units.parameters
+    return variation, variation.oscillator(value), value

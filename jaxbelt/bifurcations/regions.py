@@ -8,6 +8,7 @@ cells that differ (see `bounds`).
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -29,6 +30,7 @@ from ..checks import (
 from ..cycles.cycle import Cycle
 from ..cycles.portrait import portrait
 from ..model.oscillator import Oscillator
+from ..model.own_units import in_own_units
 from ..model.variations import Variation
 from ..results import draw
 from ..tables import table_of
@@ -206,20 +208,31 @@ def region_map(
     step = as_positive(step, "step")
     lines = as_whole(lines, "lines", 0)
     span = names[0], names[1]
-    bounds = Bounds(varied_by_names(make, span, values), values, step)
+    given = varied_by_names(make, span, values)
+    corners = [np.array(pair) for pair in product(*([one[0], one[-1]] for one in values))]
+    variation = given.in_own_units(*corners)
+    _, length, units = variation.units
+    bounds = Bounds(variation, [one / unit for one, unit in zip(values, units)], step)
+    own_starts = tuple((x1 / length, x2 / length) for x1, x2 in further)
+
+    def own(**numbers):
+        return in_own_units(make(**numbers), length)
+
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:
-        seen = beside.submit(_look_at_all, make, span, values, further)
+        seen = beside.submit(_look_at_all, own, span, values, own_starts)
         if lines:
             bounds.search_lines(lines)
         label, motions, on_line = seen.result()
     uncovered = bounds.search_between(motions, on_line) if lines else ()
     bounds.name_ends()
-    curves = tuple(bounds.curves)
+    curves = tuple(curve.in_units_of(variation) for curve in bounds.curves)
     cycles = _cycles_of_examples(make, span, values, label)
-    between = _names_between(make, span, values, label, on_line, curves, further)
+    between = _names_between(own, span, values, label, on_line, curves, own_starts)
     pair = values[0], values[1]
-    return RegionMap(span, pair, label, curves, cycles, on_line, between, make, uncovered)
+    first, second = units.tolist()
+    pairs = tuple(tuple((p * first, q * second) for p, q in pair) for pair in uncovered)
+    return RegionMap(span, pair, label, curves, cycles, on_line, between, make, pairs)
 
 
 def varied_by_names(make, names: tuple[str, str], values: Sequence[np.ndarray]) -> Variation:

@@ -92,7 +92,9 @@ def scan(
     argument.
     """
     resolution = as_whole(resolution, "resolution")
-    points = search(ParameterPath(osc, where, span, conditions), resolution)
+    path = ParameterPath(osc, where, span, conditions)
+    points = search(path, resolution)
+    points = tuple(point.in_units_of(path.variation) for point in points)
     warn_of_extrapolation((point.cycle for point in points), depth=5)
     return points
 

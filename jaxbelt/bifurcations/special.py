@@ -42,6 +42,11 @@ class SpecialPoint(NamedTuple):
     values: tuple[float, float]
     residual: float
 
+    def measured_in(self, units: np.ndarray) -> "SpecialPoint":
+        """The same with parameters that were in these units, [2]."""
+        first, second = (value * float(unit) for value, unit in zip(self.values, units))
+        return self._replace(values=(first, second))
+
     def table(self) -> "pandas.DataFrame":
         """One row: kind, belts, value_0 and value_1 of the two parameters, residual."""
         belts, (first, second) = " ".join(map(str, self.belts)), self.values

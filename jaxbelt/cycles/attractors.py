@@ -75,6 +75,10 @@ def stuck_belts(path: Itinerary) -> frozenset[int]:
     return frozenset(belt for mode in path for belt, code in enumerate(mode) if code == 0)
 
 
+#: The dimensions of a place, see `own_units.quantity`.
+PLACE_DIMENSIONS = ("length", "length", "velocity", "velocity", "time")
+
+
 def place_of(cycle: Cycle | Loop) -> np.ndarray:
     """Where a cycle is: smallest and largest x1, smallest and largest x2, period."""
     return extent(arcs_of(cycle)[1])

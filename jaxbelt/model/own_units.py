@@ -45,6 +45,10 @@ class OwnUnits(eqx.Module):
         """Whether these are known, and those of the user."""
         return is_concrete(self) and bool(np.all([self.length, self.velocity] == np.ones(2)))
 
+    def back(self, value: Any, *dimensions: str) -> Any:
+        """A quantity in the units of the user; see `quantity`."""
+        return rescaled_quantity(value, self.length, dimensions)
+
 
 class OwnOscillator(Oscillator):
     """An oscillator in units of its own, which it knows."""
@@ -183,18 +187,6 @@ def rescaled(
     oscillator: what to put in the place of one; None: those in own units as their user has them.
     """
     put = in_units_of_user if oscillator is None else oscillator
-    is_one = is_concrete(length) and np.all(np.asarray(length) == 1)
-
-    def scaled(value: Any, dimensions: tuple[str, ...]) -> Any:
-        powers = [POWERS[name] for name in dimensions]
-        if is_one or value is None or not any(powers):
-            return value
-        factors = [length**power for power in powers]
-        if isinstance(value, float):
-            return value * float(factors[0])
-        one: Any = np if isinstance(value, np.ndarray) else jnp
-        return value * (one.stack(factors) if len(factors) > 1 else factors[0])
-
     def walked(value: Any) -> Any:
         if isinstance(value, Oscillator):
             return put(value)
@@ -203,7 +195,11 @@ def rescaled(
             for field in dataclasses.fields(value):
                 old = getattr(value, field.name)
                 dimensions = field.metadata.get("dimensions")
-                changed = walked(old) if dimensions is None else scaled(old, dimensions)
+                changed = (
+                    walked(old)
+                    if dimensions is None
+                    else rescaled_quantity(old, length, dimensions)
+                )
                 if changed is not old:
                     new[field.name] = changed
             return _unchecked(type(value), **{**vars(value), **new}) if new else value
@@ -214,6 +210,18 @@ def rescaled(
         return value
 
     return walked(result)
+
+
+def rescaled_quantity(value: Any, length: Any, dimensions: tuple[str, ...]) -> Any:
+    """A quantity of known dimensions in a unit of length that is 1/length of the one before."""
+    powers = [POWERS[name] for name in dimensions]
+    if value is None or not any(powers) or (is_concrete(length) and np.all(length == 1)):
+        return value
+    factors = [length**power for power in powers]
+    if isinstance(value, float):
+        return value * float(factors[0])
+    one: Any = np if isinstance(value, np.ndarray) else jnp
+    return value * (one.stack(factors) if len(factors) > 1 else factors[0])
 
 
 def in_units_of_user(own: Oscillator) -> Oscillator:

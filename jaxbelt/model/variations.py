@@ -12,9 +12,9 @@ both are one oscillator there (`Variation.settle`). That is Newton's method once
 import functools
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations, product
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ from jax.core import Tracer
 from ..checks import as_interval, is_concrete, require, require_callable, require_value
 from ..numerics.compiling import depends, is_affine, is_outermost
 from .oscillator import Oscillator, check_oscillator, check_scalars, its_oscillator
+from .own_units import in_own_units, own_length, power_of_two_below
 from .parameters import is_number, is_real, leaf_index, names_of
 
 #: Numbers that differ by less, relative to their size beside 1, are the same but for rounding.
@@ -110,7 +111,8 @@ class Variation:
 
     make: gives the oscillator at numbers; names: of the parameters; line: all of them, where they
     are linear in the parameters; else tangents: those that are known, by the parameters.
-    varies_leaves: whether these are numbers of the oscillator, not arguments of a function.
+    varies_leaves: whether these are numbers of the oscillator, not arguments of a function. units:
+    those in which it is computed; None: the user's.
     """
 
     make: Callable[..., Oscillator]
@@ -118,6 +120,7 @@ class Variation:
     line: Family | None
     tangents: dict[tuple[float, ...], Family] = field(default_factory=dict)
     varies_leaves: bool = False
+    units: "UnitsOfVariation | None" = None
 
     @classmethod
     def of_leaves(cls, osc: Oscillator, numbers: Sequence[int]) -> "Variation":
@@ -349,11 +352,16 @@ class Variation:
         def make(p):
             return self.make(*(p if place == free else value for place in (0, 1)))
 
-        return Variation(make, (self.names[free],), line)
+        units = None
+        if self.units is not None:
+            known = self.units
+            given = known.given.held(axis, value * known.parameters[axis])
+            units = UnitsOfVariation(given, known.length, known.parameters[[free]])
+        return Variation(make, (self.names[free],), line, units=units)
 
     def measured_in(self, units: np.ndarray) -> "Variation":
         """The same with its parameters in these units, [k]."""
-        if np.all(units == 1.0):
+        if is_concrete(units) and np.all(units == 1.0):
             return self
         line = None
         if self.line is not None:
@@ -363,7 +371,39 @@ class Variation:
         def make(*p):
             return self.make(*(unit * one for unit, one in zip(units, p, strict=True)))
 
-        return Variation(make, self.names, line, varies_leaves=self.varies_leaves)
+        known = self.units
+        if known is not None:
+            known = known._replace(parameters=known.parameters * units)
+        return replace(self, make=make, line=line, tangents={}, units=known)
+
+    def in_own_units(self, *rows: Any) -> "Variation":
+        """The same oscillators in one unit of length, and the parameters in units of their own.
+
+        rows: values of the parameters, [k] each; the unit of length is the largest of the own ones
+        of the oscillators there, and that of a parameter is by how much it changes a number of the
+        first of these by one, rounded down to a power of two.
+        """
+        if self.units is not None:
+            return self
+        lengths = [own_length(self.oscillator(values)) for values in rows]
+        one: Any = np if is_concrete(lengths) else jnp
+        return self.in_units(functools.reduce(one.maximum, lengths), rows[0])
+
+    def in_units(self, length: Any, values: Any) -> "Variation":
+        """As `in_own_units`, in a given unit of length; the parameters' own are those at `values`."""
+
+        def make(*p):
+            return in_own_units(self.make(*p), length)
+
+        own = Variation(make, self.names, None, varies_leaves=self.varies_leaves)
+        if self.line is not None:
+            if not _varies_omega(self.line):
+                # Linear, as the units are fixed.
+                own = replace(own, line=own._tangent(np.asarray(self.line.origin)))
+        units = [power_of_two_below(unit) for unit in own.family(values).units]
+        pack: Any = np if is_concrete(units) else jnp
+        units = pack.stack(units)
+        return replace(own.measured_in(units), units=UnitsOfVariation(self, length, units))
 
     def rest_of(self, belt: int, start: float) -> float:
         """The value, near `start`, of the one parameter, at which a belt is at rest."""
@@ -443,6 +483,20 @@ class Variation:
                 break
         found = np.all(np.abs(misses(values)) <= SAME_NUMBER * (1 + np.abs(wanted)))
         return values if found else None
+
+
+class UnitsOfVariation(NamedTuple):
+    """What is varied as the user gave it, and what its units are in those of the user: of length,
+    and of each parameter, [k]."""
+
+    given: Variation
+    length: Any
+    parameters: Any
+
+
+def _varies_omega(line: Family) -> bool:
+    slopes = jax.tree.unflatten(jax.tree.structure(line.oscillator), line.slopes)
+    return bool(np.any(np.asarray(slopes.omega)))
 
 
 def as_span(span: Any, where: Any) -> tuple[float, float]:

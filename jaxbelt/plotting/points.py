@@ -41,7 +41,7 @@ def plot_point(point: BifurcationPoint, ax: Axes | None = None) -> Axes:
     _check_found(point, "point")
     cycles = [point.cycle] if int(point.cycle.status) == Status.OK else []
     drawn: Axes = plot_phase_portrait(point.oscillator, cycles=cycles, ax=ax)
-    orbit = point.condition.orbit(point)
+    orbit = point.orbit
     if orbit is not None and not cycles:
         draw_orbit(drawn, orbit, point.condition.line.name or point.kind)
     drawn.set_title(f"{point.condition.words} at {float(point.value):.6g}", fontsize="medium")
