@@ -10,7 +10,7 @@ the unit. With the unit of length L
 and the frequency omega is 1 in own units. L is a power of two, so that a change of unit by a power
 of two changes no bit but exponents.
 
-A field of a result that is a quantity with a dimension is declared with `quantity`; `in_given_units`
+A field of a result that has a dimension is declared with `quantity`; `in_given_units`
 reads that.
 """
 

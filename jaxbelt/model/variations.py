@@ -390,7 +390,7 @@ class Variation:
         return self.in_units(functools.reduce(one.maximum, lengths), rows[0])
 
     def in_units(self, length: Any, values: Any) -> "Variation":
-        """As `in_own_units`, in a given unit of length; the parameters' own are those at `values`."""
+        """As `in_own_units`, in a given unit of length; those of the parameters are at `values`."""
 
         def make(*p):
             return in_own_units(self.make(*p), length)
