@@ -47,29 +47,42 @@ class FingerprintError(ValueError):
     """What a value is made of cannot be told."""
 
 
-def fingerprint(value: Any) -> str:
+def fingerprint(value: Any, name: str = "a function or object of one's own") -> str:
     """What a value is made of, as a text of 32 letters, the same in every process.
 
     Args:
         value: A number, text, array, container, function, class, or an object of any class whose
             state `pickle` would find: dataclasses, Equinox modules, tree definitions, partials.
+        name: What the value is to the user, for the message of the error.
 
     Returns:
         A text. It changes with the code of a user's functions, their constants and what they reach,
-        with the version of a package whose code they use (jaxbelt is one, also from a checkout), and
-        with the Python whose bytecode it is; not with names of functions, line numbers, comments.
+        with the version of a package whose code they use (jaxbelt is one, also from a checkout),
+        and with the Python whose bytecode it is; not with names of functions, lines and comments.
 
     Raises:
         FingerprintError: If it cannot be told, as of a generator, an open file, or a module of the
             user's own that is handed around as a value.
     """
-    return _Reading().digest(value, "")
+    return _Reading(name).digest(value, "")
+
+
+def fingerprint_or_none_like_it(value: Any) -> Any:
+    """The fingerprint; of what has none, an object that equals nothing else.
+
+    For programs in memory: what cannot be told is compiled anew, and not mistaken for another.
+    """
+    try:
+        return fingerprint(value)
+    except FingerprintError:
+        return object()
 
 
 class _Reading:
     """One call of `fingerprint`: what is known of the objects that were met."""
 
-    def __init__(self):
+    def __init__(self, name: str):
+        self.name = name
         self.known: dict[int, str] = {}
         self.open: list[int] = []
         # So that no id comes back as that of another object.
@@ -131,8 +144,8 @@ class _Reading:
     def refuse(self, place: str, came: str, error: Exception | None = None) -> NoReturn:
         where = f" in {place.rstrip(': ')}" if place else ""
         raise FingerprintError(
-            "what a function or an object of one's own is made of must be numbers, texts, arrays, "
-            f"functions, classes and objects of these, got{where} {came}"
+            f"{self.name} must be made of numbers, texts, arrays, functions, classes and objects "
+            f"of these, got{where} {came}"
         ) from error
 
     def of_array(self, value: Any, place: str) -> Iterator[str]:

@@ -266,7 +266,7 @@ UNTOLD = {
 @pytest.mark.parametrize("case", UNTOLD)
 def test_what_cannot_be_told_is_refused(case):
     make, message = UNTOLD[case]
-    with pytest.raises(FingerprintError, match=f"must be numbers, texts, .*{message}"):
+    with pytest.raises(FingerprintError, match=f"must be made of numbers, .*{message}"):
         fingerprint(make())
 
 
