@@ -9,6 +9,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     spelling        what was perhaps meant by a word
     results         status codes and what to do about them
     activity        what takes long says what it does
+    identity        what a value or a function is made of, as a short text
     numerics/       spacing widths compiling
     checks          arguments, checked at the public edge
     tables          results as tables

@@ -1,11 +1,15 @@
 """Stores: what is resumed, what is refused, and that kills, full disks and lies do no harm."""
 
+import dataclasses
 import errno
+import functools
 import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import kills
@@ -295,27 +299,91 @@ def test_a_law_and_a_reducer_count_by_type_numbers_and_source(tmp_path):
     assert sweep(make=lambda nu: make(nu)).equals(sweep())
 
 
-SLOPE = [0.1]
+SLOPE = 0.1
+
+
+def slope(speed):
+    return SLOPE * jnp.tanh(speed)
 
 
 class LooksUp(Constant):
     """A law whose numbers are not its own."""
 
     def mu(self, speed):
-        return self.static - SLOPE[0] * jnp.tanh(speed)
+        return self.static - slope(speed)
 
 
-def test_a_law_counts_by_what_it_gives(tmp_path, monkeypatch):
-    def sweep():
-        def make(nu):
-            return jb.Oscillator(0.1, (jb.Belt(nu, LooksUp(jnp.asarray(0.5))),))
+@dataclasses.dataclass(frozen=True)
+class Slopes:
+    """An observable that looks up what it counts by, and equals any other of its kind."""
 
-        return jb.sweep(make, {"nu": [0.1, 0.2]}, t1=5.0, store=tmp_path / "a.zarr")
+    function: Any = None
 
-    sweep()
-    monkeypatch.setitem(globals(), "SLOPE", [0.2])
-    with pytest.raises(ValueError, match="which differs in the law of belt 0"):
-        sweep()
+    def init(self, osc, x1, x2):
+        return jnp.zeros(())
+
+    def update(self, state, event):
+        return state + slope(event.x1)
+
+    def finish(self, state, end):
+        return {"sum": state}
+
+
+class AtSlope(Slopes):
+    at = (jb.AtSection(lambda osc, x1, x2: x1 - slope(100.0)),)
+
+    def update(self, state, event):
+        return event.x1
+
+
+def makes(nu, law=None):
+    law = jb.Coulomb(0.5, 0.4) if law is None else law(jnp.asarray(0.5))
+    return jb.Oscillator(0.1, (jb.Belt(nu, law),))
+
+
+READERS = {
+    "a law": (functools.partial(makes, law=LooksUp), "final", "the law of belt 0"),
+    "an observable": (makes, Slopes(), "observe"),
+    "its section": (makes, AtSlope(), "observe"),
+    "make": (lambda nu: makes(nu * (1 + slope(100.0))), "final", "oscillator"),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_what_a_function_reads_belongs_to_the_question(reader, tmp_path, monkeypatch):
+    make, observe, word = READERS[reader]
+
+    def sweep(name=None):
+        options = dict(t1=20.0, observe=observe, progress=False)
+        return jb.sweep(
+            make, {"nu": [0.1, 0.2]}, **options, store=name and tmp_path / f"{name}.zarr"
+        )
+
+    first = sweep("a")
+    monkeypatch.setitem(globals(), "SLOPE", 0.2)
+    with pytest.raises(ValueError, match=f"which differs in {word}"):
+        sweep("a")
+    # Nor is a program that was compiled before used for it.
+    second = sweep("b")
+    assert not second.equals(first) and second.equals(sweep())
+    monkeypatch.undo()
+    assert sweep("a").equals(first) and sweep().equals(first)
+
+
+def test_what_cannot_be_told_is_refused_for_stores_only(tmp_path):
+    observe = Slopes(threading.Lock())
+
+    def sweep(**options):
+        return jb.sweep(
+            makes, {"nu": [0.1, 0.2]}, t1=5.0, observe=observe, progress=False, **options
+        )
+
+    assert np.all(np.isfinite(sweep()["sum"]))
+    with pytest.raises(
+        ValueError, match=r"observe must be made of .* got in Slopes: function: .*lock"
+    ):
+        sweep(store=tmp_path / "a.zarr")
+    assert not (tmp_path / "a.zarr").exists()
 
 
 def test_places_that_cannot_hold_a_store_are_told_before_the_computing(tmp_path, monkeypatch):
@@ -370,7 +438,7 @@ def test_stores_of_other_schemas_and_wrecks_are_refused(path):
     root = zarr.open_group(path, mode="r+", use_consolidated=False)
     root.attrs["jaxbelt_schema"] = 0
     for call in (again, jb.verify):
-        with pytest.raises(ValueError, match=r"store must be of schema 2, .* got schema 0"):
+        with pytest.raises(ValueError, match=rf"of schema {stores.SCHEMA}, .* got schema 0"):
             call(path)
     (path / "zarr.json").write_text("{")
     for call in (again, jb.verify):

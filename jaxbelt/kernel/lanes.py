@@ -193,7 +193,8 @@ class Program(eqx.Module):
 
     structure: of the oscillator's tree; mapped: which of its leaves differ from run to run; edges:
     whether a contact edge may be met; captures: whether a run ends where a pseudo-focus captures
-    it; derivatives: whether those of the results are wanted, too.
+    it; derivatives: whether those of the results are wanted, too. made_of: what tells apart
+    programs whose code of the user's own is the same, and what it reads is not.
     """
 
     structure: Any = eqx.field(static=True)
@@ -202,3 +203,4 @@ class Program(eqx.Module):
     edges: bool = eqx.field(static=True)
     captures: bool = eqx.field(static=True, default=True)
     derivatives: bool = eqx.field(static=True, default=False)
+    made_of: Any = eqx.field(static=True, default=None)

@@ -19,6 +19,7 @@ from ..checks import (
     require_value,
     traceable,
 )
+from ..identity import fingerprint_or_none_like_it
 from ..kernel.lanes import Observer, Program
 from ..model.oscillator import Oscillator, check_scalars, its_oscillator
 from ..numerics.compiling import power_of_two
@@ -40,6 +41,7 @@ class Grid:
             axes,
         )
         self.make = make
+        self.made_of = fingerprint_or_none_like_it(make)
         self.axes = {
             name: np.asarray(as_array(v, f"axis {name}", (None,))) for name, v in axes.items()
         }
@@ -88,7 +90,8 @@ class Grid:
             for belt, which in zip(self.example.belts, leaves.belts, strict=True)
             for varies, value in ((which.lower, belt.lower), (which.upper, belt.upper))
         )
-        return Program(self.structure, self.mapped, observer, bool(edges))
+        made_of = fingerprint_or_none_like_it((self.structure, observer))
+        return Program(self.structure, self.mapped, observer, bool(edges), made_of=made_of)
 
     def rows(self, runs: np.ndarray, derivatives: tuple[str, ...] = ()) -> np.ndarray:
         """Starts and varying parameters of some runs, [1 + derivatives, columns, runs]."""
@@ -99,12 +102,13 @@ class Grid:
             name: axis[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)
         }
         start = tuple(self.y0.items())
-        table = _rows(self.make, tuple(self.names), self.mapped, start, derivatives, values)
+        known = self.make, self.made_of, tuple(self.names), self.mapped
+        table = _rows(*known, start, derivatives, values)
         return np.asarray(table)[:, :, : len(runs)]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4))
-def _rows(make, names, mapped, start, derivatives, values):
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4, 5))
+def _rows(make, made_of, names, mapped, start, derivatives, values):
     def row(values):
         leaves = jax.tree.leaves(make(**{name: values[name] for name in names}))
         varying = [leaf for leaf, varies in zip(leaves, mapped, strict=True) if varies]

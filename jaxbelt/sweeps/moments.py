@@ -6,12 +6,9 @@ where x2' = 0.
 """
 
 import functools
-import hashlib
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from types import CodeType, FunctionType
 from typing import Any, NamedTuple
 
 import jax
@@ -44,7 +41,7 @@ class AtExtrema:
         require_one_of(self.of, ("x1", "x2"), "of")
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class AtSection:
     """Every crossing of a section.
 
@@ -60,16 +57,6 @@ class AtSection:
     def __post_init__(self):
         require_callable(self.function, "function", "a function of osc, x1 and x2")
         require_value(self.direction in (-1, 0, 1), "direction", "-1, 0 or 1", self.direction)
-
-    def __repr__(self) -> str:
-        """The same for the same function, in any process: stores compare it."""
-        told = repr(self.function)
-        if isinstance(self.function, FunctionType):
-            held = [cell.cell_contents for cell in self.function.__closure__ or ()]
-            told = f"{bytecode(self.function.__code__)} {self.function.__defaults__} {held}"
-        told = re.sub(r" at 0x[0-9a-fA-F]+", "", told)
-        digest = hashlib.sha256(told.encode()).hexdigest()[:16]
-        return f"AtSection({digest}, {self.direction})"
 
 
 @dataclass(frozen=True)
@@ -87,12 +74,6 @@ class AtTimes:
         fits = np.all(np.diff(times) > 0) and times[0] >= 0 and np.isfinite(times[-1])
         require_value(fits, "times", "finite, >= 0 and increasing", times)
         object.__setattr__(self, "times", tuple(times.tolist()))
-
-
-def bytecode(code: CodeType) -> str:
-    """What a compiled function does, without where it came from."""
-    constants = [bytecode(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
-    return f"{code.co_code.hex()} {code.co_names} {constants}"
 
 
 MOMENTS = (AtEvents, AtExtrema, AtSection, AtTimes)

@@ -1,6 +1,5 @@
 """What a sweep is asked: its arguments, checked once, and what makes two sweeps the same."""
 
-import ast
 import functools
 import hashlib
 import importlib.metadata
@@ -13,7 +12,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..checks import (
@@ -24,14 +22,14 @@ from ..checks import (
     require_usable_jax,
     require_value,
 )
+from ..identity import fingerprint
 from ..kernel.lanes import Observer, Program
-from ..model.friction import AbstractFriction
 from ..spelling import did_you_mean
 from .along import Along
 from .attractor import Attractor
 from .datasets import Table
 from .grid import Grid
-from .moments import AtEvents, bytecode, checked
+from .moments import AtEvents, checked
 from .observers import Final, Reduce
 from .reducers import check_reducer
 
@@ -98,7 +96,7 @@ class Question:
         start = [f"{axis} = {value}" for axis, value in grid.y0.items() if axis not in grid.axes]
         return {
             "title": "sweep of a belt-driven dry-friction oscillator",
-            "make": _name_of_function(grid.make),
+            "make": _expression(grid.make) or _text_of(grid.make),
             "call": self.call(),
             "oscillator": f"{_plain(repr(grid.example))}, where the axes do not say otherwise",
             "start": ", ".join(start) + self._only_one_start() or "along the axes",
@@ -119,12 +117,14 @@ class Question:
         )
 
     def call(self) -> str:
-        """How to ask it again, as a line of Python; `dataset` is that of the results, and a local
-        function goes by its own name, or by `make`."""
+        """How to ask it again, as a line of Python; `dataset` is that of the results, and what
+        cannot be imported goes by its own name, or by `make`."""
         settings = ", ".join(f"{name}={value!r}" for name, value in self.numbers.items())
         start, axes = tuple(self.grid.y0.values()), list(self.grid.axes)
+        name = getattr(self.grid.make, "__name__", "")
+        make = _expression(self.grid.make) or (name if name.isidentifier() else "make")
         return (
-            f"jaxbelt.sweep({_expression(self.grid.make)}, "
+            f"jaxbelt.sweep({make}, "
             f"{{name: dataset[name] for name in {axes}}}, y0={start}, {settings}, "
             f"observe={_plain(repr(self.observe))}, derivatives={self.derivatives!r})"
         )
@@ -134,7 +134,7 @@ class Question:
 
         `make` counts by what it gives, at up to `SAMPLE` points of the grid: its numbers to eleven
         digits, which do not depend on the machine, and the friction laws of its oscillator by
-        their types, numbers and, if they are not this package's, source.
+        their types, numbers and, if they are not this package's, their fingerprints.
         """
         grid = self.grid
         sample = np.unique(np.linspace(0, grid.runs - 1, SAMPLE).astype(int))
@@ -149,16 +149,15 @@ class Question:
         for i, belt in enumerate(grid.example.belts):
             shown = _plain(repr(belt.friction))
             kinds = _kinds_in(belt.friction)
-            names = " with ".join(f"{kind.__qualname__}, {_source(kind)}" for kind in kinds)
-            if any(not _is_ours(kind) for kind in kinds):
-                names = f"{names}, {_coefficients(belt.friction)}"
+            names = " with ".join(kind.__qualname__ for kind in kinds)
+            if not all(map(_is_ours, kinds)):
+                names = f"{names}, {fingerprint(belt.friction, f'the law of belt {i}')}"
             told[f"the law of belt {i}"] = f"{shown} of {names}"
         told |= {name: repr(value) for name, value in self.numbers.items()}
         told["observe"] = repr(self.observe)
         if not isinstance(self.observe, str):
-            kind = type(self.observe)
-            settings = {k: _plain(repr(v)) for k, v in sorted(vars(self.observe).items())}
-            told["observe"] = f"{kind.__qualname__} {_source(kind)} {settings}"
+            kind = type(self.observe).__qualname__
+            told["observe"] = f"{kind} {fingerprint(self.observe, 'observe')}"
         told["derivatives"] = repr(self.derivatives)
         return told
 
@@ -188,52 +187,22 @@ def _versions() -> str:
     return ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
 
 
-def _name_of_function(make: Callable) -> str:
-    """The function as it is written: its full name, the call that made it, or its text."""
+def _expression(make: Callable) -> str | None:
+    """The function as any program can have it: its full name, or the call that made it."""
     if isinstance(make, functools.partial):
+        function = _expression(make.func)
         given = [*map(_value, make.args), *(f"{k}={_value(v)}" for k, v in make.keywords.items())]
-        return f"functools.partial({', '.join([_name_of_function(make.func), *given])})"
-    name = getattr(make, "__qualname__", None)
-    if name is None:
-        return _plain(repr(make))
-    if "<" not in name and make.__module__ != "__main__":
-        return f"{make.__module__}.{name}"
+        return function and f"functools.partial({', '.join([function, *given])})"
+    name = getattr(make, "__qualname__", "<")
+    return None if "<" in name or make.__module__ == "__main__" else f"{make.__module__}.{name}"
+
+
+def _text_of(make: Callable) -> str:
+    """The source of a function, with all that stands in its lines, or else its name."""
     try:
-        text = inspect.getsource(make).strip()
+        return inspect.getsource(make).strip()
     except (OSError, TypeError):
-        return name
-    lambdas = _lambdas_in(text) if make.__name__ == "<lambda>" else []
-    return lambdas[0] if len(lambdas) == 1 else text
-
-
-def _lambdas_in(text: str) -> list[str]:
-    """The lambda expressions in a piece of source, which may begin and end anywhere."""
-    found = []
-    for begin in re.finditer(r"\blambda\b", text):
-        for end in range(len(text), begin.start(), -1):
-            try:
-                body = ast.parse(f"({text[begin.start() : end]}\n)", mode="eval").body
-            except SyntaxError:
-                continue
-            if isinstance(body, ast.Lambda):
-                found.append(ast.unparse(body))
-                break
-    return list(dict.fromkeys(found))
-
-
-def _expression(make: Callable) -> str:
-    """The function as a call has it."""
-    text = _name_of_function(make)
-    name = getattr(make, "__name__", "")
-    try:
-        body = ast.parse(text, mode="eval").body
-    except SyntaxError:
-        body = None
-    # Of a function that is written in place this may be more than the function.
-    plain = isinstance(body, ast.Lambda | ast.Name | ast.Attribute)
-    if plain or (body is not None and not name):
-        return text
-    return name if name.isidentifier() else "make"
+        return getattr(make, "__qualname__", _plain(repr(make)))
 
 
 def _value(value: Any) -> str:
@@ -261,29 +230,3 @@ def _hash(data: bytes) -> str:
 
 def _is_ours(kind: type) -> bool:
     return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
-
-
-#: Speeds at which a law of one's own is asked.
-SPEEDS = np.concatenate([[0.0], np.logspace(-4, 3, 57)])
-
-
-def _coefficients(law: AbstractFriction) -> str:
-    """A law by what it gives: its text does not tell the numbers and functions that it looks up."""
-    values = np.asarray(jax.vmap(law.mu)(jnp.asarray(SPEEDS)))
-    return _hash(" ".join(f"{x:.8e}" for x in values.tolist()).encode())
-
-
-def _source(kind: type) -> str:
-    """A class by its text, or, where there is none, by its compiled functions."""
-    if _is_ours(kind):
-        return "jaxbelt"
-    found = []
-    for one in kind.__mro__:
-        if one.__module__.partition(".")[0] in ("builtins", "abc", "equinox", "jaxbelt"):
-            continue
-        try:
-            found.append(inspect.getsource(one))
-        except (OSError, TypeError):
-            functions = sorted(inspect.getmembers(one, inspect.isfunction))
-            found += [f"{name} {bytecode(function.__code__)}" for name, function in functions]
-    return _hash("\n".join(found).encode())

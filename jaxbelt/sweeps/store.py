@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     import xarray
 
 #: Version of the layout described above.
-SCHEMA = 2
+SCHEMA = 3
 #: Runs in a block, at most: few enough that not much is lost with one.
 BLOCK_RUNS = 2**17
 #: Blocks of a smaller sweep, whose runs may be long ones (each takes some 40 ms to write), and how
