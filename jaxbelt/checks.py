@@ -302,6 +302,11 @@ def as_positive(value: Any, field: str) -> float:
     return number
 
 
+def as_tolerance(value: Any, field: str) -> float | None:
+    """`value` as a tolerance > 0 in the user's units; None: the default, in own units."""
+    return None if value is None else as_positive(value, field)
+
+
 def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array | np.ndarray:
     """As `as_array`, but left in NumPy if it is known, for what goes into a compiled function."""
     require_usable_jax()

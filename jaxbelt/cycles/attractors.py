@@ -11,7 +11,7 @@ with one sequence of events. Two things tell.
   two such cycles one lies inside of the other, or beside it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ import numpy as np
 from ..model.events import of_one_loop
 from ..model.modes import ABOVE
 from ..model.oscillator import Oscillator
+from ..model.own_units import rescaled_quantity
 from ..results import Status
 from .chains import Chain, Loop, modes_of
 from .cycle import Cycle
@@ -126,9 +127,15 @@ def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:
 # --- what a sweep tells of attractors -------------------------------------------------------------
 
 
+def error_of_runs(numbers: Mapping[str, Any], length: float) -> float:
+    """As far may places of one cycle be apart, relative to its size, in runs of such tolerances."""
+    atol = numbers.get("atol")
+    return RUN * max(numbers["rtol"], 0.0 if atol is None else atol / length)
+
+
 @dataclass(frozen=True)
 class Runs:
-    """Where the attractors of the runs of a sweep are, and what happens in a loop.
+    """Where the attractors of the runs of a sweep are, and what happens in a loop, in own units.
 
     places: as `place_of`, [.., 5], the period of what is at rest 0; signatures: names, [..]; error:
     as far may places of one cycle be apart, relative to its size.
@@ -142,10 +149,14 @@ class Runs:
     def of(cls, dataset: "xarray.Dataset", dims: Sequence[str]) -> "Runs":
         names = ("x1_min", "x1_max", "x2_min", "x2_max", "period")
         columns = [dataset[name].transpose(*dims).values for name in names]
+        places = rescaled_quantity(
+            np.nan_to_num(np.stack(columns, axis=-1)),
+            1 / np.asarray(dataset.attrs["length"]),
+            PLACE_DIMENSIONS,
+        )
         meanings = np.array(dataset["signature"].attrs["flag_meanings"].split())
         signatures = meanings[dataset["signature"].transpose(*dims).values]
-        tolerance = max(dataset.attrs["rtol"], dataset.attrs["atol"])
-        return cls(np.nan_to_num(np.stack(columns, axis=-1)), signatures, RUN * tolerance)
+        return cls(places, signatures, error_of_runs(dataset.attrs, dataset.attrs["length"]))
 
     def at(self, index: Any) -> "Runs":
         """Some of them, by an index of the arrays."""

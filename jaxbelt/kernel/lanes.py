@@ -127,6 +127,7 @@ class Variable:
 
     per_belt: whether it has a number a belt. Of a category, an integer: meanings, what the values
     stand for; or name_of(code, belts), if they are codes that are numbered when all runs are known.
+    dimension: see `own_units.quantity`.
     """
 
     long_name: str
@@ -134,6 +135,7 @@ class Variable:
     per_belt: bool = False
     meanings: Mapping[int, str] | None = None
     name_of: Callable[[int, int], str] | None = None
+    dimension: str = "time"
 
 
 class Observer(eqx.Module):

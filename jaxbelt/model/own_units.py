@@ -126,7 +126,17 @@ def in_own_units(osc: Oscillator, length: ArrayLike | None = None) -> OwnOscilla
     return _unchecked(OwnOscillator, **fields, units=units)
 
 
+def in_units_of_run(osc: Oscillator) -> OwnOscillator:
+    """The oscillator as a run of the kernel takes it: in own units, which lead back to those given.
+
+    An oscillator that comes in its own units gets its results in these.
+    """
+    own = in_own_units(osc)
+    return own if own is not osc else _unchecked(OwnOscillator, **vars(own) | dict(units=_ONES))
+
+
 _ONE = np.ones(())
+_ONES = OwnUnits(_ONE, _ONE)
 
 
 def in_units(value: Any, unit: Any, default: float) -> Any:
@@ -187,6 +197,7 @@ def rescaled(
     oscillator: what to put in the place of one; None: those in own units as their user has them.
     """
     put = in_units_of_user if oscillator is None else oscillator
+
     def walked(value: Any) -> Any:
         if isinstance(value, Oscillator):
             return put(value)
@@ -215,7 +226,8 @@ def rescaled(
 def rescaled_quantity(value: Any, length: Any, dimensions: tuple[str, ...]) -> Any:
     """A quantity of known dimensions in a unit of length that is 1/length of the one before."""
     powers = [POWERS[name] for name in dimensions]
-    if value is None or not any(powers) or (is_concrete(length) and np.all(length == 1)):
+    is_same = is_concrete(length) and np.all(np.asarray(length) == 1)
+    if value is None or is_same or not any(powers):
         return value
     factors = [length**power for power in powers]
     if isinstance(value, float):

@@ -35,12 +35,11 @@ from .moments import (
     checked,
     crossings_held,
     cut_of_step,
-    per_lane,
     section_of,
     side_of,
     value_and_rate,
 )
-from .observers import RunEnd, RunEvent
+from .observers import RunEnd, RunEvent, as_given
 
 #: Nodes and weights of Gauss's rule on [0, 1].
 NODES = [(0.5 * (1 + x), 0.5 * w) for x, w in zip(*np.polynomial.legendre.leggauss(8), strict=True)]
@@ -97,23 +96,23 @@ class Along(Observer):
         if not hasattr(self.reducer, "rates"):
             return None
         residual = mode_acceleration(osc, mode, x1, x2)
-        motion = Motion(
-            t=t,
-            x1=x1,
-            x2=x2,
-            a=jnp.where(mode.any_stuck, 0.0, residual),
-            forces=jnp.stack(_forces(osc, mode, x2, residual), axis=-1),
-        )
-        return jax.vmap(self.reducer.rates, in_axes=(per_lane(osc), 0))(osc, motion)
+        length = osc.units.length
+        a = length * jnp.where(mode.any_stuck, 0.0, residual)
+        forces = jnp.stack([length * f for f in _forces(osc, mode, x2, residual)], axis=-1)
+
+        def rates(osc, x1, x2, *rest):
+            return self.reducer.rates(osc, Motion(rest[0], x1, x2, *rest[1:]))
+
+        return as_given(rates, osc, x1, x2, t, a, forces)
 
     def start(self, osc, lanes):
-        init = jax.vmap(self.reducer.init, in_axes=(per_lane(osc), 0, 0))
         sides = []
         for _, _, function in self._sections():
             value, rate = value_and_rate(function, osc, lanes.mode, lanes.x1, lanes.x2)
             sides.append(side_of(value, rate, jnp.ones_like(value)))
         passed = tuple(jnp.zeros_like(lanes.events) for _ in self._times())
-        return _Watched(init(osc, lanes.x1, lanes.x2), tuple(sides), passed)
+        state = as_given(self.reducer.init, osc, lanes.x1, lanes.x2)
+        return _Watched(state, tuple(sides), passed)
 
     def integrals(self, osc, lanes):
         """Zeros: integrals of runs that begin."""
@@ -181,13 +180,15 @@ class Along(Observer):
         ]
         totals = jax.tree.map(lambda i, *r: i + 0.5 * delta * sum(r), lanes.integrals, *ends)
         none = jnp.zeros(t.shape, int)
-        return self._update(seen, (t, x1, x2, none, none - 1), number, totals, wanted)
+        place = t, x1, x2, none, none - 1
+        return self._update(seen, osc, place, number, totals, wanted)
 
-    def _update(self, seen: _Watched, place: Any, number, totals, wanted) -> _Watched:
+    def _update(self, seen: _Watched, osc, place: Any, number, totals, wanted) -> _Watched:
         """The state after an update where it is wanted; place: t, x1, x2, kind and belt."""
         t, x1, x2, kind, belt = place
         number = jnp.broadcast_to(jnp.asarray(number, int), t.shape)
-        event = RunEvent(t, x1, x2, kind, belt, number, totals)
+        length = osc.units.length
+        event = RunEvent(t, length * x1, length * x2, kind, belt, number, totals)
         state = jax.vmap(self.reducer.update)(seen.state, event)
         return replace(seen, state=choose(wanted, state, seen.state))
 
@@ -201,13 +202,13 @@ class Along(Observer):
         seen = lanes.memory
         for number in events:
             place = passage.t, passage.x1, passage.x2, *first
-            seen = self._update(seen, place, number, lanes.integrals, fired & busy)
+            seen = self._update(seen, osc, place, number, lanes.integrals, fired & busy)
         holds = busy & (lanes.t > passage.t)
         seen = self._held(seen, osc, ones, before, lanes, holds)
         totals = self._over_hold(osc, before, lanes, holds)
         for number in events:
             place = lanes.t, lanes.x1, lanes.x2, *second
-            seen = self._update(seen, place, number, totals, released & busy)
+            seen = self._update(seen, osc, place, number, totals, released & busy)
         lanes = replace(lanes, integrals=totals)
         sides = []
         for (number, direction, function), side in zip(self._sections(), seen.sides, strict=True):
@@ -307,7 +308,8 @@ class Along(Observer):
         return replace(seen, passed=counts), tables
 
     def finish(self, osc, lanes):
-        end = RunEnd(lanes.t, lanes.x1, lanes.x2, lanes.status, lanes.integrals)
+        x1, x2 = osc.units.length * lanes.x1, osc.units.length * lanes.x2
+        end = RunEnd(lanes.t, x1, x2, lanes.status, lanes.integrals)
         results = jax.vmap(self.reducer.finish)(lanes.memory.state, end)
         return {**results, "status": lanes.status}
 

@@ -7,6 +7,7 @@ attractor is then looked for again: it has to be the same one.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -43,23 +44,28 @@ def differing(
     rows_of: Callable[[np.ndarray], np.ndarray],
     runs: np.ndarray,
     known: Results,
-    numbers: dict[str, float],
+    numbers: dict[str, Any],
+    length: float,
 ) -> np.ndarray:
     """The numbers of the audited runs of which the long way says otherwise.
 
     rows_of(runs): the kernel's rows of some runs, [columns, runs]; known: what the sweep says of
-    the audited ones, a row each, in the form of the kernel's results.
+    the audited ones, a row each, in the form of the kernel's results; length: the own unit of
+    length of the oscillators.
     """
+    atol = numbers["rtol"] * length if numbers["atol"] is None else numbers["atol"]
+    close = functools.partial(_close, atol=atol, rtol=numbers["rtol"])
+    captured = functools.partial(_captured, within=FOCUS_RADIUS * length)
     rows = np.concatenate(
         [rows_of(part) for part in np.array_split(runs, -(-len(runs) // CHUNK.here))], axis=1
     )
     long_way = dataclasses.replace(program, observer=Final(skip=False), captures=False)
     final = _results(long_way, shared, rows, numbers)
     if isinstance(program.observer, Final):
-        return runs[~_same_ends(known, final, numbers)]
+        return runs[~_same_ends(known, final, close, captured)]
     rows[:2] = final["x1_end"], final["x2_end"]
     again = _results(program, shared, rows, numbers)
-    return runs[~_same_attractors(known, final, again, numbers)]
+    return runs[~_same_attractors(known, final, again, close, captured)]
 
 
 def _results(program, shared, rows: np.ndarray, numbers: dict[str, Any]) -> Results:
@@ -83,37 +89,37 @@ def _results(program, shared, rows: np.ndarray, numbers: dict[str, Any]) -> Resu
     return by_name(shapes, columns)
 
 
-def _close(a: np.ndarray, b: np.ndarray, numbers: dict[str, float]) -> np.ndarray:
+def _close(a: np.ndarray, b: np.ndarray, *, atol: float, rtol: float) -> np.ndarray:
     largest = np.maximum(np.abs(a), np.abs(b))
-    return np.abs(a - b) <= AUDIT_CLOSE * (numbers["atol"] + numbers["rtol"] * largest)
+    return np.abs(a - b) <= AUDIT_CLOSE * (atol + rtol * largest)
 
 
-def _same_ends(known: Results, final: Results, numbers: dict[str, float]) -> np.ndarray:
+def _same_ends(known: Results, final: Results, close: Callable, captured: Callable) -> np.ndarray:
     """Whether final states agree: to the tolerance, or within the reach of a pseudo-focus."""
     same = (known["n_events"] == final["n_events"]) & (known["status"] == final["status"])
     same &= np.all(known["mode_end"] == final["mode_end"], axis=1)
     for name in ("x1_end", "x2_end"):
-        same &= _close(known[name], final[name], numbers)
+        same &= close(known[name], final[name])
     lost = (known["status"] == Status.NOT_FINITE) & (final["status"] == Status.NOT_FINITE)
-    return same | lost | _captured(known["x1_end"], known, final)
+    return same | lost | captured(known["x1_end"], known, final)
 
 
-def _captured(x1: np.ndarray, known: Results, final: Results) -> np.ndarray:
+def _captured(x1: np.ndarray, known: Results, final: Results, *, within: float) -> np.ndarray:
     """Whether a run that was ended by a pseudo-focus at x1 has not left it on the long way."""
     distance = np.hypot(final["x1_end"] - x1, final["x2_end"])
-    return (known["status"] == Status.PSEUDO_FOCUS) & (distance <= FOCUS_RADIUS)
+    return (known["status"] == Status.PSEUDO_FOCUS) & (distance <= within)
 
 
 def _same_attractors(
-    known: Results, final: Results, again: Results, numbers: dict[str, float]
+    known: Results, final: Results, again: Results, close: Callable, captured: Callable
 ) -> np.ndarray:
     """Whether attractors agree, each with its place. What is undecided claims nothing."""
     decided = (known["kind"] != UNDECIDED) & (again["kind"] != UNDECIDED)
     same = known["kind"] == again["kind"]
     for name in ("x1_min", "x1_max", "x2_min", "x2_max"):
-        same &= _close(known[name], again[name], numbers)
+        same &= close(known[name], again[name])
     cycle = same & (known["kind"] == CYCLE)
-    same &= ~cycle | _close(known["period"], again["period"], numbers)
+    same &= ~cycle | close(known["period"], again["period"])
     belts = known["sticks"].shape[1]
     for i in np.flatnonzero(cycle):
         loops = (
@@ -121,4 +127,4 @@ def _same_attractors(
             for word in (known["signature"][i], again["signature"][i])
         )
         same[i] &= len(set(loops)) == 1
-    return same | ~decided | _captured(known["x1_max"], known, final)
+    return same | ~decided | captured(known["x1_max"], known, final)

@@ -37,11 +37,12 @@ from ..cycles.unstable import from_starts, unstable_cycle
 from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator, check_oscillator
+from ..model.own_units import in_given_units, in_own_units, in_units_of_run
 from ..results import Status, draw
 from ..tables import table_of
 from .attractor import KINDS, Attractor
 from .datasets import decoded, flags
-from .question import LONG_ENOUGH
+from .question import LONG_ENOUGH, numbers_of_runs
 from .sweep import sweep
 from .work import results_of
 
@@ -123,7 +124,7 @@ class Basins(eqx.Module):
         count. NaN of a cycle that shooting did not find. `ValueError` for what is not positive.
         """
         t, within = as_positive(t, "t"), as_positive(within, "within")
-        settings = {name: self.dataset.attrs[name] for name in ("rtol", "atol")}
+        settings = {name: self.dataset.attrs.get(name) for name in ("rtol", "atol")}
         axes = {name: self.dataset[name].values for name in ("x1", "x2")}
         ends = sweep(lambda: self.oscillator, axes, t1=t, progress=False, **settings)
         states = np.stack([ends[name].values for name in ("x1_end", "x2_end")], axis=-1)
@@ -257,13 +258,13 @@ def basins(
     x2: ArrayLike | Sequence[float],
     t1: float = LONG_ENOUGH,
     rtol: float = 1e-8,
-    atol: float = 1e-8,
+    atol: float | None = None,
     progress: bool | None = None,
 ) -> Basins:
     """A grid of starts, labelled by where each leads, and the unstable cycle between them.
 
     x1, x2: displacements and velocities of the starts, increasing, [n] and [m], dimensionless. t1:
-    when a run that reached no attractor is given up. rtol, atol: tolerances of a step. progress:
+    when a run that reached no attractor is given up. rtol, atol: as in `sweep`. progress:
     whether to show how far it is, as in `sweep`. `ValueError` names an argument that is impossible.
     """
     check_oscillator(oscillator, "oscillator")
@@ -281,14 +282,17 @@ def basins(
         tell("telling the attractors apart")
         labels, attractors, cycles = _labels(oscillator, dataset)
         # With one attractor there is hardly one, and to look among all cycles takes its time.
-        boundary = (unstable_cycle if len(attractors) > 1 else from_starts)(oscillator)
+        own = in_own_units(oscillator)
+        boundary = (unstable_cycle if len(attractors) > 1 else from_starts)(own)
+        boundary = in_given_units(boundary, oscillator, own)
     dataset["label"] = (
         ("x1", "x2"),
         labels,
         {"long_name": "number of the attractor"}
         | flags({-1: "undecided", **dict(enumerate(attractors))}, "int32"),
     )
-    settings = ", ".join(f"{name}={dataset.attrs[name]!r}" for name in ("t1", "rtol", "atol"))
+    known = (name for name in ("t1", "rtol", "atol") if name in dataset.attrs)
+    settings = ", ".join(f"{name}={dataset.attrs[name]!r}" for name in known)
     dataset.attrs["call"] = (
         f'jaxbelt.basins(oscillator, x1=dataset["x1"], x2=dataset["x2"], {settings})'
     )
@@ -314,6 +318,7 @@ def _labels(
     low, high = np.asarray(dataset["x1_min"]), np.asarray(dataset["x1_max"])
     rest, held, _ = rest_reached(osc, 0.5 * (low + high))
     runs = Runs.of(dataset, ("x1", "x2"))
+    own, length = in_own_units(osc, np.asarray(dataset.attrs["length"])), dataset.attrs["length"]
     found: list[_Found] = []
     left = kinds != "undecided"
     while np.any(left):
@@ -321,7 +326,8 @@ def _labels(
         kind, stuck = kinds[first], sticks[first]
         same, cycle, before = left & (kinds == kind), None, None
         if kind == "cycle":
-            cycle = cycle_from(osc, (float(dataset.x1[first[0]]), float(dataset.x2[first[1]])))
+            start = np.array([dataset.x1[first[0]], dataset.x2[first[1]]]) / length
+            cycle = cycle_from(own, jnp.asarray(start))
             # Runs that differ by what a sweep does not tell exactly may still be of one cycle.
             before = next((one for one in found if one.is_of(cycle)), None)
             same &= runs.same(runs.at(first))[0]
@@ -338,7 +344,7 @@ def _labels(
     labels = np.full(kinds.shape, -1, "int32")
     for i, one in enumerate(found):
         labels[one.runs] = i
-    cycles = tuple(one.cycle for one in found if one.cycle is not None)
+    cycles = tuple(in_given_units(one.cycle, osc, own) for one in found if one.cycle is not None)
     return labels, tuple(one.name for one in found), cycles
 
 
@@ -354,7 +360,7 @@ class _Found(NamedTuple):
         return self.cycle is not None and is_same(self.cycle, cycle)
 
 
-#: Runs end no further from the equilibrium that captures them.
+#: Runs end no further from the equilibrium that captures them, in own units.
 NEAR_REST = 1e-2
 
 
@@ -365,17 +371,19 @@ def rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarra
     A run ends near the equilibrium; where none is near, it is told where the run is. A segment
     across an edge is in pieces.
     """
-    found = equilibria(osc)
+    own = in_own_units(osc)
+    length = 1.0 if own is osc else float(own.units.length)
+    near_rest, found = NEAR_REST * length, equilibria(osc)
     is_segment = np.asarray(found.kind) == EquilibriumKind.SEGMENT
     is_point = ~is_segment & (np.asarray(found.kind) != EquilibriumKind.SADDLE)
     lower, upper = np.asarray(found.x1_lower), np.asarray(found.x1_upper)
-    rest, pieces = np.round(x1 / NEAR_REST) * NEAR_REST, np.stack([lower, upper], 1)[is_segment]
+    rest, pieces = np.round(x1 / near_rest) * near_rest, np.stack([lower, upper], 1)[is_segment]
     segment, ends = np.zeros(x1.shape, int), np.zeros((0, 2))
     for which in (is_point, is_point & np.asarray(found.stable)):
         points = np.asarray(found.x1)[which]
         if len(points):
             nearest = points[np.argmin(np.abs(x1[..., None] - points), axis=-1)]
-            rest = np.where(np.abs(nearest - x1) < NEAR_REST, nearest, rest)
+            rest = np.where(np.abs(nearest - x1) < near_rest, nearest, rest)
     if len(pieces):
         begins = np.append(True, pieces[1:, 0] > pieces[:-1, 1])
         outside = np.maximum(pieces[:, 0] - x1[..., None], x1[..., None] - pieces[:, 1])
@@ -403,7 +411,7 @@ def basin_stability(
     key: Array,
     t1: float = LONG_ENOUGH,
     rtol: float = 1e-8,
-    atol: float = 1e-8,
+    atol: float | None = None,
 ) -> BasinStability:
     """The fraction of a box of starts that leads to each kind of attractor.
 
@@ -414,8 +422,7 @@ def basin_stability(
     check_oscillator(oscillator, "oscillator")
     corners, n = as_box(box), as_whole(n, "n")
     check_key(key)
-    given = {"t1": t1, "rtol": rtol, "atol": atol}
-    numbers = {name: as_positive(value, name) for name, value in given.items()}
+    numbers = numbers_of_runs(t1, rtol, atol)
     kinds = _kinds(oscillator, starts_in(corners, n, key), **numbers)
     fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(KINDS)}
     errors = {name: float(standard_error(f, n)) for name, f in fractions.items()}
@@ -449,7 +456,7 @@ def check_key(key: Any) -> None:
 
 def _kinds(osc: Oscillator, starts: np.ndarray, t1, rtol, atol) -> np.ndarray:
     """Numbers of `attractor.KINDS` for starts [2, n], in the order of the starts."""
-    leaves, structure = jax.tree.flatten(osc)
+    leaves, structure = jax.tree.flatten(in_units_of_run(osc))
     edges = bool(np.any([np.isfinite([belt.lower, belt.upper]) for belt in osc.belts]))
     program = Program(structure, (False,) * len(leaves), Attractor(), edges)
 

@@ -9,19 +9,22 @@ compiled program, that of `sweep` for attractors.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, tell
 from ..checks import as_positive, as_whole, outside_of_traces
-from ..cycles.attractors import APART, RUN, Runs, place_of
+from ..cycles.attractors import APART, Runs, error_of_runs, place_of
 from ..cycles.cycle import cycle_from
 from ..model.equilibria import equilibria
 from ..model.oscillator import Oscillator
+from ..model.own_units import quantity, rescaled
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
@@ -30,7 +33,7 @@ from ..tables import table_of
 from .attractor import CYCLE, EQUILIBRIUM, KINDS, STUCK_FOR_EVER, UNDECIDED, Attractor
 from .basins import as_box, check_key, rest_reached, standard_error, starts_in
 from .grid import Grid
-from .question import LONG_ENOUGH
+from .question import LONG_ENOUGH, numbers_of_runs
 from .shares import told_apart
 from .work import results_of
 
@@ -74,10 +77,10 @@ class BasinFractions(eqx.Module):
     fractions: np.ndarray
     standard_errors: np.ndarray
     undecided: np.ndarray
-    x1_min: np.ndarray
-    x1_max: np.ndarray
-    x2_min: np.ndarray
-    x2_max: np.ndarray
+    x1_min: np.ndarray = quantity("length")
+    x1_max: np.ndarray = quantity("length")
+    x2_min: np.ndarray = quantity("velocity")
+    x2_max: np.ndarray = quantity("velocity")
     period: np.ndarray
     n: int
     name: str = eqx.field(static=True)
@@ -137,7 +140,7 @@ def basin_fractions(
     moves: float | None = None,
     t1: ArrayLike = LONG_ENOUGH,
     rtol: ArrayLike = 1e-8,
-    atol: ArrayLike = 1e-8,
+    atol: ArrayLike | None = None,
 ) -> BasinFractions:
     """The fraction of a box of starts that leads to each attractor, against one parameter.
 
@@ -175,18 +178,23 @@ def basin_fractions(
     first, last = as_span(span, where)
     corners, n, rows = as_box(box), as_whole(n, "n"), as_whole(rows, "rows", 2)
     check_key(key)
-    given = {"t1": t1, "rtol": rtol, "atol": atol}
-    numbers = {name: as_positive(value, name) for name, value in given.items()}
+    numbers = numbers_of_runs(t1, rtol, atol)
     moves = None if moves is None else as_positive(moves, "moves")
-    variation = varied(osc, where, (first,))
+    given = varied(osc, where, (first,))
     for value in (first, last):
-        variation.check(value)
+        given.check(value)
     values = evenly_spaced(first, last, rows)
     starts = [starts_in(corners, n, jax.random.fold_in(key, row)) for row in range(rows)]
-    found = _found_along(variation, values, np.stack(starts), numbers)
-    if moves is None:
-        moves = MOVES * _longest(corners, found)
-    return _matched(found, values, moves, n, variation)
+    # From here on in own units.
+    variation = given.in_own_units(*np.array([[0.5 * (first + last)], [first], [last]]))
+    _, length, (unit,) = variation.units
+    if numbers["atol"] is not None:
+        numbers["atol"] /= float(length)
+    found = _found_along(variation, values / unit, np.stack(starts) / length, numbers)
+    longest = _longest(corners / length, found)
+    moves = MOVES * longest if moves is None else moves / float(length)
+    fractions = _matched(found, values / unit, moves, n, variation)
+    return replace(rescaled(fractions, length), values=values)
 
 
 def _longest(corners: np.ndarray, found: list[list["_Met"]]) -> float:
@@ -206,13 +214,13 @@ class _Met(NamedTuple):
 
 
 def _found_along(
-    variation: Variation, values: np.ndarray, starts: np.ndarray, numbers: dict[str, float]
+    variation: Variation, values: np.ndarray, starts: np.ndarray, numbers: dict[str, Any]
 ) -> list[list[_Met]]:
     """The attractors at each value that its starts, [values, 2, n], lead to, the largest fraction
     first."""
     grid = Grid(lambda parameter: variation.make(parameter), {"parameter": values}, (0.0, 0.0))
     program, n = grid.program(Attractor()), starts.shape[2]
-    error = RUN * max(numbers["rtol"], numbers["atol"])
+    error = error_of_runs(numbers, 1.0)
     found: list[list[_Met]] = []
     step = max(1, MOST_AT_ONCE // n)
     for first in range(0, len(values), step):
@@ -275,7 +283,7 @@ def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
         first = int(np.argmax(np.where(untold, beside, -1)))
         same = untold & runs.same(runs.at(first))[0]
         same[first] = True
-        cycle = cycle_from(osc, (float(runs.places[first, 1]), 0.0))
+        cycle = cycle_from(osc, jnp.asarray(np.array([runs.places[first, 1], 0.0])))
         attracts = int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1 - ATTRACTS
         closed |= same & (not attracts)
         untold &= ~same
@@ -358,7 +366,7 @@ def _seeded(osc: Oscillator, one: _Met) -> _Met | None:
     cycle turns back; of points of rest the nearest."""
     place = np.zeros(len(PLACE))
     if one.kind == CYCLE:
-        cycle = cycle_from(osc, (float(one.place[1]), 0.0))
+        cycle = cycle_from(osc, jnp.asarray(np.array([one.place[1], 0.0])))
         if int(cycle.status) != Status.OK or not bool(cycle.stable):
             return None
         place = place_of(cycle)

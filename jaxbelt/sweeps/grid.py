@@ -22,6 +22,7 @@ from ..checks import (
 from ..identity import fingerprint_or_none_like_it
 from ..kernel.lanes import Observer, Program
 from ..model.oscillator import Oscillator, check_scalars, its_oscillator
+from ..model.own_units import in_units_of_run
 from ..numerics.compiling import power_of_two
 
 #: Rows that are made of a few runs, too, so that few shapes are compiled.
@@ -66,7 +67,7 @@ class Grid:
         known = "one of known numbers: sweeps are not for jit, vmap or derivatives"
         require(is_concrete(self.example), "make", known, "a traced one")
         check_scalars(self.example)
-        leaves, self.structure = jax.tree.flatten(self.example)
+        leaves, self.structure = jax.tree.flatten(in_units_of_run(self.example))
         self.mapped = traceable(self._varying, "make", returns)
         pairs = zip(leaves, self.mapped, strict=True)
         self.shared = [jnp.asarray(leaf) for leaf, mapped in pairs if not mapped]
@@ -77,7 +78,8 @@ class Grid:
 
         def probe(values):
             # What does not depend on the mapped values is computed on the spot.
-            found.extend(not is_concrete(leaf) for leaf in jax.tree.leaves(self.make(**values)))
+            run = in_units_of_run(self.make(**values))
+            found.extend(not is_concrete(leaf) for leaf in jax.tree.leaves(run))
             return 0
 
         jax.vmap(probe, axis_size=2, out_axes=None)({name: np.zeros(2) for name in self.names})
@@ -92,6 +94,19 @@ class Grid:
         )
         made_of = fingerprint_or_none_like_it((self.structure, observer))
         return Program(self.structure, self.mapped, observer, bool(edges), made_of=made_of)
+
+    def length(self) -> float:
+        """The smallest own unit of length among the oscillators of the grid, as a sample tells."""
+        units = jax.tree.unflatten(self.structure, self.mapped).units
+        if not units.length:
+            leaves = iter(self.shared)
+            found = [None if mapped else next(leaves) for mapped in self.mapped]
+            return float(jax.tree.unflatten(self.structure, found).units.length)
+        # The units are the last leaves: length, velocity.
+        sample = np.unique(np.linspace(0, self.runs - 1, FEWEST_ROWS).astype(int))
+        column = 2 + sum(self.mapped) - 1 - bool(units.velocity)
+        lengths = self.rows(sample)[0, column]
+        return float(np.min(lengths))
 
     def rows(self, runs: np.ndarray, derivatives: tuple[str, ...] = ()) -> np.ndarray:
         """Starts and varying parameters of some runs, [1 + derivatives, columns, runs]."""
@@ -110,7 +125,7 @@ class Grid:
 @functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4, 5))
 def _rows(make, made_of, names, mapped, start, derivatives, values):
     def row(values):
-        leaves = jax.tree.leaves(make(**{name: values[name] for name in names}))
+        leaves = jax.tree.leaves(in_units_of_run(make(**{name: values[name] for name in names})))
         varying = [leaf for leaf, varies in zip(leaves, mapped, strict=True) if varies]
         return jnp.stack([*(jnp.asarray(values.get(x, default)) for x, default in start), *varying])
 

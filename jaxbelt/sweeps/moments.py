@@ -20,6 +20,7 @@ from jaxtyping import Array
 from ..checks import require_callable, require_one_of, require_value
 from ..model.modes import Mode, mode_acceleration, without_rounding
 from ..model.oscillator import Oscillator
+from .observers import as_given
 
 
 @dataclass(frozen=True)
@@ -87,11 +88,6 @@ def checked(at: Any) -> tuple[Any, ...]:
     return at
 
 
-def per_lane(osc: Oscillator) -> Any:
-    """The axes of `jax.vmap` for an oscillator of which some leaves differ from lane to lane."""
-    return jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
-
-
 def section_of(moment: AtSection | AtExtrema) -> Callable[..., Array]:
     """The function of (osc, mode, x1, x2), arrays [lanes], whose zeros are the moments."""
     if isinstance(moment, AtExtrema):
@@ -99,7 +95,7 @@ def section_of(moment: AtSection | AtExtrema) -> Callable[..., Array]:
     function = moment.function
 
     def value(osc, mode, x1, x2):
-        return jax.vmap(function, in_axes=(per_lane(osc), 0, 0))(osc, x1, x2)
+        return as_given(function, osc, x1, x2)
 
     return value
 

@@ -1,6 +1,6 @@
 """Observers of whole runs: the state at t1, and what a user's reducer makes of the events."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -12,6 +12,7 @@ from jaxtyping import Array
 from ..kernel.events import event_kinds
 from ..kernel.lanes import Observer, Variable, choose
 from ..kernel.marks import Mark
+from ..model.own_units import OwnOscillator, in_units_of_user
 
 #: What contact codes stand for.
 CONTACTS = {
@@ -32,8 +33,8 @@ class Final(Observer):
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {
-        "x1_end": Variable("displacement at t1"),
-        "x2_end": Variable("velocity at t1"),
+        "x1_end": Variable("displacement at t1", dimension="length"),
+        "x2_end": Variable("velocity at t1", dimension="velocity"),
         "mode_end": Variable(
             "contact at t1, as in Trajectory.modes", "int8", per_belt=True, meanings=CONTACTS
         ),
@@ -62,6 +63,24 @@ class Final(Observer):
             "n_events": lanes.events,
             "status": lanes.status,
         }
+
+
+def as_given(
+    function: Callable[..., Any], osc: OwnOscillator, x1: Array, x2: Array, *more: Array
+) -> Any:
+    """What a function of the user's tells of each lane, an oscillator and a state in its units.
+
+    more: further arguments, [lanes, ...], which are in the user's units already.
+    """
+
+    def of_lane(osc, x1, x2, *more):
+        length = osc.units.length
+        return function(in_units_of_user(osc), length * x1, length * x2, *more)
+
+    # Some of the oscillator's leaves differ from lane to lane.
+    axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
+    in_axes = (axes, 0, 0, *(0 for _ in more))
+    return jax.vmap(of_lane, in_axes=in_axes)(osc, x1, x2, *more)
 
 
 class RunEvent(eqx.Module):
@@ -96,15 +115,15 @@ class Reduce(Observer):
     reducer: Any = eqx.field(static=True)
 
     def start(self, osc, lanes):
-        axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
-        return jax.vmap(self.reducer.init, in_axes=(axes, 0, 0))(osc, lanes.x1, lanes.x2)
+        return as_given(self.reducer.init, osc, lanes.x1, lanes.x2)
 
     def watch(self, osc, lanes, passage, ones, t1, tol):
         memory, busy = lanes.memory, lanes.run >= 0
         (fired, kind, belt), (released, *release) = event_kinds(lanes, passage)
-        event = RunEvent(passage.t, passage.x1, passage.x2, kind, belt)
+        length = osc.units.length
+        event = RunEvent(passage.t, length * passage.x1, length * passage.x2, kind, belt)
         memory = self._update(memory, event, fired & busy)
-        event = RunEvent(lanes.t, lanes.x1, lanes.x2, *release)
+        event = RunEvent(lanes.t, length * lanes.x1, length * lanes.x2, *release)
         memory = self._update(memory, event, released & busy)
         return replace(lanes, memory=memory)
 
@@ -112,5 +131,6 @@ class Reduce(Observer):
         return choose(happened, jax.vmap(self.reducer.update)(memory, event), memory)
 
     def finish(self, osc, lanes):
-        end = RunEnd(lanes.t, lanes.x1, lanes.x2, lanes.status)
+        length = osc.units.length
+        end = RunEnd(lanes.t, length * lanes.x1, length * lanes.x2, lanes.status)
         return {**jax.vmap(self.reducer.finish)(lanes.memory, end), "status": lanes.status}

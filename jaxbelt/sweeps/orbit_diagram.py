@@ -22,6 +22,7 @@ from ..checks import (
     as_array,
     as_interval,
     as_positive,
+    as_tolerance,
     as_whole,
     check_finite,
     outside_of_traces,
@@ -128,7 +129,7 @@ def orbit_diagram(
     y0: ArrayLike | Sequence[Any] = (3.0, 0.0),
     rows: int = 400,
     rtol: ArrayLike = 1e-8,
-    atol: ArrayLike = 1e-8,
+    atol: ArrayLike | None = None,
 ) -> OrbitDiagram:
     """The points of attractors against one parameter, from given starts: an orbit diagram.
 
@@ -151,7 +152,7 @@ def orbit_diagram(
     kinds = AtExtrema | AtSection | AtEvents
     require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
     starts = _starts_of(y0)
-    numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_positive(atol, "atol")}
+    numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_tolerance(atol, "atol")}
     variation = varied(osc, where, (first,))
     rows = as_whole(rows, "rows", 2)
     check_sections((at,), variation.oscillator(np.array([first])))
@@ -178,7 +179,7 @@ class Sampling:
     at: Any
     starts: np.ndarray
     rows: int
-    numbers: dict[str, float]
+    numbers: dict[str, Any]
 
     def diagram(self, span: tuple[float, float]) -> OrbitDiagram:
         """The orbit diagram over a span of the parameter."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..checks import (
     as_positive,
+    as_tolerance,
     in_words,
     require,
     require_one_of,
@@ -60,8 +61,7 @@ class Question:
             given = 'given, the end of each run, but for observe="attractor"'
             require(observe == "attractor", "t1", given, "None")
             t1 = LONG_ENOUGH
-        given = {"t1": t1, "rtol": rtol, "atol": atol}
-        numbers: dict[str, Any] = {name: as_positive(value, name) for name, value in given.items()}
+        numbers = numbers_of_runs(t1, rtol, atol)
         wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
         fits = isinstance(wanted, Sequence)
         require_value(fits, "derivatives", "a tuple of names of axes", wanted)
@@ -100,11 +100,12 @@ class Question:
             "call": self.call(),
             "oscillator": f"{_plain(repr(grid.example))}, where the axes do not say otherwise",
             "start": ", ".join(start) + self._only_one_start() or "along the axes",
-            **self.numbers,
+            **{name: value for name, value in self.numbers.items() if value is not None},
+            "length": self.grid.length(),
             "observe": observe if isinstance(observe, str) else type(observe).__name__,
             "derivatives": ", ".join(self.derivatives) or "none",
             "versions": _versions(),
-            "units": "all results are dimensionless; time is tau = omega t",
+            "units": "lengths and velocities as in the oscillator; time is tau = omega t",
         }
 
     def _only_one_start(self) -> str:
@@ -119,7 +120,8 @@ class Question:
     def call(self) -> str:
         """How to ask it again, as a line of Python; `dataset` is that of the results, and what
         cannot be imported goes by its own name, or by `make`."""
-        settings = ", ".join(f"{name}={value!r}" for name, value in self.numbers.items())
+        given = {name: value for name, value in self.numbers.items() if value is not None}
+        settings = ", ".join(f"{name}={value!r}" for name, value in given.items())
         start, axes = tuple(self.grid.y0.values()), list(self.grid.axes)
         name = getattr(self.grid.make, "__name__", "")
         make = _expression(self.grid.make) or (name if name.isidentifier() else "make")
@@ -160,6 +162,12 @@ class Question:
             told["observe"] = f"{kind} {fingerprint(self.observe, 'observe')}"
         told["derivatives"] = repr(self.derivatives)
         return told
+
+
+def numbers_of_runs(t1: Any, rtol: Any, atol: Any) -> dict[str, Any]:
+    """The arguments of runs, checked; atol may be None, for the default in own units."""
+    positive = {name: as_positive(value, name) for name, value in (("t1", t1), ("rtol", rtol))}
+    return {**positive, "atol": as_tolerance(atol, "atol")}
 
 
 def _observer(observe: Any) -> Observer:

@@ -25,11 +25,11 @@ from jax import lax
 from jaxtyping import Array
 
 from ..kernel.events import pass_events
-from ..kernel.lanes import Lanes, Program, are_finite, choose
+from ..kernel.lanes import Lanes, Observer, Program, are_finite, choose
 from ..kernel.rounds import STEPS_PER_ROUND, lanes_at_start
 from ..kernel.step import take_step, window_of
 from ..model.modes import without_edges
-from ..model.oscillator import Oscillator
+from ..model.own_units import OwnOscillator, in_units
 from ..model.rest import start_at_focus
 from ..numerics.compiling import one_kernel
 from ..numerics.derivatives import in_directions
@@ -40,7 +40,11 @@ from ..results import Status
 ROUNDS_PER_PASS = 4
 
 
-def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> Oscillator:
+#: The default absolute tolerance of a step, in own units.
+TOLERANCE = 1e-8
+
+
+def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> OwnOscillator:
     """The oscillators of the lanes: leaves that differ from run to run are arrays [lanes]."""
     leaves, column = [], 2
     others = iter(shared)
@@ -56,6 +60,7 @@ def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> Oscillato
 
 def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
     """Lanes at the start of their runs."""
+    x1, x2 = x1 / osc.units.length, x2 / osc.units.length
     if program.derivatives:
         x1, x2 = start_at_focus(osc, x1, x2)
     lanes = lanes_at_start(osc, run, x1, x2, passes, rtol)
@@ -109,6 +114,16 @@ def _ordered(values: dict[str, Any]) -> list[str]:
     return sorted(values)
 
 
+def _results(observer: Observer, osc: OwnOscillator, lanes: Lanes) -> dict[str, Any]:
+    """What is known of the lanes, in the units in which their runs were given."""
+    found = observer.finish(osc, lanes)
+    for name, value in found.items():
+        known = observer.variables.get(name)
+        if known is not None and known.dimension != "time":
+            found[name] = jax.tree.map(lambda x, to=known.dimension: osc.units.back(x, to), value)
+    return found
+
+
 def _columns(values: dict[str, Any]) -> list[Array]:
     """Results as columns [lanes] of floats: what is a tuple has a column each."""
     columns = []
@@ -122,8 +137,8 @@ def _columns(values: dict[str, Any]) -> list[Array]:
 class Common(eqx.Module):
     """What all runs of a call have in common.
 
-    shared: the leaves of the oscillator that do not differ from run to run; t1; rtol, atol; limit:
-    how many passes a run may take.
+    shared: the leaves of the oscillator that do not differ from run to run; t1; rtol; atol: in the
+    units in which runs are given, NaN for the default; limit: how many passes a run may take.
     """
 
     shared: list[Array]
@@ -179,7 +194,7 @@ def _refill(program: Program, common: Common, block: _Block, desk: _Desk) -> _De
     finished = finished & (_rank(finished) < ones.size - desk.filled)
     # In order, behind what is there.
     source = jnp.searchsorted(_rank(finished), slots - desk.filled)
-    new = [lanes.run, *_columns(observer.finish(osc, lanes))]
+    new = [lanes.run, *_columns(_results(observer, osc, lanes))]
     pairs = zip([desk.numbers, *desk.columns], new, strict=True)
     handed = [
         jnp.where(slots < desk.filled, old, value.at[source].get(mode="fill", fill_value=-1))
@@ -208,7 +223,7 @@ def _work(program: Program, common: Common, stream: Stream, slopes: Sequence[Str
     """The stream after ROUNDS_PER_PASS times some steps, each time past the events at first, and
     its derivatives, one for each direction."""
     observer, ones = program.observer, stream.ones
-    t1, rtol, atol = common.t1, common.rtol, common.atol
+    t1, rtol = common.t1, common.rtol
     forward = functools.partial(take_step, derivatives=program.derivatives)
     rules = dict(captures=program.captures, derivatives=program.derivatives)
 
@@ -220,6 +235,7 @@ def _work(program: Program, common: Common, stream: Stream, slopes: Sequence[Str
 
     def step(rows, lanes, window):
         osc = _oscillators(program, common.shared, rows)
+        atol = in_units(common.atol, osc.units.length, TOLERANCE)
         return observer.follow(forward, osc, window, ones, lanes, t1, rtol, atol)
 
     rows, rows_slopes = stream.rows, [one.rows for one in slopes]
@@ -373,7 +389,7 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
     def finish():
         stream = idle(program, shared, 1, 2 + sum(program.mapped))
         osc = _oscillators(program, shared, stream.rows)
-        return program.observer.finish(osc, stream.lanes)
+        return _results(program.observer, osc, stream.lanes)
 
     values = jax.eval_shape(finish)
     shapes = {}

@@ -10,6 +10,7 @@ from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..activity import announced
@@ -17,6 +18,7 @@ from ..checks import require, require_callable
 from ..cycles.attractors import Runs, is_same
 from ..cycles.cycle import cycle_from
 from ..model.oscillator import Oscillator
+from ..model.own_units import in_own_units
 from ..results import Status
 from .attractor import CYCLE, EQUILIBRIUM, UNDECIDED
 from .datasets import check_dataset
@@ -188,7 +190,9 @@ def _without_doubt(
         place = dict(zip(others, np.unravel_index(point, sizes), strict=True))
         here = dataset.isel({name: int(i) for name, i in place.items()})
         given = (str(name) for name in here.coords if name not in NO_PARAMETERS)
-        osc = make(**{name: float(here[name]) for name in given})
+        osc = in_own_units(
+            make(**{name: float(here[name]) for name in given}), np.asarray(dataset.attrs["length"])
+        )
         flat[point] = _settled(osc, flat[point], runs.places[point], pairs)
     return flat.reshape(labels.shape)
 
@@ -201,7 +205,7 @@ def _settled(
     for number in sorted({number for pair in pairs for number in pair}):
         # From where the cycle turns back: there it is known best.
         x1_max = places[np.argmax(labels == number), 1]
-        cycles[number] = cycle_from(osc, (float(x1_max), 0.0))
+        cycles[number] = cycle_from(osc, jnp.asarray(np.array([x1_max, 0.0])))
         if int(cycles[number].status) != Status.OK or not bool(cycles[number].stable):
             settled[labels == number] = -1
     for one, other in pairs:

@@ -52,7 +52,7 @@ def sweep(
     y0: ArrayLike | tuple = (3.0, 0.0),
     t1: ArrayLike | None = None,
     rtol: ArrayLike = 1e-8,
-    atol: ArrayLike = 1e-8,
+    atol: ArrayLike | None = None,
     observe: Any = "final",
     derivatives: Sequence[str] = (),
     store: str | Path | None = None,
@@ -70,7 +70,7 @@ def sweep(
     but the oscillator at the first finite value of each axis, which is made before anything runs,
     has to be possible. y0: start (x1, x2) where no axis says
     otherwise. t1: end of each run, from t = 0 (dimensionless time tau = omega t). rtol, atol:
-    tolerances of a step.
+    tolerances of a step, atol a length (None: 1e-8 of the oscillator's own size).
 
     observe: what is wanted, and the variables of the dataset, over the axes:
 
@@ -214,7 +214,13 @@ def _audited(question: Question, results: Memory | Store, share: float) -> dict[
     runs = chosen(grid.runs, share)
     known = results.of_runs(runs)
     differ = differing(
-        question.program, grid.shared, lambda i: grid.rows(i)[0], runs, known, question.numbers
+        question.program,
+        grid.shared,
+        lambda i: grid.rows(i)[0],
+        runs,
+        known,
+        question.numbers,
+        grid.length(),
     )
     if len(differ):
         places = [tuple(map(int, np.unravel_index(run, grid.shape))) for run in differ[:5]]
@@ -266,7 +272,7 @@ def explain(
     y0: ArrayLike | tuple = (3.0, 0.0),
     t1: ArrayLike | None = None,
     rtol: ArrayLike = 1e-8,
-    atol: ArrayLike = 1e-8,
+    atol: ArrayLike | None = None,
     observe: Any = "final",
     derivatives: Sequence[str] = (),
 ) -> Explanation:

@@ -63,7 +63,7 @@ def run(
     *,
     t1: float,
     rtol: float,
-    atol: float,
+    atol: float | None,
     derivatives: int = 0,
     budget: float = 1.0,
     threads: int | None = None,
@@ -72,9 +72,10 @@ def run(
     """Do all runs, on so many threads or, with None, on all cores.
 
     rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]: the starts and the
-    parameters that vary, and their derivatives in so many directions. put(numbers, results) takes
-    results [1 + derivatives, columns, runs] in any order, on any thread. budget: the share of
-    `STEP_BUDGET` that a run may take.
+    parameters that vary, and their derivatives in so many directions. Starts and atol are in the
+    units in which the oscillators were given; atol None: the default, in own units. put(numbers,
+    results) takes results [1 + derivatives, columns, runs] in any order, on any thread. budget: the
+    share of `STEP_BUDGET` that a run may take.
 
     Every thread feeds chunks to one compiled kernel (which lets go of Python's lock) on its own
     lanes. Long runs stay in their lanes while the next chunk is worked on. An exception, a
@@ -89,6 +90,7 @@ def run(
     limit = min(limit, most)
     threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
+    atol = np.nan if atol is None else atol
     team = _Team(
         functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit))),
         functools.partial(_first_streams, program, shared, columns, derivatives),

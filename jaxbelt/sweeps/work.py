@@ -71,7 +71,7 @@ def results_of(
     *,
     t1: float,
     rtol: float,
-    atol: float,
+    atol: float | None,
 ) -> dict[str, np.ndarray]:
     """The results of runs by name, [runs, ...], in the order of the runs; arguments: of
     `threads.run`."""
