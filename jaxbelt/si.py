@@ -71,7 +71,7 @@ SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energ
 
 
 #: Where the mass rests, at the end of the words for an attractor of `basins`.
-REST = re.compile(r"(?<=rest.at.)-?\d+\.\d+$")
+REST = re.compile(r"(?<=rest.at.)-?\d+(\.\d+)?(e[+-]\d+)?$")
 #: What else to do with a result that `in_si` does not take.
 INSTEAD = {
     BifurcationPoint: "; its value is in the unit of the argument where a function was given in "
@@ -188,7 +188,7 @@ def rest_in_m(words: str, units: Units) -> str:
     """The words for an attractor with where the mass rests in m, with the digits that are known."""
 
     def in_m(found: re.Match) -> str:
-        digits = len(found[0].replace(".", "").lstrip("-0"))
+        digits = len(found[0].partition("e")[0].replace(".", "").lstrip("-0"))
         return f"{float(found[0]) * float(units.length):.{max(1, digits)}g} m"
 
     return REST.sub(in_m, words)

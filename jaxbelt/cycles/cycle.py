@@ -472,14 +472,16 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     room = None if max_arcs is None else as_whole(max_arcs, "max_arcs")
-    own = in_own_units(osc)
-    cycle = in_given_units(cycle_from(own, y0 / own.units.length, room), osc, own)
+    cycle = cycle_from(osc, y0, room)
     warn_of_extrapolation([cycle])
     return cycle
 
 
 def cycle_from(osc: Oscillator, y0: Array, max_arcs: int | None = None) -> Cycle:
-    """The cycle that a start leads to, of an oscillator in own units, without any warning."""
+    """What `find_cycle` returns, without its checks and its warning."""
+    own = in_own_units(osc)
+    if own is not osc:
+        return in_given_units(cycle_from(own, y0 / own.units.length, max_arcs), osc, own)
     room = SIZES[-1] if max_arcs is None else max_arcs
     loop, count, status, y = _loop_reached(osc, y0, room)
     for _ in range(MORE_BUDGETS if is_concrete(status) else 0):

@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, number, require, require_one_of
 from ..model.oscillator import Oscillator, check_oscillator
-from ..model.own_units import OwnOscillator, in_given_units, in_own_units, quantity, rescaled
+from ..model.own_units import OwnOscillator, in_given_units, in_units_of_run, quantity, rescaled
 from ..results import Status, describe, draw
 from ..tables import table_of
 from .nearest import ShortestWay, end_of_way, sampled_curve, sampled_point, shortest_between
@@ -71,7 +71,7 @@ class FatalShock(eqx.Module):
         """The smallest fatal shock at each of n phases of the cycle, evenly spread over a period
         (of an equilibrium at its one state): t, the time since the first of them, x1, x2, distance,
         shock_x1, shock_x2; inf and NaN where there is no boundary in that direction."""
-        known, along_x2 = in_own_units(self.portrait.oscillator), self.direction == "x2"
+        known, along_x2 = in_units_of_run(self.portrait.oscillator), self.direction == "x2"
         told, unit = _in_units_of(self.portrait, known), float(known.units.length)
         end = destination_of_name(self.attractor)
         ts, states = _phases(told, end, as_whole(n, "n"))
@@ -148,7 +148,7 @@ def minimal_fatal_shock(
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     require_one_of(direction, DIRECTIONS, "direction")
-    given, osc = osc, in_own_units(osc)
+    given, osc = osc, in_units_of_run(osc)
     y0 = y0 / osc.units.length
     known, start = lax.stop_gradient((osc, y0))
     concrete = is_concrete((known, start))

@@ -162,11 +162,10 @@ def design(
 
     def off(achieved):
         wanted = np.clip(achieved, *intervals.T)
-        return (achieved - wanted) / np.maximum(1.0, np.abs(wanted)), wanted
+        return (achieved - wanted) / sizes, wanted
 
-    def improved(slopes, miss, wanted, damping):
-        size = np.maximum(1.0, np.abs(wanted))[:, None]
-        matrix = np.nan_to_num(np.where(miss[:, None] != 0, slopes / size, 0.0))
+    def improved(slopes, miss, damping):
+        matrix = np.nan_to_num(np.where(miss[:, None] != 0, slopes / sizes[:, None], 0.0))
         gram = matrix @ matrix.T
         # Damping vanishes with the miss, for quadratic convergence.
         damping = damping * np.max(gram) * np.max(np.abs(miss)) + 1e-14
@@ -174,12 +173,16 @@ def design(
         return u + step * min(1.0, LONGEST_CHANGE / max(np.max(np.abs(step)), 1e-300))
 
     achieved, slopes, cycle = evaluate(u)
+    # What is off is measured by the largest of the numbers that are known of each target.
+    known = np.column_stack([np.asarray(achieved), intervals])
+    sizes = np.max(np.abs(np.where(np.isfinite(known), known, 0.0)), axis=1)
+    sizes = np.where(sizes > 0, sizes, 1.0)
     miss, wanted = off(np.asarray(achieved))
     damping, iterations, idle = 1e-3, 0, 0
     while iterations < 2 * ITERATIONS and idle < 5:
         if not np.all(np.isfinite(miss)) or np.max(np.abs(miss)) < MET or damping > 1e8:
             break
-        new = improved(np.asarray(slopes), miss, wanted, damping)
+        new = improved(np.asarray(slopes), miss, damping)
         trial = evaluate(new)
         new_miss, new_wanted = off(np.asarray(trial[0]))
         iterations += 1

@@ -34,13 +34,21 @@ from jaxtyping import Array, ArrayLike
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, outside_of_traces, require, require_value
 from ..model.oscillator import Oscillator, check_oscillator
+from ..model.own_units import in_own_units, own_length, quantity, rescaled
 from ..motion.simulate import simulate
 from ..numerics.compiling import jit
 from ..results import Status, describe, draw
 from ..tables import table_of
 from .record import OVERESTIMATED, WINDOW, Record, Verdict, record_of, verdict_on
 from .search import first_guesses
-from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of, told_to
+from .selection import (
+    ITERATIONS,
+    LONGEST_CHANGE,
+    Selection,
+    selection_of,
+    sizes_of,
+    told_to,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -58,9 +66,9 @@ LONGER, GAIN_ENOUGH, GAIN_LEFT = 10, 1e-5, 1e-1
 #: Factors by which the damping shrinks and grows: along a bent valley a large one is refused at
 #: every other step.
 LESS_DAMPED, MORE_DAMPED = 3.0, 4.0
-#: Parameters nearer to zero than this may have errors of this size; and those whose error in a
-#: direction that is not told is this many of their sizes have a share in it.
-SMALLEST, LEAST_PART = 0.1, 0.3
+#: Parameters whose error in a direction that is not told is this many of their sizes have a share
+#: in it.
+LEAST_PART = 0.3
 
 
 # --- 2 and 3: windows of the exact motion ---------------------------------------------------------
@@ -76,7 +84,7 @@ def _linearized(selection: Selection, osc: Oscillator, record: Record, u, starts
     """
 
     def motion(u, starts):
-        moved = selection.put(osc, selection.values(u))
+        moved = in_own_units(selection.put(osc, selection.values(u)), record.length)
 
         def piece(y, row):
             times, start, is_fresh = row
@@ -195,11 +203,13 @@ class Fit(eqx.Module):
     candidates: how many starts were followed; evaluations: of the motion and its Jacobian; status:
     OK, MISFIT (plausibility below 1e-6, or, where the noise was estimated, residuals of its size
     with an autocorrelation that noise has not), NOT_IDENTIFIED (no misfit, and a standard error
-    that is infinite, or larger than its parameter and than 0.1), NO_CONVERGENCE (a further step
-    would move the estimates by a third of a standard error) or NOT_FINITE. Standard errors are
+    that is infinite, or larger than its parameter and than 0.1 of its unit), NO_CONVERGENCE (a
+    further step would move the estimates by a third of a standard error) or NOT_FINITE. Standard
+    errors are
     those of the linearised problem: right where the model is and the errors are small. With a
     MISFIT they mean nothing, and `table` and the text leave them out. noise_was_estimated: whether
-    it was, of a column at least.
+    it was, of a column at least; units: of the parameters, by how much each changes the oscillator
+    by its own size, as a power of two, [p].
     """
 
     oscillator: Oscillator
@@ -207,19 +217,20 @@ class Fit(eqx.Module):
     estimates: Array
     standard_errors: Array
     covariance: Array
-    y0: Array
-    y0_standard_errors: Array
+    y0: Array = quantity("length", "velocity")
+    y0_standard_errors: Array = quantity("length", "velocity")
     ts: Array
-    ys: Array
-    residuals: Array
-    noise: Array
+    ys: Array = quantity("length", "velocity")
+    residuals: Array = quantity("length", "velocity")
+    noise: Array = quantity("length", "velocity")
     reduced_chi_squared: Array
     plausibility: Array
     autocorrelation: Array
     candidates: int
     evaluations: int
     status: Array
-    noise_was_estimated: bool = eqx.field(static=True, default=False)
+    noise_was_estimated: bool = eqx.field(static=True)
+    units: np.ndarray
 
     @property
     def undetermined(self) -> tuple[tuple[str, ...], ...]:
@@ -227,7 +238,8 @@ class Fit(eqx.Module):
         name by itself the parameter. Empty unless the status is NOT_IDENTIFIED."""
         if int(self.status) != Status.NOT_IDENTIFIED:
             return ()
-        return _undetermined(self.names, self.covariance, _sizes(self.estimates))
+        sizes = sizes_of(self.estimates, self.units)
+        return _undetermined(self.names, self.covariance, sizes)
 
     def intervals(self, level: float = 0.95) -> Array:
         """Confidence intervals of the parameters, (lower, upper) each, [p, 2]."""
@@ -283,11 +295,6 @@ class Fit(eqx.Module):
             for group in self.undetermined
         ]
         return "\n".join([head, *rows, *advice])
-
-
-def _sizes(estimates: ArrayLike) -> np.ndarray:
-    """What a standard error is measured by: the parameter, or, of one that is near zero, this."""
-    return np.maximum(np.abs(np.asarray(estimates)), SMALLEST)
 
 
 def _undetermined(names: Sequence[str], covariance: ArrayLike, sizes: np.ndarray):
@@ -361,7 +368,10 @@ def fit(
     tell = told_to(report)
     selection, u = selection_of(oscillator, where, bounds)
 
-    record = record_of(times, values, sigmas)
+    # The record and its motions are in the own units of the guess.
+    length = float(own_length(oscillator))
+    values, sigmas = values / length, [one if one is None else one / length for one in sigmas]
+    record = record_of(times, values, sigmas, length)
     evaluations = 0
 
     def linearized(u, starts, fresh):
@@ -390,9 +400,10 @@ def fit(
             break
     best = min(followed, key=_misfit_of)
     verdict = judged(best), estimated
-    result = _result(
+    found = _result(
         oscillator, selection, record, times, values, best, *verdict, len(followed), evaluations
     )
+    result = rescaled(found, length)
     tell(repr(result).splitlines()[0])
     return result
 
@@ -507,7 +518,7 @@ def _result(
     ys, weights = _motion_of(point, values), _weights_of(record, values)
     status = Status.OK if verdict.is_noise else Status.MISFIT
     if status == Status.OK:  # of a misfit errors mean nothing
-        if not np.all(errors[:p] <= _sizes(estimates)):
+        if not np.all(errors[:p] <= sizes_of(estimates, selection.unit)):
             status = Status.NOT_IDENTIFIED
         elif not _gain_left(point.blocks[0]) < GAIN_LEFT:
             status = Status.NO_CONVERGENCE
@@ -533,6 +544,7 @@ def _result(
         evaluations=evaluations,
         status=jnp.asarray(status.value),
         noise_was_estimated=estimated,
+        units=np.asarray(selection.unit),
     )
 
 

@@ -13,7 +13,7 @@ from ..cycles.portrait import portrait
 from ..cycles.shocks import DIRECTIONS, length_of, minimal_fatal_shock, shortest_way_out
 from ..cycles.sides import leads_to
 from ..model.oscillator import Oscillator
-from ..model.own_units import in_own_units
+from ..model.own_units import in_own_units, in_units_of_run
 from ..results import Status
 
 
@@ -35,7 +35,7 @@ class BasinMargin(eqx.Module):
 
         For oscillators beside that one it is a function that JAX can trace.
         """
-        own = in_own_units(osc)
+        own = in_units_of_run(osc)
         length = own.units.length
         told = portrait(own)
         (end,) = leads_to(told, np.asarray(y0 / length)[None])

@@ -27,7 +27,7 @@ class Record(eqx.Module):
     values: x1 and x2, [pieces, samples, 2]; weights: 1/noise, 0 where there is no datum, the same;
     starts: states at the starts of the pieces as the record has them, [pieces, 2]; scale: of each
     component, [2]; lacks: 1.0 where only velocities are known, so that the x1 of the starts lack a
-    common constant, else 0.0.
+    common constant, else 0.0; length: the unit of length of all of these.
     """
 
     times: Array
@@ -36,10 +36,14 @@ class Record(eqx.Module):
     starts: Array
     scale: Array
     lacks: Array
+    length: Array
 
 
-def record_of(ts: np.ndarray, values: np.ndarray, noise: Sequence[float | None]) -> Record:
-    """values: [samples, 2], NaN where there is no datum; noise: None to be estimated."""
+def record_of(
+    ts: np.ndarray, values: np.ndarray, noise: Sequence[float | None], length: float
+) -> Record:
+    """values: [samples, 2], NaN where there is no datum; noise: None to be estimated; length: the
+    unit of length in which both are."""
     n = len(ts)
     step = (ts[-1] - ts[0]) / (n - 1)
     size = int(np.clip(round(WINDOW / step), 1, n))
@@ -72,6 +76,7 @@ def record_of(ts: np.ndarray, values: np.ndarray, noise: Sequence[float | None])
         starts=jnp.asarray(states[begin]),
         scale=jnp.asarray(np.std(states, axis=0)),
         lacks=jnp.asarray(float(0 not in given)),
+        length=jnp.asarray(np.float64(length)),
     )
 
 

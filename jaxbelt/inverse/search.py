@@ -17,6 +17,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from ..model.oscillator import Oscillator
+from ..model.own_units import in_own_units
 from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
 from .record import Record
@@ -29,7 +30,7 @@ SEARCH_STEPS, LEARNING_RATE = 60, 0.1
 def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
     """Misfit of the smooth formulation over all windows, of size one where it is off by `scale`."""
     u, shift = unknown
-    osc = selection.put(osc, selection.values(u))
+    osc = in_own_units(selection.put(osc, selection.values(u)), record.length)
     h = record.times[:, -1] / steps
 
     def field(y):
@@ -101,7 +102,8 @@ def first_guesses(
     # the slope of the friction there; two belts of one velocity double it.
     # A record of one velocity, of a mass that sticks throughout, gives none: its length has to do.
     eps = 0.1 * max(float(record.scale[1]), 0.1 * float(record.scale[0]))
-    slope = max(float(b.load * b.friction.static * osc.omega) for b in osc.belts) / eps
+    belts = in_own_units(osc, record.length).belts
+    slope = max(float(belt.load * belt.friction.static) for belt in belts) / eps
     steps = 16 * int(np.ceil(float(jnp.max(record.times)) * max(20.0, slope / 1.3) / 16))
     rng = np.random.default_rng(0)
     spread = rng.standard_normal((starts, u.size + 1))

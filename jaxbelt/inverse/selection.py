@@ -13,16 +13,20 @@ from ..activity import tell
 from ..checks import as_numbers, require, require_value
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_groups, names_of
+from ..model.variations import Variation
 
 #: Most steps of a damped Newton iteration, and the longest, in units of `Selection.values`' u.
 ITERATIONS, LONGEST_CHANGE = 40, 0.4
+#: The size of a parameter that is nearer to zero than this, in its own unit.
+SMALLEST = 0.1
 
 
 class Selection(eqx.Module):
     """Parameters of an oscillator: for each the numbers of the leaves that it sets, and bounds.
 
-    Each is a function of an unbounded variable u: lower + exp(u), upper - exp(-u), between two
-    bounds a logistic function of u, without bounds size u.
+    Each is a function of an unbounded variable u: lower + unit exp(u), upper - unit exp(-u),
+    between two bounds a logistic function of u, without bounds size u. unit: the parameter's own,
+    see `Variation.in_own_units`.
     """
 
     leaves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
@@ -30,11 +34,13 @@ class Selection(eqx.Module):
     lower: Array
     upper: Array
     size: Array
+    unit: Array
 
     def values(self, u: Array) -> Array:
         has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         low, high = jnp.where(has_lower, self.lower, 0.0), jnp.where(has_upper, self.upper, 0.0)
-        one_sided = jnp.where(has_lower, low + jnp.exp(u), high - jnp.exp(-u))
+        unit = self.unit
+        one_sided = jnp.where(has_lower, low + unit * jnp.exp(u), high - unit * jnp.exp(-u))
         between = low + (high - low) * jax.nn.sigmoid(u)
         bounded = jnp.where(has_lower & has_upper, between, one_sided)
         return jnp.where(has_lower | has_upper, bounded, self.size * u)
@@ -42,8 +48,8 @@ class Selection(eqx.Module):
     def unbounded(self, values: ArrayLike) -> Array:
         """The u that belong to values within the bounds."""
         has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
-        above = jnp.log(jnp.where(has_lower, values - self.lower, 1.0))
-        below = -jnp.log(jnp.where(has_upper, self.upper - values, 1.0))
+        above = jnp.log(jnp.where(has_lower, (values - self.lower) / self.unit, 1.0))
+        below = -jnp.log(jnp.where(has_upper, (self.upper - values) / self.unit, 1.0))
         return jnp.where(has_lower | has_upper, above + below, values / self.size)
 
     def put(self, osc: Oscillator, values: Array) -> Oscillator:
@@ -86,9 +92,22 @@ def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, n
         require(lower < value < upper, name, inside, f"{value:.12g}")
         pairs.append((lower, upper))
     lower, upper = jnp.asarray(pairs).T
-    size = jnp.asarray(np.maximum(np.abs(values), 0.1))
-    selection = Selection(groups, names, lower, upper, size)
+    units = [_own_unit(osc, group[0], value) for group, value in zip(groups, values, strict=True)]
+    size = jnp.asarray(sizes_of(values, np.array(units)))
+    selection = Selection(groups, names, lower, upper, size, jnp.asarray(np.array(units)))
     return selection, np.asarray(selection.unbounded(jnp.asarray(values)))
+
+
+def sizes_of(values: ArrayLike, units: ArrayLike) -> np.ndarray:
+    """The sizes of parameters: of one that is near zero a part of its own unit."""
+    return np.maximum(np.abs(np.asarray(values)), SMALLEST * np.asarray(units))
+
+
+def _own_unit(osc: Oscillator, leaf: int, value: float) -> float:
+    """By how much a parameter changes the oscillator in its own units by one, as a power of two."""
+    own = Variation.of_leaves(osc, [leaf]).in_own_units(np.array([value]))
+    assert own.units is not None
+    return float(own.units.parameters[0])
 
 
 def _pairs_of(bounds: Any, names: Sequence[str]) -> list[tuple[float, float] | None]:

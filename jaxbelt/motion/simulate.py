@@ -24,7 +24,7 @@ from ..checks import (
 )
 from ..model.modes import has_edges, without_edges
 from ..model.oscillator import Oscillator, check_oscillator, has_possible_numbers
-from ..model.own_units import in_given_units, in_own_units, in_units, quantity
+from ..model.own_units import in_given_units, in_units, in_units_of_run, quantity
 from ..model.rest import start_at_focus
 from ..model.transitions import contact
 from ..numerics.compiling import jit, power_of_two
@@ -150,7 +150,7 @@ TOLERANCE, WIDTH = 1e-10, 1e-3
 @jit
 def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution) -> Trajectory:
     """A trajectory of the switch or the smooth formulation: samples without events or arcs."""
-    osc = in_own_units(given)
+    osc = in_units_of_run(given)
     y0 = y0 / osc.units.length
     atol = in_units(atol, osc.units.length, TOLERANCE)
     width = in_units(width, osc.units.velocity, WIDTH)
@@ -184,7 +184,7 @@ def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resoluti
 def _filippov(
     given, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution, ends_at_t1
 ) -> Trajectory:
-    osc = in_own_units(given)
+    osc = in_units_of_run(given)
     y0 = y0 / osc.units.length
     atol = in_units(atol, osc.units.length, TOLERANCE)
     if ts is None:

@@ -9,6 +9,7 @@ attractor at some time. All run in the kernel behind `sweep`, where a run ends a
 attractor is known.
 """
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -337,7 +338,7 @@ def _labels(
             same &= np.all(sticks == stuck, axis=-1) & (place == place[first])
         left &= ~same
         if before is None:
-            found.append(_Found(_words_for(kind, stuck, rest[first]), same, cycle))
+            found.append(_Found(_words_for(kind, stuck, rest[first], length), same, cycle))
         else:
             before.runs[same] = True
     found.sort(key=lambda one: -int(np.sum(one.runs)))
@@ -392,10 +393,12 @@ def rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return rest, segment, ends
 
 
-def _words_for(kind: str, sticks: np.ndarray, x1: float) -> str:
+def _words_for(kind: str, sticks: np.ndarray, x1: float, length: float) -> str:
     belts = " and ".join(f"belt {i}" for i in np.flatnonzero(sticks))
     if kind == "equilibrium":
-        return f"rest at {x1:.3f}"
+        # To a thousandth of the own unit of length.
+        decimals = 3 - math.floor(math.log10(length) + 0.5)
+        return f"rest at {x1:.{decimals}f}" if 0 < decimals <= 6 else f"rest at {x1:.4g}"
     if kind == "stuck":
         return f"stuck to {belts}" if belts else "stuck"
     return f"cycle that sticks to {belts}" if belts else "cycle that never sticks"
