@@ -477,7 +477,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     return cycle
 
 
-def cycle_from(osc: Oscillator, y0: Array, max_arcs: int | None = None) -> Cycle:
+def cycle_from(osc: Oscillator, y0: Array | np.ndarray, max_arcs: int | None = None) -> Cycle:
     """What `find_cycle` returns, without its checks and its warning."""
     own = in_own_units(osc)
     if own is not osc:

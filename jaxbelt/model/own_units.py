@@ -21,6 +21,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -119,10 +120,10 @@ def in_own_units(osc: Oscillator, length: ArrayLike | None = None) -> OwnOscilla
     length = own_length(osc) if length is None else length
     known = is_concrete((osc.omega, length))
     omega: Any = np.asarray(osc.omega) if known else osc.omega
-    units = OwnUnits(length, omega * length)
     if known and length == 1 and omega == 1:
-        return _unchecked(OwnOscillator, **vars(osc), units=units)
-    fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=_ONE)
+        return _unchecked(OwnOscillator, **vars(osc), units=_units_of_one())
+    units = _known_units(length, omega * length) if known else OwnUnits(length, omega * length)
+    fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=jnp.ones(()))
     return _unchecked(OwnOscillator, **fields, units=units)
 
 
@@ -132,11 +133,20 @@ def in_units_of_run(osc: Oscillator) -> OwnOscillator:
     An oscillator that comes in its own units gets its results in these.
     """
     own = in_own_units(osc)
-    return own if own is not osc else _unchecked(OwnOscillator, **vars(own) | dict(units=_ONES))
+    if own is not osc:
+        return own
+    return _unchecked(OwnOscillator, **vars(own) | dict(units=_units_of_one()))
 
 
-_ONE = np.ones(())
-_ONES = OwnUnits(_ONE, _ONE)
+def _known_units(length: Any, velocity: Any) -> OwnUnits:
+    with jax.ensure_compile_time_eval():
+        return OwnUnits(*(jnp.asarray(np.asarray(unit)) for unit in (length, velocity)))
+
+
+@functools.cache
+def _units_of_one() -> OwnUnits:
+    """Made once, as to put a number into JAX takes as long as all else."""
+    return _known_units(1.0, 1.0)
 
 
 def in_units(value: Any, unit: Any, default: float) -> Any:
@@ -233,7 +243,9 @@ def rescaled_quantity(value: Any, length: Any, dimensions: tuple[str, ...]) -> A
     if isinstance(value, float):
         return value * float(factors[0])
     one: Any = np if isinstance(value, np.ndarray) else jnp
-    return value * (one.stack(factors) if len(factors) > 1 else factors[0])
+    columns = one.stack([one.asarray(factor) for factor in factors])
+    many = (1,) * (one.ndim(value) - 1) + (-1,)
+    return value * (one.reshape(columns, many) if len(factors) > 1 else columns[0])
 
 
 def in_units_of_user(own: Oscillator) -> Oscillator:
