@@ -4,6 +4,8 @@ A change of unit by a power of two changes no bit of a result but exponents; any
 nothing but rounding. The relation is exact, so it needs no oracle, and no tolerance.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,7 +91,7 @@ def test_derivatives_and_batches(units):
     for transformed in (jax.grad(end), jax.jacfwd(end)):
         same(
             jax.vmap(transformed)(numbers),
-            jax.vmap(lambda x: transformed(x, *units))(numbers),
+            jax.vmap(functools.partial(transformed, length=length, omega=omega))(numbers),
             length,
         )
 
@@ -252,8 +254,8 @@ def test_diagrams_maps_fractions_fits_and_designs(units):
     ts = np.linspace(0.0, 30.0, 300)
     noise = 1e-3 * np.random.default_rng(0).normal(size=300)
     found = []
-    for unit, frequency, osc in ((1.0, 1.0, osc), (length, omega, other)):
-        x1 = np.asarray(jb.simulate(osc, (3.0 * unit, 0.0), 30.0, ts=ts).ys[:, 0])
+    for unit, frequency, one in ((1.0, 1.0, osc), (length, omega, other)):
+        x1 = np.asarray(jb.simulate(one, (3.0 * unit, 0.0), 30.0, ts=ts).ys[:, 0])
         guess = oscillator(0.47, 0.33, length=unit, omega=frequency)
         found.append(
             jb.fit(
