@@ -46,8 +46,7 @@ def plot_friction_law(
     require_value(isinstance(unit, str), "unit", 'a text such as "m/s"', unit)
     require_axes(ax)
     is_new, ax = ax is None, new_axes() if ax is None else ax
-    r = np.append(np.linspace(0.0, speed, 401), min(end, speed))
-    r.sort()
+    r = np.union1d(np.linspace(0.0, speed, 401), min(end, speed))
     mu, static = np.asarray(_coefficient(friction, r)), float(friction.static)
     ax.axhline(0, color="0.7", linewidth=0.6)
     ax.axvline(0, color="0.7", linewidth=0.6)
