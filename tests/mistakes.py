@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,10 +61,10 @@ MISTAKES = [
     ("jb.Belt(0.3, law, upper=math.nan)", "upper of belt must be a number, got nan"),
     ("jb.Oscillator(0.5, belts=None)", "belts must be a tuple of belts, .*got None"),
     (
-        "jb.Belt(0.3, Worded(jnp.asarray(1.0), 'soft'))",
+        "jb.Belt(0.3, Worded(1.0, 'soft'))",
         r"word of Worded must be a number .* equinox.field\(static=True\), got 'soft'",
     ),
-    ("jb.PhysicalBelt(0.3, Worded(jnp.asarray(1.0), nu0), 1.0)", "word of Worded .* got the func"),
+    ("jb.PhysicalBelt(0.3, Worded(1.0, nu0), 1.0)", "word of Worded .* got the func"),
     ("jb.Belt(0.3, NumpyLaw())", "mu of NumpyLaw must be .* JAX can trace .*not .*np.sqrt"),
     ("jb.Belt(0.3, BranchingLaw())", "mu of BranchingLaw must be .* JAX can trace .* or if"),
     ("jb.Belt(0.3)", "missing 1 required positional argument: 'friction'"),
@@ -700,7 +701,7 @@ class BranchingLaw(jb.AbstractFriction):
 
 
 class OwnLaw(jb.AbstractFriction):
-    function: Callable
+    function: Callable = eqx.field(static=True)
     static: float = 1.0
 
     @property

@@ -110,7 +110,7 @@ class Table:
         """Raise a `ValueError` where two things of the dataset have one name, or a name has none in
         a store."""
         axes, results = [*self.grid.axes], [*self.shapes]
-        dimensions = {name for result in results for name in self.dims(result)} - {*axes}
+        dimensions = {name for result in results for name in self.dims(result)[len(axes) :]}
         others = "a dimension, or ledger, and without /"
         for name in axes:
             taken = {*results, *dimensions, *TAKEN}
