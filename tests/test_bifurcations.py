@@ -265,6 +265,7 @@ def test_a_hopf_point_is_no_fold_of_cycles():
     # More damping than at the degenerate Hopf point of the test above.
     point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.55, (jb.Belt(0.35, BELL),)), where=nu0)
     assert point.status == Status.NO_FOLD and jnp.isnan(point.value)
+    assert "value nan, NO_FOLD: " in repr(point)
 
 
 def test_convergence_is_quadratic():

@@ -47,7 +47,6 @@ class Grid:
             name: np.asarray(as_array(v, f"axis {name}", (None,))) for name, v in axes.items()
         }
         for name, values in self.axes.items():
-            require(name != "belt", "axes", "without the name belt, a dimension of results", name)
             require(values.size > 0, f"axis {name}", "at least one value", "none")
         start = as_array(y0, "y0", (2,))
         check_finite(start, "y0")
