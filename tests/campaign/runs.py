@@ -17,7 +17,9 @@ BATCH = 4096
 
 
 def settings(options):
-    names = ("runs", "by", "structure", "tol", "extreme_share")
+    names = ["runs", "by", "structure", "tol", "extreme_share"]
+    # Files of results that were written before there were any have no such setting.
+    names += ["heavy"] if options.heavy else []
     return {name: getattr(options, name) for name in names}
 
 
@@ -94,6 +96,8 @@ def _case(rng, structure, options):
         if options.by == "find_cycle":
             return cases.grazing_cycle(rng, smallest)
         return cases.grazing_case(rng, structure, smallest)
+    if options.heavy:
+        return cases.heavy_case(rng, structure)
     chance = rng.random()
     if chance < 0.5:
         return cases.rational_case(rng, structure)
