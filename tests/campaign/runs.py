@@ -35,6 +35,8 @@ def outcome(options, number):
     judge = compare.judge_label if labels else compare.judge
     if labels and options.by != "find_cycle":
         judge = functools.partial(judge, again=lambda case, tol: package.labels([case], tol)[0])
+    elif options.heavy and options.what == "final":
+        judge = functools.partial(judge, again=lambda case, tol: package.finals([case], tol)[0])
     one, right = Outcome(f"{count} runs"), []
     told = _ask(batch, options)
     for case, answer, (verdict, mine) in zip(batch, told, _judged(judge, batch, told, options)):
