@@ -59,9 +59,11 @@ STEP_SAFETY = 0.9
 #: Bounds of error/tolerance. Smaller values may be rounding; larger ones, and NaN, shrink a step by
 #: no more than a factor of 100000^(1/8), 4.2.
 LEAST_ERROR, LARGEST_ERROR = 1e-5, 1e5
-#: Longest way to a guard that a Taylor step bridges, over the square root of the tolerance: the
-#: terms that it leaves out are below the tolerance then.
+#: Longest time that a Taylor step to a guard bridges, over the square root of the tolerance: where
+#: x2'' is of order one, the terms that it leaves out are far below the tolerance then.
 LANDING = 0.1
+#: Largest of these terms, x2'' delta^2, over the tolerance: heavy belts change x2' faster.
+LEFT_OUT = 0.1
 #: Speed over |x2'| below which an edge is passed slowly: over a way d, the terms that the Taylor
 #: step leaves out grow like (|x2'| d / x2^2)^2.
 SLOW = 0.1
@@ -312,14 +314,21 @@ class _Landing(eqx.Module):
 
 
 def _landing(
-    window: _Window, ones, lanes: Lanes, new: _Attempt, path: _Interpolant, rtol
+    window: _Window, ones, lanes: Lanes, new: _Attempt, path: _Interpolant, rtol, atol
 ) -> _Landing:
     low, high = _bounds_of_x2(window, ones, lanes)
     beyond_extremum = path.has_extremum & ((path.x2_extremum > high) | (path.x2_extremum < low))
     peak = jnp.where(beyond_extremum, path.x2_extremum, new.x2)
     reach = LANDING * jnp.sqrt(rtol)
     bound = jnp.where(new.a > 0, high, low)
+    room = LEFT_OUT * (atol + rtol * jnp.abs(new.x2)) * new.h
+
+    def is_straight(way, speed):
+        """Whether x2'' over the step is small enough to be left out on that way."""
+        return way * way * jnp.abs(new.a - lanes.a) <= room * speed * speed
+
     reached = ~beyond_extremum & (jnp.abs(bound - new.x2) <= reach * jnp.abs(new.a))
+    reached = reached & is_straight(bound - new.x2, new.a)
     slope = jnp.where(reached, new.a, 1.0)
     delta = jnp.where(reached, bound - new.x2, NEVER) / slope
     # The next term counts where x2' is small, and there x2'' is -x2.
@@ -333,7 +342,11 @@ def _landing(
     start, end = lanes.x2, peak
     on_edge, edge = jnp.zeros_like(reached), lanes.x1
     if window.x1 is not None:
-        edge, near, delta1 = _way_to_edge(window.x1, new, reach)
+        # No edge is passed on the way to a boundary.
+        reached = reached & ~_is_beyond(window.x1, new, delta)
+        delta = jnp.where(reached, delta, NEVER)
+        blocked = outside & ~reached
+        edge, near, delta1 = _way_to_edge(window.x1, new, reach, is_straight)
         on_edge = near & (delta1 < delta)
         reached, delta = reached | near, jnp.minimum(delta, delta1)
         integral, beyond, side = _beyond_edge(window.x1, lanes, new, near, poly)
@@ -356,13 +369,24 @@ def _landing(
     )
 
 
-def _way_to_edge(x1: tuple[Array, Array], new: _Attempt, reach) -> tuple[Array, Array, Array]:
+def _is_beyond(x1: tuple[Array, Array], new: _Attempt, delta) -> Array:
+    """Whether the Taylor step leads beyond an edge, though not up to rounding."""
+    left, right = x1
+    end = new.x1 + delta * (new.x2 + 0.5 * delta * new.a)
+    rounding = ULPS * (1 + jnp.abs(end))
+    return (end > right + rounding) | (end < left - rounding)
+
+
+def _way_to_edge(
+    x1: tuple[Array, Array], new: _Attempt, reach, is_straight: Callable[[Array, Array], Array]
+) -> tuple[Array, Array, Array]:
     """The edge ahead, whether a Taylor step bridges the way to it, and the time that it takes."""
     left, right = x1
     edge = jnp.where(new.x2 > 0, right, left)
     # Slow passages are bridged over less of the way, for there x2' counts more than x2.
     way, speed = edge - new.x1, jnp.abs(new.x2)
     near = jnp.abs(way) * jnp.maximum(speed, SLOW * jnp.abs(new.a)) < reach * speed * speed
+    near = near & is_straight(way, speed)
     there = jnp.abs(way) <= ULPS * jnp.abs(new.x1)
     slope = jnp.where(near, new.x2, 1.0)
     delta = jnp.where(near, way, jnp.where(there, 0.0, NEVER)) / slope
@@ -429,7 +453,7 @@ def take_step(
     h = jnp.where(going, jnp.minimum(lanes.h, remaining), 0.0)
     new = attempt(osc, window, ones, lanes, h, rtol, atol, rates, derivatives)
     path = _interpolate(ones, lanes, new)
-    at = _landing(window, ones, lanes, new, path, rtol)
+    at = _landing(window, ones, lanes, new, path, rtol, atol)
     blocked, reached = at.blocked, at.reached
     if derivatives:
         # At rest no bound has a say in how the neighbours of a lane move.

@@ -130,6 +130,7 @@ def simulate(
     extrema=False,
     capture=True,
     max_events=20_000,
+    max_steps=1_000_000,
 ):
     """The run from y0 over [0, T].
 
@@ -137,6 +138,7 @@ def simulate(
     atol; every step of length h is disturbed by noise (1 + |y|) h, the state after every event by
     noise (1 + |y|), at random. turns, extrema: record the zeros of x2 (belt 0: a maximum of x1, 1:
     a minimum), the extrema of x2. capture: end, at rest, where the run converges to a pseudo-focus.
+    max_steps: beside a thousand for each unit of time.
     """
     n = len(osc.belts)
     given = np.full(n, 9, np.int64) if mode is None else np.array(mode, np.int64)
@@ -154,6 +156,7 @@ def simulate(
         noise,
         seed,
         flags,
+        max_steps,
         out,
     )
     rows = out[:count]
@@ -589,7 +592,7 @@ def _contraction(z, w, B, left, right, edge):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
+def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, max_steps, out):
     n = B.shape[0]
     turns, extrema, capture = flags % 2 == 1, flags // 2 % 2 == 1, flags < 4
     s, old = given.copy(), given.copy()
@@ -615,7 +618,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         if count >= out.shape[0] - 2:
             status = BUDGET
             break
-        if steps > 1000 * T + 1_000_000:
+        if steps > 1000 * T + max_steps:
             status = STEPS
             break
         kind = 0
@@ -679,7 +682,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
             hit, h_hit, m1, m2 = -1, 0.0, 0.0, 0.0
             while t < T:
                 steps += 1
-                if steps > 1000 * T + 1_000_000:
+                if steps > 1000 * T + max_steps:
                     break
                 last = h >= T - t
                 if last:
