@@ -52,6 +52,9 @@ from .chains import Chain, Loop, following_codes
 
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 ARC_STEPS = 8
+#: A mesh is laid along a march of steps of this stride over the `density`, so many at most; more
+#: than this density is never wanted.
+MESH_STRIDE, MESH_MARCH, DENSEST = 0.2, 128, 1e5
 #: An arc of a shorter duration may have none: it is the square root of rounding.
 LASTS = 1e-6
 #: An arc magnifies, if its end moves so much faster than its entry.
@@ -115,31 +118,49 @@ def _meshes(steps: int) -> Callable:
 
 def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
     """Steps as fractions of the duration, [steps], so that each has about the same share of it."""
-    n = 24
 
-    def march():
-        def advance(y, _):
-            return _coarse_step(osc, codes, y, duration / n)
+    def unfinished(carry):
+        number, _, _, left, _, _ = carry
+        return (number < MESH_MARCH) & any_lane(left > 0)
 
-        return lax.scan(advance, y, None, length=n)[1]
+    def advance(carry):
+        number, y, rho, left, shares, times = carry
+        # The last step that there is room for goes to the end.
+        wanted = jnp.where(number < MESH_MARCH - 1, MESH_STRIDE / rho, left)
+        h = jnp.minimum(wanted, left)
+        y, after = _coarse_step(osc, codes, y, h)
+        left, share = left - h, shares[number] + 0.5 * h * (rho + after)
+        shares, times = (
+            lax.dynamic_update_index_in_dim(column, value, number + 1, 0)
+            for column, value in ((shares, share), (times, duration - left))
+        )
+        return number + 1, y, after, left, shares, times
 
+    columns = jnp.zeros(MESH_MARCH + 1), jnp.zeros(MESH_MARCH + 1)
+    start = jnp.asarray(0), y, _density_at(osc, codes, y), duration, *columns
     # Stick phases, and what pads a chain, take no steps.
-    rest = lax.cond(any_lane(duration != 0), march, lambda: jnp.ones(n))
-    rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
-    # Clipped: where a guess is poor the mesh is only less good.
-    rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
-    share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
-    grid = jnp.interp(
-        jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
+    number, *_, shares, times = lax.while_loop(unfinished, advance, start)
+    rows = jnp.arange(MESH_MARCH + 1)
+    shares, times = (
+        jnp.where(rows > number, column[number], column) for column in (shares, times)
     )
-    return jnp.diff(grid)
+    total, last = shares[-1], times[-1]
+    even = jnp.linspace(0.0, 1.0, steps + 1)
+    grid = jnp.interp(even * total, shares, times) / jnp.where(last > 0, last, 1.0)
+    return jnp.diff(jnp.where(last > 0, grid, even))
+
+
+def _density_at(osc: Oscillator, codes: Array, y: Array) -> Array:
+    # Clipped: where a guess is poor the mesh is only less good.
+    rho = density(osc, mode_of(codes), *y)
+    return jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, DENSEST)
 
 
 @lanes_in_one_kernel
 def _coarse_step(osc: Oscillator, codes: Array, y: Array, h: Array) -> tuple[Array, Array]:
     """The state after a step, and the density of steps that is wanted there."""
     y = _step(functools.partial(_slip_slopes, osc, codes), y, h, _COARSE)
-    return y, density(osc, mode_of(codes), *y)
+    return y, _density_at(osc, codes, y)
 
 
 def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, extra=None):
