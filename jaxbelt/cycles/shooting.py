@@ -54,7 +54,7 @@ from .chains import Chain, Loop, following_codes
 ARC_STEPS = 8
 #: A mesh is laid along a march of steps of this stride over the `density`, so many at most; more
 #: than this density is never wanted.
-MESH_STRIDE, MESH_MARCH, DENSEST = 0.2, 128, 1e5
+MESH_STRIDE, MESH_MARCH, DENSEST = 0.3, 1024, 1e5
 #: An arc of a shorter duration may have none: it is the square root of rounding.
 LASTS = 1e-6
 #: An arc magnifies, if its end moves so much faster than its entry.
@@ -95,13 +95,32 @@ def _slip_slopes(osc: Oscillator, codes: Array, y: Array) -> Array:
     return jnp.stack([y[1], mode_acceleration(osc, mode_of(codes), y[0], y[1])])
 
 
-def meshed(osc: Oscillator, loop: Loop, steps: int = ARC_STEPS) -> tuple[Chain, Array]:
-    """The chain of a loop with its mesh, and the guess of its unknowns."""
+def meshed(osc: Oscillator, loop: Loop | Chain, steps: int = ARC_STEPS, z: Array | None = None):
+    """The chain of a loop with its mesh, and the guess of its unknowns.
+
+    z: unknowns of a chain, instead of a loop; its tangent arcs are meshed backwards, from their
+    points, as they are followed.
+    """
+    if z is None:
+        z = jnp.concatenate([loop.entries, loop.durations[:, None]], axis=1)
     stuck = jnp.any(loop.codes == 0, axis=-1)
-    slip = jnp.where(stuck, 0.0, loop.durations)
-    mesh = _meshes(steps)(osc, (loop.codes, loop.entries, slip))
-    z = jnp.concatenate([loop.entries, loop.durations[:, None]], axis=1)
+    slip = jnp.where(stuck, 0.0, z[:, 2])
+    back = loop.ends >= Ends(len(osc.belts)).tangent
+    points = jax.vmap(functools.partial(tangency_of, osc))(loop.codes, loop.ends)
+    starts = jnp.where(back[:, None], points, z[:, :2])
+    mesh = _meshes(steps)(osc, (loop.codes, starts, jnp.where(back, -slip, slip)))
+    mesh = jnp.where(back[:, None], jnp.flip(mesh, axis=1), mesh)
     return lax.stop_gradient((Chain(loop.codes, loop.ends, mesh), z))
+
+
+def tangency_of(osc: Oscillator, codes: Array, end: Array) -> Array:
+    """The point of the boundary with x2' = 0 at which an arc ends that is tangent to it; of any
+    other arc a state with x2 = 0."""
+    velocity = jnp.zeros(())
+    for i, belt in enumerate(osc.belts):
+        is_it = end == Ends(len(osc.belts)).tangent + i
+        velocity = velocity + jnp.where(is_it, belt.velocity / osc.omega, 0.0)
+    return jnp.stack([mode_acceleration(osc, mode_of(codes), jnp.zeros(()), velocity), velocity])
 
 
 @functools.cache
@@ -117,7 +136,9 @@ def _meshes(steps: int) -> Callable:
 
 
 def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
-    """Steps as fractions of the duration, [steps], so that each has about the same share of it."""
+    """Steps as fractions of the duration, which may be < 0, [steps], so that each has about the
+    same share of it."""
+    way = jnp.sign(duration)
 
     def unfinished(carry):
         number, _, _, left, _, _ = carry
@@ -128,22 +149,20 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
         # The last step that there is room for goes to the end.
         wanted = jnp.where(number < MESH_MARCH - 1, MESH_STRIDE / rho, left)
         h = jnp.minimum(wanted, left)
-        y, after = _coarse_step(osc, codes, y, h)
+        y, after = _coarse_step(osc, codes, y, way * h)
         left, share = left - h, shares[number] + 0.5 * h * (rho + after)
         shares, times = (
             lax.dynamic_update_index_in_dim(column, value, number + 1, 0)
-            for column, value in ((shares, share), (times, duration - left))
+            for column, value in ((shares, share), (times, jnp.abs(duration) - left))
         )
         return number + 1, y, after, left, shares, times
 
     columns = jnp.zeros(MESH_MARCH + 1), jnp.zeros(MESH_MARCH + 1)
-    start = jnp.asarray(0), y, _density_at(osc, codes, y), duration, *columns
+    start = jnp.asarray(0), y, _density_at(osc, codes, y), jnp.abs(duration), *columns
     # Stick phases, and what pads a chain, take no steps.
     number, *_, shares, times = lax.while_loop(unfinished, advance, start)
     rows = jnp.arange(MESH_MARCH + 1)
-    shares, times = (
-        jnp.where(rows > number, column[number], column) for column in (shares, times)
-    )
+    shares, times = (jnp.where(rows > number, column[number], column) for column in (shares, times))
     total, last = shares[-1], times[-1]
     even = jnp.linspace(0.0, 1.0, steps + 1)
     grid = jnp.interp(even * total, shares, times) / jnp.where(last > 0, last, 1.0)
@@ -269,11 +288,7 @@ def _followed(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> A
     """`_arc_equations` of an arc that is used."""
     names = Ends(len(osc.belts))
     is_tangent = end >= names.tangent
-    velocity = jnp.zeros(())
-    for i, belt in enumerate(osc.belts):
-        velocity = velocity + jnp.where(end == names.tangent + i, belt.velocity / osc.omega, 0.0)
-    x1 = mode_acceleration(osc, mode_of(codes), jnp.zeros(()), velocity)
-    point = jnp.stack([x1, velocity])
+    point = tangency_of(osc, codes, end)
     start = jnp.where(is_tangent, point, unknown[:2])
     back = is_tangent | backwards
     duration = jnp.where(back, -unknown[2], unknown[2])
