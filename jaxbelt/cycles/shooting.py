@@ -54,7 +54,7 @@ from .chains import Chain, Loop, following_codes
 ARC_STEPS = 8
 #: A mesh is laid along a march of steps of this stride over the `density`, so many at most; more
 #: than this density is never wanted.
-MESH_STRIDE, MESH_MARCH, DENSEST = 0.3, 1024, 1e5
+MESH_STRIDE, MESH_MARCH, DENSEST = 0.3, 20_000, 1e5
 #: An arc of a shorter duration may have none: it is the square root of rounding.
 LASTS = 1e-6
 #: An arc magnifies, if its end moves so much faster than its entry.
@@ -138,35 +138,36 @@ def _meshes(steps: int) -> Callable:
 def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
     """Steps as fractions of the duration, which may be < 0, [steps], so that each has about the
     same share of it."""
-    way = jnp.sign(duration)
+    way, even = jnp.sign(duration), jnp.linspace(0.0, 1.0, steps + 1)
 
-    def unfinished(carry):
-        number, _, _, left, _, _ = carry
-        return (number < MESH_MARCH) & any_lane(left > 0)
+    def march(total):
+        """The share of the whole duration; and the times of even shares of `total`."""
 
-    def advance(carry):
-        number, y, rho, left, shares, times = carry
-        # The last step that there is room for goes to the end.
-        wanted = jnp.where(number < MESH_MARCH - 1, MESH_STRIDE / rho, left)
-        h = jnp.minimum(wanted, left)
-        y, after = _coarse_step(osc, codes, y, way * h)
-        left, share = left - h, shares[number] + 0.5 * h * (rho + after)
-        shares, times = (
-            lax.dynamic_update_index_in_dim(column, value, number + 1, 0)
-            for column, value in ((shares, share), (times, jnp.abs(duration) - left))
-        )
-        return number + 1, y, after, left, shares, times
+        def unfinished(carry):
+            number, _, _, left, _, _ = carry
+            return (number < MESH_MARCH) & any_lane(left > 0)
 
-    columns = jnp.zeros(MESH_MARCH + 1), jnp.zeros(MESH_MARCH + 1)
-    start = jnp.asarray(0), y, _density_at(osc, codes, y), jnp.abs(duration), *columns
+        def advance(carry):
+            number, y, rho, left, share, grid = carry
+            # The last step that there is room for goes to the end.
+            wanted = jnp.where(number < MESH_MARCH - 1, MESH_STRIDE / rho, left)
+            h = jnp.minimum(wanted, left)
+            y, after = _coarse_step(osc, codes, y, way * h)
+            more, passed = 0.5 * h * (rho + after), jnp.abs(duration) - left
+            behind = even * total - share
+            inside = (behind >= 0) & (behind <= more)
+            grid = jnp.where(inside, passed + h * behind / jnp.where(more > 0, more, 1.0), grid)
+            return number + 1, y, after, left - h, share + more, grid
+
+        at = _density_at(osc, codes, y)
+        start = jnp.asarray(0), y, at, jnp.abs(duration), jnp.zeros(()), jnp.zeros(steps + 1)
+        *_, share, grid = lax.while_loop(unfinished, advance, start)
+        return share, grid
+
     # Stick phases, and what pads a chain, take no steps.
-    number, *_, shares, times = lax.while_loop(unfinished, advance, start)
-    rows = jnp.arange(MESH_MARCH + 1)
-    shares, times = (jnp.where(rows > number, column[number], column) for column in (shares, times))
-    total, last = shares[-1], times[-1]
-    even = jnp.linspace(0.0, 1.0, steps + 1)
-    grid = jnp.interp(even * total, shares, times) / jnp.where(last > 0, last, 1.0)
-    return jnp.diff(jnp.where(last > 0, grid, even))
+    _, grid = march(march(jnp.ones(()))[0])
+    grid = grid.at[-1].set(jnp.abs(duration)) / jnp.where(duration == 0, 1.0, jnp.abs(duration))
+    return jnp.diff(jnp.where(duration == 0, even, grid))
 
 
 def _density_at(osc: Oscillator, codes: Array, y: Array) -> Array:
@@ -203,15 +204,18 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     def advance(state, fraction):
         return _step(field, state, slip_time * fraction, _FINE), None
 
-    def advance_some(state, fractions):
-        # What pads a mesh is not worth a step.
-        some = any_lane(jnp.any(fractions > 0))
-        return lax.cond(some, lambda: lax.scan(advance, state, fractions)[0], lambda: state), None
+    def through(state, fractions):
+        if fractions.size <= ARC_STEPS or fractions.size % ARC_STEPS:
+            return lax.scan(advance, state, fractions)[0]
+        # What pads a mesh is not worth a step, nor a look at each.
+        blocks = fractions.reshape(min(fractions.size // ARC_STEPS, ARC_STEPS), -1)
+        return lax.scan(through_some, state, blocks)[0]
 
-    if mesh.size > ARC_STEPS and mesh.size % ARC_STEPS == 0:
-        slipped, _ = lax.scan(advance_some, start, mesh.reshape(-1, ARC_STEPS))
-    else:
-        slipped, _ = lax.scan(advance, start, mesh)
+    def through_some(state, fractions):
+        some = any_lane(jnp.any(fractions > 0))
+        return lax.cond(some, lambda: through(state, fractions), lambda: state), None
+
+    slipped = through(start, mesh)
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
     stuck_end = jnp.stack([y[0] + v * duration, v])
     if extra is not None:
