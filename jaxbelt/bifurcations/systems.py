@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..cycles.attractors import extent
-from ..cycles.chains import Chain, Loop, following_codes
+from ..cycles.chains import Chain, following_codes
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import jacobian, meshed, residual, residual_and_blocks
 from ..model.modes import capacity, edge_guards, mode_acceleration, mode_of
@@ -41,8 +41,9 @@ WEIGHT = 0.1
 DETERMINED = 1e-3
 #: The integration steps of an arc are cut into so many parts if they leave a larger error in its
 #: equations, relative to the motion: beside a slow belt and under a steep law 1e-8 was seen, which
-#: moved the point by 1e-6, and 1e-15 with the parts.
-PARTS_OF_ARC, EXACT_ARC = 8, 1e-13
+#: moved the point by 1e-6, and 1e-15 with the parts. And each of these again and again where a
+#: very steep law holds the orbit in its layer.
+PARTS_OF_ARC, CUT_TIMES, EXACT_ARC = 8, 3, 1e-13
 #: The place of nothing.
 NOWHERE = np.full(5, np.nan)
 #: Functions by what it means that one vanishes: the name of a special point, the belts concerned.
@@ -241,23 +242,27 @@ class CycleSystem(AbstractSystem):
         return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
 
     def remeshed(self, osc, x):
-        loop = Loop(self.chain.codes, self.chain.ends, x[:, :2], x[:, 2])
-        return eqx.tree_at(lambda system: system.chain, self, meshed(osc, loop)[0]).refined(osc, x)
+        chain, _ = meshed(osc, self.chain, z=x)
+        return eqx.tree_at(lambda system: system.chain, self, chain).refined(osc, x)
 
     def refined(self, osc: Oscillator, x: Array) -> "CycleSystem":
         """The same with shorter integration steps on arcs that need them, by the error that their
         steps leave in the equations at x; steps of length zero pad the others."""
-        chain = self.chain
-        values, misses = _on_both_meshes(self, lambda one: residual(osc, one.chain, x))
-        error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
-        is_tangent = chain.ends >= Ends(chain.codes.shape[-1]).tangent
-        error = jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
-        mesh, others = chain.mesh, (PARTS_OF_ARC - 1) * chain.mesh.shape[-1]
-        fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
-        coarse = jnp.pad(mesh, [(0, 0), (0, others)])
-        is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
-        mesh = jnp.where(is_exact[:, None], coarse, fine)
-        return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
+        system = self
+        for _ in range(CUT_TIMES):
+            chain = system.chain
+            values, misses = _on_both_meshes(system, lambda one: residual(osc, one.chain, x))
+            error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
+            is_tangent = chain.ends >= Ends(chain.codes.shape[-1]).tangent
+            of_misses = jnp.maximum(error, jnp.abs(misses[0] - misses[1]))
+            error = jnp.where(is_tangent, of_misses, error)
+            mesh, others = chain.mesh, (PARTS_OF_ARC - 1) * chain.mesh.shape[-1]
+            fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
+            coarse = jnp.pad(mesh, [(0, 0), (0, others)])
+            is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
+            mesh = lax.stop_gradient(jnp.where(is_exact[:, None], coarse, fine))
+            system = eqx.tree_at(lambda system: system.chain.mesh, system, mesh)
+        return system
 
 
 def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:

@@ -180,9 +180,11 @@ class Adaptive(AbstractIntegrator):
 def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     """How many steps per unit of time an orbit wants: more where the friction law bends.
 
-    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0. And at least
-    half the rate at which disturbances change in the linearised field: of that, the motion itself
-    tells nothing where it is small.
+    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0. That of a
+    steep law tells nothing until the orbit is in its layer at r = 0, which a step of its own length
+    would jump: outside of the layer the length is the distance from it, so that each step goes at
+    most about half of the way. And at least half the rate at which disturbances change in the
+    linearised field: of that, the motion itself tells nothing where it is small.
     """
     a, a_by_x2 = jax.jvp(
         lambda x2: mode_acceleration(osc, mode, x1, x2), (x2,), (jnp.ones_like(x2),)
@@ -194,9 +196,11 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
         def slope(r, belt=belt):
             return jax.jvp(belt.friction.mu, (r,), (jnp.ones_like(r),))[1]
 
-        curvature = jax.jvp(slope, (speed,), (jnp.ones_like(speed),))[1]
-        slips = jnp.abs(code) == 1
-        bend = bend + jnp.where(slips, jnp.sqrt(jnp.abs(belt.load * curvature)), 0.0)
+        speeds = jnp.stack([speed, jnp.zeros_like(speed)])
+        curvature = jax.jvp(slope, (speeds,), (jnp.ones_like(speeds),))[1]
+        here, at_boundary = jnp.sqrt(jnp.abs(belt.load * curvature))
+        nearing = at_boundary / (1 + at_boundary * speed)
+        bend = bend + jnp.where(jnp.abs(code) == 1, jnp.maximum(here, nearing), 0.0)
     near_extremum = jnp.sqrt(bend * jnp.abs(osc.omega * x2))  # where x2' = 0, x2'' = -x2
     wanted = 1 + 0.4 * bend * jnp.abs(osc.omega * a) + near_extremum
     return jnp.maximum(wanted, 0.5 * fastest_rate(a_by_x2))

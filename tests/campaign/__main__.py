@@ -24,7 +24,10 @@ from .outcome import Outcome, summed
 #: Of which module each campaign is.
 CAMPAIGNS = {
     **dict.fromkeys(("final", "simulate", "derivatives", "attractors", "grazing"), "runs"),
-    **{name: name for name in ("paths", "refine", "portraits", "shocks", "fractions", "maps")},
+    **{
+        name: name
+        for name in ("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep")
+    },
 }
 #: What can be asked of each campaign beside `--results`.
 PLAIN = frozenset({"seed", "runs"})
@@ -32,6 +35,7 @@ RUNS = PLAIN | {"threads", "extreme_share", "heavy", "structure", "tol", "table"
 KNOWN = {
     **dict.fromkeys(("paths", "refine", "portraits", "shocks"), PLAIN),
     "maps": frozenset(),
+    "steep": PLAIN,
     "fractions": PLAIN | {"threads"},
     **dict.fromkeys(("final", "simulate", "attractors"), RUNS),
     "derivatives": RUNS | {"by"},
