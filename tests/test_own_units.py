@@ -127,9 +127,9 @@ def test_points_and_curves(units):
     fold = jb.refine(jb.NonsmoothFold(1), oscillator(0.52), where=nu0)
     other = jb.refine(jb.NonsmoothFold(1), oscillator(0.52, length=length, omega=omega), where=nu0)
     same_tables(fold.table(), other.table(), length, speed)
-    span = np.array([(0.2, 0.7), (0.2, 0.6)])
-    curve = jb.bifurcation_curve(fold, (nu0, nu1), span)
-    again = jb.bifurcation_curve(other, (nu0, nu1), span * speed)
+    curve = jb.bifurcation_curve(fold, (nu0, nu1), ((0.2, 0.7), (0.2, 0.6)))
+    span = (0.2 * speed, 0.7 * speed), (0.2 * speed, 0.6 * speed)
+    again = jb.bifurcation_curve(other, (nu0, nu1), span)
     same(curve.values, again.values, speed)
     same(curve.places[:, :4], again.places[:, :4], length)
 
