@@ -15,6 +15,7 @@ import numpy as np
 
 import jaxbelt as jb
 from jaxbelt.model.events import of_one_loop
+from jaxbelt.model.own_units import in_units_of_run
 from jaxbelt.sweeps import question
 
 from . import engine
@@ -119,14 +120,18 @@ def _from_numbers(structure, row):
 # ---------------------------------------------------------------- sweep
 
 
-def _leaves(structure, table):
-    """Rows of numbers in the order of the oscillator's leaves."""
+def _leaves(structure, table, moves=None):
+    """Rows of numbers in the order of the leaves of the oscillators that the kernel takes; with
+    `moves`, their derivatives along these."""
 
     def leaves(row):
-        osc = _from_numbers(structure, row)
+        osc = in_units_of_run(_from_numbers(structure, row))
         return jnp.stack([jnp.asarray(leaf, float) for leaf in jax.tree.leaves(osc)])
 
-    return np.asarray(jax.vmap(leaves)(jnp.asarray(table)))
+    if moves is None:
+        return np.asarray(jax.vmap(leaves)(jnp.asarray(table)))
+    along = jax.vmap(lambda row, move: jax.jvp(leaves, (row,), (move,))[1])
+    return np.asarray(along(jnp.asarray(table), jnp.asarray(moves)))
 
 
 def swept(cases, observe, directions=None, **options):
@@ -143,7 +148,7 @@ def swept(cases, observe, directions=None, **options):
         options["derivatives"] = "case"
         pairs = [tangent(case, direction) for case, direction in zip(cases, directions)]
         rows, moves = (np.array(part) for part in zip(*pairs))
-        tables.append(np.column_stack([moves, _leaves(structure, rows)]))
+        tables.append(np.column_stack([moves, _leaves(structure, table, rows)]))
 
     class Cases(question.Grid):
         def rows(self, runs, derivatives=()):
