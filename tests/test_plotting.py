@@ -429,7 +429,9 @@ def test_a_sweep_of_attractors_says_that_one_start_was_asked():
     nus = np.array([0.15, 0.22, 0.3])
     one = jb.sweep(jb.presets.class_a, {"nu0": nus}, y0=(0.7, 0.1), observe="attractor")
     assert one.attrs["start"].startswith("x1 = 0.7, x2 = 0.1: of several attractors the one")
-    assert jb.plot_sweep(one, "stick_duration").get_title() == "from one start, x1 = 0.7, x2 = 0.1"
+    ax = jb.plot_sweep(one, "stick_duration")
+    assert ax.get_title() == "from one start, x1 = 0.7, x2 = 0.1"
+    assert ax.get_xlim()[0] < 0.15 and ax.get_xlim()[1] > 0.3  # also where there is no cycle
     axes = {"nu0": nus, "x1": np.array([0.7, 3.0, 3.5]), "x2": [0.0]}
     several = jb.sweep(jb.presets.class_a, axes, observe="attractor")
     ax = jb.plot_sweep(several, "kind", share="cycle")

@@ -91,6 +91,10 @@ def plot_sweep(
             if len(lines) > 1:
                 style |= {"color": belt_colour(i), "label": f"{last} {i}"}
             ax.plot(x, line, linestyle=("-", "--", ":", "-.")[i % 4], **style)
+        # All that was swept is shown, also where there is nothing to draw.
+        ends = [float(x.min()), float(x.max())]
+        ax.update_datalim(np.column_stack([ends, ends]), updatey=False)
+        ax.autoscale_view(scaley=False)
         ax.set(xlabel=names[0], ylabel=label)
         add_key(ax)
         return ax
