@@ -81,7 +81,7 @@ def test_motions(units):
 
 
 def test_derivatives_and_batches(units):
-    length, _omega = units
+    length, omega = units
 
     def end(nu0, length=1.0, omega=1.0):
         osc = oscillator(nu0, length=length, omega=omega)
