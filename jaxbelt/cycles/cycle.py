@@ -481,7 +481,7 @@ def cycle_from(osc: Oscillator, y0: Array | np.ndarray, max_arcs: int | None = N
     """What `find_cycle` returns, without its checks and its warning."""
     own = in_own_units(osc)
     if own is not osc:
-        return in_given_units(cycle_from(own, y0 / own.units.length, max_arcs), osc, own)
+        return in_given_units(cycle_from(own, own.units.into(y0), max_arcs), osc, own)
     room = SIZES[-1] if max_arcs is None else max_arcs
     loop, count, status, y = _loop_reached(osc, y0, room)
     for _ in range(MORE_BUDGETS if is_concrete(status) else 0):

@@ -46,6 +46,10 @@ class OwnUnits(eqx.Module):
         """Whether these are known, and those of the user."""
         return is_concrete(self) and bool(np.all([self.length, self.velocity] == np.ones(2)))
 
+    def into(self, states: Any) -> Any:
+        """States (x1, x2) of the user in these units."""
+        return states if self is _units_of_one() else states / self.length
+
     def back(self, value: Any, *dimensions: str) -> Any:
         """A quantity in the units of the user; see `quantity`."""
         return rescaled_quantity(value, self.length, dimensions)
@@ -207,22 +211,21 @@ def rescaled(
     oscillator: what to put in the place of one; None: those in own units as their user has them.
     """
     put = in_units_of_user if oscillator is None else oscillator
+    is_one = _is_one(length)
 
     def walked(value: Any) -> Any:
         if isinstance(value, Oscillator):
             return put(value)
         if isinstance(value, eqx.Module):
             new = {}
-            for field in dataclasses.fields(value):
-                old = getattr(value, field.name)
-                dimensions = field.metadata.get("dimensions")
-                changed = (
-                    walked(old)
-                    if dimensions is None
-                    else rescaled_quantity(old, length, dimensions)
-                )
+            for name, dimensions in _fields_of(type(value)):
+                old = vars(value)[name]
+                if dimensions is None:
+                    changed = walked(old)
+                else:
+                    changed = old if is_one else rescaled_quantity(old, length, dimensions)
                 if changed is not old:
-                    new[field.name] = changed
+                    new[name] = changed
             return _unchecked(type(value), **{**vars(value), **new}) if new else value
         if type(value) in (tuple, list):
             return type(value)(map(walked, value))
@@ -233,11 +236,22 @@ def rescaled(
     return walked(result)
 
 
+@functools.cache
+def _fields_of(kind: type) -> list[tuple[str, tuple[str, ...] | None]]:
+    """The names of the fields of a module, and the dimensions of those that have any."""
+    return [(one.name, one.metadata.get("dimensions")) for one in dataclasses.fields(kind)]
+
+
+def _is_one(length: Any) -> bool:
+    if length is _units_of_one().length:
+        return True
+    return is_concrete(length) and bool(np.all(np.asarray(length) == 1))
+
+
 def rescaled_quantity(value: Any, length: Any, dimensions: tuple[str, ...]) -> Any:
     """A quantity of known dimensions in a unit of length that is 1/length of the one before."""
     powers = [POWERS[name] for name in dimensions]
-    is_same = is_concrete(length) and np.all(np.asarray(length) == 1)
-    if value is None or is_same or not any(powers):
+    if value is None or _is_one(length) or not any(powers):
         return value
     factors = [length**power for power in powers]
     if isinstance(value, float):
