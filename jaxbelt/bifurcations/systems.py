@@ -41,9 +41,9 @@ WEIGHT = 0.1
 DETERMINED = 1e-3
 #: The integration steps of an arc are cut into so many parts if they leave a larger error in its
 #: equations, relative to the motion: beside a slow belt and under a steep law 1e-8 was seen, which
-#: moved the point by 1e-6, and 1e-15 with the parts. And each of these again and again where a
-#: very steep law holds the orbit in its layer.
-PARTS_OF_ARC, CUT_TIMES, EXACT_ARC = 8, 3, 1e-13
+#: moved the point by 1e-6, and 1e-15 with the parts. And each of these once more where a very steep
+#: law holds the orbit in its layer.
+PARTS_OF_ARC, CUT_TIMES, EXACT_ARC = 8, 2, 1e-13
 #: The place of nothing.
 NOWHERE = np.full(5, np.nan)
 #: Functions by what it means that one vanishes: the name of a special point, the belts concerned.
