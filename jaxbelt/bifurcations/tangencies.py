@@ -31,7 +31,7 @@ from ..model.modes import STUCK, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
-from ..motion.integrators import STRIDE, density
+from ..motion.integrators import density
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS, newton
 from ..results import EventKind, Status
@@ -54,9 +54,9 @@ from .systems import (
 DEPARTURE = 1e-5
 #: Integration steps for each arc of that orbit; it takes long to leave.
 DEPARTURE_STEPS = 48
-#: Steps that an arc is followed backwards from a tangency, and displacements, over the friction
-#: that all belts have, within which it is.
-MOST_STEPS_BACK, BEYOND = 16384, 100.0
+#: Steps that an arc is followed backwards from a tangency, of what length over the density that is
+#: wanted, and displacements, over the friction that all belts have, within which it is.
+MOST_STEPS_BACK, STRIDE_BACK, BEYOND = 16384, 0.5, 100.0
 
 
 class Encounter(CycleSystem):
@@ -318,7 +318,7 @@ def _duration_to_tangency(osc: Oscillator, arc: Loop, end: Array) -> Array:
 
     def step(carry):
         number, y, passed, nearest, at, where = carry
-        h = jnp.minimum(STRIDE / density(osc, mode, *y), longest - passed)
+        h = jnp.minimum(STRIDE_BACK / density(osc, mode, *y), longest - passed)
         y = flow(osc, arc.codes, jnp.ones(1), y, -h)
         away, passed = jnp.sum((y - arc.entries) ** 2), passed + h
         # Out of reach, backwards, it may go anywhere.

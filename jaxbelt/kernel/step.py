@@ -342,8 +342,7 @@ def _landing(
     start, end = lanes.x2, peak
     on_edge, edge = jnp.zeros_like(reached), lanes.x1
     if window.x1 is not None:
-        # No edge is passed on the way to a boundary.
-        reached = reached & ~_is_beyond(window.x1, new, delta)
+        reached = reached & ~_passes_edge(window.x1, new, delta)
         delta = jnp.where(reached, delta, NEVER)
         blocked = outside & ~reached
         edge, near, delta1 = _way_to_edge(window.x1, new, reach, is_straight)
@@ -369,12 +368,14 @@ def _landing(
     )
 
 
-def _is_beyond(x1: tuple[Array, Array], new: _Attempt, delta) -> Array:
-    """Whether the Taylor step leads beyond an edge, though not up to rounding."""
+def _passes_edge(x1: tuple[Array, Array], new: _Attempt, delta) -> Array:
+    """Whether the Taylor step onward to a boundary would pass an edge, and not by rounding only."""
     left, right = x1
     end = new.x1 + delta * (new.x2 + 0.5 * delta * new.a)
     rounding = ULPS * (1 + jnp.abs(end))
-    return (end > right + rounding) | (end < left - rounding)
+    passes_right = (new.x1 <= right) & (end > right + rounding)
+    passes_left = (new.x1 >= left) & (end < left - rounding)
+    return (delta > 0) & (passes_right | passes_left)
 
 
 def _way_to_edge(
