@@ -1,6 +1,5 @@
 """The grid of a sweep: its points, the oscillators there, and the blocks in which it is done."""
 
-import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -22,7 +21,7 @@ from ..checks import (
 from ..identity import fingerprint_or_none_like_it
 from ..kernel.lanes import Observer, Program
 from ..model.oscillator import Oscillator, check_scalars, its_oscillator
-from ..numerics.compiling import power_of_two
+from ..numerics.compiling import jit, power_of_two
 
 #: Rows that are made of a few runs, too, so that few shapes are compiled.
 FEWEST_ROWS = 2**14
@@ -107,7 +106,7 @@ class Grid:
         return np.asarray(table)[:, :, : len(runs)]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4, 5))
+@jit
 def _rows(make, made_of, names, mapped, start, derivatives, values):
     def row(values):
         leaves = jax.tree.leaves(make(**{name: values[name] for name in names}))
