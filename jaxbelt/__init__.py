@@ -36,7 +36,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     paper           the paper's table and figures
     api             the public names
     __init__        the same, imported when the first of them is used
-    commands/       options reproduce simulate diagram map sweep basins verify
+    commands/       options reproduce simulate diagram map sweep basins verify warm
+    commands/       cache
     cli             the command line
 """
 
