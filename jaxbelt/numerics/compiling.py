@@ -74,6 +74,16 @@ def is_concrete(value: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
 
+@functools.cache
+def diffrax() -> Any:
+    """The package, imported when something is compiled: it takes a quarter of a second."""
+    # Arrays that it makes as it is imported must not be part of a trace.
+    with jax.ensure_compile_time_eval():
+        import diffrax
+
+    return diffrax
+
+
 # --- options of the compiler ----------------------------------------------------------------------
 
 #: XLA's newer emitter of fused loops takes half as long again to compile programs like these, many
