@@ -44,6 +44,7 @@ def use(folder: Path) -> None:
     """Keep programs in this folder from now on."""
     os.environ["JAXBELT_CACHE_DIR"] = str(folder)
     programs.ON = True
+    programs.are_kept.cache_clear()
 
 
 def child(folder: Path, bound: int, seed: float, begins) -> None:

@@ -2,7 +2,6 @@
 
 import errno
 import json
-import logging
 import os
 import random
 import subprocess
@@ -24,9 +23,11 @@ from jaxbelt.numerics import compiling, programs
 def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(programs, "ON", True)
     monkeypatch.setenv("JAXBELT_CACHE_DIR", str(tmp_path))
-    programs._checked.cache_clear()
+    programs._usable_folder.cache_clear()
+    programs.are_kept.cache_clear()
     yield tmp_path / "programs"
-    programs._checked.cache_clear()
+    programs._usable_folder.cache_clear()
+    programs.are_kept.cache_clear()
 
 
 def files(folder):
@@ -209,11 +210,6 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 import jaxbelt as jb
 print(np.asarray(jb.equilibria(jb.presets.class_b(0.45, 0.35)).x1_lower).tobytes().hex())
 """
-    script = (
-        script.replace("jb.equilibria", "jb.fixed_points")
-        if not hasattr(jb, "equilibria")
-        else script
-    )
     environment = os.environ | {
         "JAXBELT_CACHE": "1",
         "JAXBELT_CACHE_DIR": str(tmp_path),
@@ -263,7 +259,7 @@ def test_a_pickle_that_is_none_is_recognised(folder, caplog):
 
 def test_folders_of_others_are_not_used(folder, monkeypatch, caplog):
     fresh()(X, 3)
-    programs._checked.cache_clear()
+    programs._usable_folder.cache_clear()
     monkeypatch.setattr(os, "getuid", lambda: os.stat(folder).st_uid + 1)
     assert programs.folder() is None and "belongs to another user" in caplog.text
     assert len(compiled_names(fresh(), X, 3)) == 1
@@ -272,7 +268,7 @@ def test_folders_of_others_are_not_used(folder, monkeypatch, caplog):
 @pytest.mark.parametrize("mode", [0o755, 0o770, 0o701])
 def test_folders_that_others_may_use_are_not_used(folder, mode, caplog):
     fresh()(X, 3)
-    programs._checked.cache_clear()
+    programs._usable_folder.cache_clear()
     folder.chmod(mode)
     assert programs.folder() is None and "0700" in caplog.text
     fresh()(X, 3)
@@ -368,7 +364,3 @@ def test_it_can_be_switched_off(tmp_path):
     assert code == 0 and "switched off" in text and not list(tmp_path.iterdir())
     code, text = command(tmp_path, "warm", JAXBELT_CACHE="0")
     assert code == 2 and "JAXBELT_CACHE=0" in text
-
-
-def test_the_log_is_that_of_the_package():
-    assert programs.logger is logging.getLogger("jaxbelt")

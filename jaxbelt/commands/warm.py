@@ -16,8 +16,9 @@ from .options import Json, make_console, plain_errors, say, turn_on_float64
 
 #: Where the runs of the commands and of the paper begin.
 START = (3.0, 0.0)
-#: Points of each axis of sweeps, maps and pictures: how many there are is no part of a program.
-FEW = 3
+#: The paper's path, and few points of the axes of others: how many is no part of a program.
+SPAN = (-0.7, 0.7)
+FEW, GRID = 3, [-3.0, 0.0, 3.0]
 
 
 def warm(
@@ -76,16 +77,50 @@ def warm(
 
 def jobs() -> list[tuple[str, Callable[[], Any]]]:
     """What is done for its programs, by name; what is most often asked for first."""
+    import equinox as eqx
+    import numpy as np
+
+    def where(osc):
+        return osc.belts[0].velocity
+
+    def swept(osc):
+        def make(nu0):
+            return eqx.tree_at(where, osc, nu0)
+
+        axes = {"nu0": np.linspace(0.1, 0.6, FEW)}
+        for observe in ("attractor", "final"):
+            jb.sweep(make, axes, y0=START, t1=100.0, observe=observe, progress=False)
+
+    motions: dict[str, Callable[[Any], Any]] = {
+        "simulate": lambda osc: jb.simulate(osc, START, 100.0),
+        "find_cycle": lambda osc: jb.find_cycle(osc, START),
+        "sweep": swept,
+        "basins": lambda osc: jb.basins(osc, x1=GRID, x2=GRID, progress=False),
+        "portrait": jb.portrait,
+    }
+    # Paths are many programs; those of the paper's law are enough.
+    paths: dict[str, Callable[[Any], Any]] = {
+        "scan": lambda osc: jb.scan(osc, where, SPAN),
+        "bifurcation_diagram": lambda osc: jb.bifurcation_diagram(osc, where, SPAN),
+    }
     found = []
     for name, law in _laws().items():
-        for shape, osc in _oscillators(law).items():
-            motions = [_simulate, _find_cycle, _sweep, _basins, _portrait]
-            # Paths are many programs; those of the paper's law are enough.
-            more = [_scan, _diagram] if name == "Conti" else []
-            for function in (*motions, *more):
-                words = f"{function.__name__[1:]}, {shape}, {name}"
-                found.append((words, lambda f=function, osc=osc: f(osc)))
-    return [*found, ("region_map", _region_map), ("reproduce", _reproduce)]
+        for shape, osc in _of_shapes(law).items():
+            for function, call in (motions | paths if name == "Conti" else motions).items():
+                words = f"{function}, {shape}, {name}"
+                found.append((words, lambda call=call, osc=osc: call(osc)))
+
+    def planes():
+        nus = np.linspace(*SPAN, 8)
+        return jb.region_map(jb.presets.class_b, {"nu0": nus, "nu1": nus})
+
+    def paper():
+        from ..paper import reproduce
+
+        with tempfile.TemporaryDirectory() as folder:
+            return reproduce(Path(folder), lambda _: None)
+
+    return [*found, ("region_map", planes), ("reproduce", paper)]
 
 
 def _laws() -> dict[str, Any]:
@@ -96,7 +131,7 @@ def _laws() -> dict[str, Any]:
     }
 
 
-def _oscillators(law: Any) -> "dict[str, jb.Oscillator]":
+def _of_shapes(law: Any) -> "dict[str, jb.Oscillator]":
     def made(*belts):
         return jb.Oscillator(damping=0.5, belts=belts)
 
@@ -105,59 +140,3 @@ def _oscillators(law: Any) -> "dict[str, jb.Oscillator]":
         "two belts": made(jb.Belt(0.45, law), jb.Belt(0.35, law)),
         "two belts with edges": made(jb.Belt(0.2, law, upper=1.0), jb.Belt(0.4, law, lower=0.5)),
     }
-
-
-def _simulate(osc: "jb.Oscillator") -> Any:
-    return jb.simulate(osc, START, 100.0)
-
-
-def _find_cycle(osc: "jb.Oscillator") -> Any:
-    return jb.find_cycle(osc, START)
-
-
-def _portrait(osc: "jb.Oscillator") -> Any:
-    return jb.portrait(osc)
-
-
-def _basins(osc: "jb.Oscillator") -> Any:
-    import numpy as np
-
-    return jb.basins(osc, x1=np.linspace(-3, 3, FEW), x2=np.linspace(-3, 3, FEW), progress=False)
-
-
-def _sweep(osc: "jb.Oscillator") -> Any:
-    import equinox as eqx
-    import numpy as np
-
-    def with_velocity(nu0):
-        return eqx.tree_at(_velocity, osc, nu0)
-
-    axes = {"nu0": np.linspace(0.1, 0.6, FEW)}
-    for observe in ("attractor", "final"):
-        jb.sweep(with_velocity, axes, y0=START, t1=100.0, observe=observe, progress=False)
-
-
-def _velocity(osc: "jb.Oscillator") -> Any:
-    return osc.belts[0].velocity
-
-
-def _scan(osc: "jb.Oscillator") -> Any:
-    return jb.scan(osc, _velocity, (-0.7, 0.7))
-
-
-def _diagram(osc: "jb.Oscillator") -> Any:
-    return jb.bifurcation_diagram(osc, _velocity, (-0.7, 0.7))
-
-
-def _region_map() -> Any:
-    import numpy as np
-
-    nus = np.linspace(-0.7, 0.7, 8)
-    return jb.region_map(jb.presets.class_b, {"nu0": nus, "nu1": nus})
-
-
-def _reproduce() -> Any:
-    from .. import paper
-
-    with tempfile.TemporaryDirectory() as folder:
-        return paper.reproduce(Path(folder), lambda _: None)

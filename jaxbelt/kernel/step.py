@@ -46,7 +46,7 @@ from ..model.modes import (
 from ..model.modes import edges as edge_positions
 from ..model.oscillator import Oscillator
 from ..model.rest import is_at_rest
-from ..numerics.compiling import diffrax
+from ..numerics.compiling import the_solvers
 from .lanes import Lanes, choose, materialise
 
 #: First step of a run and after each event, at a tolerance of 1e-8: about what the tolerance allows
@@ -92,7 +92,7 @@ class _Tableau(NamedTuple):
 def _nystroem() -> _Tableau:
     # Order eight takes twice the stages of order five and a third of the steps at 1e-8, and most of
     # a step's cost is not in its stages but in its interpolant, bounds and choices.
-    tableau = diffrax().Dopri8.tableau
+    tableau = the_solvers().Dopri8.tableau
     n, e = tableau.b_sol.size, tableau.b_error
     a = np.zeros((n, n))
     for i, row in enumerate(tableau.a_lower):

@@ -22,7 +22,7 @@ from jaxtyping import Array
 
 from ..model.modes import Mode, fastest_rate, mode_acceleration
 from ..model.oscillator import Oscillator
-from ..numerics.compiling import diffrax
+from ..numerics.compiling import the_solvers
 from ..numerics.extrapolation import increments, scheme
 
 State = tuple[Array, Array]
@@ -84,7 +84,7 @@ def slip_field(osc: Oscillator, mode: Mode, y: State) -> State:
 @functools.cache
 def _extrapolation() -> Any:
     """The solver of `Adaptive`."""
-    dfx = diffrax()
+    dfx = the_solvers()
 
     class _Extrapolation(dfx.AbstractAdaptiveSolver):
         """The midpoint rule extrapolated to order eight, the error from the extrapolation to six.
@@ -160,7 +160,7 @@ class Adaptive(AbstractIntegrator):
             # A lane that has nothing to do, and may be NaN, must not keep a batch waiting.
             return jnp.where(self.span > 0, jnp.maximum(*(jnp.abs(part) for part in y)), 0.0)
 
-        dfx = diffrax()
+        dfx = the_solvers()
         # Where no event is looked for, a step may be as long as its error allows.
         first, longest = (1.0, 1.0) if ends_outside is None else (FIRST_FRACTION, MAX_FRACTION)
         solution = dfx.diffeqsolve(

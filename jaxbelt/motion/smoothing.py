@@ -16,7 +16,7 @@ from jaxtyping import Array
 from ..model.modes import STUCK, Mode, capacity, mode_acceleration, select, stick_velocity
 from ..model.oscillator import Oscillator
 from ..model.transitions import contact
-from ..numerics.compiling import diffrax
+from ..numerics.compiling import the_solvers
 from ..numerics.derivatives import forward_jacobian
 
 #: Steps between two samples before a run is given up.
@@ -76,7 +76,7 @@ def smooth_field(osc: Oscillator, y: tuple[Array, Array], eps: Array) -> tuple[A
 
 @forward_jacobian
 def _smoothed_flow(field, osc, width, y, duration, rtol, atol):
-    dfx = diffrax()
+    dfx = the_solvers()
     solution = dfx.diffeqsolve(
         dfx.ODETerm(lambda t, y, args: field(osc, y, width)),
         dfx.Tsit5(scan_kind="lax"),

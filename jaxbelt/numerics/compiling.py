@@ -2,6 +2,7 @@
 
 - `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `one_kernel_alone`,
   `lanes_in_one_kernel`, `with_batches`, `wide`, `any_lane` and `where_any` save time of running.
+- What `jit` and `wide` compile is kept on disk by `programs`, which uses what is not promised, too.
 - `depends` and `is_affine` look at what a function does with its arguments.
 - `require_own_threads` looks at whether JAX was in use before a process was forked.
 
@@ -75,8 +76,8 @@ def is_concrete(value: Any) -> bool:
 
 
 @functools.cache
-def diffrax() -> Any:
-    """The package, imported when something is compiled: it takes a quarter of a second."""
+def the_solvers() -> Any:
+    """diffrax, imported when something is compiled: it takes a quarter of a second."""
     # Arrays that it makes as it is imported must not be part of a trace.
     with jax.ensure_compile_time_eval():
         import diffrax
@@ -177,23 +178,23 @@ class _Kept:
     def __init__(self, function: Callable, is_array: Callable[[Any], bool], options: Callable):
         self.function, self.is_array, self.options = function, is_array, options
         #: By what they are called with, and by what they are made of.
-        self.called: dict[Any, programs.Program | None] = {}
-        self.made: dict[str, programs.Program] = {}
+        self.called: dict[Any, programs.KeptProgram | None] = {}
+        self.made: dict[str, programs.KeptProgram] = {}
         self.locks: dict[Any, Any] = {}
 
     def program(self, leaves: list[Any], structure: Any) -> tuple[Any, list[Any]]:
         """The program of these arguments, and the arrays among them; None: it cannot be kept."""
         arrays, told = [], []
-        if PLAIN or not programs.ON:
+        if PLAIN or not programs.are_kept():
             return None, arrays
         for leaf in leaves:
             if self.is_array(leaf):
                 arrays.append(leaf)
-                told.append(programs.signature(leaf))
+                told.append(programs.type_of_leaf(leaf))
             else:
                 # 1, 1.0 and True are equal, and so are 0.0 and -0.0.
                 told.append((type(leaf), repr(leaf) if type(leaf) is float else leaf))
-        asked = structure, tuple(told), programs.settings()
+        asked = structure, tuple(told), programs.jax_settings()
         try:
             if asked in self.called:
                 return self.called[asked], arrays
@@ -208,7 +209,7 @@ class _Kept:
                 self.called[asked] = self._found(leaves, structure, asked, arrays)
         return self.called[asked], arrays
 
-    def _found(self, leaves, structure, asked, arrays) -> "programs.Program | None":
+    def _found(self, leaves, structure, asked, arrays) -> "programs.KeptProgram | None":
         """The program, loaded or compiled; None where it cannot be kept."""
         if programs.folder() is None or not programs.can_be_kept(arrays):
             return None
@@ -223,7 +224,7 @@ class _Kept:
         if key not in self.made:
             program = programs.load(key, template)
             if program is None and _usable("compiled programs from disk", programs.trial):
-                program = programs.compiled(key, self.function, template, arrays, options)
+                program = programs.compile_and_keep(key, self.function, template, arrays, options)
             if program is None:
                 return None
             self.made[key] = program

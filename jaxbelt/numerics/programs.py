@@ -2,7 +2,7 @@
 
 A program is known by what it was made of: the source of jaxbelt, its name, what it is called with
 but for the numbers, versions, the processor, JAX's settings. `load` gives the program that was kept
-under such a key and `save` keeps one. Nothing here raises on account of what it finds on the disk:
+under such a key and `keep` keeps one. Nothing here raises on account of what it finds on the disk:
 what is not there, is damaged or belongs to others is compiled anew, and the logger "jaxbelt" is
 told.
 
@@ -32,12 +32,11 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jax._src import config
 
 from ..identity import fingerprint, is_installed
 from .widths import is_cpu
 
-logger = logging.getLogger("jaxbelt")
+_log = logging.getLogger("jaxbelt")
 
 #: Whether programs are kept at all.
 ON = os.environ.get("JAXBELT_CACHE", "1") not in ("", "0")
@@ -62,7 +61,7 @@ def folder() -> Path | None:
 
     It is `programs` in JAXBELT_CACHE_DIR, or else in the user's cache folder.
     """
-    return _checked(place()) if ON else None
+    return _usable_folder(place()) if ON else None
 
 
 def place() -> Path:
@@ -76,7 +75,7 @@ def place() -> Path:
 
 
 @functools.lru_cache(maxsize=16)
-def _checked(path: Path) -> Path | None:
+def _usable_folder(path: Path) -> Path | None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.mkdir(mode=0o700, exist_ok=True)
@@ -84,7 +83,7 @@ def _checked(path: Path) -> Path | None:
     except OSError as error:
         reason = f"it cannot be made ({error})"
     if reason:
-        logger.warning("compiled programs are not kept in %s: %s", path, reason)
+        _log.warning("compiled programs are not kept in %s: %s", path, reason)
     return None if reason else path
 
 
@@ -134,7 +133,7 @@ def clear() -> int:
     return count
 
 
-def _make_room(path: Path) -> None:
+def _evict(path: Path) -> None:
     files = sorted(_files(path))
     for one in files:
         if one.path.suffix != SUFFIX and one.used < time.time() - ABANDONED:
@@ -161,23 +160,23 @@ def _read(path: Path, key: str) -> bytes | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        logger.warning("%s cannot be read (%s); it is compiled anew", path, error)
+        _log.warning("%s cannot be read (%s); it is compiled anew", path, error)
         return None
     head, _, contents = data.partition(b"\n")
-    if head != _head(key, contents):
-        _give_up(path, "is damaged")
+    if head != _first_line(key, contents):
+        _discard(path, "is damaged")
         return None
     with contextlib.suppress(OSError):
         os.utime(path)
     return contents
 
 
-def _head(key: str, contents: bytes) -> bytes:
+def _first_line(key: str, contents: bytes) -> bytes:
     return MAGIC + hashlib.sha256(key.encode() + contents).hexdigest().encode()
 
 
-def _give_up(path: Path, reason: str) -> None:
-    logger.warning("%s %s; the program is compiled anew", path, reason)
+def _discard(path: Path, reason: str) -> None:
+    _log.warning("%s %s; the program is compiled anew", path, reason)
     with contextlib.suppress(OSError):
         path.unlink()
 
@@ -186,12 +185,12 @@ def _write(path: Path, key: str, contents: bytes) -> None:
     part = path.with_name(f"{secrets.token_hex(8)}.part")
     try:
         with part.open("wb") as file:
-            file.write(_head(key, contents) + b"\n")
+            file.write(_first_line(key, contents) + b"\n")
             file.write(contents)
         part.replace(path)
-        _make_room(path.parent)
+        _evict(path.parent)
     except OSError as error:
-        logger.warning("%s cannot be written: %s", path, error)
+        _log.warning("%s cannot be written: %s", path, error)
         with contextlib.suppress(OSError):
             part.unlink()
 
@@ -242,7 +241,7 @@ class Hole:
 HOLE = Hole()
 
 
-class Program(NamedTuple):
+class KeptProgram(NamedTuple):
     """A compiled program of arrays, and how its results are put together.
 
     call: of a list of arrays; gives a list of them. structure, rest: of the results; rest has
@@ -259,7 +258,7 @@ class Program(NamedTuple):
         return jax.tree.unflatten(self.structure, leaves)
 
 
-def signature(leaf: Any) -> Any:
+def type_of_leaf(leaf: Any) -> Any:
     """What a program is compiled for: shape, type, and whether this is a weak one."""
     if isinstance(leaf, jax.Array):
         return leaf.shape, leaf.dtype, leaf.weak_type
@@ -268,15 +267,34 @@ def signature(leaf: Any) -> Any:
     return type(leaf)
 
 
-def settings() -> tuple[Any, ...]:
+@functools.cache
+def _config() -> Any:
+    from jax._src import config
+
+    return config
+
+
+@functools.cache
+def are_kept() -> bool:
+    """Whether programs are kept at all: it is not switched off, and JAX tells its settings."""
+    try:
+        return ON and isinstance(jax_settings(), tuple)
+    except Exception as error:
+        _log.warning("compiled programs are not kept: %s: %s", type(error).__name__, error)
+        return False
+
+
+def jax_settings() -> tuple[Any, ...]:
     """Those of JAX that programs depend on, hashable."""
-    return config.trace_context(), config.debug_nans.value, config.debug_infs.value
+    return _config().trace_context(), _config().debug_nans.value, _config().debug_infs.value
 
 
 def can_be_kept(arrays: list[Any]) -> bool:
     """Whether programs of these arrays, with the settings of today, can be kept: those for one
     processor, in which nothing is looked at underway."""
-    watched = config.debug_nans.value or config.debug_infs.value or config.disable_jit.value
+    watched = (
+        _config().debug_nans.value or _config().debug_infs.value or _config().disable_jit.value
+    )
     return is_cpu() and jax.device_count() == 1 and not watched
 
 
@@ -285,38 +303,42 @@ def key_of(function: Callable, template: Any, signatures: Sequence[Any], options
     name = getattr(function, "__module__", ""), getattr(function, "__qualname__", "")
     told = fingerprint((name, function, template, options))
     # The last one is an object of JAX's own, and empty outside of traces.
-    context = [repr(one) for one in settings()[0][:-1]]
+    context = [repr(one) for one in jax_settings()[0][:-1]]
     parts = surroundings(), told, [str(one) for one in signatures], context
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-def compiled(
+def compile_and_keep(
     key: str, function: Callable, template: Any, arrays: list[Any], options: Any
-) -> Program | None:
+) -> KeptProgram | None:
     """Compile the program of a function and keep it; None where it cannot be compiled this way."""
     told: list[Any] = []
 
     def flat(arrays):
-        args, kwargs = filled(template, arrays)
+        args, kwargs = with_arrays(template, arrays)
         leaves, structure = jax.tree.flatten(function(*args, **kwargs))
         told[:] = structure, [HOLE if eqx.is_array(leaf) else leaf for leaf in leaves]
         return [leaf for leaf in leaves if eqx.is_array(leaf)]
 
-    # Name and settings see to it that JAX's own cache neither has it nor gets it: what comes out
-    # of there cannot be loaded again.
     name = getattr(function, "__name__", "program")
     flat.__name__ = flat.__qualname__ = f"{name}_{key[:8]}"
     try:
-        with config.persistent_cache_min_compile_time_secs(1e9):
-            call = jax.jit(flat).lower(arrays).compile(compiler_options=options)
+        call = _compile(flat, arrays, options)
     except Exception:  # of the function; it is raised again where this is compiled as usual
         return None
-    program = Program(call, *told)
-    save(key, program, template)
+    program = KeptProgram(call, *told)
+    keep(key, program, template)
     return program
 
 
-def filled(template: Any, arrays: Sequence[Any]) -> Any:
+def _compile(function: Callable, arrays: list[Any], options: Any) -> Any:
+    """Under a name of its own, and never written there, JAX's own cache does not have it: what
+    comes out of that cannot be loaded again."""
+    with _config().persistent_cache_min_compile_time_secs(1e9):
+        return jax.jit(function).lower(arrays).compile(compiler_options=options)
+
+
+def with_arrays(template: Any, arrays: Sequence[Any]) -> Any:
     """The tree with arrays in its holes."""
     leaves, structure = jax.tree.flatten(template)
     rest = iter(arrays)
@@ -324,7 +346,7 @@ def filled(template: Any, arrays: Sequence[Any]) -> Any:
     return jax.tree.unflatten(structure, filled)
 
 
-def save(key: str, program: Program, template: Any) -> None:
+def keep(key: str, program: KeptProgram, template: Any) -> None:
     """Keep a program that was compiled and not called yet.
 
     template: the tree of its arguments, with a `HOLE` for every array.
@@ -333,14 +355,14 @@ def save(key: str, program: Program, template: Any) -> None:
     if path is None:
         return
     try:
-        contents = _packed(program, template)
+        contents = _file_of(program, template)
     except Exception as error:  # of whatever the insides of JAX and of results raise
-        logger.info("a program is not kept: %s: %s", type(error).__name__, error)
+        _log.info("a program is not kept: %s: %s", type(error).__name__, error)
         return
     _write(path / (key + SUFFIX), key, contents)
 
 
-def _packed(program: Program, template: Any) -> bytes:
+def _file_of(program: KeptProgram, template: Any) -> bytes:
     from jax.experimental import serialize_executable
 
     compiled: Any = program.call
@@ -351,13 +373,13 @@ def _packed(program: Program, template: Any) -> bytes:
     executable, arrays, out = serialize_executable.serialize(compiled)
     known = _own_objects(template)
     results = _pickled(jax.tree.unflatten(program.structure, program.rest), known)
-    if _results(results, known) != (program.structure, program.rest):
+    if _results_in(results, known) != (program.structure, program.rest):
         raise ValueError("its results do not come back as they were")
     needs_lapack = b"lapack" in executable
     return pickle.dumps((executable, results, arrays.num_leaves, out.num_leaves, needs_lapack))
 
 
-def load(key: str, template: Any) -> Program | None:
+def load(key: str, template: Any) -> KeptProgram | None:
     """The program that was kept under a key, ready to be called; None: there is none."""
     path = folder()
     contents = path and _read(path / (key + SUFFIX), key)
@@ -366,11 +388,11 @@ def load(key: str, template: Any) -> Program | None:
     try:
         return _unpacked(contents, template)
     except Exception as error:
-        _give_up(path / (key + SUFFIX), f"cannot be loaded ({type(error).__name__}: {error})")
+        _discard(path / (key + SUFFIX), f"cannot be loaded ({type(error).__name__}: {error})")
         return None
 
 
-def _unpacked(contents: bytes, template: Any) -> Program:
+def _unpacked(contents: bytes, template: Any) -> KeptProgram:
     from jax.experimental import serialize_executable
 
     executable, results, arrays, out, needs_lapack = pickle.loads(contents)
@@ -378,7 +400,7 @@ def _unpacked(contents: bytes, template: Any) -> Program:
         _start_lapack()
     trees = [jax.tree.structure(one) for one in ((([0] * arrays,), {}), [0] * out)]
     call = serialize_executable.deserialize_and_load(executable, *trees)
-    return Program(call, *_results(results, _own_objects(template)))
+    return KeptProgram(call, *_results_in(results, _own_objects(template)))
 
 
 @functools.cache
@@ -389,8 +411,8 @@ def _start_lapack() -> None:
     _lapack.initialize()
 
 
-def _results(pickled: bytes, known: list[Any]) -> tuple[Any, list[Any]]:
-    """Structure of the results and the rest, see `Program`."""
+def _results_in(pickled: bytes, known: list[Any]) -> tuple[Any, list[Any]]:
+    """Structure of the results and the rest, see `KeptProgram`."""
 
     class Unpickler(pickle.Unpickler):
         def persistent_load(self, pid):
@@ -438,12 +460,12 @@ def _is_own(obj: Any) -> bool:
 def trial() -> bool:
     """Whether a small program comes back from its pickle and gives the same."""
 
-    def flat(arrays):
+    def trial_of_kept_programs(arrays):
         return [2 * arrays[0]]
 
-    call = jax.jit(flat).lower([np.ones(2)]).compile()
+    call = _compile(trial_of_kept_programs, [np.ones(2)], None)
     structure = jax.tree.structure((0, 0))
     template = (HOLE, "word")
-    packed = _packed(Program(call, structure, [HOLE, "word"]), template)
+    packed = _file_of(KeptProgram(call, structure, [HOLE, "word"]), template)
     found = _unpacked(packed, template)([np.ones(2)])
     return found[0].tolist() == [2.0, 2.0] and found[1] == "word"
