@@ -114,6 +114,13 @@ def test_surroundings_make_another_program(folder, monkeypatch, change):
     programs.surroundings.cache_clear()
 
 
+def test_a_constant_that_was_changed_makes_another_program(folder, monkeypatch):
+    fresh()(X, 2)
+    monkeypatch.setattr("jaxbelt.kernel.step.SLOW", 0.2)
+    assert len(compiled_names(fresh(), X, 2)) == 1
+    assert len(files(folder)) == 2
+
+
 def test_settings_make_another_program(folder):
     fresh()(X, 2)
     with jax.default_matmul_precision("float32"):

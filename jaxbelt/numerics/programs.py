@@ -217,6 +217,23 @@ def _sources() -> str:
     return told.hexdigest()
 
 
+#: Folders of jaxbelt whose modules programs are made of. All of them are imported at once.
+FOLDERS = "numerics model kernel motion cycles sweeps bifurcations inverse".split()
+
+
+def _constants() -> list[str]:
+    """Numbers and words by a name in capitals in the modules of jaxbelt, as they are now: a session
+    that changes one has programs of its own, and leaves none to others."""
+    found = []
+    for name, module in sorted(sys.modules.items()):
+        if name.startswith("jaxbelt.") and name.split(".")[1] in FOLDERS and name != __name__:
+            for key, value in vars(module).items():
+                if key.isupper() and isinstance(value, bool | int | float | str | tuple):
+                    told = repr(value)
+                    found.append(f"{name} {key} {told}" if " at 0x" not in told else "")
+    return found
+
+
 def _processor() -> str:
     """What the processor can do; XLA makes code for all of it."""
     words = ("model name", "flags", "features", "cpu part", "cpu implementer")
@@ -304,7 +321,7 @@ def key_of(function: Callable, template: Any, signatures: Sequence[Any], options
     told = fingerprint((name, function, template, options))
     # The last one is an object of JAX's own, and empty outside of traces.
     context = [repr(one) for one in jax_settings()[0][:-1]]
-    parts = surroundings(), told, [str(one) for one in signatures], context
+    parts = surroundings(), _constants(), told, [str(one) for one in signatures], context
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
