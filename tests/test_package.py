@@ -122,7 +122,9 @@ def test_modules_are_imported_by_statements_only(module: str):
     """So that the test above sees every import."""
     used = set(".".join(set(imported_names(module)) - {"importlib.metadata"}).split("."))
     # These ask what was imported.
-    hidden = HIDDEN_WAYS - ({"modules"} if module in ("__init__", "identity") else set())
+    hidden = HIDDEN_WAYS - (
+        {"modules"} if module in ("__init__", "identity", "numerics.programs") else set()
+    )
     for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
         if isinstance(node, ast.Name) and node.id != "importlib":
             used.add(node.id)

@@ -316,7 +316,7 @@ def can_be_kept(arrays: list[Any]) -> bool:
 
 
 def key_of(function: Callable, template: Any, signatures: Sequence[Any], options: Any) -> str:
-    """What a program is known by; `FingerprintError` where this cannot be told."""
+    """What a program is known by; an error where this cannot be told."""
     name = getattr(function, "__module__", ""), getattr(function, "__qualname__", "")
     told = fingerprint((name, function, template, options))
     # The last one is an object of JAX's own, and empty outside of traces.
@@ -337,7 +337,8 @@ def compile_and_keep(
         told[:] = structure, [HOLE if eqx.is_array(leaf) else leaf for leaf in leaves]
         return [leaf for leaf in leaves if eqx.is_array(leaf)]
 
-    name = getattr(function, "__name__", "program")
+    named = getattr(function, "func", function)  # of a partial
+    name = getattr(named, "__name__", "program")
     flat.__name__ = flat.__qualname__ = f"{name}_{key[:8]}"
     try:
         call = _compile(flat, arrays, options)
