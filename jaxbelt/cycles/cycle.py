@@ -209,6 +209,7 @@ def cycle_of_zeros(osc: Oscillator) -> Cycle:
     return Cycle(osc, chain, jnp.zeros((arcs, 3)), number, number, whole, whole)
 
 
+@jit
 def as_loop(cycle: Cycle, size: int) -> Loop:
     """The loop that a cycle is, padded to `size` arcs."""
     chain, z = cycle.chain, cycle.unknowns
@@ -386,6 +387,7 @@ def warn_of_fast_loops(
         )
 
 
+@jit
 def _is_inexact(cycle: Cycle, error: Array) -> Array:
     return (cycle.status == Status.NO_CONVERGENCE) | (error > EXACT)
 

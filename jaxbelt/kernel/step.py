@@ -23,9 +23,8 @@ size one in the linearised field.
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -47,6 +46,7 @@ from ..model.modes import (
 from ..model.modes import edges as edge_positions
 from ..model.oscillator import Oscillator
 from ..model.rest import is_at_rest
+from ..numerics.compiling import the_solvers
 from .lanes import Lanes, choose, materialise
 
 #: First step of a run and after each event, at a tolerance of 1e-8: about what the tolerance allows
@@ -72,27 +72,35 @@ NO_STEP = 1e-15
 #: A time that no Taylor step bridges, and finite, so that derivatives are.
 NEVER = 1e300
 
-#: Order eight takes twice the stages of order five and a third of the steps at 1e-8, and most of a
-#: step's cost is not in its stages but in its interpolant, bounds and choices.
-_TABLEAU = diffrax.Dopri8.tableau
 
+class _Tableau(NamedTuple):
+    """Weights of the stages' accelerations for x'' = a: in x2 (`a`) and in x1 (`aa`), a row a
+    stage, the last one the solution; the stages' times `c`; the same weights of the error estimate
+    (`e`, `ea`).
 
-def _nystroem() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The tableau for x'' = a: weights of the stages' accelerations in x2 and in x1.
-
-    A row a stage, the last one the solution, and the same of the error estimate.
+    linear: a bound of the error of a step of y' = k y, over (h k)^8 y, for h k up to 0.9: a quarter
+    of its estimate, which is sixteen times the error at 0.7 and nine times at 0.9.
     """
-    n = _TABLEAU.b_sol.size
+
+    a: np.ndarray
+    aa: np.ndarray
+    c: np.ndarray
+    e: np.ndarray
+    ea: np.ndarray
+    linear: float
+
+
+@functools.cache
+def _nystroem() -> _Tableau:
+    # Order eight takes twice the stages of order five and a third of the steps at 1e-8, and most of
+    # a step's cost is not in its stages but in its interpolant, bounds and choices.
+    tableau = the_solvers().Dopri8.tableau
+    n, e = tableau.b_sol.size, tableau.b_error
     a = np.zeros((n, n))
-    for i, row in enumerate(_TABLEAU.a_lower):
+    for i, row in enumerate(tableau.a_lower):
         a[i + 1, : row.size] = row
-    return a, a @ a, a.sum(axis=1), _TABLEAU.b_error, _TABLEAU.b_error @ a
-
-
-_A, _AA, _C, _E, _EA = _nystroem()
-#: A bound of the error of a step of y' = k y, over (h k)^8 y, for h k up to 0.9: a quarter of its
-#: estimate, which is sixteen times the error at 0.7 and nine times at 0.9.
-_E_LINEAR = 0.25 * float(np.abs(_E @ np.linalg.matrix_power(_A, 7) @ np.ones(_E.size)))
+    linear = 0.25 * float(np.abs(e @ np.linalg.matrix_power(a, 7) @ np.ones(e.size)))
+    return _Tableau(a, a @ a, a.sum(axis=1), e, e @ a, linear)
 
 
 class _Window(eqx.Module):
@@ -237,25 +245,26 @@ def attempt(
     """One Runge-Kutta step of all lanes; rates, derivatives: see `take_step`."""
     x1, x2, stages = lanes.x1, lanes.x2, [lanes.a]
     slopes = [rates(osc, lanes.mode, lanes.t, x1, x2)] if rates else []
-    for row, row1, c in zip(_A[1:-1], _AA[1:-1], _C[1:-1].tolist(), strict=True):
+    own = _nystroem()
+    for row, row1, c in zip(own.a[1:-1], own.aa[1:-1], own.c[1:-1].tolist(), strict=True):
         drift = c * x2 + h * _combine(row1, stages) if np.any(row1) else c * x2
         x2_stage = x2 + h * _combine(row, stages)
         stages.append(_quotient(osc, window, ones, x1 + h * drift, x2_stage))
         if rates:
             slopes.append(rates(osc, lanes.mode, lanes.t + c * h, x1 + h * drift, x2_stage))
     # The weights of the solution are those of the last stage, which is the next step's first.
-    y1 = materialise(x1 + h * (x2 + h * _combine(_AA[-1], stages)), ones)
-    y2 = materialise(x2 + h * _combine(_A[-1], stages), ones)
+    y1 = materialise(x1 + h * (x2 + h * _combine(own.aa[-1], stages)), ones)
+    y2 = materialise(x2 + h * _combine(own.a[-1], stages), ones)
     stages.append(_quotient(osc, window, ones, y1, y2))
     scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
     scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
-    error1, error2 = jnp.abs(h * h * _combine(_EA, stages)), jnp.abs(h * _combine(_E, stages))
+    error1, error2 = jnp.abs(h * h * _combine(own.ea, stages)), jnp.abs(h * _combine(own.e, stages))
     error = jnp.maximum(error1 * scale2, error2 * scale1) / (scale1 * scale2)
     if derivatives:
         ends = (x1, x2), (y1, y2)
         fastest = functools.reduce(jnp.maximum, [_rate(osc, window, ones, *end) for end in ends])
-        error = jnp.maximum(error, _E_LINEAR / rtol * ((h * fastest) ** 2) ** 4)
-    integrals = jax.tree.map(lambda i, *s: i + h * _combine(_A[-1], s), lanes.integrals, *slopes)
+        error = jnp.maximum(error, own.linear / rtol * ((h * fastest) ** 2) ** 4)
+    integrals = jax.tree.map(lambda i, *s: i + h * _combine(own.a[-1], s), lanes.integrals, *slopes)
     return _Attempt(h, y1, y2, stages[-1], lax.stop_gradient(error), integrals)
 
 
