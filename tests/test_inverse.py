@@ -11,7 +11,7 @@ import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.inverse.fit import _inverse, _undetermined
 from jaxbelt.inverse.record import local_cubics
-from jaxbelt.inverse.selection import Selection, sizes_of
+from jaxbelt.inverse.selection import Selection, parameter_sizes
 
 TS = np.arange(400) * 0.1
 START = (0.0, -2.0)
@@ -198,7 +198,8 @@ def test_bounded_values_and_back():
     """lower, upper: (-inf, inf), (0, inf), (-inf, 1), (0.2, 0.9)."""
     inf = np.inf
     lower, upper = jnp.array([-inf, 0.0, -inf, 0.2]), jnp.array([inf, inf, 1.0, 0.9])
-    selection = Selection(((0,),) * 4, ("",) * 4, lower, upper, jnp.array([2.0, 1.0, 1.0, 1.0]))
+    sizes, units = jnp.array([2.0, 1.0, 1.0, 1.0]), jnp.array([1.0, 4.0, 0.5, 1.0])
+    selection = Selection(((0,),) * 4, ("",) * 4, lower, upper, sizes, units)
     values = jnp.array([-0.7, 3.0, -5.0, 0.3])
     np.testing.assert_allclose(selection.values(selection.unbounded(values)), values, rtol=1e-13)
     far = selection.values(jnp.array([30.0, -30.0, 30.0, 30.0]))
@@ -227,9 +228,9 @@ def test_what_is_told_in_combination_only_is_named():
     names, estimates = ("a", "b", "c", "d", "e"), np.array([1.0, -2.0, 3.0, 1e-3, 1.0])
     trade = np.array([5.0, -7.0, 1e-2, 1e-3, 0.0])
     covariance = np.outer(trade, trade) + np.diag([1e-4, 1e-4, 1e-2, 2e-3, np.inf])
-    assert _undetermined(names, covariance, sizes_of(estimates, 1.0)) == (("e",), ("a", "b"))
+    assert _undetermined(names, covariance, parameter_sizes(estimates, 1.0)) == (("e",), ("a", "b"))
     apart = np.diag([4.0, 1e-2, 100.0, 1e-4, 1e-2])
-    assert _undetermined(names, apart, sizes_of(estimates, 1.0)) == (("a",), ("c",))
+    assert _undetermined(names, apart, parameter_sizes(estimates, 1.0)) == (("a",), ("c",))
 
 
 @pytest.mark.slow

@@ -46,8 +46,8 @@ from .selection import (
     LONGEST_CHANGE,
     Selection,
     own_units_of,
+    parameter_sizes,
     selection_of,
-    sizes_of,
     told_to,
 )
 
@@ -237,7 +237,7 @@ class Fit(eqx.Module):
         name by itself the parameter. Empty unless the status is NOT_IDENTIFIED."""
         if int(self.status) != Status.NOT_IDENTIFIED:
             return ()
-        sizes = sizes_of(self.estimates, own_units_of(self.oscillator, self.names))
+        sizes = parameter_sizes(self.estimates, own_units_of(self.oscillator, self.names))
         return _undetermined(self.names, self.covariance, sizes)
 
     def intervals(self, level: float = 0.95) -> Array:
@@ -517,7 +517,7 @@ def _result(
     ys, weights = _motion_of(point, values), _weights_of(record, values)
     status = Status.OK if verdict.is_noise else Status.MISFIT
     if status == Status.OK:  # of a misfit errors mean nothing
-        if not np.all(errors[:p] <= sizes_of(estimates, selection.unit)):
+        if not np.all(errors[:p] <= parameter_sizes(estimates, selection.unit)):
             status = Status.NOT_IDENTIFIED
         elif not _gain_left(point.blocks[0]) < GAIN_LEFT:
             status = Status.NO_CONVERGENCE

@@ -93,12 +93,12 @@ def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, n
         pairs.append((lower, upper))
     lower, upper = jnp.asarray(pairs).T
     units = own_units_of(osc, names)
-    size = jnp.asarray(sizes_of(values, units))
+    size = jnp.asarray(parameter_sizes(values, units))
     selection = Selection(groups, names, lower, upper, size, jnp.asarray(units))
     return selection, np.asarray(selection.unbounded(jnp.asarray(values)))
 
 
-def sizes_of(values: ArrayLike, units: ArrayLike) -> np.ndarray:
+def parameter_sizes(values: ArrayLike, units: ArrayLike) -> np.ndarray:
     """The sizes of parameters: of one that is near zero a part of its own unit."""
     return np.maximum(np.abs(np.asarray(values)), SMALLEST * np.asarray(units))
 

@@ -63,7 +63,7 @@ LEAST_ERROR, LARGEST_ERROR = 1e-5, 1e5
 #: x2'' is of order one, the terms that it leaves out are far below the tolerance then.
 LANDING = 0.1
 #: Largest of these terms, x2'' delta^2, over the tolerance: heavy belts change x2' faster.
-LEFT_OUT = 0.1
+LANDS_WITHIN = 0.1
 #: Speed over |x2'| below which an edge is passed slowly: over a way d, the terms that the Taylor
 #: step leaves out grow like (|x2'| d / x2^2)^2.
 SLOW = 0.1
@@ -330,7 +330,7 @@ def _landing(
     peak = jnp.where(beyond_extremum, path.x2_extremum, new.x2)
     reach = LANDING * jnp.sqrt(rtol)
     bound = jnp.where(new.a > 0, high, low)
-    room = LEFT_OUT * (atol + rtol * jnp.abs(new.x2)) * new.h
+    room = LANDS_WITHIN * (atol + rtol * jnp.abs(new.x2)) * new.h
 
     def is_straight(way, speed):
         """Whether x2'' over the step is small enough to be left out on that way."""

@@ -68,11 +68,14 @@ def own_length(osc: Oscillator) -> ArrayLike:
     that distance of the origin. A heavy belt whose contact ends earlier moves the mass no farther
     than to the edge; there edges and velocities tell the size, and so they do without friction.
     """
-    known = is_concrete(osc)
-    one: Any = np if known else jnp
-    number: Any = np.asarray if known else lax.stop_gradient
+
+    def number(leaf: Any) -> Any:
+        """A leaf without derivatives; in NumPy where it is known, which compiles nothing."""
+        return np.asarray(leaf) if is_concrete(leaf) else lax.stop_gradient(leaf)
+
     loads = [number(belt.load) for belt in osc.belts]
     pulls = [load * number(belt.friction.static) for load, belt in zip(loads, osc.belts)]
+    one: Any = np if is_concrete(pulls) else jnp
     force = functools.reduce(one.maximum, pulls)
     edges = [
         (load, number(edge))
@@ -82,6 +85,7 @@ def own_length(osc: Oscillator) -> ArrayLike:
     ]
     size = force
     if edges or not is_concrete(force) or not force > 0:
+        one = np if is_concrete(osc) else jnp
         # An edge at 0 has no length, and cuts all the same.
         cuts = [(load > 0) & one.isfinite(edge) for load, edge in edges]
         lengths = [

@@ -186,14 +186,20 @@ class Adaptive(AbstractIntegrator):
 # --- steps that are short where the friction law bends --------------------------------------------
 
 
+#: Inverse thickness, in own units, of the thickest layer of a friction law at r = 0 that steps
+#: which do not look for it might jump.
+THIN = 30.0
+
+
 def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     """How many steps per unit of time an orbit wants: more where the friction law bends.
 
     The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0. That of a
     steep law tells nothing until the orbit is in its layer at r = 0, which a step of its own length
-    would jump: outside of the layer the length is the distance from it, so that each step goes at
-    most about half of the way. And at least half the rate at which disturbances change in the
-    linearised field: of that, the motion itself tells nothing where it is small.
+    would jump: outside of a layer that is thinner than 1/`THIN` the length is the distance from it,
+    so that each step goes at most about half of the way. And at least half the rate at which
+    disturbances change in the linearised field: of that, the motion itself tells nothing where it
+    is small.
     """
     a, a_by_x2 = jax.jvp(
         lambda x2: mode_acceleration(osc, mode, x1, x2), (x2,), (jnp.ones_like(x2),)
@@ -208,7 +214,8 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
         speeds = jnp.stack([speed, jnp.zeros_like(speed)])
         curvature = jax.jvp(slope, (speeds,), (jnp.ones_like(speeds),))[1]
         here, at_boundary = jnp.sqrt(jnp.abs(belt.load * curvature))
-        nearing = at_boundary / (1 + at_boundary * speed)
+        thin = jnp.maximum(0.0, 1.0 - THIN / jnp.maximum(at_boundary, THIN))
+        nearing = thin * at_boundary / (1 + at_boundary * speed)
         bend = bend + jnp.where(jnp.abs(code) == 1, jnp.maximum(here, nearing), 0.0)
     near_extremum = jnp.sqrt(bend * jnp.abs(osc.omega * x2))  # where x2' = 0, x2'' = -x2
     wanted = 1 + 0.4 * bend * jnp.abs(osc.omega * a) + near_extremum

@@ -146,7 +146,7 @@ class Trajectory(eqx.Module):
 
 #: The default tolerances of a step, and width of the band of the switch model and of the smooth
 #: one's tanh, in own units.
-TOLERANCE, WIDTH = 1e-10, 1e-3
+SIMULATION_TOLERANCE, BAND_WIDTH = 1e-10, 1e-3
 
 
 @jit
@@ -154,8 +154,8 @@ def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resoluti
     """A trajectory of the switch or the smooth formulation: samples without events or arcs."""
     osc = in_units_of_run(given)
     y0 = y0 / osc.units.length
-    atol = in_units(atol, osc.units.length, TOLERANCE)
-    width = in_units(width, osc.units.velocity, WIDTH)
+    atol = in_units(atol, osc.units.length, SIMULATION_TOLERANCE)
+    width = in_units(width, osc.units.velocity, BAND_WIDTH)
     if ts is None:
         ts = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)
     field = switch_field if formulation == "switch" else smooth_field
@@ -188,7 +188,7 @@ def _filippov(
 ) -> Trajectory:
     osc = in_units_of_run(given)
     y0 = y0 / osc.units.length
-    atol = in_units(atol, osc.units.length, TOLERANCE)
+    atol = in_units(atol, osc.units.length, SIMULATION_TOLERANCE)
     if ts is None:
         wanted_times = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)[:-1]
     else:
@@ -252,7 +252,7 @@ def simulate(
     *,
     t0: ArrayLike = 0.0,
     ts: ArrayLike | list | tuple | None = None,
-    rtol: ArrayLike = TOLERANCE,
+    rtol: ArrayLike = SIMULATION_TOLERANCE,
     atol: ArrayLike | None = None,
     formulation: str = "filippov",
     v_star: ArrayLike | None = None,

@@ -351,7 +351,7 @@ def axes_of(flags):
 #: Lanes of a group.
 GROUP = SideBySide(on_cpu=64, elsewhere=2**15)
 #: So many lanes, or fewer, are not worth the longer compilation of a group.
-FEW = 8
+FEW_LANES = 8
 
 
 def in_groups(function: Callable) -> Callable:
@@ -361,7 +361,7 @@ def in_groups(function: Callable) -> Callable:
     def batch(_, axis_size, batched, *args):
         lane, leaves = of_lane(function, batched, args)
         size = GROUP.here
-        if axis_size <= FEW:
+        if axis_size <= FEW_LANES:
             return each(lane)(leaves)
         if axis_size <= size:
             return jax.vmap(lane)(leaves)

@@ -43,7 +43,7 @@ from ..results import Status, draw
 from ..tables import table_of
 from .attractor import KINDS, Attractor
 from .datasets import decoded, flags
-from .question import LONG_ENOUGH, numbers_of_runs
+from .question import LONG_ENOUGH, settings_of_runs
 from .sweep import sweep
 from .work import results_of
 
@@ -425,7 +425,7 @@ def basin_stability(
     check_oscillator(oscillator, "oscillator")
     corners, n = as_box(box), as_whole(n, "n")
     check_key(key)
-    numbers = numbers_of_runs(t1, rtol, atol)
+    numbers = settings_of_runs(t1, rtol, atol)
     kinds = _kinds(oscillator, starts_in(corners, n, key), **numbers)
     fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(KINDS)}
     errors = {name: float(standard_error(f, n)) for name, f in fractions.items()}

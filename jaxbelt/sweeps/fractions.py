@@ -33,7 +33,7 @@ from ..tables import table_of
 from .attractor import CYCLE, EQUILIBRIUM, KINDS, STUCK_FOR_EVER, UNDECIDED, Attractor
 from .basins import as_box, check_key, rest_reached, standard_error, starts_in
 from .grid import Grid
-from .question import LONG_ENOUGH, numbers_of_runs
+from .question import LONG_ENOUGH, settings_of_runs
 from .shares import told_apart
 from .work import results_of
 
@@ -178,7 +178,7 @@ def basin_fractions(
     first, last = as_span(span, where)
     corners, n, rows = as_box(box), as_whole(n, "n"), as_whole(rows, "rows", 2)
     check_key(key)
-    numbers = numbers_of_runs(t1, rtol, atol)
+    numbers = settings_of_runs(t1, rtol, atol)
     moves = None if moves is None else as_positive(moves, "moves")
     given = varied(osc, where, (first,))
     for value in (first, last):

@@ -61,7 +61,7 @@ class Question:
             given = 'given, the end of each run, but for observe="attractor"'
             require(observe == "attractor", "t1", given, "None")
             t1 = LONG_ENOUGH
-        numbers = numbers_of_runs(t1, rtol, atol)
+        numbers = settings_of_runs(t1, rtol, atol)
         wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
         fits = isinstance(wanted, Sequence)
         require_value(fits, "derivatives", "a tuple of names of axes", wanted)
@@ -166,7 +166,7 @@ class Question:
         return told
 
 
-def numbers_of_runs(t1: Any, rtol: Any, atol: Any) -> dict[str, Any]:
+def settings_of_runs(t1: Any, rtol: Any, atol: Any) -> dict[str, Any]:
     """The arguments of runs, checked; atol may be None, for the default in own units."""
     positive = {name: as_positive(value, name) for name, value in (("t1", t1), ("rtol", rtol))}
     return {**positive, "atol": as_tolerance(atol, "atol")}

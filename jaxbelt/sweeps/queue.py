@@ -41,7 +41,7 @@ ROUNDS_PER_PASS = 4
 
 
 #: The default absolute tolerance of a step, in own units.
-TOLERANCE = 1e-8
+DEFAULT_TOLERANCE = 1e-8
 
 
 def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> OwnOscillator:
@@ -114,7 +114,7 @@ def _ordered(values: dict[str, Any]) -> list[str]:
     return sorted(values)
 
 
-def _results(observer: Observer, osc: OwnOscillator, lanes: Lanes) -> dict[str, Any]:
+def _handed_in(observer: Observer, osc: OwnOscillator, lanes: Lanes) -> dict[str, Any]:
     """What is known of the lanes, in the units in which their runs were given."""
     found = observer.finish(osc, lanes)
     for name, value in found.items():
@@ -194,7 +194,7 @@ def _refill(program: Program, common: Common, block: _Block, desk: _Desk) -> _De
     finished = finished & (_rank(finished) < ones.size - desk.filled)
     # In order, behind what is there.
     source = jnp.searchsorted(_rank(finished), slots - desk.filled)
-    new = [lanes.run, *_columns(_results(observer, osc, lanes))]
+    new = [lanes.run, *_columns(_handed_in(observer, osc, lanes))]
     pairs = zip([desk.numbers, *desk.columns], new, strict=True)
     handed = [
         jnp.where(slots < desk.filled, old, value.at[source].get(mode="fill", fill_value=-1))
@@ -235,7 +235,7 @@ def _work(program: Program, common: Common, stream: Stream, slopes: Sequence[Str
 
     def step(rows, lanes, window):
         osc = _oscillators(program, common.shared, rows)
-        atol = in_units(common.atol, osc.units.length, TOLERANCE)
+        atol = in_units(common.atol, osc.units.length, DEFAULT_TOLERANCE)
         return observer.follow(forward, osc, window, ones, lanes, t1, rtol, atol)
 
     rows, rows_slopes = stream.rows, [one.rows for one in slopes]
@@ -389,7 +389,7 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
     def finish():
         stream = idle(program, shared, 1, 2 + sum(program.mapped))
         osc = _oscillators(program, shared, stream.rows)
-        return _results(program.observer, osc, stream.lanes)
+        return _handed_in(program.observer, osc, stream.lanes)
 
     values = jax.eval_shape(finish)
     shapes = {}
