@@ -349,7 +349,7 @@ class BifurcationPoint(eqx.Module):
     steps: Array
     error: Array
     multiplier: Array
-    x1: Array = quantity("length")
+    x1: Array = eqx.field(metadata=quantity("length"))
     oscillator: Oscillator
     cycle: Cycle
     status: Array
@@ -359,7 +359,7 @@ class BifurcationPoint(eqx.Module):
         """A point that was found in own units, in those of whoever gave what is varied."""
         if variation.units is None:
             return self
-        given, length, (unit,) = variation.units
+        given, length, (unit,) = variation.own
         value = self.value * unit
         osc = given.oscillator(np.asarray(value)[None] if is_concrete(value) else value[None])
         found = rescaled(self, length, lambda _: osc)

@@ -66,7 +66,7 @@ class BifurcationCurve(eqx.Module):
     classes: tuple[type[AbstractCondition], ...] = eqx.field(static=True)
     multiplier: np.ndarray
     residual: np.ndarray
-    places: np.ndarray = quantity(*PLACE_DIMENSIONS)
+    places: np.ndarray = eqx.field(metadata=quantity(*PLACE_DIMENSIONS))
     special: tuple[SpecialPoint, ...] = eqx.field(static=True)
     ends: tuple[Stop, Stop] = eqx.field(static=True)
     names: tuple[str, str] = eqx.field(static=True)
@@ -78,7 +78,7 @@ class BifurcationCurve(eqx.Module):
         """A curve that was found in own units, in those of whoever gave what is varied."""
         if variation.units is None:
             return self
-        _, length, units = variation.units
+        _, length, units = variation.own
         special = tuple(one.measured_in(units) for one in self.special)
         found = rescaled(self, length)
         return replace(found, values=self.values * units, special=special)
@@ -197,7 +197,7 @@ def bifurcation_curve(
     own = in_own_units(point.oscillator, length)
     point = rescaled(point, 1 / length, lambda _: own)
     variation = given.in_units(length, np.mean(limits, axis=1) if near is None else near)
-    units = variation.units.parameters
+    units = variation.own.parameters
     start = variation.values_of(
         own, limits / units[:, None], None if near is None else near / units
     )

@@ -60,14 +60,14 @@ class Branch(eqx.Module):
     values: np.ndarray
     stable: np.ndarray
     neutral: np.ndarray
-    x1_min: np.ndarray = quantity("length")
-    x1_max: np.ndarray = quantity("length")
-    x2_min: np.ndarray = quantity("velocity")
-    x2_max: np.ndarray = quantity("velocity")
+    x1_min: np.ndarray = eqx.field(metadata=quantity("length"))
+    x1_max: np.ndarray = eqx.field(metadata=quantity("length"))
+    x2_min: np.ndarray = eqx.field(metadata=quantity("velocity"))
+    x2_max: np.ndarray = eqx.field(metadata=quantity("velocity"))
     period: np.ndarray
     multiplier: np.ndarray
     stick_durations: np.ndarray
-    stick_velocities: np.ndarray = quantity("velocity")
+    stick_velocities: np.ndarray = eqx.field(metadata=quantity("velocity"))
     cycles: tuple[Cycle, ...]
 
     @property
@@ -226,7 +226,7 @@ def bifurcation_diagram(
         warn_of_fast_loops(fast, depth=5)
     pieces = [*_equilibrium_pieces(path, nodes), *_cycle_pieces(path, nodes, labels)]
     names = [region_name(path.at(v), label) for v, label in zip(middles, labels, strict=True)]
-    given, length, (unit,) = path.variation.units
+    given, length, (unit,) = path.variation.own
     branches = rescaled(tuple(_joined(pieces, list(special.values()))), length)
     at_ends = [given.oscillator(np.array([unit * v])) for v in (path.first, *middles, path.last)]
     return BifurcationDiagram(

@@ -97,7 +97,7 @@ class ParameterPath:
         ends = np.array([[0.5 * (first + last)], [first], [last]])
         self.variation = given.in_own_units(*ends)
         self._oscillators: dict[float, Oscillator] = {}
-        measured = 1.0 if given.units is not None else float(self.variation.units.parameters[0])
+        measured = 1.0 if given.units is not None else float(self.variation.own.parameters[0])
         self.first, self.last = first / measured, last / measured
         self.conditions = conditions
         self.length = self.last - self.first

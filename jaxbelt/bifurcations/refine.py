@@ -177,8 +177,8 @@ def _begun(
         condition.check(osc)
         value = jnp.asarray(jax.tree.leaves(osc)[number], dtype=jnp.float64).reshape(1)
         variation = Variation.of_leaves(osc, [number]).in_own_units(lax.stop_gradient(value))
-        own = in_own_units(osc, variation.units.length)
-        return variation, own, value / variation.units.parameters
+        own = in_own_units(osc, variation.own.length)
+        return variation, own, value / variation.own.parameters
     require(at is not None, "at", "the value of the parameter to begin from", "None")
     at = as_array(at, "at")
     check_finite(at, "at")
@@ -188,5 +188,5 @@ def _begun(
     value = at.reshape(1)
     condition.check(variation.oscillator(value))
     variation = variation.in_own_units(lax.stop_gradient(value))
-    value = value / variation.units.parameters
+    value = value / variation.own.parameters
     return variation, variation.oscillator(value), value

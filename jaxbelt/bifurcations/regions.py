@@ -211,7 +211,7 @@ def region_map(
     given = varied_by_names(make, span, values)
     corners = [np.array(pair) for pair in product(*([one[0], one[-1]] for one in values))]
     variation = given.in_own_units(*corners)
-    _, length, units = variation.units
+    _, length, units = variation.own
     bounds = Bounds(variation, [one / unit for one, unit in zip(values, units)], step)
     own_starts = tuple((x1 / length, x2 / length) for x1, x2 in further)
 
@@ -231,7 +231,9 @@ def region_map(
     between = _names_between(own, span, values, label, on_line, curves, own_starts)
     pair = values[0], values[1]
     first, second = units.tolist()
-    pairs = tuple(tuple((p * first, q * second) for p, q in pair) for pair in uncovered)
+    pairs = tuple(
+        ((a * first, b * second), (c * first, d * second)) for (a, b), (c, d) in uncovered
+    )
     return RegionMap(span, pair, label, curves, cycles, on_line, between, make, pairs)
 
 

@@ -47,7 +47,7 @@ class Loop(eqx.Module):
 
     codes: Array
     ends: Array
-    entries: Array = quantity("length", "velocity")
+    entries: Array = eqx.field(metadata=quantity("length", "velocity"))
     durations: Array
 
     @property

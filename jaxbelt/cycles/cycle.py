@@ -84,7 +84,7 @@ class Cycle(eqx.Module):
 
     oscillator: Oscillator
     chain: Chain
-    unknowns: Array = quantity("length", "velocity", "time")
+    unknowns: Array = eqx.field(metadata=quantity("length", "velocity", "time"))
     multiplier: Array
     residual: Array
     iterations: Array

@@ -72,8 +72,8 @@ class Portrait(eqx.Module):
     unstable: tuple[Cycle, ...]
     separatrices: tuple[Separatrix, ...]
     escapes: bool = eqx.field(static=True)
-    reach: float = quantity("length", static=True)
-    gaps: Array = quantity("length")
+    reach: float = eqx.field(metadata=quantity("length"), static=True)
+    gaps: Array = eqx.field(metadata=quantity("length"))
     status: Array
 
     def table(self) -> "pandas.DataFrame":

@@ -91,11 +91,11 @@ class Separatrix(eqx.Module):
       oscillator reversed in time. What ends the last one, if it was left there, is "unused".
     """
 
-    point: Array = quantity("length", "velocity")
+    point: Array = eqx.field(metadata=quantity("length", "velocity"))
     side: str = eqx.field(static=True)
     stable: bool = eqx.field(static=True)
     ts: Array
-    ys: Array = quantity("length", "velocity")
+    ys: Array = eqx.field(metadata=quantity("length", "velocity"))
     end: str = eqx.field(static=True)
     to: int = eqx.field(static=True)
     arcs: Loop

@@ -62,9 +62,9 @@ class FatalShock(eqx.Module):
     attractor: str = eqx.field(static=True)
     boundary: str = eqx.field(static=True)
     beyond: str = eqx.field(static=True)
-    distance: Array = quantity("length")
-    start: Array = quantity("length", "velocity")
-    shock: Array = quantity("length", "velocity")
+    distance: Array = eqx.field(metadata=quantity("length"))
+    start: Array = eqx.field(metadata=quantity("length", "velocity"))
+    shock: Array = eqx.field(metadata=quantity("length", "velocity"))
     status: Array
 
     def at_phases(self, n: int) -> "pandas.DataFrame":

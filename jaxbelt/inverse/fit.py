@@ -217,12 +217,12 @@ class Fit(eqx.Module):
     estimates: Array
     standard_errors: Array
     covariance: Array
-    y0: Array = quantity("length", "velocity")
-    y0_standard_errors: Array = quantity("length", "velocity")
+    y0: Array = eqx.field(metadata=quantity("length", "velocity"))
+    y0_standard_errors: Array = eqx.field(metadata=quantity("length", "velocity"))
     ts: Array
-    ys: Array = quantity("length", "velocity")
-    residuals: Array = quantity("length", "velocity")
-    noise: Array = quantity("length", "velocity")
+    ys: Array = eqx.field(metadata=quantity("length", "velocity"))
+    residuals: Array = eqx.field(metadata=quantity("length", "velocity"))
+    noise: Array = eqx.field(metadata=quantity("length", "velocity"))
     reduced_chi_squared: Array
     plausibility: Array
     autocorrelation: Array

@@ -112,8 +112,7 @@ def own_units_of(osc: Oscillator, names: Sequence[str]) -> np.ndarray:
     for name in names:
         leaf = named.index(name.partition(" = ")[0])
         own = Variation.of_leaves(osc, [leaf]).in_own_units(np.array([float(leaves[leaf])]))
-        assert own.units is not None
-        units.append(float(own.units.parameters[0]))
+        units.append(float(own.own.parameters[0]))
     return np.array(units)
 
 

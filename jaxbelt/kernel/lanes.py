@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..model.modes import Mode
-from ..model.oscillator import Oscillator
+from ..model.own_units import OwnOscillator
 
 #: A motion this large grows beyond all bounds. The cube of a velocity above 5.6e102, which Conti's
 #: law takes, is no longer a number; there steps become ever smaller.
@@ -151,13 +151,13 @@ class Observer(eqx.Module):
         return None
 
     @abc.abstractmethod
-    def start(self, osc: Oscillator, lanes: Lanes) -> Any:
+    def start(self, osc: OwnOscillator, lanes: Lanes) -> Any:
         """The memory of runs that begin, a tree of arrays [lanes].
 
         lanes: at their starts, memory None.
         """
 
-    def integrals(self, osc: Oscillator, lanes: Lanes) -> Any:
+    def integrals(self, osc: OwnOscillator, lanes: Lanes) -> Any:
         """The integrals of runs that begin, a tree of zeros [lanes]; None: no integrals."""
         return None
 
@@ -169,7 +169,7 @@ class Observer(eqx.Module):
 
     @abc.abstractmethod
     def watch(
-        self, osc: Oscillator, lanes: Lanes, passage: Passage, ones: Array, t1: Array, tol: Array
+        self, osc: OwnOscillator, lanes: Lanes, passage: Passage, ones: Array, t1: Array, tol: Array
     ) -> Lanes:
         """The lanes after `events.pass_events`, before the next steps.
 
@@ -178,12 +178,12 @@ class Observer(eqx.Module):
         with `done` where a run may end; lanes whose run is -1, or that are done, may hold anything.
         """
 
-    def watch_rarely(self, osc: Oscillator, lanes: Lanes, ones: Array) -> Lanes:
+    def watch_rarely(self, osc: OwnOscillator, lanes: Lanes, ones: Array) -> Lanes:
         """The lanes before each refill, every dozen steps or so: for what is costly to find out."""
         return lanes
 
     @abc.abstractmethod
-    def finish(self, osc: Oscillator, lanes: Lanes) -> dict[str, Any]:
+    def finish(self, osc: OwnOscillator, lanes: Lanes) -> dict[str, Any]:
         """The results of runs that ended, by the names in `variables`.
 
         Arrays [lanes, ...], or tuples of arrays [lanes]; of the other lanes they are not used.

@@ -92,9 +92,9 @@ class Equilibria(eqx.Module):
     """
 
     kind: Array
-    x1: Array = quantity("length")
-    x1_lower: Array = quantity("length")
-    x1_upper: Array = quantity("length")
+    x1: Array = eqx.field(metadata=quantity("length"))
+    x1_lower: Array = eqx.field(metadata=quantity("length"))
+    x1_upper: Array = eqx.field(metadata=quantity("length"))
     modes: Array
     jacobian: Array
     eigenvalues: Array

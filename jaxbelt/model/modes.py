@@ -259,7 +259,10 @@ def has_edges(osc: Oscillator) -> bool:
     return not is_concrete(bounds) or bool(np.any(np.isfinite(bounds)))
 
 
-def without_edges(osc: Oscillator) -> Oscillator:
+AnyOscillator = TypeVar("AnyOscillator", bound=Oscillator)
+
+
+def without_edges(osc: AnyOscillator) -> AnyOscillator:
     """The oscillator whose belts touch the mass everywhere, known in every trace: their bounds are
     None."""
     belts = tuple(

@@ -10,8 +10,7 @@ the unit. With the unit of length L
 and the frequency omega is 1 in own units. L is a power of two, so that a change of unit by a power
 of two changes no bit but exponents.
 
-A field of a result that has a dimension is declared with `quantity`; `in_given_units`
-reads that.
+A field of a result that has a dimension says so by `quantity`; `in_given_units` reads that.
 """
 
 import dataclasses
@@ -25,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from ..checks import is_concrete
 from .oscillator import Belt, Oscillator, scaled_edge
@@ -61,7 +60,7 @@ class OwnOscillator(Oscillator):
     units: OwnUnits = dataclasses.field(kw_only=True)
 
 
-def own_length(osc: Oscillator) -> ArrayLike:
+def own_length(osc: Oscillator) -> Any:
     """The own unit of length: the size of an oscillator, rounded down to a power of two.
 
     The size is the largest friction force over the stiffness, u0 mu(0): the mass sticks within
@@ -118,7 +117,7 @@ def power_of_two_below(size: Any) -> Any:
     return lax.bitcast_convert_type(bits & EXPONENT, jnp.float64)
 
 
-def in_own_units(osc: Oscillator, length: ArrayLike | None = None) -> OwnOscillator:
+def in_own_units(osc: Oscillator, length: Any = None) -> OwnOscillator:
     """The oscillator in its own units, or in those with a given unit of length.
 
     An oscillator that is in its own units already stays as it is.
@@ -190,12 +189,12 @@ def _unchecked(kind: type, /, **fields: Any) -> Any:
 # --- results ------------------------------------------------------------------------------------
 
 
-def quantity(*dimensions: str, **settings: Any) -> Any:
-    """A field of a result that has a dimension: one of `POWERS`.
+def quantity(*dimensions: str) -> dict[str, tuple[str, ...]]:
+    """What the field of a result says of its dimension, as `eqx.field(metadata=quantity("length"))`.
 
-    Several stand for the columns of an array's last axis.
+    One of `POWERS`; several stand for the columns of an array's last axis.
     """
-    return eqx.field(metadata={"dimensions": dimensions}, **settings)
+    return {"dimensions": dimensions}
 
 
 #: Dimensions, as powers of the unit of length; time has none.

@@ -384,6 +384,12 @@ class Variation:
             known = known._replace(parameters=known.parameters * units)
         return replace(self, make=make, line=line, tangents={}, units=known)
 
+    @property
+    def own(self) -> "UnitsOfVariation":
+        """The units of what is computed in own ones."""
+        assert self.units is not None
+        return self.units
+
     def in_own_units(self, *rows: Any) -> "Variation":
         """The same oscillators in one unit of length, and the parameters in units of their own.
 

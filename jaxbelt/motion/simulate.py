@@ -46,7 +46,7 @@ class Events(eqx.Module):
     """
 
     t: Array
-    y: Array = quantity("length", "velocity")
+    y: Array = eqx.field(metadata=quantity("length", "velocity"))
     kind: Array
     belt: Array
 
@@ -79,7 +79,7 @@ class Arcs(eqx.Module):
     """
 
     t: Array
-    y: Array = quantity("length", "velocity")
+    y: Array = eqx.field(metadata=quantity("length", "velocity"))
     mode: Array
     duration: Array
 
@@ -110,7 +110,7 @@ class Trajectory(eqx.Module):
     """
 
     ts: Array
-    ys: Array = quantity("length", "velocity")
+    ys: Array = eqx.field(metadata=quantity("length", "velocity"))
     modes: Array
     events: Events
     arcs: Arcs

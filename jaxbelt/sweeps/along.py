@@ -25,7 +25,7 @@ from ..kernel.events import event_kinds
 from ..kernel.lanes import Lanes, Observer, choose, materialise
 from ..kernel.step import LANDING
 from ..model.modes import Mode, mode_acceleration
-from ..model.oscillator import Oscillator
+from ..model.own_units import OwnOscillator
 from .moments import (
     PARTS_OF_STEP,
     AtEvents,
@@ -91,7 +91,7 @@ class Along(Observer):
 
     # --- integrals
 
-    def rates(self, osc: Oscillator, mode: Mode, t, x1, x2) -> Any:
+    def rates(self, osc: OwnOscillator, mode: Mode, t, x1, x2) -> Any:
         """The reducer's rates, a tree of arrays [lanes], or None if it has none."""
         if not hasattr(self.reducer, "rates"):
             return None
@@ -319,13 +319,13 @@ def _first(table: tuple[Array, ...]) -> Array:
     return functools.reduce(jnp.minimum, [jnp.min(part, axis=0) for part in table])
 
 
-def _state_and_rate(osc: Oscillator, lanes: Lanes) -> tuple[Array, Array, Array]:
+def _state_and_rate(osc: OwnOscillator, lanes: Lanes) -> tuple[Array, Array, Array]:
     """x1, x2 and x2' in the mode of the lanes, which slip; without derivatives."""
     osc, lanes = lax.stop_gradient((osc, lanes))
     return lanes.x1, lanes.x2, mode_acceleration(osc, lanes.mode, lanes.x1, lanes.x2)
 
 
-def _moved(osc: Oscillator, lanes: Lanes, delta: Array) -> tuple[Array, Array]:
+def _moved(osc: OwnOscillator, lanes: Lanes, delta: Array) -> tuple[Array, Array]:
     """The state that is `delta` away, by Taylor's formula of order 3 in x1 and 2 in x2."""
 
     def field(x1, x2):
@@ -356,7 +356,7 @@ def _next(times: tuple[float, ...], passed: Array) -> Array:
     return jnp.asarray((*times, np.inf))[jnp.minimum(passed, len(times))]
 
 
-def _forces(osc: Oscillator, mode: Mode, x2: Array, residual: Array) -> list[Array]:
+def _forces(osc: OwnOscillator, mode: Mode, x2: Array, residual: Array) -> list[Array]:
     """The friction force of each belt on the mass; stuck belts share what is needed by capacity."""
     limits = [
         jnp.where(stuck, belt.load * belt.friction.static, 0.0)

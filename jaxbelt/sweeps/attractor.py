@@ -15,7 +15,7 @@ from ..kernel.lanes import Lanes, Observer, Passage, Variable, materialise
 from ..kernel.marks import Mark
 from ..model.events import signature_name
 from ..model.modes import select
-from ..model.oscillator import Oscillator
+from ..model.own_units import OwnOscillator
 from ..model.rest import is_neutral, settling_margin
 from ..model.transitions import begins_at_rest
 from ..results import Status
@@ -60,7 +60,7 @@ class _LoopSoFar(eqx.Module):
     loop_events: Array
 
 
-def _extended(osc: Oscillator, loop: _LoopSoFar, lanes: Lanes, passage: Passage) -> _LoopSoFar:
+def _extended(osc: OwnOscillator, loop: _LoopSoFar, lanes: Lanes, passage: Passage) -> _LoopSoFar:
     """The loop with what has just happened: extrema of x1, time stuck, events."""
     sticks = tuple(
         total + jnp.where(stuck, passage.duration, 0.0)

@@ -77,10 +77,10 @@ class BasinFractions(eqx.Module):
     fractions: np.ndarray
     standard_errors: np.ndarray
     undecided: np.ndarray
-    x1_min: np.ndarray = quantity("length")
-    x1_max: np.ndarray = quantity("length")
-    x2_min: np.ndarray = quantity("velocity")
-    x2_max: np.ndarray = quantity("velocity")
+    x1_min: np.ndarray = eqx.field(metadata=quantity("length"))
+    x1_max: np.ndarray = eqx.field(metadata=quantity("length"))
+    x2_min: np.ndarray = eqx.field(metadata=quantity("velocity"))
+    x2_max: np.ndarray = eqx.field(metadata=quantity("velocity"))
     period: np.ndarray
     n: int
     name: str = eqx.field(static=True)
@@ -187,7 +187,7 @@ def basin_fractions(
     starts = [starts_in(corners, n, jax.random.fold_in(key, row)) for row in range(rows)]
     # From here on in own units.
     variation = given.in_own_units(*np.array([[0.5 * (first + last)], [first], [last]]))
-    _, length, (unit,) = variation.units
+    _, length, (unit,) = variation.own
     if numbers["atol"] is not None:
         numbers["atol"] /= float(length)
     found = _found_along(variation, values / unit, np.stack(starts) / length, numbers)
