@@ -117,14 +117,14 @@ def power_of_two_below(size: Any) -> Any:
     return lax.bitcast_convert_type(bits & EXPONENT, jnp.float64)
 
 
-def in_own_units(osc: Oscillator, length: Any = None) -> OwnOscillator:
+def in_own_units(osc: Oscillator, unit: Any = None) -> OwnOscillator:
     """The oscillator in its own units, or in those with a given unit of length.
 
     An oscillator that is in its own units already stays as it is.
     """
     if isinstance(osc, OwnOscillator):
         return osc
-    length = own_length(osc) if length is None else length
+    length: Any = own_length(osc) if unit is None else unit
     known = is_concrete((osc.omega, length))
     omega: Any = np.asarray(osc.omega) if known else osc.omega
     if known and length == 1 and omega == 1:
@@ -190,7 +190,7 @@ def _unchecked(kind: type, /, **fields: Any) -> Any:
 
 
 def quantity(*dimensions: str) -> dict[str, tuple[str, ...]]:
-    """What the field of a result says of its dimension, as `eqx.field(metadata=quantity("length"))`.
+    """The metadata of a field of a result that has a dimension, for `eqx.field`.
 
     One of `POWERS`; several stand for the columns of an array's last axis.
     """
