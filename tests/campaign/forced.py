@@ -25,16 +25,20 @@ velocity of every other touching belt, where
 
 All are explicit functions of the time, and their first root is found by the same proof, with bounds
 of their first and second derivatives over an interval of time. A double root touches and the phase
-goes on; a triple root passes. A phase is for ever (status STUCK_FOREVER) where x1 does not drift and
-the limits hold for all phases of all waves, or over one period that all frequencies have in common;
-such a run goes on to its final time, for a belt may swing.
+goes on; a triple root passes. A phase is for ever (status STUCK_FOREVER) where x1 does not drift
+and the limits hold for all phases of all waves, or over one period that all frequencies have in
+common; such a run goes on to its final time, for a belt may swing.
 
 What follows an event is decided by the forces at that very point. Z are the touching belts with
 r = 0. Each velocity among those of Z is tried: sticking to it asks for a friction that the belts of
-that velocity can exert, while the signs of the others are those of the difference of velocities just
-afterwards. The belt that the mass is stuck to comes first, then the one that was met. If none can
-hold it, the mass slips with the only signs that agree with its acceleration. At |needed| = capacity
-exactly, the derivatives of |needed| - capacity decide.
+that velocity can exert, while the signs of the others are those of the differences of velocities
+just afterwards. The belt that the mass is stuck to comes first, then the one that was met. If none
+can hold it, the mass slips with the only signs that agree with its acceleration. At |needed| =
+capacity exactly, the derivatives of |needed| - capacity decide.
+
+A mass may also rest on an edge to which it is pushed from both sides. A run that starts there, or
+whose loops around such a point are lost in the rounding of x1, ends at that time with the status
+PSEUDO_FOCUS: when it leaves, and whether, is not told.
 
 Codes of contact, a belt each: 1, -1 slips with that sign of r; 0 stuck; -2, 2 mass below, above the
 interval. Kinds of events:
@@ -151,7 +155,7 @@ class Harmonic:
 @dataclass(frozen=True)
 class Belt:
     """velocity, load: numbers or `Oscillating`. law: as of `engine.Belt`, or ("cubic", a0, a1, a3),
-    mu(r) = a0 - a1 r + a3 r^3."""
+    mu(r) = a0 - a1 r + a3 r^3, or ("polynomial", c0, c1, c2, c3)."""
 
     velocity: float | Oscillating
     law: tuple
@@ -186,6 +190,8 @@ class Oscillator:
                 law = (1, static - p[0], 1 / p[1], p[0], 0.0, 0.0, 0.0)
             elif name == "cubic":
                 law = (0, 0.0, 0.0, static, -p[0], 0.0, p[1])
+            elif name == "polynomial":
+                law = (0, 0.0, 0.0, static, *p)
             else:
                 raise ValueError(f"unknown law {name}")
             rows.append((*_numbers(b.velocity), *_numbers(b.load), b.lower, b.upper, static, *law))
@@ -249,9 +255,7 @@ class Run:
         return tuple(zip(self.kind.tolist(), self.belt.tolist()))
 
 
-def simulate(
-    osc, y0, t1, *, t0=0.0, tol=1e-13, noise=0.0, seed=0, mode=None, max_events=20_000
-):
+def simulate(osc, y0, t1, *, t0=0.0, tol=1e-13, noise=0.0, seed=0, mode=None, max_events=20_000):
     """The run from y0 over [t0, t1].
 
     mode: contact codes to go on with, None: those of the state. noise: a tolerance, as rtol and
@@ -505,8 +509,8 @@ def force(osc, mode, t, x1, x2):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _waves(B, F, s, t, h, E):
-    """Bounds over [t, t + h], into E: of a belt nu, nu', nu'', u, u'; in the last row the forces and
-    their derivative."""
+    """Bounds over [t, t + h], into E: of a belt nu, nu', nu'', u, u'; in the last row the forces
+    and their derivative."""
     n = B.shape[0]
     for i in range(n):
         if s[i] == 1 or s[i] == -1:
@@ -622,12 +626,13 @@ def _enclose(z, w, B, F, s, t, x1, x2, a, y1, y2, b, h, E, box):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _verdict(g0, g1, d0, d1, c0, c1, h, shift, touch, R):
+def _verdict(g0, g1, d0, d1, h, shift, touch, R):
     """Whether a distance, from g0 > 0 to g1 with slopes d0 and d1, is negative in between.
 
     R: bounds of the distance, its slope and its curvature over the interval, which are made
-    tighter. shift: what was added to a distance that began at zero. Returns 0 no, 1 yes, once, 2
-    perhaps, in a convex loop, 3 cannot tell.
+    tighter. shift: what was added to a distance that began at zero. touch: how far below zero a
+    convex distance has not passed it. Returns 0 no, 1 yes, once, 2 perhaps, in a convex loop, 3
+    cannot tell.
     """
     R[2] = max(R[2], max(d0 + min(0.0, h * R[4]), d1 - max(0.0, h * R[5])))
     R[3] = min(R[3], min(d0 + max(0.0, h * R[5]), d1 - min(0.0, h * R[4])))
@@ -640,7 +645,7 @@ def _verdict(g0, g1, d0, d1, c0, c1, h, shift, touch, R):
         return 0
     if not (rising or falling or convex or concave) and h > _SHORTEST:
         return 3
-    if g1 > 0:
+    if g1 > 0 or (convex and g1 >= -touch):
         return 2 if convex and d0 < 0 < d1 else 0
     return 1
 
@@ -709,7 +714,7 @@ def _slip_root(z, w, B, F, s, L, line, order, shift, t, x1, x2, a, right, f_left
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _stick_line(z, w, B, F, s, k, start, x1, L, line, t, h, R):
-    """Bounds of a distance of a stick phase, of its slope and its curvature over [t, t + h], into R.
+    """Bounds of a distance of a stick phase, of its slope and curvature over [t, t + h], into R.
 
     The mass is stuck to belt k, and was at x1 at the time `start`. With h = 0 these are values.
     """
@@ -928,7 +933,7 @@ def _settle(z, w, B, F, t, x1, x2, s, zero, first, second, R):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _at_zero(w, B, t, x1, x2, s, k, zero):
+def _at_zero(w, B, t, x2, s, k, zero):
     """The touching belts with r = 0, into `zero`; k: one of them, or -1."""
     for i in range(B.shape[0]):
         zero[i] = False
@@ -968,13 +973,13 @@ def _begin(z, w, B, F, t, x1, x2, s, zero, R):
     if same or x2 != 0:
         for i in range(n):
             s[i] = right[i] if x2 > 0 or same else left[i]
-        _at_zero(w, B, t, x1, x2, s, -1, zero)
+        _at_zero(w, B, t, x2, s, -1, zero)
         stuck, gap, _ = _settle(z, w, B, F, t, x1, x2, s, zero, -1, -1, R)
         return stuck, OK, gap
     # At rest on an edge: the accelerations on the two sides decide.
-    _at_zero(w, B, t, x1, x2, left, -1, zero)
+    _at_zero(w, B, t, x2, left, -1, zero)
     stuck_l, gap_l, a_l = _settle(z, w, B, F, t, x1, x2, left, zero, -1, -1, R)
-    _at_zero(w, B, t, x1, x2, right, -1, zero)
+    _at_zero(w, B, t, x2, right, -1, zero)
     stuck_r, gap_r, a_r = _settle(z, w, B, F, t, x1, x2, right, zero, -1, -1, R)
     gap = min(min(gap_l, gap_r), min(abs(a_l), abs(a_r)))
     go_right = a_r > 0 or (a_r == 0 and stuck_r >= 0 and a_l >= 0)
@@ -1001,7 +1006,7 @@ def _edges(B, s, L):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _nearest(w, B, s, L, stuck, t, x1, x2):
+def _nearest(w, B, s, L, t, x1, x2):
     """Distance of a state from the lines of its mode that it is not on."""
     d = np.inf
     for j in range(2):
@@ -1070,30 +1075,28 @@ def _stick_phase(z, w, B, F, s, k, start, x1, T, period, L, shifts, R, Q):
             if line < 2 and not np.isfinite(L[line]):
                 continue
             _stick_line(z, w, B, F, s, k, start, x1, L, line, t, 0.0, R)
-            g0, d0, c0 = R[0] + shifts[line], R[2], R[4]
+            g0, d0 = R[0] + shifts[line], R[2]
             if g0 <= 0:
-                if t > start and g0 > -10 * touch and d0 >= -1e-7:
-                    g0 = 1e-300  # touches here
+                if t > start and g0 >= -touch and d0 >= -1e-6:
+                    g0 = 1e-300  # it touches here
                 else:
-                    if 0.0 < t_hit - t or hit < 0:
+                    if t < t_hit:
                         hit, t_hit = line, t
                     continue
             _stick_line(z, w, B, F, s, k, start, x1, L, line, t + h, 0.0, R)
-            g1, d1, c1 = R[0] + shifts[line], R[2], R[4]
+            g1, d1 = R[0] + shifts[line], R[2]
             _stick_line(z, w, B, F, s, k, start, x1, L, line, t, h, R)
             R[0] += shifts[line]
             if not (R[0] <= R[1] + shifts[line]) and h > _SHORTEST:
                 unclear = True
                 break
-            found = _verdict(g0, g1, d0, d1, c0, c1, h, shifts[line], touch, R)
+            found = _verdict(g0, g1, d0, d1, h, shifts[line], touch, R)
             if found == 3:
                 unclear = True
                 break
             end, f_left = t + h, g0
             if found == 2:
-                end = _stick_root(
-                    z, w, B, F, s, k, start, x1, L, line, 1, 0.0, t, t + h, d0, Q
-                )
+                end = _stick_root(z, w, B, F, s, k, start, x1, L, line, 1, 0.0, t, t + h, d0, Q)
                 _stick_line(z, w, B, F, s, k, start, x1, L, line, end, 0.0, Q)
                 if shifts[line] == 0:
                     closest = min(closest, abs(Q[0]))
@@ -1157,9 +1160,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
         if stuck >= 0:
             # ---------------- a stick phase
             k = stuck
-            line, end, gap, ever = _stick_phase(
-                z, w, B, F, s, k, t, x1, T, period, L, shifts, R, Q
-            )
+            line, end, gap, ever = _stick_phase(z, w, B, F, s, k, t, x1, T, period, L, shifts, R, Q)
             margin = min(margin, gap)
             if line < 0 or end > T:
                 margin = min(margin, end - T if end > T else np.inf)
@@ -1182,7 +1183,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                 stuck = -1
             elif line >= 4:
                 met = line - 4
-                _at_zero(w, B, t, x1, x2, s, k, zero)
+                _at_zero(w, B, t, x2, s, k, zero)
                 for i in range(n):
                     zero[i] = zero[i] or (abs(s[i]) == 1 and _mates(B, i, met))
                 stuck, gap, _ = _settle(z, w, B, F, t, x1, x2, s, zero, k, met, R)
@@ -1202,7 +1203,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                 kind = EDGE
                 x1 = L[line]
                 _touching(w, B, t, x1, x2, line == 1, old, s)
-                _at_zero(w, B, t, x1, x2, s, k, zero)
+                _at_zero(w, B, t, x2, s, k, zero)
                 stuck, gap, _ = _settle(z, w, B, F, t, x1, x2, s, zero, k, -1, R)
                 margin = min(margin, min(gap, abs(x2)))
         else:
@@ -1267,15 +1268,15 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                             if line >= 2 and abs(s[line - 2]) != 1:
                                 continue
                             shift = shifts[line]
-                            g0, d0, c0 = _slip_line(z, w, B, F, s, L, line, t, x1, x2, a)
-                            g1, d1, c1 = _slip_line(z, w, B, F, s, L, line, t + h, y1, y2, b)
+                            g0, d0, _ = _slip_line(z, w, B, F, s, L, line, t, x1, x2, a)
+                            g1, d1, _ = _slip_line(z, w, B, F, s, L, line, t + h, y1, y2, b)
                             g0, g1 = g0 + shift, g1 + shift
                             if g0 <= 0:
                                 hit, h_hit, m1, m2 = line, 0.0, x1, x2
                                 break
                             _slip_bounds(w, s, L, line, E, box, R)
                             R[0] += shift
-                            found = _verdict(g0, g1, d0, d1, c0, c1, h, shift, 0.0, R)
+                            found = _verdict(g0, g1, d0, d1, h, shift, 0.0, R)
                             if found == 3:
                                 unclear = True
                                 break
@@ -1314,7 +1315,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                         g, d, _ = _slip_line(z, w, B, F, s, L, line, t, x1, x2, a)
                         if g > shifts[line]:
                             shifts[line] = 0.0
-                if noise > 0 and _nearest(w, B, s, L, False, t, x1, x2) > 100 * noise:
+                if noise > 0 and _nearest(w, B, s, L, t, x1, x2) > 100 * noise:
                     random ^= random << np.uint64(13)
                     random ^= random >> np.uint64(7)
                     random ^= random << np.uint64(17)
@@ -1334,7 +1335,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
             if hit >= 2:
                 k = hit - 2
                 x2 = _wave(B[k], 0, t, 0) / w
-                _at_zero(w, B, t, x1, x2, s, k, zero)
+                _at_zero(w, B, t, x2, s, k, zero)
                 stuck, gap, _ = _settle(z, w, B, F, t, x1, x2, s, zero, k, -1, R)
                 margin = min(margin, gap)
                 kind = STICK if stuck >= 0 else CROSS
@@ -1349,7 +1350,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                 x1 = L[hit]
                 kind = EDGE
                 _touching(w, B, t, x1, x2, hit == 1, old, s)
-                _at_zero(w, B, t, x1, x2, s, -1, zero)
+                _at_zero(w, B, t, x2, s, -1, zero)
                 arrived = False
                 for i in range(n):
                     # Belts that stay keep their sign unless one that arrives has r = 0, too.
@@ -1374,7 +1375,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                 if (abs(before[i]) == 2) != (abs(s[i]) == 2):
                     belt = i
         _edges(B, s, L)
-        margin = min(margin, _nearest(w, B, s, L, stuck >= 0, t, x1, x2))
+        margin = min(margin, _nearest(w, B, s, L, t, x1, x2))
         out[count, 0], out[count, 1], out[count, 2] = t, kind, belt
         out[count, 3], out[count, 4], out[count, 5] = x1, x2, speed
         for i in range(n):
@@ -1385,7 +1386,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
             random ^= random >> np.uint64(7)
             random ^= random << np.uint64(17)
             move = noise * (1.0 if random & np.uint64(1) else -1.0)
-            if _nearest(w, B, s, L, stuck >= 0, t, x1, x2) > 100 * noise:
+            if _nearest(w, B, s, L, t, x1, x2) > 100 * noise:
                 if kind == EDGE:
                     x2 += 0.0 if stuck >= 0 else move * (1 + abs(x2))
                 else:
@@ -1394,5 +1395,5 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
         margin = min(margin, abs(T - out[count - 1, 0]))
     if status == OK:
         _edges(B, s, L)
-        margin = min(margin, _nearest(w, B, s, L, stuck >= 0, t, x1, x2))
+        margin = min(margin, _nearest(w, B, s, L, t, x1, x2))
     return count, t, x1, x2, status, margin, s, steps
