@@ -198,9 +198,22 @@ class Oscillator:
         return np.array(rows, dtype=float)
 
     def clock(self):
-        """The forces as rows (0, amplitude, frequency, phase)."""
-        waves = [Oscillating(0.0, f.amplitude, f.frequency, f.phase) for f in self.forces]
-        return np.array([_numbers(w) for w in waves], dtype=float).reshape(-1, 4)
+        """The forces as rows (0, amplitude, frequency, phase), one a frequency.
+
+        Forces that cancel one another do so in sums of numbers, but not of intervals.
+        """
+        groups, rows = {}, []
+        for f in self.forces:
+            row = _numbers(Oscillating(0.0, f.amplitude, f.frequency, f.phase))
+            groups.setdefault(row[2], []).append(row)
+        for frequency, some in groups.items():
+            if len(some) == 1:
+                rows += some
+                continue
+            total = sum(amplitude * np.exp(1j * phase) for _, amplitude, _, phase in some)
+            if abs(total) > 1e-15 * sum(abs(amplitude) for _, amplitude, _, _ in some):
+                rows.append((0.0, abs(total), frequency, np.angle(total)))
+        return np.array(rows, dtype=float).reshape(-1, 4)
 
     def common_period(self):
         """The period that all waves have in common, 0 where there are none, inf where none is
@@ -1389,6 +1402,9 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
             if _nearest(w, B, s, L, t, x1, x2) > 100 * noise:
                 if kind == EDGE:
                     x2 += 0.0 if stuck >= 0 else move * (1 + abs(x2))
+                elif kind == SLIP:
+                    # Onward, or it would stick again at once.
+                    x1 += s[belt] * abs(move) * (1 + abs(x1))
                 else:
                     x1 += move * (1 + abs(x1))
     if count > 0:
