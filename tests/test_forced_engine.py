@@ -745,6 +745,9 @@ def test_verdicts():
     verdicts = forced_cases.judged(batch, [answer(run) for run in again], 1e-9)
     assert all(verdict in forced_cases.GOOD for verdict, _ in verdicts)
     assert sum(verdict == "same" for verdict, _ in verdicts) > 40
+    again = forced_cases.simulate_all(batch, noise=1e-9, seed=99)
+    verdicts = forced_cases.judged(batch, [answer(run) for run in again], 1e-9)
+    assert all(verdict in forced_cases.GOOD for verdict, _ in verdicts)
     clear = [(c, r) for c, r in zip(batch, runs) if r.margin > 1e-5 and len(r.t)]
     assert len(clear) > 15
     for case, run in clear[:6]:
