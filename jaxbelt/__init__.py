@@ -10,7 +10,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     results         status codes and what to do about them
     activity        what takes long says what it does
     identity        what a value or a function is made of, as a short text
-    numerics/       spacing widths compiling
+    numerics/       spacing widths programs compiling
     checks          arguments, checked at the public edge
     tables          results as tables
     numerics/       derivatives extrapolation newton continuation roots
@@ -36,7 +36,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     paper           the paper's table and figures
     api             the public names
     __init__        the same, imported when the first of them is used
-    commands/       options reproduce simulate diagram map sweep basins verify
+    commands/       options reproduce simulate diagram map sweep basins verify warm
+    commands/       cache
     cli             the command line
 """
 

@@ -8,6 +8,7 @@ from typer.core import TyperCommand
 import jaxbelt
 
 from .commands.basins import basins
+from .commands.cache import cache
 from .commands.diagram import diagram
 from .commands.map import region_map
 from .commands.options import CLASSES, plain_errors
@@ -15,6 +16,7 @@ from .commands.reproduce import reproduce
 from .commands.simulate import simulate
 from .commands.sweep import sweep
 from .commands.verify import verify
+from .commands.warm import warm
 from .spelling import near
 
 
@@ -87,5 +89,7 @@ for name, command in (
     ("sweep", sweep),
     ("basins", basins),
     ("verify", verify),
+    ("warm", warm),
+    ("cache", cache),
 ):
     app.command(name, cls=Command)(command)

@@ -359,3 +359,8 @@ def _package_in(top: str, file: str | None) -> str | None:
 @functools.cache
 def _distributions() -> Any:
     return importlib.metadata.packages_distributions()
+
+
+def is_installed(value: Any) -> bool:
+    """Whether an installed package or Python defines a class or a function under its name."""
+    return _installed_name(value) != ""

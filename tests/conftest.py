@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # for the commands that tests start, too
+# JAX keeps what tests compile, see below. With JAXBELT_CACHE=1 jaxbelt does, as for its users.
+os.environ.setdefault("JAXBELT_CACHE", "0")
 
 import jax
 

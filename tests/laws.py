@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import jaxbelt as jb
 
@@ -23,6 +24,31 @@ def bell(r):
 
 
 BELL = Lorentz(jnp.asarray(1.0), jnp.asarray(0.6), jnp.asarray(0.4))
+
+
+class Peak(jb.AbstractFriction):
+    """mu(r) = kinetic + (static - kinetic) exp(-(r/velocity)^2) + viscous r, the Stribeck curve of
+    LuGre models: a narrow layer at r = 0 of which no derivative tells outside of it."""
+
+    static: jax.Array
+    kinetic: jax.Array
+    velocity: jax.Array
+    viscous: jax.Array
+
+    def mu(self, speed):
+        falls = self.static - self.kinetic
+        return (
+            self.kinetic + falls * jnp.exp(-((speed / self.velocity) ** 2)) + self.viscous * speed
+        )
+
+
+def peak(static, kinetic, velocity, viscous):
+    """The same law for the package, and for the oracle as a function with its static limit."""
+
+    def mu(r):
+        return kinetic + (static - kinetic) * np.exp(-((r / velocity) ** 2)) + viscous * r
+
+    return Peak(*map(jnp.asarray, (static, kinetic, velocity, viscous))), (mu, static)
 
 
 class Nested(jb.AbstractFriction):

@@ -12,7 +12,9 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,6 +60,11 @@ MISTAKES = [
     ("jb.Conti([1.0], 0.6, 10.0)", r"static must be a scalar .*, got shape \(1,\)"),
     ("jb.Belt(0.3, law, upper=math.nan)", "upper of belt must be a number, got nan"),
     ("jb.Oscillator(0.5, belts=None)", "belts must be a tuple of belts, .*got None"),
+    (
+        "jb.Belt(0.3, Worded(1.0, 'soft'))",
+        r"word of Worded must be a number .* equinox.field\(static=True\), got 'soft'",
+    ),
+    ("jb.PhysicalBelt(0.3, Worded(1.0, nu0), 1.0)", "word of Worded .* got the func"),
     ("jb.Belt(0.3, NumpyLaw())", "mu of NumpyLaw must be .* JAX can trace .*not .*np.sqrt"),
     ("jb.Belt(0.3, BranchingLaw())", "mu of BranchingLaw must be .* JAX can trace .* or if"),
     ("jb.Belt(0.3)", "missing 1 required positional argument: 'friction'"),
@@ -456,6 +463,26 @@ MISTAKES = [
         "jb.sweep(jb.presets.class_b, AXES, t1=9.0, observe=Sectioned())",
         "function of AtSection must be .* returns one number, got an array of bool",
     ),
+    (
+        "jb.sweep(keyed('status'), {'status': row}, t1=9.0)",
+        "axes must be named otherwise than a result, .*ledger, .* got 'status'",
+    ),
+    ("jb.sweep(keyed('kind'), {'kind': row}, observe='attractor')", "axes must .* got 'kind'"),
+    ("jb.sweep(keyed('belt'), {'belt': row}, t1=9.0)", "axes must be named .* got 'belt'"),
+    ("jb.sweep(keyed('ledger'), {'ledger': row}, t1=9.0)", "axes must be named .* got 'ledger'"),
+    ("jb.sweep(keyed('a/b'), {'a/b': row}, t1=9.0)", "axes must be .* without /, got 'a/b'"),
+    (
+        "jb.sweep(keyed('nu'), {'nu': row}, t1=9.0, observe=Named('nu'))",
+        "axes must be named otherwise than a result, .* got 'nu'",
+    ),
+    (
+        "jb.sweep(keyed('nu'), {'nu': row}, t1=9.0, observe=Named('ledger'))",
+        "observe must be an observable whose results are named otherwise .* got 'ledger'",
+    ),
+    (
+        "jb.sweep(keyed('nu'), {'nu': row}, t1=9.0, observe=Named('status'))",
+        "observe.finish must be .* without status, which is the run's own, got one with it",
+    ),
     ("jb.verify('nowhere.zarr', repair='yes')", "repair must be True or False, got 'yes'"),
     ("jb.basins(osc, x1=row, x2=row, progress='yes')", "progress must be True, .*got 'yes'"),
     (
@@ -649,6 +676,16 @@ MISTAKES = [
 # --- what the calls above are about ---------------------------------------------------------------
 
 
+class Worded(jb.AbstractFriction):
+    """A law whose field is neither a number nor static."""
+
+    static: jax.Array
+    word: Any
+
+    def mu(self, speed):
+        return self.static + 0 * speed
+
+
 class NumpyLaw(jb.AbstractFriction):
     static: float = 1.0
 
@@ -664,7 +701,7 @@ class BranchingLaw(jb.AbstractFriction):
 
 
 class OwnLaw(jb.AbstractFriction):
-    function: Callable
+    function: Callable = eqx.field(static=True)
     static: float = 1.0
 
     @property
@@ -697,6 +734,14 @@ class Numbered(Reducer):
         return {1: state}
 
 
+class Named(Reducer):
+    def __init__(self, name):
+        self.name = name
+
+    def finish(self, state, end):
+        return {self.name: state}
+
+
 class Sectioned(Reducer):
     at = (jb.AtSection(lambda osc, x1, x2: x1 > 0),)
 
@@ -704,6 +749,11 @@ class Sectioned(Reducer):
 class Growing(Reducer):
     def update(self, state, event):
         return state, event.t
+
+
+def keyed(name):
+    """A maker whose argument has any name."""
+    return lambda **given: jb.presets.class_a(given[name])
 
 
 def with_float(nu0):

@@ -179,6 +179,41 @@ def test_an_excursion_within_one_step_is_found():
     assert dataset.n_events.values.tolist() == [4, 0, 4, 0]
 
 
+# A belt of load 5e4 beyond an edge, to which the mass comes back again and again: a bounce takes
+# some 1e-5. The final state by the engine of tests/campaign at 1e-13, and by `simulate`.
+HEAVY = jb.Oscillator(
+    0.24881058016541968,
+    (
+        jb.Belt(
+            -0.7727968126474689,
+            jb.Conti(1.141401599297721, 1.0817844937744994, 1.1550828769555714),
+            47792.18037920744,
+            lower=-0.5,
+        ),
+        jb.Belt(
+            0.05,
+            jb.Conti(0.7839371576095431, 0.621952093843681, 13.292461028521792),
+            0.0011496192886156667,
+            lower=0.0016014717825907354,
+            upper=0.3,
+        ),
+    ),
+)
+HEAVY_END = (-0.5000461133112228, -0.01132346337252263)
+
+
+@pytest.mark.parametrize("tol", [1e-6, 1e-8, 1e-10])
+def test_no_event_of_a_heavy_belt_is_missed(tol):
+    """At 1e-6 and 1e-8 there were 77 events. An error at an edge counts 235 bounces long."""
+    dataset = lists.swept(
+        [HEAVY], y0=(-0.24666868128577546, 1.7499879137357852), t1=50.0, rtol=tol, atol=tol
+    )
+    assert dataset.status.item() == Status.OK and dataset.n_events.item() == 470
+    end = dataset.x1_end.item(), dataset.x2_end.item()
+    # 5e-8: the rounding of x1 there, 1e-16, in 235 bounces of a load of 5e4.
+    np.testing.assert_allclose(end, HEAVY_END, rtol=0, atol=30 * tol + 1e-7)
+
+
 class Logarithmic(jb.AbstractFriction):
     """A law of a user's own, no quotient: mu falls with the logarithm of the speed."""
 

@@ -6,7 +6,8 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
-from laws import BELL, bell
+from laws import BELL, bell, peak
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import jaxbelt as jb
@@ -265,6 +266,7 @@ def test_a_hopf_point_is_no_fold_of_cycles():
     # More damping than at the degenerate Hopf point of the test above.
     point = jb.refine(jb.FoldOfCycles(), jb.Oscillator(0.55, (jb.Belt(0.35, BELL),)), where=nu0)
     assert point.status == Status.NO_FOLD and jnp.isnan(point.value)
+    assert "value nan, NO_FOLD: " in repr(point)
 
 
 def test_convergence_is_quadratic():
@@ -427,3 +429,32 @@ def test_grazing_of_either_of_two_belts_of_one_velocity(mirrored):
 
     point = jb.refine(jb.GrazingSliding(2 if mirrored else 0), make, at=0.705676900485494)
     assert float(point.value) == pytest.approx(0.695676900485494, abs=1e-10)
+
+
+@pytest.mark.parametrize("scale", [0.0042, 0.0014])
+def test_a_fold_of_a_law_with_a_narrow_layer(scale):
+    """The layer holds the orbit until it comes to slip onset: forwards no number leads there."""
+    law, (mu, static) = peak(1.5, 1.0, scale, 0.28)
+
+    def least_x1(nu, way):
+        """Of the orbit from slip onset, or backwards from there."""
+
+        def field(_, y):
+            return way * y[1], way * (mu(nu - y[1]) - y[0])
+
+        def bottom(_, y):
+            return y[1]
+
+        bottom.direction, bottom.terminal = way, True
+        # By a method for stiff equations, which stays in the layer.
+        options = dict(method="LSODA", rtol=1e-12, atol=1e-13, events=bottom)
+        return solve_ivp(field, (0, 9), (static, nu), **options).y_events[0][0][0]
+
+    value = brentq(lambda nu: least_x1(nu, 1) - least_x1(nu, -1), 0.262, 0.282, xtol=1e-12)
+
+    def make(nu):
+        return jb.Oscillator(0.0, (jb.Belt(nu, law),))
+
+    point = jb.refine(jb.NonsmoothFold(0), make, at=0.266)
+    assert point.status == Status.OK
+    assert point.value == pytest.approx(value, abs=1e-9)

@@ -307,6 +307,7 @@ def test_a_campaign_that_is_stopped_goes_on(swallows, monkeypatch, tmp_path, cap
         ("maps --seed 3", "--seed: maps does not know it"),
         ("paths --threads 2", "--threads: paths does not know it"),
         ("grazing --extreme-share 0.1", "--extreme-share: grazing does not know it"),
+        ("grazing --heavy", "--heavy: grazing does not know it"),
         ("grazing --by find_cycle --structure 0", "cycles that graze have none"),
         ("final --structure 9", "expected 0 to 8, got 9"),
         ("final --runs 0", "expected 1 or more, got 0"),
@@ -340,6 +341,7 @@ def test_nothing_done_is_summed_up(module):
             "final --runs 300 --structure 0 --seed 11", marks=pytest.mark.slow(first=True)
         ),
         pytest.param("attractors --runs 100 --structure 0 --seed 12", marks=pytest.mark.slow),
+        pytest.param("final --heavy --runs 300 --structure 0 --seed 13", marks=pytest.mark.slow),
     ],
 )
 def test_small_campaign(arguments, capsys):

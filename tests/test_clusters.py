@@ -95,7 +95,7 @@ def test_a_block_is_done_once_however_often_it_is_asked_for(tmp_path, whole, mon
 
     path = tmp_path / "a.zarr"
     again(path, blocks=(0, 1))
-    question = Question.of(MAKE, AXES, (3.0, 0.0), 20.0, 1e-8, 1e-8, "final", ())
+    question = Question.of(MAKE, AXES, (3.0, 0.0), 20.0, 1e-8, None, "final", ())
     packed = cloudpickle.dumps((question.arguments(), stores.Store(path, question).hash))
     told = [clusters.do_block(packed, str(path), block) for block in (0, 1, 1)]
     assert told[1] == told[2] == {"block": 1, "statuses": {0: 3}}

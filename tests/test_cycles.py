@@ -12,6 +12,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from laws import peak
 from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
@@ -81,6 +82,36 @@ def test_cycle_that_crosses_a_belt_at_rest(load):
     assert cycle.stick_durations == pytest.approx(expected.stick_durations, abs=1e-10)
     for name in EXTREMA:
         assert getattr(cycle, name) == pytest.approx(getattr(expected, name), abs=1e-10)
+
+
+def _steep(name, scale):
+    """A law that falls by a third within a scale of r = 0, for the package and for the oracle."""
+    if name == "Peak":
+        return peak(1.5, 1.0, scale, 0.28)
+    if name == "Conti":
+        return jb.Conti(1.5, 1.0, 1 / scale), oracle.conti(1.5, 1.0, 1 / scale)
+    return jb.Stribeck(1.5, 1.0, scale), oracle.stribeck(1.5, 1.0, scale)
+
+
+@pytest.mark.parametrize(
+    ("name", "nu", "scale"),
+    [
+        # Orbits whose last step before the boundary went past the layer of the law there.
+        *(("Peak", nu, 0.0042) for nu in (0.2256, 0.2362, 0.2602, 0.2606)),
+        ("Peak", 0.2602, 0.0014),
+        ("Conti", 0.2, 2e-3),
+        ("Stribeck", 0.2, 2e-3),
+    ],
+)
+def test_cycle_of_a_law_with_a_narrow_layer(name, nu, scale):
+    law, mu = _steep(name, scale)
+    cycle = jb.find_cycle(jb.Oscillator(0.0, (jb.Belt(nu, law),)), (1.4, nu))
+    own = oracle.Oscillator(0.0, (oracle.Belt(nu, *mu),))
+    expected = oracle_cycles.sticking_cycle(own, (1.4, nu), max_step=0.02)
+    assert cycle.status == Status.OK
+    assert tuple((kind.name, belt) for kind, belt in cycle.signature) == expected.signature
+    assert cycle.period == pytest.approx(expected.period, abs=1e-9)
+    assert cycle.stick_durations == pytest.approx(expected.stick_durations, abs=1e-9)
 
 
 @pytest.mark.slow

@@ -385,7 +385,8 @@ def test_a_change_that_no_condition_explains_is_reported():
     )
     assert point.kind == "Unexplained" and point.status == Status.UNEXPLAINED
     assert point.value == pytest.approx(0.5, abs=1e-9)  # known to 1e-9 of the span
-    assert "Simulate on both sides" in repr(point)
+    told = f"BifurcationPoint(Unexplained(), value {float(point.value):.12g}, error < "
+    assert repr(point).startswith(told) and "Simulate on both sides" in repr(point)
 
 
 @pytest.mark.slow(first=True)

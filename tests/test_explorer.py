@@ -32,6 +32,30 @@ def test_sliders_move_the_oscillator_and_the_picture():
     assert max(begins) == 2.5
 
 
+@pytest.mark.slow(first=True)
+def test_a_machine_is_explored_in_its_units():
+    law = jb.Tabulated([0.0, 0.01, 0.02, 0.05], [0.8, 0.6, 0.5, 0.45])
+    belts = (
+        jb.PhysicalBelt(0.02, law, 5.0),
+        jb.PhysicalBelt(-0.03, jb.Conti(0.4, 0.25, 100.0), 3.0),
+    )
+    machine = jb.Machine(0.5, 2000.0, 1.0, belts)
+    explorer = jb.explore(machine, t1=1.0)
+    assert {"mass", "stiffness", "belts[0].normal_force", "x1"} <= explorer.sliders.keys()
+    assert repr(explorer.oscillator) == repr(machine.oscillator)
+    for _ in range(2):  # also when they are drawn anew
+        labels = [(ax.get_xlabel(), ax.get_ylabel()) for ax in explorer.figure.axes]
+        assert ("displacement $X$ (m)", r"velocity $\dot X$ (m/s)") in labels
+        assert ("relative velocity $R$ (m/s)", r"$\mu\,\mathrm{sgn}\,R$") in labels
+        assert explorer.figure.axes[-1].get_xlim()[1] == pytest.approx(1.0)
+        explorer.sliders["belts[0].velocity"].value = 0.03
+    assert float(explorer.shown.belts[0].velocity) == 0.03
+    assert explorer.message.value.startswith("OK")
+    # The unit of a law's speeds is no number of the machine.
+    names = jb.explore(machine.oscillator, t1=1.0).sliders
+    assert not [name for name in names if name.endswith("unit")]
+
+
 def three_belts():
     velocities = np.linspace(0.0, 3.0, 13)
     measured = jb.Tabulated(velocities, 0.6 + 0.4 / (1 + 5 * velocities))

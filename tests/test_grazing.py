@@ -13,6 +13,7 @@ import pytest
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.kernel.lanes import Program
+from jaxbelt.model.own_units import in_units_of_run
 from jaxbelt.sweeps.observers import Final
 from jaxbelt.sweeps.queue import layout
 from jaxbelt.sweeps.threads import run
@@ -121,7 +122,7 @@ def simulated_slopes(case, kind, tolerance):
 
 def _leaves(kind):
     def leaves(parts):
-        return jax.tree.leaves(oscillator(parts, kind == "jump"))
+        return jax.tree.leaves(in_units_of_run(oscillator(parts, kind == "jump")))
 
     return jax.vmap(leaves, (AXES,))
 
@@ -136,7 +137,9 @@ def sweep_all(case, kind, tolerance, along=()):
         slopes = jax.jvp(leaves, (parts,), (d_parts,))[1]
         rows.append(np.stack([*map(np.asarray, d_start), *map(np.asarray, slopes)]))
     table, n = np.stack(rows), case.belt.size
-    one = oscillator({k: part[..., 0] for k, part in parts.items()}, kind == "jump")
+    one = in_units_of_run(
+        oscillator({k: part[..., 0] for k, part in parts.items()}, kind == "jump")
+    )
     mapped = (True,) * (table.shape[1] - 2)
     program = Program(jax.tree.structure(one), mapped, Final(), True)
     shapes = layout(program, [])

@@ -9,9 +9,9 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.inverse.fit import _inverse, _sizes, _undetermined
+from jaxbelt.inverse.fit import _inverse, _undetermined
 from jaxbelt.inverse.record import local_cubics
-from jaxbelt.inverse.selection import Selection
+from jaxbelt.inverse.selection import Selection, sizes_of
 
 TS = np.arange(400) * 0.1
 START = (0.0, -2.0)
@@ -227,9 +227,9 @@ def test_what_is_told_in_combination_only_is_named():
     names, estimates = ("a", "b", "c", "d", "e"), np.array([1.0, -2.0, 3.0, 1e-3, 1.0])
     trade = np.array([5.0, -7.0, 1e-2, 1e-3, 0.0])
     covariance = np.outer(trade, trade) + np.diag([1e-4, 1e-4, 1e-2, 2e-3, np.inf])
-    assert _undetermined(names, covariance, _sizes(estimates)) == (("e",), ("a", "b"))
+    assert _undetermined(names, covariance, sizes_of(estimates, 1.0)) == (("e",), ("a", "b"))
     apart = np.diag([4.0, 1e-2, 100.0, 1e-4, 1e-2])
-    assert _undetermined(names, apart, _sizes(estimates)) == (("a",), ("c",))
+    assert _undetermined(names, apart, sizes_of(estimates, 1.0)) == (("a",), ("c",))
 
 
 @pytest.mark.slow

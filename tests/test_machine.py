@@ -683,6 +683,9 @@ def test_what_has_no_si_units_is_told():
         jb.plot_in_si(jb.plot_sweep(dataset, "x1_end"), m)
     with pytest.raises(ValueError, match=r"machine must be a function of V that .* 'speed'"):
         jb.in_si(dataset, lambda speed: machine(speed))
+    by_itself = r"or what it shows itself: jb.plot_in_si\(diagram, .* got axes of .*stick fraction"
+    with pytest.raises(ValueError, match=by_itself):
+        jb.plot_in_si(along()[2].plot(quantity=jb.stick_fraction), m)
     _, ax = plt.subplots()
     ax.set_xlabel("time in hours")
     with pytest.raises(ValueError, match="got axes of 'time in hours', ''"):

@@ -77,7 +77,8 @@ def test_a_name_that_is_not_there_is_answered_with_one_that_is():
 @pytest.mark.parametrize("status", [status for status in jb.Status if status != jb.Status.OK])
 def test_a_point_that_was_not_found_names_the_search_that_finds_every_point(status):
     point = object.__new__(jb.BifurcationPoint)  # with what its text is made of, and no more
-    known = {"condition": jb.Hopf(), "value": np.array(np.nan), "status": np.array(status.value)}
+    nan = np.array(np.nan)
+    known = {"condition": jb.Hopf(), "value": nan, "error": nan, "status": np.array(status.value)}
     for name, value in known.items():
         object.__setattr__(point, name, value)
     assert "jb.scan" in repr(point) and jb.describe(status) in repr(point)

@@ -122,7 +122,9 @@ def test_modules_are_imported_by_statements_only(module: str):
     """So that the test above sees every import."""
     used = set(".".join(set(imported_names(module)) - {"importlib.metadata"}).split("."))
     # These ask what was imported.
-    hidden = HIDDEN_WAYS - ({"modules"} if module in ("__init__", "identity") else set())
+    hidden = HIDDEN_WAYS - (
+        {"modules"} if module in ("__init__", "identity", "numerics.programs") else set()
+    )
     for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
         if isinstance(node, ast.Name) and node.id != "importlib":
             used.add(node.id)
@@ -131,9 +133,12 @@ def test_modules_are_imported_by_statements_only(module: str):
     assert used.isdisjoint(hidden)
 
 
-@pytest.mark.parametrize("module", [name for name in LADDER if name != "numerics.compiling"])
+UNPROMISED = ("numerics.compiling", "numerics.programs")
+
+
+@pytest.mark.parametrize("module", [name for name in LADDER if name not in UNPROMISED])
 def test_what_others_do_not_promise_is_used_in_one_place(module: str):
-    """Behind the switch JAXBELT_PLAIN."""
+    """Behind the switch JAXBELT_PLAIN; what is kept on disk is, too."""
     inside = ("jax._src", "jax.extend", "jax.experimental", "jax.custom_batching")
     inside = (*inside, "equinox.internal", "eqx.internal")
     assert not [name for name in imported_names(module) if name.startswith(inside)]

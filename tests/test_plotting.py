@@ -16,7 +16,7 @@ from jaxbelt.bifurcations.diagrams import Branch
 from jaxbelt.cycles.chains import Chain
 from jaxbelt.motion.arcs import Ends
 from jaxbelt.plotting.phase import _vector_field, draw_overview, stick_phases
-from jaxbelt.plotting.style import BELT_COLOURS, journal_style, save
+from jaxbelt.plotting.style import BELT_COLOURS, journal_style, key_entries, save
 
 
 def run(nu0: float, start=(3.0, 0.0)) -> jb.Trajectory:
@@ -164,15 +164,21 @@ def test_names_of_edges_do_not_touch():
     assert not first.overlaps(second)
 
 
+def key_colours(ax, label):
+    """The colours in which the key of some axes shows a thing."""
+    (handles,) = (handles for name, handles in key_entries([ax]).items() if name == label)
+    return [handle.get_color() for handle in handles]
+
+
 def test_the_sliding_set_is_where_the_contact_holds():
     nu0 = 0.2
     ax = jb.plot_phase_portrait(jb.presets.class_a(nu0), xlim=(-3.0, 3.0))
-    # In the key it is black, for it may be that of any belt.
-    key = line(ax, "sliding set")
-    assert key.get_color() == "black" and not len(states(key))
-    bands = [one for one in ax.get_lines() if one.get_linewidth() == key.get_linewidth()]
-    (drawn,) = (one for one in bands if one is not key)
+    # Its key has its colour.
+    drawn = line(ax, "sliding set")
     assert drawn.get_color() == BELT_COLOURS[0]
+    assert key_colours(ax, "sliding set") == [BELT_COLOURS[0]]
+    both = jb.plot_phase_portrait(jb.presets.class_b(-0.2, 0.35), xlim=(-3.0, 3.0))
+    assert key_colours(both, "sliding set") == [*BELT_COLOURS[:2]]
     x1, band = states(drawn).T
     # Eq. (10): |-x1 - zeta nu0| < u0 mus, here with u0 = mus = omega = 1.
     np.testing.assert_array_equal(np.isfinite(band), np.abs(-x1 - 0.5 * nu0) < 1)
@@ -398,6 +404,43 @@ def test_a_phase_portrait_has_a_key(two_sided):
     assert {"orbit", "sliding set", "unstable fixed point"} <= labels
     _, ax = plt.subplots()
     assert jb.plot_phase_portrait(osc, trajectory, ax=ax).get_legend() is None
+
+
+def test_what_a_table_does_not_cover_is_dashed():
+    law = jb.Tabulated([0.0, 0.1, 0.5], [0.8, 0.6, 0.5])
+    ax = jb.plot_friction_law(law)
+    assert ax.get_xlim() == (-0.5, 0.5) and ax.get_legend() is None  # nothing is extrapolated
+    ax = jb.plot_friction_law(law, speed=1.0)
+    beyond = line(ax, "extrapolated")
+    assert beyond.get_linestyle() == "--" and ax.get_legend() is not None
+    r, mu = beyond.get_xdata(), beyond.get_ydata()
+    assert (r[0], r[-1]) == (0.5, 1.0) and mu[0] == pytest.approx(0.5, abs=1e-9)
+    solid = [one for one in ax.lines if one.get_linestyle() == "-" and len(one.get_xdata()) > 2]
+    assert max(np.max(np.abs(one.get_xdata())) for one in solid) == 0.5
+
+
+def test_a_law_of_a_physical_belt_is_in_its_unit():
+    belt = jb.PhysicalBelt(0.02, jb.Conti(0.4, 0.25, 100.0), 5.0)
+    assert jb.plot_friction_law(belt, speed=0.1).get_xlabel() == "relative velocity $R$ (m/s)"
+
+
+def test_a_sweep_of_attractors_says_that_one_start_was_asked():
+    """Class (a) rests or sticks, by its start, between its Hopf point and its fold."""
+    nus = np.array([0.15, 0.22, 0.3])
+    one = jb.sweep(jb.presets.class_a, {"nu0": nus}, y0=(0.7, 0.1), observe="attractor")
+    assert one.attrs["start"].startswith("x1 = 0.7, x2 = 0.1: of several attractors the one")
+    ax = jb.plot_sweep(one, "stick_duration")
+    assert ax.get_title() == "from one start, x1 = 0.7, x2 = 0.1"
+    assert ax.get_xlim()[0] < 0.15 and ax.get_xlim()[1] > 0.3  # also where there is no cycle
+    axes = {"nu0": nus, "x1": np.array([0.7, 3.0, 3.5]), "x2": [0.0]}
+    several = jb.sweep(jb.presets.class_a, axes, observe="attractor")
+    ax = jb.plot_sweep(several, "kind", share="cycle")
+    assert ax.get_title() == "" and ax.get_ylabel() == "share of starts: cycle"
+    shares = ax.lines[0].get_ydata()
+    assert shares[0] == 1.0 and 0 < shares[1] < 1 and shares[2] == 0.0
+    for dataset, share in ((one, "cycle"), (several, "circle")):
+        with pytest.raises(ValueError, match="share must be"):
+            jb.plot_sweep(dataset, "kind", share=share)
 
 
 def test_a_friction_law_in_units_of_its_own():

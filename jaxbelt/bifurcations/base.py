@@ -458,7 +458,10 @@ class BifurcationPoint(eqx.Module):
             name, advice = Status(int(self.status)).name, describe(self.status)
             if "jb.scan" not in advice:
                 advice += " Every bifurcation point in an interval is found by jb.scan."
-            return f"BifurcationPoint({self.condition!r}, {name}: {advice})"
+            # Where the kind alone is not known, the place is, up to `error`.
+            value, error = f"value {number(self.value)}", float(self.error)
+            value = f"{value}, error < {error:.1e}" if np.isfinite(error) else value
+            return f"BifurcationPoint({self.condition!r}, {value}, {name}: {advice})"
         sort = f"{self.type}, " if self.type else ""
         return (
             f"BifurcationPoint({self.condition!r}, {sort}value {number(self.value)}, "

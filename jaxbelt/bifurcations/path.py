@@ -96,6 +96,7 @@ class ParameterPath:
         #: In own units, the parameter too, as all that follows.
         ends = np.array([[0.5 * (first + last)], [first], [last]])
         self.variation = given.in_own_units(*ends)
+        self._oscillators: dict[float, Oscillator] = {}
         measured = 1.0 if given.units is not None else float(self.variation.units.parameters[0])
         self.first, self.last = first / measured, last / measured
         self.conditions = conditions
@@ -127,8 +128,10 @@ class ParameterPath:
         return end + CLOSE * (middle - end) if vanishes else end
 
     def at(self, value: float) -> Oscillator:
-        """The oscillator there."""
-        return self.variation.oscillator(np.array([value]))
+        """The oscillator there, made once."""
+        if value not in self._oscillators:
+            self._oscillators[value] = self.variation.oscillator(np.array([value]))
+        return self._oscillators[value]
 
     def unstable(self, value: float, around: int) -> Cycle:
         """The unstable cycle there around an equilibrium, or why there is none; computed once."""

@@ -99,7 +99,7 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         return point
     unit = float(variation.family(np.asarray(value)).unit)
     away = _away(point, guess)
-    is_direct = bool(point.steps[0] <= SHORT_STEP) and not condition.has_several
+    is_direct = bool(np.asarray(point.steps)[0] <= SHORT_STEP) and not condition.has_several
     if away <= unit * (QUITE_NEAR if is_direct else BESIDE_OTHERS):
         return point
     for reach in (unit * each for each in REACHES):

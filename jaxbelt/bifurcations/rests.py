@@ -132,7 +132,7 @@ class AbstractRestOfSeveral(AbstractRestCondition):
     def beginnings(self, osc, cycles):
         systems, x, status = self.as_data().prepared(osc, ANY)
         order = np.argsort(np.asarray(_misses(systems, osc, x)))
-        return [np.array(row) for row in order if status[row] == Status.OK]
+        return [np.array(row) for row in order if np.asarray(status)[row] == Status.OK]
 
     def solved(self, family, system, x, p, status):
         return _solved_nearest(family, system, x, p, status, jnp.asarray(self.no_cycle.value))
@@ -140,7 +140,12 @@ class AbstractRestOfSeveral(AbstractRestCondition):
     def followed(self, point):
         systems, x, status = self.as_data().prepared(point.oscillator, ANY)
         row = _row_that_holds(systems, point.oscillator, x, status, point.x1, point.member)
-        return jax.tree.map(lambda leaf: leaf[row], (systems, x))
+        return _of_row((systems, x), row)
+
+
+@jit
+def _of_row(tree: Any, row: Array) -> Any:
+    return jax.tree.map(lambda leaf: leaf[row], tree)
 
 
 @jit
@@ -240,8 +245,7 @@ class Hopf(AbstractRestOfSeveral):
 
     def is_slow_at(self, point):
         # Around a fixed point on an edge the cycle beside it hardly attracts, or repels.
-        away = jnp.abs(jnp.stack(edges(point.oscillator)) - point.x1)
-        return bool(jnp.any(away <= edge_rounding(point.x1)))
+        return bool(_is_on_edge(point.oscillator, point.x1))
 
     def type_of(self, point):
         return criticality(*_hopf_growth(*self.followed(point), point.oscillator))
@@ -251,6 +255,12 @@ class Hopf(AbstractRestOfSeveral):
 
     def place(self, point):
         return np.array([point.x1, point.x1, 0.0, 0.0, 0.0])
+
+
+@jit
+def _is_on_edge(osc: Oscillator, x1: Array) -> Array:
+    away = jnp.abs(jnp.stack(edges(osc)) - x1)
+    return jnp.any(away <= edge_rounding(x1))
 
 
 def criticality(coefficient: Array, size: Array) -> str:

@@ -251,7 +251,8 @@ def _is_told_there(path: ParameterPath, a: float, b: float, point: BifurcationPo
 def _is_inside(a: float, b: float, point: BifurcationPoint) -> bool:
     """Whether a point is in an interval, as far as is known: at a value that was looked at it lies,
     up to rounding, on either side of that."""
-    return bool(a - point.error <= point.value <= b + point.error)
+    value, error = float(point.value), float(point.error)
+    return a - error <= value <= b + error
 
 
 def _explained(path: ParameterPath, a: float, b: float) -> BifurcationPoint | None:

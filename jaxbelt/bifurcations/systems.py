@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..cycles.attractors import extent
-from ..cycles.chains import Chain, Loop, following_codes
+from ..cycles.chains import Chain, following_codes
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import jacobian, meshed, residual, residual_and_blocks
 from ..model.modes import capacity, edge_guards, mode_acceleration, mode_of
@@ -41,8 +41,12 @@ WEIGHT = 0.1
 DETERMINED = 1e-3
 #: The integration steps of an arc are cut into so many parts if they leave a larger error in its
 #: equations, relative to the motion: beside a slow belt and under a steep law 1e-8 was seen, which
-#: moved the point by 1e-6, and 1e-15 with the parts.
-PARTS_OF_ARC, EXACT_ARC = 8, 1e-13
+#: moved the point by 1e-6, and 1e-15 with the parts. And each of these once more where a very steep
+#: law holds the orbit in its layer.
+PARTS_OF_ARC, CUT_TIMES, EXACT_ARC = 8, 2, 1e-13
+#: A tangent arc in such a layer may need to be cut once more. That is worth its time where what it
+#: misses is less than this, for from further off Newton's method fails.
+NEARLY_TANGENT = 1e-2
 #: The place of nothing.
 NOWHERE = np.full(5, np.nan)
 #: Functions by what it means that one vanishes: the name of a special point, the belts concerned.
@@ -241,23 +245,39 @@ class CycleSystem(AbstractSystem):
         return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
 
     def remeshed(self, osc, x):
-        loop = Loop(self.chain.codes, self.chain.ends, x[:, :2], x[:, 2])
-        return eqx.tree_at(lambda system: system.chain, self, meshed(osc, loop)[0]).refined(osc, x)
+        chain, _ = meshed(osc, self.chain, z=x)
+        return eqx.tree_at(lambda system: system.chain, self, chain).refined(osc, x)
 
     def refined(self, osc: Oscillator, x: Array) -> "CycleSystem":
         """The same with shorter integration steps on arcs that need them, by the error that their
         steps leave in the equations at x; steps of length zero pad the others."""
-        chain = self.chain
-        values, misses = _on_both_meshes(self, lambda one: residual(osc, one.chain, x))
-        error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
-        is_tangent = chain.ends >= Ends(chain.codes.shape[-1]).tangent
-        error = jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
-        mesh, others = chain.mesh, (PARTS_OF_ARC - 1) * chain.mesh.shape[-1]
+        tangent = self.chain.ends >= Ends(self.chain.codes.shape[-1]).tangent
+        system = self
+        for _ in range(CUT_TIMES):
+            system = system._cut(_inexact_arcs(osc, system, x))
+        finest = system._cut(tangent & _inexact_arcs(osc, system, x))
+        value, miss = residual(osc, finest.chain, x)
+        misses = jnp.append(jnp.where(tangent, value[:, 2], 0.0), miss)
+        is_near = jnp.max(jnp.abs(misses)) < NEARLY_TANGENT
+        nothing = system._cut(jnp.zeros_like(tangent))
+        mesh = jnp.where(is_near, finest.chain.mesh, nothing.chain.mesh)
+        return eqx.tree_at(lambda system: system.chain.mesh, system, mesh)
+
+    def _cut(self, arcs: Array) -> "CycleSystem":
+        """The same with the steps of some arcs cut into parts; zeros pad those of the others."""
+        mesh, others = self.chain.mesh, (PARTS_OF_ARC - 1) * self.chain.mesh.shape[-1]
         fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
-        coarse = jnp.pad(mesh, [(0, 0), (0, others)])
-        is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
-        mesh = jnp.where(is_exact[:, None], coarse, fine)
+        mesh = jnp.where(arcs[:, None], fine, jnp.pad(mesh, [(0, 0), (0, others)]))
         return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
+
+
+def _inexact_arcs(osc: Oscillator, system: CycleSystem, x: Array) -> Array:
+    """The arcs whose integration steps leave an error in the equations at x, by halved ones."""
+    values, misses = _on_both_meshes(system, lambda one: residual(osc, one.chain, x))
+    error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
+    is_tangent = system.chain.ends >= Ends(system.chain.codes.shape[-1]).tangent
+    error = jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
+    return ~(error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2]))))
 
 
 def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:

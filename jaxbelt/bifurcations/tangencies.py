@@ -21,15 +21,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from ..cycles.chains import SIZES, Chain, Loop
 from ..cycles.orbits import Orbit, follow, last_loop, loop_of
-from ..cycles.shooting import admissible, meshed, trace_of
-from ..model.modes import STUCK, mode_acceleration, mode_of
+from ..cycles.shooting import admissible, flow, meshed, tangency_of, trace_of
+from ..model.modes import STUCK, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
+from ..motion.integrators import density
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS, newton
 from ..results import EventKind, Status
@@ -52,6 +54,9 @@ from .systems import (
 DEPARTURE = 1e-5
 #: Integration steps for each arc of that orbit; it takes long to leave.
 DEPARTURE_STEPS = 48
+#: Steps that an arc is followed backwards from a tangency, of what length over the density that is
+#: wanted, and displacements, over the friction that all belts have, within which it is.
+MOST_STEPS_BACK, STRIDE_BACK, BEYOND = 16384, 0.5, 100.0
 
 
 class Encounter(CycleSystem):
@@ -139,13 +144,19 @@ class AbstractTangency(AbstractStickCondition):
         fits = jnp.sum(loop.used) < loop.ends.size  # it may need one arc more
         status = jnp.where(fits | (status != Status.OK), status, Status.TOO_MANY_ARCS.value)
         loop, row, found = _with_stick(osc, loop, self.belt)
-        chain, z = meshed(osc, loop)
         status = jnp.where(found | (status != Status.OK), status, Status.NOT_TOUCHED.value)
         status = jnp.where(velocity_of(osc, self.belt) == 0, Status.STUCK_FOREVER.value, status)
         # The arc before the stick arc is the one that becomes tangent.
-        before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
-        ends = chain.ends.at[before].set(Ends(len(osc.belts)).tangent + self.belt)
-        chain, belts = Chain(chain.codes, ends, chain.mesh), jnp.stack([self.belt, self.belt])
+        before = (row - 1) % jnp.maximum(jnp.sum(loop.used), 1)
+        end = Ends(len(osc.belts)).tangent + self.belt
+        lasts = _duration_to_tangency(osc, jax.tree.map(lambda leaf: leaf[before], loop), end)
+        loop = eqx.tree_at(
+            lambda loop: (loop.ends, loop.durations),
+            loop,
+            (loop.ends.at[before].set(end), loop.durations.at[before].set(lasts)),
+        )
+        chain, z = meshed(osc, loop)
+        belts = jnp.stack([self.belt, self.belt])
         return Encounter(chain, belts, row, self.wanted), z, status
 
     def beginnings(self, osc, cycles):
@@ -284,6 +295,44 @@ def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, A
     )
     loop = jax.tree.map(lambda a, b: jnp.where(has_own, a, b), loop, new)
     return loop, jnp.where(has_own, own, at + 1), has_own | jnp.any(loops)
+
+
+def _duration_to_tangency(osc: Oscillator, arc: Loop, end: Array) -> Array:
+    """How long an arc lasts that is to end tangent to a boundary, by its `end`, if it was entered
+    where the orbit backwards from the point of tangency comes nearest to the entry of this one.
+
+    Before the tangency a steep law holds the orbit in its layer: it moves with the belt, along
+    forces at rest that repel it, while x1 goes on to the point (a canard). Nothing tells that of
+    an orbit that arrives a little earlier or later, but backwards it is attracted.
+    """
+    point = tangency_of(osc, arc.codes, end)
+    # All of the friction may have to be made up for by the spring, at the belt's velocity.
+    mode, held = mode_of(arc.codes), jnp.zeros(())
+    for belt in osc.belts:
+        held = held + belt.load * belt.friction.static
+    longest = 2 * arc.durations + held / jnp.abs(point[1])
+
+    def unfinished(carry):
+        number, _, passed, *_ = carry
+        return (number < MOST_STEPS_BACK) & (passed < longest)
+
+    def step(carry):
+        number, y, passed, nearest, at, where = carry
+        h = jnp.minimum(STRIDE_BACK / density(osc, mode, *y), longest - passed)
+        y = flow(osc, arc.codes, jnp.ones(1), y, -h)
+        away, passed = jnp.sum((y - arc.entries) ** 2), passed + h
+        # Out of reach, backwards, it may go anywhere.
+        longer = jnp.where(jnp.max(jnp.abs(y)) < BEYOND * held, passed, longest)
+        better = away < nearest
+        found = select(better, (away, passed, y), (nearest, at, where))
+        return number + 1, y, longer, *found
+
+    start = jnp.asarray(0), point, jnp.zeros(()), jnp.asarray(jnp.inf), jnp.zeros(()), point
+    *_, nearest, at, y = lax.while_loop(unfinished, step, start)
+    # From that step on straight to where it is nearest.
+    slope = jnp.stack([y[1], mode_acceleration(osc, mode, y[0], y[1])])
+    at = at + jnp.sum(slope * (y - arc.entries)) / jnp.sum(slope * slope)
+    return jnp.where(jnp.isfinite(nearest) & (at > 0), at, arc.durations)
 
 
 # --- the limit at a belt at rest ------------------------------------------------------------------

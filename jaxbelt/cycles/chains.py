@@ -89,4 +89,4 @@ def cut(loops: Sequence[Loop], *, more: int = 0) -> list[Loop]:
     unused = Ends(loops[0].codes.shape[-1]).unused
     longest = max(int(np.sum(np.asarray(loop.ends) != unused)) for loop in loops)
     room = slice(room_of(min(longest + more, SIZES[-1])))
-    return [jax.tree.map(lambda leaf: leaf[room], loop) for loop in loops]
+    return [jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[room]), loop) for loop in loops]

@@ -209,6 +209,7 @@ def cycle_of_zeros(osc: Oscillator) -> Cycle:
     return Cycle(osc, chain, jnp.zeros((arcs, 3)), number, number, whole, whole)
 
 
+@jit
 def as_loop(cycle: Cycle, size: int) -> Loop:
     """The loop that a cycle is, padded to `size` arcs."""
     chain, z = cycle.chain, cycle.unknowns
@@ -386,6 +387,7 @@ def warn_of_fast_loops(
         )
 
 
+@jit
 def _is_inexact(cycle: Cycle, error: Array) -> Array:
     return (cycle.status == Status.NO_CONVERGENCE) | (error > EXACT)
 
@@ -477,11 +479,11 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     return cycle
 
 
-def cycle_from(osc: Oscillator, y0: Array, max_arcs: int | None = None) -> Cycle:
+def cycle_from(osc: Oscillator, y0: Array | np.ndarray, max_arcs: int | None = None) -> Cycle:
     """What `find_cycle` returns, without its checks and its warning."""
     own = in_own_units(osc)
     if own is not osc:
-        return in_given_units(cycle_from(own, y0 / own.units.length, max_arcs), osc, own)
+        return in_given_units(cycle_from(own, own.units.into(y0), max_arcs), osc, own)
     room = SIZES[-1] if max_arcs is None else max_arcs
     loop, count, status, y = _loop_reached(osc, y0, room)
     for _ in range(MORE_BUDGETS if is_concrete(status) else 0):

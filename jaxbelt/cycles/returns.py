@@ -30,6 +30,7 @@ from jaxtyping import Array
 from ..checks import pick
 from ..model.equilibria import Equilibria, EquilibriumKind, side_pulls
 from ..model.far_out import contraction_far_out, is_bounded
+from ..model.friction import AbstractFriction
 from ..model.modes import edges
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
@@ -485,11 +486,17 @@ def _reach_of_friction_that_grows(osc: Oscillator, reach: float) -> float:
 
 
 def _pulls_more_far_out(belt) -> bool:
-    fast = belt.friction.mu(jnp.asarray(np.geomspace(1.0, FARTHEST, 65)))
+    fast = _coefficients(belt.friction, np.geomspace(1.0, FARTHEST, 65))
     return float(belt.load) * float(np.max(fast)) > _largest_pull(belt) * (1 + 1e-9)
 
 
 def _largest_pull(belt) -> float:
     speeds = np.linspace(0.0, 1.0 + abs(float(belt.velocity)), 65)
-    largest = max(float(belt.friction.static), float(np.max(belt.friction.mu(jnp.asarray(speeds)))))
+    coefficients = _coefficients(belt.friction, speeds)
+    largest = max(float(belt.friction.static), float(np.max(coefficients)))
     return float(belt.load) * largest
+
+
+@jit
+def _coefficients(friction: AbstractFriction, speeds: Array) -> Array:
+    return friction.mu(speeds)

@@ -52,6 +52,9 @@ from .chains import Chain, Loop, following_codes
 
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 ARC_STEPS = 8
+#: A mesh is laid along a march of steps of this stride over the `density`, so many at most; more
+#: than this density is never wanted.
+MESH_STRIDE, MESH_MARCH, DENSEST = 0.3, 20_000, 1e5
 #: An arc of a shorter duration may have none: it is the square root of rounding.
 LASTS = 1e-6
 #: An arc magnifies, if its end moves so much faster than its entry.
@@ -92,13 +95,32 @@ def _slip_slopes(osc: Oscillator, codes: Array, y: Array) -> Array:
     return jnp.stack([y[1], mode_acceleration(osc, mode_of(codes), y[0], y[1])])
 
 
-def meshed(osc: Oscillator, loop: Loop, steps: int = ARC_STEPS) -> tuple[Chain, Array]:
-    """The chain of a loop with its mesh, and the guess of its unknowns."""
+def meshed(osc: Oscillator, loop: Loop | Chain, steps: int = ARC_STEPS, z: Array | None = None):
+    """The chain of a loop with its mesh, and the guess of its unknowns.
+
+    z: unknowns of a chain, instead of a loop; its tangent arcs are meshed backwards, from their
+    points, as they are followed.
+    """
+    if z is None:
+        z = jnp.concatenate([loop.entries, loop.durations[:, None]], axis=1)
     stuck = jnp.any(loop.codes == 0, axis=-1)
-    slip = jnp.where(stuck, 0.0, loop.durations)
-    mesh = _meshes(steps)(osc, (loop.codes, loop.entries, slip))
-    z = jnp.concatenate([loop.entries, loop.durations[:, None]], axis=1)
+    slip = jnp.where(stuck, 0.0, z[:, 2])
+    back = loop.ends >= Ends(len(osc.belts)).tangent
+    points = jax.vmap(functools.partial(tangency_of, osc))(loop.codes, loop.ends)
+    starts = jnp.where(back[:, None], points, z[:, :2])
+    mesh = _meshes(steps)(osc, (loop.codes, starts, jnp.where(back, -slip, slip)))
+    mesh = jnp.where(back[:, None], jnp.flip(mesh, axis=1), mesh)
     return lax.stop_gradient((Chain(loop.codes, loop.ends, mesh), z))
+
+
+def tangency_of(osc: Oscillator, codes: Array, end: Array) -> Array:
+    """The point of the boundary with x2' = 0 at which an arc ends that is tangent to it; of any
+    other arc a state with x2 = 0."""
+    velocity = jnp.zeros(())
+    for i, belt in enumerate(osc.belts):
+        is_it = end == Ends(len(osc.belts)).tangent + i
+        velocity = velocity + jnp.where(is_it, belt.velocity / osc.omega, 0.0)
+    return jnp.stack([mode_acceleration(osc, mode_of(codes), jnp.zeros(()), velocity), velocity])
 
 
 @functools.cache
@@ -114,32 +136,51 @@ def _meshes(steps: int) -> Callable:
 
 
 def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
-    """Steps as fractions of the duration, [steps], so that each has about the same share of it."""
-    n = 24
+    """Steps as fractions of the duration, which may be < 0, [steps], so that each has about the
+    same share of it."""
+    way, even = jnp.sign(duration), jnp.linspace(0.0, 1.0, steps + 1)
 
-    def march():
-        def advance(y, _):
-            return _coarse_step(osc, codes, y, duration / n)
+    def march(total):
+        """The share of the whole duration; and the times of even shares of `total`."""
 
-        return lax.scan(advance, y, None, length=n)[1]
+        def unfinished(carry):
+            number, _, _, left, _, _ = carry
+            return (number < MESH_MARCH) & any_lane(left > 0)
+
+        def advance(carry):
+            number, y, rho, left, share, grid = carry
+            # The last step that there is room for goes to the end.
+            wanted = jnp.where(number < MESH_MARCH - 1, MESH_STRIDE / rho, left)
+            h = jnp.minimum(wanted, left)
+            y, after = _coarse_step(osc, codes, y, way * h)
+            more, passed = 0.5 * h * (rho + after), jnp.abs(duration) - left
+            behind = even * total - share
+            inside = (behind >= 0) & (behind <= more)
+            grid = jnp.where(inside, passed + h * behind / jnp.where(more > 0, more, 1.0), grid)
+            return number + 1, y, after, left - h, share + more, grid
+
+        at = _density_at(osc, codes, y)
+        start = jnp.asarray(0), y, at, jnp.abs(duration), jnp.zeros(()), jnp.zeros(steps + 1)
+        *_, share, grid = lax.while_loop(unfinished, advance, start)
+        return share, grid
 
     # Stick phases, and what pads a chain, take no steps.
-    rest = lax.cond(any_lane(duration != 0), march, lambda: jnp.ones(n))
-    rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
+    _, grid = march(march(jnp.ones(()))[0])
+    grid = grid.at[-1].set(jnp.abs(duration)) / jnp.where(duration == 0, 1.0, jnp.abs(duration))
+    return jnp.diff(jnp.where(duration == 0, even, grid))
+
+
+def _density_at(osc: Oscillator, codes: Array, y: Array) -> Array:
     # Clipped: where a guess is poor the mesh is only less good.
-    rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
-    share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
-    grid = jnp.interp(
-        jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
-    )
-    return jnp.diff(grid)
+    rho = density(osc, mode_of(codes), *y)
+    return jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, DENSEST)
 
 
 @lanes_in_one_kernel
 def _coarse_step(osc: Oscillator, codes: Array, y: Array, h: Array) -> tuple[Array, Array]:
     """The state after a step, and the density of steps that is wanted there."""
     y = _step(functools.partial(_slip_slopes, osc, codes), y, h, _COARSE)
-    return y, density(osc, mode_of(codes), *y)
+    return y, _density_at(osc, codes, y)
 
 
 def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, extra=None):
@@ -163,15 +204,18 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     def advance(state, fraction):
         return _step(field, state, slip_time * fraction, _FINE), None
 
-    def advance_some(state, fractions):
-        # What pads a mesh is not worth a step.
-        some = any_lane(jnp.any(fractions > 0))
-        return lax.cond(some, lambda: lax.scan(advance, state, fractions)[0], lambda: state), None
+    def through(state, fractions):
+        if fractions.size <= ARC_STEPS or fractions.size % ARC_STEPS:
+            return lax.scan(advance, state, fractions)[0]
+        # What pads a mesh is not worth a step, nor a look at each.
+        blocks = fractions.reshape(min(fractions.size // ARC_STEPS, ARC_STEPS), -1)
+        return lax.scan(through_some, state, blocks)[0]
 
-    if mesh.size > ARC_STEPS and mesh.size % ARC_STEPS == 0:
-        slipped, _ = lax.scan(advance_some, start, mesh.reshape(-1, ARC_STEPS))
-    else:
-        slipped, _ = lax.scan(advance, start, mesh)
+    def through_some(state, fractions):
+        some = any_lane(jnp.any(fractions > 0))
+        return lax.cond(some, lambda: through(state, fractions), lambda: state), None
+
+    slipped = through(start, mesh)
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
     stuck_end = jnp.stack([y[0] + v * duration, v])
     if extra is not None:
@@ -248,11 +292,7 @@ def _followed(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> A
     """`_arc_equations` of an arc that is used."""
     names = Ends(len(osc.belts))
     is_tangent = end >= names.tangent
-    velocity = jnp.zeros(())
-    for i, belt in enumerate(osc.belts):
-        velocity = velocity + jnp.where(end == names.tangent + i, belt.velocity / osc.omega, 0.0)
-    x1 = mode_acceleration(osc, mode_of(codes), jnp.zeros(()), velocity)
-    point = jnp.stack([x1, velocity])
+    point = tangency_of(osc, codes, end)
     start = jnp.where(is_tangent, point, unknown[:2])
     back = is_tangent | backwards
     duration = jnp.where(back, -unknown[2], unknown[2])

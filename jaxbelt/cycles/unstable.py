@@ -23,7 +23,7 @@ from ..model.equilibria import Equilibria, EquilibriumKind, candidates, equilibr
 from ..model.modes import STUCK
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.own_units import in_given_units, in_own_units
-from ..numerics.compiling import each, is_outermost, jit
+from ..numerics.compiling import each, in_groups, is_outermost, jit
 from ..results import Status
 from .attractors import arcs_of, place_of
 from .chains import SIZES, Loop, modes_of
@@ -99,7 +99,11 @@ def separating_loop(osc: Oscillator, size: int, around: int = 0) -> tuple[Loop, 
 
 @jit
 def _separating_loop(osc: Oscillator, rests: Equilibria, around: Array, size: int):
-    still, rests = lax.stop_gradient((osc, rests))
+    separating = in_groups(functools.partial(_separating_in_lanes, size=size))
+    return separating(*lax.stop_gradient((osc, rests, around)))
+
+
+def _separating_in_lanes(still: Oscillator, rests: Equilibria, around: Array, size: int):
     eligible = _eligible(rests)
     meant = eligible & (jnp.cumsum(eligible) - 1 == around)
     exists = jnp.any(meant)
@@ -124,7 +128,7 @@ def _separating_loop(osc: Oscillator, rests: Equilibria, around: Array, size: in
     bracket, (found, orbits) = lax.scan(narrow, jnp.array([1e-4, 10.0]), None, length=REFINEMENTS)
     orbit = jax.tree.map(lambda leaf: leaf[-1], orbits)
     status = jnp.where(exists & found[0], Status.OK.value, Status.NO_UNSTABLE_CYCLE.value)
-    return loop_of(orbit, size, len(osc.belts)), status, bracket[0]
+    return loop_of(orbit, size, len(still.belts)), status, bracket[0]
 
 
 @jit

@@ -45,6 +45,7 @@ from .selection import (
     ITERATIONS,
     LONGEST_CHANGE,
     Selection,
+    own_units_of,
     selection_of,
     sizes_of,
     told_to,
@@ -208,8 +209,7 @@ class Fit(eqx.Module):
     errors are
     those of the linearised problem: right where the model is and the errors are small. With a
     MISFIT they mean nothing, and `table` and the text leave them out. noise_was_estimated: whether
-    it was, of a column at least; units: of the parameters, by how much each changes the oscillator
-    by its own size, as a power of two, [p].
+    it was, of a column at least.
     """
 
     oscillator: Oscillator
@@ -229,8 +229,7 @@ class Fit(eqx.Module):
     candidates: int
     evaluations: int
     status: Array
-    noise_was_estimated: bool = eqx.field(static=True)
-    units: np.ndarray
+    noise_was_estimated: bool = eqx.field(static=True, default=False)
 
     @property
     def undetermined(self) -> tuple[tuple[str, ...], ...]:
@@ -238,7 +237,7 @@ class Fit(eqx.Module):
         name by itself the parameter. Empty unless the status is NOT_IDENTIFIED."""
         if int(self.status) != Status.NOT_IDENTIFIED:
             return ()
-        sizes = sizes_of(self.estimates, self.units)
+        sizes = sizes_of(self.estimates, own_units_of(self.oscillator, self.names))
         return _undetermined(self.names, self.covariance, sizes)
 
     def intervals(self, level: float = 0.95) -> Array:
@@ -544,7 +543,6 @@ def _result(
         evaluations=evaluations,
         status=jnp.asarray(status.value),
         noise_was_estimated=estimated,
-        units=np.asarray(selection.unit),
     )
 
 

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.special import gammaincc, gammaincinv
 
 #: Length of the first windows, less than half a loop: no phase is lost over it.
 WINDOW = 2.5
@@ -97,6 +96,8 @@ def local_cubics(ts: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.nda
     inverse = np.linalg.pinv(powers)
     cubics = np.einsum("tpi,ti->tp", inverse, x[rows])
     off = x[rows] - np.einsum("tip,tp->ti", powers, cubics)
+    from scipy.special import gammaincinv  # late, as only fits need it
+
     # The median: corners of the motion are no noise. That of chi^2 is below its mean, the freedom.
     freedom = 2 * half - 3
     median = 2 * gammaincinv(0.5 * freedom, 0.5)
@@ -120,6 +121,8 @@ def verdict_on(off: np.ndarray, chi2: float, freedom: int, estimated: bool) -> V
     """
     if not np.isfinite(chi2):
         return Verdict(np.nan, np.nan, np.nan, False)
+    from scipy.special import gammaincc  # late, as only fits need it
+
     plausibility = float(gammaincc(0.5 * freedom, 0.5 * chi2))
     correlation = _autocorrelation(off)
     # Noise that was taken from the record is no witness: it may be the motion's own.

@@ -92,9 +92,9 @@ def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, n
         require(lower < value < upper, name, inside, f"{value:.12g}")
         pairs.append((lower, upper))
     lower, upper = jnp.asarray(pairs).T
-    units = [_own_unit(osc, group[0], value) for group, value in zip(groups, values, strict=True)]
-    size = jnp.asarray(sizes_of(values, np.array(units)))
-    selection = Selection(groups, names, lower, upper, size, jnp.asarray(np.array(units)))
+    units = own_units_of(osc, names)
+    size = jnp.asarray(sizes_of(values, units))
+    selection = Selection(groups, names, lower, upper, size, jnp.asarray(units))
     return selection, np.asarray(selection.unbounded(jnp.asarray(values)))
 
 
@@ -103,11 +103,18 @@ def sizes_of(values: ArrayLike, units: ArrayLike) -> np.ndarray:
     return np.maximum(np.abs(np.asarray(values)), SMALLEST * np.asarray(units))
 
 
-def _own_unit(osc: Oscillator, leaf: int, value: float) -> float:
-    """By how much a parameter changes the oscillator in its own units by one, as a power of two."""
-    own = Variation.of_leaves(osc, [leaf]).in_own_units(np.array([value]))
-    assert own.units is not None
-    return float(own.units.parameters[0])
+def own_units_of(osc: Oscillator, names: Sequence[str]) -> np.ndarray:
+    """By how much each parameter changes the oscillator in its own units by one, as powers of two.
+
+    names: as in `Selection`.
+    """
+    named, leaves, units = names_of(osc), jax.tree.leaves(osc), []
+    for name in names:
+        leaf = named.index(name.partition(" = ")[0])
+        own = Variation.of_leaves(osc, [leaf]).in_own_units(np.array([float(leaves[leaf])]))
+        assert own.units is not None
+        units.append(float(own.units.parameters[0]))
+    return np.array(units)
 
 
 def _pairs_of(bounds: Any, names: Sequence[str]) -> list[tuple[float, float] | None]:

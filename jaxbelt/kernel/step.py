@@ -23,9 +23,8 @@ size one in the linearised field.
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -47,6 +46,7 @@ from ..model.modes import (
 from ..model.modes import edges as edge_positions
 from ..model.oscillator import Oscillator
 from ..model.rest import is_at_rest
+from ..numerics.compiling import the_solvers
 from .lanes import Lanes, choose, materialise
 
 #: First step of a run and after each event, at a tolerance of 1e-8: about what the tolerance allows
@@ -59,9 +59,11 @@ STEP_SAFETY = 0.9
 #: Bounds of error/tolerance. Smaller values may be rounding; larger ones, and NaN, shrink a step by
 #: no more than a factor of 100000^(1/8), 4.2.
 LEAST_ERROR, LARGEST_ERROR = 1e-5, 1e5
-#: Longest way to a guard that a Taylor step bridges, over the square root of the tolerance: the
-#: terms that it leaves out are below the tolerance then.
+#: Longest time that a Taylor step to a guard bridges, over the square root of the tolerance: where
+#: x2'' is of order one, the terms that it leaves out are far below the tolerance then.
 LANDING = 0.1
+#: Largest of these terms, x2'' delta^2, over the tolerance: heavy belts change x2' faster.
+LEFT_OUT = 0.1
 #: Speed over |x2'| below which an edge is passed slowly: over a way d, the terms that the Taylor
 #: step leaves out grow like (|x2'| d / x2^2)^2.
 SLOW = 0.1
@@ -70,27 +72,35 @@ NO_STEP = 1e-15
 #: A time that no Taylor step bridges, and finite, so that derivatives are.
 NEVER = 1e300
 
-#: Order eight takes twice the stages of order five and a third of the steps at 1e-8, and most of a
-#: step's cost is not in its stages but in its interpolant, bounds and choices.
-_TABLEAU = diffrax.Dopri8.tableau
 
+class _Tableau(NamedTuple):
+    """Weights of the stages' accelerations for x'' = a: in x2 (`a`) and in x1 (`aa`), a row a
+    stage, the last one the solution; the stages' times `c`; the same weights of the error estimate
+    (`e`, `ea`).
 
-def _nystroem() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The tableau for x'' = a: weights of the stages' accelerations in x2 and in x1.
-
-    A row a stage, the last one the solution, and the same of the error estimate.
+    linear: a bound of the error of a step of y' = k y, over (h k)^8 y, for h k up to 0.9: a quarter
+    of its estimate, which is sixteen times the error at 0.7 and nine times at 0.9.
     """
-    n = _TABLEAU.b_sol.size
+
+    a: np.ndarray
+    aa: np.ndarray
+    c: np.ndarray
+    e: np.ndarray
+    ea: np.ndarray
+    linear: float
+
+
+@functools.cache
+def _nystroem() -> _Tableau:
+    # Order eight takes twice the stages of order five and a third of the steps at 1e-8, and most of
+    # a step's cost is not in its stages but in its interpolant, bounds and choices.
+    tableau = the_solvers().Dopri8.tableau
+    n, e = tableau.b_sol.size, tableau.b_error
     a = np.zeros((n, n))
-    for i, row in enumerate(_TABLEAU.a_lower):
+    for i, row in enumerate(tableau.a_lower):
         a[i + 1, : row.size] = row
-    return a, a @ a, a.sum(axis=1), _TABLEAU.b_error, _TABLEAU.b_error @ a
-
-
-_A, _AA, _C, _E, _EA = _nystroem()
-#: A bound of the error of a step of y' = k y, over (h k)^8 y, for h k up to 0.9: a quarter of its
-#: estimate, which is sixteen times the error at 0.7 and nine times at 0.9.
-_E_LINEAR = 0.25 * float(np.abs(_E @ np.linalg.matrix_power(_A, 7) @ np.ones(_E.size)))
+    linear = 0.25 * float(np.abs(e @ np.linalg.matrix_power(a, 7) @ np.ones(e.size)))
+    return _Tableau(a, a @ a, a.sum(axis=1), e, e @ a, linear)
 
 
 class _Window(eqx.Module):
@@ -235,25 +245,26 @@ def attempt(
     """One Runge-Kutta step of all lanes; rates, derivatives: see `take_step`."""
     x1, x2, stages = lanes.x1, lanes.x2, [lanes.a]
     slopes = [rates(osc, lanes.mode, lanes.t, x1, x2)] if rates else []
-    for row, row1, c in zip(_A[1:-1], _AA[1:-1], _C[1:-1].tolist(), strict=True):
+    own = _nystroem()
+    for row, row1, c in zip(own.a[1:-1], own.aa[1:-1], own.c[1:-1].tolist(), strict=True):
         drift = c * x2 + h * _combine(row1, stages) if np.any(row1) else c * x2
         x2_stage = x2 + h * _combine(row, stages)
         stages.append(_quotient(osc, window, ones, x1 + h * drift, x2_stage))
         if rates:
             slopes.append(rates(osc, lanes.mode, lanes.t + c * h, x1 + h * drift, x2_stage))
     # The weights of the solution are those of the last stage, which is the next step's first.
-    y1 = materialise(x1 + h * (x2 + h * _combine(_AA[-1], stages)), ones)
-    y2 = materialise(x2 + h * _combine(_A[-1], stages), ones)
+    y1 = materialise(x1 + h * (x2 + h * _combine(own.aa[-1], stages)), ones)
+    y2 = materialise(x2 + h * _combine(own.a[-1], stages), ones)
     stages.append(_quotient(osc, window, ones, y1, y2))
     scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
     scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
-    error1, error2 = jnp.abs(h * h * _combine(_EA, stages)), jnp.abs(h * _combine(_E, stages))
+    error1, error2 = jnp.abs(h * h * _combine(own.ea, stages)), jnp.abs(h * _combine(own.e, stages))
     error = jnp.maximum(error1 * scale2, error2 * scale1) / (scale1 * scale2)
     if derivatives:
         ends = (x1, x2), (y1, y2)
         fastest = functools.reduce(jnp.maximum, [_rate(osc, window, ones, *end) for end in ends])
-        error = jnp.maximum(error, _E_LINEAR / rtol * ((h * fastest) ** 2) ** 4)
-    integrals = jax.tree.map(lambda i, *s: i + h * _combine(_A[-1], s), lanes.integrals, *slopes)
+        error = jnp.maximum(error, own.linear / rtol * ((h * fastest) ** 2) ** 4)
+    integrals = jax.tree.map(lambda i, *s: i + h * _combine(own.a[-1], s), lanes.integrals, *slopes)
     return _Attempt(h, y1, y2, stages[-1], lax.stop_gradient(error), integrals)
 
 
@@ -312,14 +323,21 @@ class _Landing(eqx.Module):
 
 
 def _landing(
-    window: _Window, ones, lanes: Lanes, new: _Attempt, path: _Interpolant, rtol
+    window: _Window, ones, lanes: Lanes, new: _Attempt, path: _Interpolant, rtol, atol
 ) -> _Landing:
     low, high = _bounds_of_x2(window, ones, lanes)
     beyond_extremum = path.has_extremum & ((path.x2_extremum > high) | (path.x2_extremum < low))
     peak = jnp.where(beyond_extremum, path.x2_extremum, new.x2)
     reach = LANDING * jnp.sqrt(rtol)
     bound = jnp.where(new.a > 0, high, low)
+    room = LEFT_OUT * (atol + rtol * jnp.abs(new.x2)) * new.h
+
+    def is_straight(way, speed):
+        """Whether x2'' over the step is small enough to be left out on that way."""
+        return way * way * jnp.abs(new.a - lanes.a) <= room * speed * speed
+
     reached = ~beyond_extremum & (jnp.abs(bound - new.x2) <= reach * jnp.abs(new.a))
+    reached = reached & is_straight(bound - new.x2, new.a)
     slope = jnp.where(reached, new.a, 1.0)
     delta = jnp.where(reached, bound - new.x2, NEVER) / slope
     # The next term counts where x2' is small, and there x2'' is -x2.
@@ -333,7 +351,10 @@ def _landing(
     start, end = lanes.x2, peak
     on_edge, edge = jnp.zeros_like(reached), lanes.x1
     if window.x1 is not None:
-        edge, near, delta1 = _way_to_edge(window.x1, new, reach)
+        reached = reached & ~_passes_edge(window.x1, new, delta)
+        delta = jnp.where(reached, delta, NEVER)
+        blocked = outside & ~reached
+        edge, near, delta1 = _way_to_edge(window.x1, new, reach, is_straight)
         on_edge = near & (delta1 < delta)
         reached, delta = reached | near, jnp.minimum(delta, delta1)
         integral, beyond, side = _beyond_edge(window.x1, lanes, new, near, poly)
@@ -356,13 +377,26 @@ def _landing(
     )
 
 
-def _way_to_edge(x1: tuple[Array, Array], new: _Attempt, reach) -> tuple[Array, Array, Array]:
+def _passes_edge(x1: tuple[Array, Array], new: _Attempt, delta) -> Array:
+    """Whether the Taylor step onward to a boundary would pass an edge, and not by rounding only."""
+    left, right = x1
+    end = new.x1 + delta * (new.x2 + 0.5 * delta * new.a)
+    rounding = ULPS * (1 + jnp.abs(end))
+    passes_right = (new.x1 <= right) & (end > right + rounding)
+    passes_left = (new.x1 >= left) & (end < left - rounding)
+    return (delta > 0) & (passes_right | passes_left)
+
+
+def _way_to_edge(
+    x1: tuple[Array, Array], new: _Attempt, reach, is_straight: Callable[[Array, Array], Array]
+) -> tuple[Array, Array, Array]:
     """The edge ahead, whether a Taylor step bridges the way to it, and the time that it takes."""
     left, right = x1
     edge = jnp.where(new.x2 > 0, right, left)
     # Slow passages are bridged over less of the way, for there x2' counts more than x2.
     way, speed = edge - new.x1, jnp.abs(new.x2)
     near = jnp.abs(way) * jnp.maximum(speed, SLOW * jnp.abs(new.a)) < reach * speed * speed
+    near = near & is_straight(way, speed)
     there = jnp.abs(way) <= ULPS * jnp.abs(new.x1)
     slope = jnp.where(near, new.x2, 1.0)
     delta = jnp.where(near, way, jnp.where(there, 0.0, NEVER)) / slope
@@ -429,7 +463,7 @@ def take_step(
     h = jnp.where(going, jnp.minimum(lanes.h, remaining), 0.0)
     new = attempt(osc, window, ones, lanes, h, rtol, atol, rates, derivatives)
     path = _interpolate(ones, lanes, new)
-    at = _landing(window, ones, lanes, new, path, rtol)
+    at = _landing(window, ones, lanes, new, path, rtol, atol)
     blocked, reached = at.blocked, at.reached
     if derivatives:
         # At rest no bound has a say in how the neighbours of a lane move.

@@ -107,13 +107,21 @@ _asked_of_kinks: set[type] = set()
 
 
 def check_law(law: AbstractFriction) -> None:
-    """Raise a `ValueError` where `mu` of a law of one's own cannot be traced, once for each class.
+    """Raise a `ValueError` where a law of one's own holds what is no number and not static, or its
+    `mu` cannot be traced, the latter once for each class.
 
     A law that asks NumPy for an exponential gives right numbers by itself and fails inside of what
     is compiled.
     """
     kind = type(law)
-    if kind in _traced or kind.__module__ == __name__:
+    if kind.__module__ == __name__:
+        return
+    for path, leaf in jax.tree_util.tree_flatten_with_path(law)[0]:
+        name = jax.tree_util.keystr(path).lstrip(".")
+        expected = "a number or an array, or declared as equinox.field(static=True)"
+        is_number = isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int)
+        require_value(is_number, f"{name} of {kind.__name__}", expected, leaf)
+    if kind in _traced:
         return
     speed = jax.ShapeDtypeStruct((), jnp.float64)
 

@@ -21,6 +21,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -44,6 +45,10 @@ class OwnUnits(eqx.Module):
     def is_given(self) -> bool:
         """Whether these are known, and those of the user."""
         return is_concrete(self) and bool(np.all([self.length, self.velocity] == np.ones(2)))
+
+    def into(self, states: Any) -> Any:
+        """States (x1, x2) of the user in these units."""
+        return states if self is _units_of_one() else states / self.length
 
     def back(self, value: Any, *dimensions: str) -> Any:
         """A quantity in the units of the user; see `quantity`."""
@@ -119,10 +124,10 @@ def in_own_units(osc: Oscillator, length: ArrayLike | None = None) -> OwnOscilla
     length = own_length(osc) if length is None else length
     known = is_concrete((osc.omega, length))
     omega: Any = np.asarray(osc.omega) if known else osc.omega
-    units = OwnUnits(length, omega * length)
     if known and length == 1 and omega == 1:
-        return _unchecked(OwnOscillator, **vars(osc), units=units)
-    fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=_ONE)
+        return _unchecked(OwnOscillator, **vars(osc), units=_units_of_one())
+    units = _known_units(length, omega * length) if known else OwnUnits(length, omega * length)
+    fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=jnp.ones(()))
     return _unchecked(OwnOscillator, **fields, units=units)
 
 
@@ -132,11 +137,20 @@ def in_units_of_run(osc: Oscillator) -> OwnOscillator:
     An oscillator that comes in its own units gets its results in these.
     """
     own = in_own_units(osc)
-    return own if own is not osc else _unchecked(OwnOscillator, **vars(own) | dict(units=_ONES))
+    if own is not osc:
+        return own
+    return _unchecked(OwnOscillator, **vars(own) | dict(units=_units_of_one()))
 
 
-_ONE = np.ones(())
-_ONES = OwnUnits(_ONE, _ONE)
+def _known_units(length: Any, velocity: Any) -> OwnUnits:
+    with jax.ensure_compile_time_eval():
+        return OwnUnits(*(jnp.asarray(np.asarray(unit)) for unit in (length, velocity)))
+
+
+@functools.cache
+def _units_of_one() -> OwnUnits:
+    """Made once, as to put a number into JAX takes as long as all else."""
+    return _known_units(1.0, 1.0)
 
 
 def in_units(value: Any, unit: Any, default: float) -> Any:
@@ -197,22 +211,21 @@ def rescaled(
     oscillator: what to put in the place of one; None: those in own units as their user has them.
     """
     put = in_units_of_user if oscillator is None else oscillator
+    is_one = _is_one(length)
 
     def walked(value: Any) -> Any:
         if isinstance(value, Oscillator):
             return put(value)
         if isinstance(value, eqx.Module):
             new = {}
-            for field in dataclasses.fields(value):
-                old = getattr(value, field.name)
-                dimensions = field.metadata.get("dimensions")
-                changed = (
-                    walked(old)
-                    if dimensions is None
-                    else rescaled_quantity(old, length, dimensions)
-                )
+            for name, dimensions in _fields_of(type(value)):
+                old = vars(value)[name]
+                if dimensions is None:
+                    changed = walked(old)
+                else:
+                    changed = old if is_one else rescaled_quantity(old, length, dimensions)
                 if changed is not old:
-                    new[field.name] = changed
+                    new[name] = changed
             return _unchecked(type(value), **{**vars(value), **new}) if new else value
         if type(value) in (tuple, list):
             return type(value)(map(walked, value))
@@ -223,17 +236,30 @@ def rescaled(
     return walked(result)
 
 
+@functools.cache
+def _fields_of(kind: type) -> list[tuple[str, tuple[str, ...] | None]]:
+    """The names of the fields of a module, and the dimensions of those that have any."""
+    return [(one.name, one.metadata.get("dimensions")) for one in dataclasses.fields(kind)]
+
+
+def _is_one(length: Any) -> bool:
+    if length is _units_of_one().length:
+        return True
+    return is_concrete(length) and bool(np.all(np.asarray(length) == 1))
+
+
 def rescaled_quantity(value: Any, length: Any, dimensions: tuple[str, ...]) -> Any:
     """A quantity of known dimensions in a unit of length that is 1/length of the one before."""
     powers = [POWERS[name] for name in dimensions]
-    is_same = is_concrete(length) and np.all(np.asarray(length) == 1)
-    if value is None or is_same or not any(powers):
+    if value is None or _is_one(length) or not any(powers):
         return value
     factors = [length**power for power in powers]
     if isinstance(value, float):
         return value * float(factors[0])
     one: Any = np if isinstance(value, np.ndarray) else jnp
-    return value * (one.stack(factors) if len(factors) > 1 else factors[0])
+    columns = one.stack([one.asarray(factor) for factor in factors])
+    many = (1,) * (one.ndim(value) - 1) + (-1,)
+    return value * (one.reshape(columns, many) if len(factors) > 1 else columns[0])
 
 
 def in_units_of_user(own: Oscillator) -> Oscillator:

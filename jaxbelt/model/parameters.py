@@ -34,7 +34,7 @@ class Parameter:
     __hash__ = object.__hash__
 
 
-def names_of(osc: Oscillator) -> list[str]:
+def names_of(osc: Any) -> list[str]:
     """The names of the leaves in their order, such as "belts[0].velocity"."""
     paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(osc)]
     return [jax.tree_util.keystr(path).removeprefix(".") for path in paths]

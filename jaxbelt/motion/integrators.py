@@ -10,10 +10,10 @@ A state is a tuple of scalars, (x1, x2), and a field a function of it.
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from jaxtyping import Array
 
 from ..model.modes import Mode, fastest_rate, mode_acceleration
 from ..model.oscillator import Oscillator
+from ..numerics.compiling import the_solvers
 from ..numerics.extrapolation import increments, scheme
 
 State = tuple[Array, Array]
@@ -80,34 +81,41 @@ def slip_field(osc: Oscillator, mode: Mode, y: State) -> State:
 # --- steps whose error is controlled --------------------------------------------------------------
 
 
-class _Extrapolation(diffrax.AbstractAdaptiveSolver):
-    """The midpoint rule extrapolated to order eight, the error from the extrapolation to six.
+@functools.cache
+def _extrapolation() -> Any:
+    """The solver of `Adaptive`."""
+    dfx = the_solvers()
 
-    Its state is where its last step began and where it ended, (t, x1, x2) each.
-    """
+    class _Extrapolation(dfx.AbstractAdaptiveSolver):
+        """The midpoint rule extrapolated to order eight, the error from the extrapolation to six.
 
-    scheme: ClassVar = scheme((2, 4, 6, 8), (2, 4, 6))
-    term_structure = diffrax.ODETerm
-    interpolation_cls = diffrax.LocalLinearInterpolation
+        Its state is where its last step began and where it ended, (t, x1, x2) each.
+        """
 
-    def order(self, terms):
-        return 7  # that of the controlled error
+        scheme: ClassVar = scheme((2, 4, 6, 8), (2, 4, 6))
+        term_structure = dfx.ODETerm
+        interpolation_cls = dfx.LocalLinearInterpolation
 
-    def init(self, terms, t0, t1, y0, args):
-        return (t0, *y0), (t0, *y0)
+        def order(self, terms):
+            return 7  # that of the controlled error
 
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
+        def init(self, terms, t0, t1, y0, args):
+            return (t0, *y0), (t0, *y0)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        def field(y):
-            return terms.vf(t0, y, args)
+        def func(self, terms, t0, y0, args):
+            return terms.vf(t0, y0, args)
 
-        best, lower = increments(field, y0, t1 - t0, self.scheme)
-        y1 = tuple(a + b for a, b in zip(y0, best, strict=True))
-        error = tuple(a - b for a, b in zip(best, lower, strict=True))
-        last = (t0, *y0), (t1, *y1)
-        return y1, error, {"y0": y0, "y1": y1}, last, diffrax.RESULTS.successful
+        def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+            def field(y):
+                return terms.vf(t0, y, args)
+
+            best, lower = increments(field, y0, t1 - t0, self.scheme)
+            y1 = tuple(a + b for a, b in zip(y0, best, strict=True))
+            error = tuple(a - b for a, b in zip(best, lower, strict=True))
+            last = (t0, *y0), (t1, *y1)
+            return y1, error, {"y0": y0, "y1": y1}, last, dfx.RESULTS.successful
+
+    return _Extrapolation()
 
 
 class Adaptive(AbstractIntegrator):
@@ -152,21 +160,22 @@ class Adaptive(AbstractIntegrator):
             # A lane that has nothing to do, and may be NaN, must not keep a batch waiting.
             return jnp.where(self.span > 0, jnp.maximum(*(jnp.abs(part) for part in y)), 0.0)
 
+        dfx = the_solvers()
         # Where no event is looked for, a step may be as long as its error allows.
         first, longest = (1.0, 1.0) if ends_outside is None else (FIRST_FRACTION, MAX_FRACTION)
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(scaled),
-            _Extrapolation(),
+        solution = dfx.diffeqsolve(
+            dfx.ODETerm(scaled),
+            _extrapolation(),
             t0=0.0,
             t1=1.0,
             dt0=first,
             y0=y,
-            saveat=diffrax.SaveAt(solver_state=True),
-            stepsize_controller=diffrax.PIDController(
+            saveat=dfx.SaveAt(solver_state=True),
+            stepsize_controller=dfx.PIDController(
                 rtol=self.rtol, atol=self.atol, dtmax=longest, norm=norm
             ),
-            event=None if ends_outside is None else diffrax.Event(ends_outside),
-            adjoint=diffrax.ForwardMode(),
+            event=None if ends_outside is None else dfx.Event(ends_outside),
+            adjoint=dfx.ForwardMode(),
             max_steps=MAX_ADAPTIVE_STEPS,
             throw=False,
         )
@@ -180,9 +189,11 @@ class Adaptive(AbstractIntegrator):
 def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     """How many steps per unit of time an orbit wants: more where the friction law bends.
 
-    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0. And at least
-    half the rate at which disturbances change in the linearised field: of that, the motion itself
-    tells nothing where it is small.
+    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0. That of a
+    steep law tells nothing until the orbit is in its layer at r = 0, which a step of its own length
+    would jump: outside of the layer the length is the distance from it, so that each step goes at
+    most about half of the way. And at least half the rate at which disturbances change in the
+    linearised field: of that, the motion itself tells nothing where it is small.
     """
     a, a_by_x2 = jax.jvp(
         lambda x2: mode_acceleration(osc, mode, x1, x2), (x2,), (jnp.ones_like(x2),)
@@ -194,9 +205,11 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
         def slope(r, belt=belt):
             return jax.jvp(belt.friction.mu, (r,), (jnp.ones_like(r),))[1]
 
-        curvature = jax.jvp(slope, (speed,), (jnp.ones_like(speed),))[1]
-        slips = jnp.abs(code) == 1
-        bend = bend + jnp.where(slips, jnp.sqrt(jnp.abs(belt.load * curvature)), 0.0)
+        speeds = jnp.stack([speed, jnp.zeros_like(speed)])
+        curvature = jax.jvp(slope, (speeds,), (jnp.ones_like(speeds),))[1]
+        here, at_boundary = jnp.sqrt(jnp.abs(belt.load * curvature))
+        nearing = at_boundary / (1 + at_boundary * speed)
+        bend = bend + jnp.where(jnp.abs(code) == 1, jnp.maximum(here, nearing), 0.0)
     near_extremum = jnp.sqrt(bend * jnp.abs(osc.omega * x2))  # where x2' = 0, x2'' = -x2
     wanted = 1 + 0.4 * bend * jnp.abs(osc.omega * a) + near_extremum
     return jnp.maximum(wanted, 0.5 * fastest_rate(a_by_x2))

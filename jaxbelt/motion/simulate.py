@@ -133,12 +133,14 @@ class Trajectory(eqx.Module):
     def __repr__(self) -> str:
         if not is_concrete(self.ts) or self.ts.ndim != 1:
             return f"Trajectory(ts={self.ts.shape}, ys={self.ys.shape})"
-        known = np.asarray(self.ts)[np.all(np.isfinite(self.ys), axis=1)]
+        ts = np.asarray(self.ts)
+        known = ts[np.all(np.isfinite(self.ys), axis=1)]
         until = f", known up to {known[-1]:.6g}" if known.size else ", nothing of it known"
-        until = until if known.size < self.ts.size else ""
+        until = until if known.size < ts.size else ""
+        span = f"t {ts[0]:.6g} to {ts[-1]:.6g}{until}, " if ts.size else ""
         return (
-            f"Trajectory(t {self.ts[0]:.6g} to {self.ts[-1]:.6g}{until}, {self.ts.size} samples, "
-            f"{self.events!r}, status {Status(int(self.status)).name}: {describe(self.status)})"
+            f"Trajectory({span}{ts.size} samples, {self.events!r}, "
+            f"status {Status(int(self.status)).name}: {describe(self.status)})"
         )
 
 

@@ -8,7 +8,6 @@ to zero they approach the exact motion at first order. The switch field is disco
 derivatives through its integration lack the jumps at the band: take them from the exact one.
 """
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -17,6 +16,7 @@ from jaxtyping import Array
 from ..model.modes import STUCK, Mode, capacity, mode_acceleration, select, stick_velocity
 from ..model.oscillator import Oscillator
 from ..model.transitions import contact
+from ..numerics.compiling import the_solvers
 from ..numerics.derivatives import forward_jacobian
 
 #: Steps between two samples before a run is given up.
@@ -76,16 +76,17 @@ def smooth_field(osc: Oscillator, y: tuple[Array, Array], eps: Array) -> tuple[A
 
 @forward_jacobian
 def _smoothed_flow(field, osc, width, y, duration, rtol, atol):
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, args: field(osc, y, width)),
-        diffrax.Tsit5(scan_kind="lax"),
+    dfx = the_solvers()
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: field(osc, y, width)),
+        dfx.Tsit5(scan_kind="lax"),
         t0=jnp.zeros_like(duration),
         t1=duration,
         dt0=None,
         y0=y,
-        saveat=diffrax.SaveAt(t1=True),
-        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol, dtmax=0.5),
-        adjoint=diffrax.ForwardMode(),
+        saveat=dfx.SaveAt(t1=True),
+        stepsize_controller=dfx.PIDController(rtol=rtol, atol=atol, dtmax=0.5),
+        adjoint=dfx.ForwardMode(),
         max_steps=MAX_STEPS_A_SAMPLE,
         throw=False,
     )

@@ -2,6 +2,7 @@
 
 - `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `one_kernel_alone`,
   `lanes_in_one_kernel`, `with_batches`, `wide`, `any_lane` and `where_any` save time of running.
+- What `jit` and `wide` compile is kept on disk by `programs`, which uses what is not promised, too.
 - `depends` and `is_affine` look at what a function does with its arguments.
 - `require_own_threads` looks at whether JAX was in use before a process was forked.
 
@@ -27,6 +28,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
+from . import programs
 from .widths import SideBySide, is_cpu
 
 #: Whether to use only what is promised.
@@ -72,6 +74,16 @@ def is_concrete(value: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
 
+@functools.cache
+def the_solvers() -> Any:
+    """diffrax, imported when something is compiled: it takes a quarter of a second."""
+    # Arrays that it makes as it is imported must not be part of a trace.
+    with jax.ensure_compile_time_eval():
+        import diffrax
+
+    return diffrax
+
+
 # --- options of the compiler ----------------------------------------------------------------------
 
 #: XLA's newer emitter of fused loops takes half as long again to compile programs like these, many
@@ -105,7 +117,7 @@ def is_outermost(*values: Any) -> bool:
 
 
 def jit(function: Callable) -> Any:
-    """`equinox.filter_jit`, compiled with the options `QUICK`.
+    """`equinox.filter_jit`, compiled with the options `QUICK` and kept on disk, see `programs`.
 
     Inside of another trace, where JAX takes no options, without them.
     """
@@ -117,17 +129,105 @@ def jit(function: Callable) -> Any:
         options = known(QUICK)
         return filter_jit(function, compiler_options=options) if options else plain
 
+    kept = _Kept(function, eqx.is_array, lambda: known(QUICK))
+
     @functools.wraps(function)
     def call(*args, **kwargs):
         require_own_threads()
-        return (quick() if is_outermost(args, kwargs) else plain)(*args, **kwargs)
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        if not is_outermost(leaves):
+            return plain(*args, **kwargs)
+        program, arrays = kept.program(leaves, structure)
+        return quick()(*args, **kwargs) if program is None else program(arrays)
 
     return call
 
 
 def wide(function: Callable) -> Any:
-    """`jax.jit` for many lanes side by side, compiled with the options `WIDE`."""
-    return jax.jit(function, compiler_options=known(WIDE) if _has_wide_vectors() else None)
+    """`jax.jit` for many lanes side by side, compiled with the options `WIDE` and kept on disk."""
+
+    def options():
+        return known(WIDE) if _has_wide_vectors() else None
+
+    @functools.cache
+    def plain():
+        return jax.jit(function, compiler_options=options())
+
+    kept = _Kept(function, lambda leaf: True, options)
+
+    @functools.wraps(function)
+    def call(*args):
+        program, arrays = kept.program(*jax.tree.flatten((args, {})))
+        return plain()(*args) if program is None else program(arrays)
+
+    return call
+
+
+#: Programs of one function that are known in memory, before all of them are forgotten.
+MOST_PROGRAMS = 4096
+
+
+class _Kept:
+    """The programs of a function, which are kept on disk.
+
+    is_array: which leaves of the arguments are numbers, the rest is part of the program; options:
+    gives the compiler's.
+    """
+
+    def __init__(self, function: Callable, is_array: Callable[[Any], bool], options: Callable):
+        self.function, self.is_array, self.options = function, is_array, options
+        #: By what they are called with, and by what they are made of.
+        self.called: dict[Any, programs.KeptProgram | None] = {}
+        self.made: dict[str, programs.KeptProgram] = {}
+        self.locks: dict[Any, Any] = {}
+
+    def program(self, leaves: list[Any], structure: Any) -> tuple[Any, list[Any]]:
+        """The program of these arguments, and the arrays among them; None: it cannot be kept."""
+        arrays, told = [], []
+        if PLAIN or not programs.are_kept():
+            return None, arrays
+        for leaf in leaves:
+            if self.is_array(leaf):
+                arrays.append(leaf)
+                told.append(programs.type_of_leaf(leaf))
+            else:
+                # 1, 1.0 and True are equal, and so are 0.0 and -0.0.
+                told.append((type(leaf), repr(leaf) if type(leaf) is float else leaf))
+        asked = structure, tuple(told), programs.jax_settings()
+        try:
+            if asked in self.called:
+                return self.called[asked], arrays
+        except TypeError:  # what is not hashable JAX refuses, too
+            return None, arrays
+        with self.locks.setdefault(asked, threading.RLock()):
+            if asked not in self.called:
+                if len(self.called) >= MOST_PROGRAMS:
+                    self.called.clear()
+                    self.made.clear()
+                    self.locks.clear()
+                self.called[asked] = self._found(leaves, structure, asked, arrays)
+        return self.called[asked], arrays
+
+    def _found(self, leaves, structure, asked, arrays) -> "programs.KeptProgram | None":
+        """The program, loaded or compiled; None where it cannot be kept."""
+        if programs.folder() is None or not programs.can_be_kept(arrays):
+            return None
+        holes = [programs.HOLE if self.is_array(leaf) else leaf for leaf in leaves]
+        template = jax.tree.unflatten(structure, holes)
+        options = self.options()
+        signatures = [told for told, leaf in zip(asked[1], holes) if leaf is programs.HOLE]
+        try:
+            key = programs.key_of(self.function, template, signatures, options)
+        except Exception:  # what it is made of cannot be told
+            return None
+        if key not in self.made:
+            program = programs.load(key, template)
+            if program is None and _usable("compiled programs from disk", programs.trial):
+                program = programs.compile_and_keep(key, self.function, template, arrays, options)
+            if program is None:
+                return None
+            self.made[key] = program
+        return self.made[key]
 
 
 @functools.cache
@@ -250,6 +350,8 @@ def axes_of(flags):
 
 #: Lanes of a group.
 GROUP = SideBySide(on_cpu=64, elsewhere=2**15)
+#: So many lanes, or fewer, are not worth the longer compilation of a group.
+FEW = 8
 
 
 def in_groups(function: Callable) -> Callable:
@@ -259,6 +361,8 @@ def in_groups(function: Callable) -> Callable:
     def batch(_, axis_size, batched, *args):
         lane, leaves = of_lane(function, batched, args)
         size = GROUP.here
+        if axis_size <= FEW:
+            return each(lane)(leaves)
         if axis_size <= size:
             return jax.vmap(lane)(leaves)
         groups = -(-axis_size // size)

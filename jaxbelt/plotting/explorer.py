@@ -13,12 +13,15 @@ from matplotlib.figure import Figure
 
 from ..activity import announced
 from ..checks import as_numbers, check_finite, check_positive
+from ..model.friction import LawInUnits
+from ..model.machine import Machine, PhysicalBelt, Units
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.parameters import names_of
 from ..motion.simulate import simulate
 from ..results import Status, describe
 from .model import plot_friction_law
 from .phase import plot_phase_portrait, plot_time_history
+from .si import plot_in_si
 from .style import belt_colour
 
 #: Where the sliders of these numbers end, at least; other numbers go from 0 to 1 at least. They go
@@ -38,12 +41,12 @@ RANGES = {
 class Explorer:
     """Sliders beside a picture of the motion, which follows them; see `explore`.
 
-    sliders: ipywidgets by name, one for each finite number of the oscillator ("damping",
+    sliders: ipywidgets by name, one for each finite number of the oscillator or machine ("damping",
     "belts[0].velocity") and for the start ("x1", "x2"); figure: what is drawn; message: how the run
     ended, or why there is none; widget: all of it. A cell that ends in an explorer shows it.
     """
 
-    def __init__(self, osc: Oscillator, start: tuple[float, float], t1: float):
+    def __init__(self, osc: Oscillator | Machine, start: tuple[float, float], t1: float):
         try:
             import ipywidgets
         except ImportError:
@@ -52,9 +55,13 @@ class Explorer:
         self._leaves, self._structure = jax.tree.flatten(osc)
         self._names, self._t1 = names_of(osc), t1
         numbers = dict(zip(self._names, map(float, self._leaves), strict=True))
+        for number, belt in enumerate(osc.belts):
+            if isinstance(belt.friction, LawInUnits):  # the unit of speeds is no number of the law
+                numbers.pop(f"belts[{number}].friction.unit")
         numbers |= {"x1": start[0], "x2": start[1]}
+        units = osc.units if isinstance(osc, Machine) else None
         self.sliders = {
-            name: _slider(ipywidgets, name, value)
+            name: _slider(ipywidgets, name, value, units)
             for name, value in numbers.items()
             if np.isfinite(value)
         }
@@ -71,31 +78,47 @@ class Explorer:
         self.redraw()
 
     @property
-    def oscillator(self) -> Oscillator:
-        """The oscillator that the sliders show; `ValueError` where there can be none."""
+    def shown(self) -> Oscillator | Machine:
+        """The oscillator or machine that the sliders show; `ValueError` where there can be none."""
         values = [
             jnp.asarray(self.sliders[name].value) if name in self.sliders else leaf
             for name, leaf in zip(self._names, self._leaves, strict=True)
         ]
-        osc = jax.tree.unflatten(self._structure, values)
+        shown = jax.tree.unflatten(self._structure, values)
+        if isinstance(shown, Machine):  # made anew, for its checks
+            belts = [PhysicalBelt(**vars(belt)) for belt in shown.belts]
+            return Machine(shown.mass, shown.stiffness, shown.damping, belts)
+        check_oscillator(shown)
+        return shown
+
+    @property
+    def oscillator(self) -> Oscillator:
+        """The oscillator that the sliders show, that of their machine; `ValueError` likewise."""
+        shown = self.shown
+        osc = shown.oscillator if isinstance(shown, Machine) else shown
         check_oscillator(osc)
         return osc
 
     def redraw(self) -> None:
         """Draw the motion of the oscillator that the sliders show."""
         try:
-            osc = self.oscillator
+            shown, osc = self.shown, self.oscillator
         except ValueError as error:
             self.message.value = str(error)
             return
-        start = self.sliders["x1"].value, self.sliders["x2"].value
-        run = simulate(osc, start, self._t1)
+        start, t1 = (self.sliders["x1"].value, self.sliders["x2"].value), self._t1
+        if isinstance(shown, Machine):
+            start, t1 = shown.start(*start), shown.tau(t1)
+        run = simulate(osc, start, t1)
         portrait, laws, upper, lower = self._axes
         for axes in self._axes:
             _empty(axes)
+            axes.autoscale(True)
         plot_phase_portrait(osc, run, ax=portrait)
-        _draw_laws(osc, laws)
+        _draw_laws(shown, laws)
         plot_time_history(run, (upper, lower))
+        if isinstance(shown, Machine):
+            plot_in_si([portrait, upper, lower], shown)
         page = io.BytesIO()
         # Drawn once; savefig draws twice.
         FigureCanvasAgg(self.figure).print_png(page)
@@ -115,17 +138,27 @@ class Explorer:
 
 @announced("explore")
 def explore(
-    osc: Oscillator, start: ArrayLike | tuple = (1.5, 0.0), *, t1: ArrayLike = 60.0
+    osc: Oscillator | Machine,
+    start: ArrayLike | tuple | None = None,
+    *,
+    t1: ArrayLike | None = None,
 ) -> Explorer:
     """A live picture of an oscillator, in a notebook, with a slider for each of its numbers.
 
-    Phase portrait, time history and friction laws, drawn anew as sliders move. start: (x1, x2) at
-    the beginning; t1: until when it is followed; dimensionless, both. What is returned has
-    `sliders` by name, the `oscillator` that they show, its `figure`, and a `message` on how the run
-    ended. Needs ipywidgets, and raises an `ImportError` without; `ValueError` names an impossible
-    argument.
+    Phase portrait, time history and friction laws, drawn anew as sliders move. osc: an
+    `Oscillator`; or a `Machine`, whose sliders and pictures are in SI units. start: (x1, x2) at the
+    beginning (None: 1.5 units of length, at rest); t1: until when it is followed (None: 60 units of
+    time); dimensionless, and of a `Machine` in m, m/s and s. What is returned has `sliders` by
+    name, the `oscillator` that they show, its `figure`, and a `message` on how the run ended. Needs
+    ipywidgets, and raises an `ImportError` without; `ValueError` names an impossible argument.
     """
-    check_oscillator(osc)
+    length, time = 1.0, 1.0
+    if isinstance(osc, Machine):
+        length, time = float(osc.units.length), float(osc.units.time)
+    else:
+        check_oscillator(osc)
+    start = (1.5 * length, 0.0) if start is None else start
+    t1 = 60.0 * time if t1 is None else t1
     state, until = as_numbers(start, "start", (2,)), as_numbers(t1, "t1")
     check_finite(state, "start")
     check_positive(until, "t1")
@@ -140,10 +173,19 @@ def _empty(ax: Axes) -> None:
     ax.relim()
 
 
-def _slider(ipywidgets: Any, name: str, value: float) -> Any:
+def _slider(ipywidgets: Any, name: str, value: float, units: Units | None) -> Any:
     *_, last = path = name.split(".")
     least, most = RANGES.get(".".join(path[-2:]), RANGES.get(last, (0.0, 1.0)))
+    if units is not None:
+        # Of a machine's numbers nothing is known but their size, and that of its motions.
+        quantity = {"x1": "length", "lower": "length", "upper": "length", "x2": "velocity"}
+        quantity |= {"velocity": "velocity"}
+        unit = float(getattr(units, quantity[last])) if last in quantity else 0.0
+        least, most = (unit * end for end in (least, most))
+        if last in ("mass", "stiffness"):
+            least = 0.1 * value
     least, most = min(least, 2 * value), max(most, 2 * value)
+    most = most if most > least else 1.0
     return ipywidgets.FloatSlider(
         value,
         description=name.removeprefix("belts"),
@@ -155,10 +197,13 @@ def _slider(ipywidgets: Any, name: str, value: float) -> Any:
     )
 
 
-def _draw_laws(osc: Oscillator, ax: Any) -> None:
-    for number, belt in enumerate(osc.belts):
+def _draw_laws(shown: Oscillator | Machine, ax: Any) -> None:
+    speed = 2.0 * float(shown.units.velocity) if isinstance(shown, Machine) else 2.0
+    for number, belt in enumerate(shown.belts):
         before = len(ax.lines)
-        plot_friction_law(belt.friction, ax, speed=2.0)
+        law = belt if isinstance(belt, PhysicalBelt) else belt.friction
+        plot_friction_law(law, ax, speed=speed)
         for line in ax.lines[before:]:
             line.set_color(belt_colour(number) if len(line.get_xdata()) > 2 else "0.7")
-    ax.set_ylabel(r"$\mu\,\mathrm{sgn}\,\nu_{\mathrm{R}}$")
+    symbol = "R" if isinstance(shown, Machine) else r"\nu_{\mathrm{R}}"
+    ax.set_ylabel(rf"$\mu\,\mathrm{{sgn}}\,{symbol}$")

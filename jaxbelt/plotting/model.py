@@ -1,6 +1,7 @@
 """The model: its friction laws, its formulations side by side, and the machine itself."""
 
-import jax.numpy as jnp
+from typing import Any
+
 import numpy as np
 from jaxtyping import Array
 from matplotlib.axes import Axes
@@ -9,8 +10,9 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from ..activity import announced
 from ..checks import as_positive, require_value
 from ..model.friction import AbstractFriction
+from ..model.machine import PhysicalBelt
 from ..numerics.compiling import jit
-from .style import belt_colour, new_axes, require_axes
+from .style import add_key, belt_colour, new_axes, require_axes
 
 
 @jit
@@ -20,31 +22,49 @@ def _coefficient(friction: AbstractFriction, speed: Array) -> Array:
 
 @announced("plot_friction_law")
 def plot_friction_law(
-    friction: AbstractFriction, ax: Axes | None = None, *, speed: float = 1.0, unit: str = ""
+    friction: AbstractFriction | PhysicalBelt,
+    ax: Axes | None = None,
+    *,
+    speed: float | None = None,
+    unit: str | None = None,
 ) -> Axes:
     """Friction coefficient mu(|nu_R|) sgn(nu_R) over the relative velocity nu_R, up to `speed`.
 
-    unit: of the speeds that the law takes, for the label of the axis: "m/s" for the law of a
-    `PhysicalBelt`, with a `speed` that its machine reaches. A stuck mass takes any value on the
-    vertical bar at nu_R = 0. Returns the axes.
+    friction: the law; or a `PhysicalBelt`, whose law takes speeds in m/s. speed: None: to where the
+    table of a `Tabulated` ends, and 1 for another law; what is drawn beyond such an end is dashed,
+    an extrapolation. unit: of the speeds that the law takes, for the label of the axis; None: that
+    of a `PhysicalBelt`, and else none. A stuck mass takes any value on the vertical bar at
+    nu_R = 0. Returns the axes.
     """
-    law = "a law such as jb.Conti(...)"
+    if isinstance(friction, PhysicalBelt):
+        friction, unit = friction.friction, "m/s" if unit is None else unit
+    law = "a law such as jb.Conti(...), or a PhysicalBelt"
     require_value(isinstance(friction, AbstractFriction), "friction", law, friction)
-    speed = as_positive(speed, "speed")
+    end = float(np.asarray(friction.measured_to))
+    speed = (end if np.isfinite(end) else 1.0) if speed is None else as_positive(speed, "speed")
+    unit = "" if unit is None else unit
     require_value(isinstance(unit, str), "unit", 'a text such as "m/s"', unit)
     require_axes(ax)
-    ax = new_axes() if ax is None else ax
-    r = jnp.linspace(0.0, speed, 401)
+    is_new, ax = ax is None, new_axes() if ax is None else ax
+    r = np.union1d(np.linspace(0.0, speed, 401), min(end, speed))
     mu, static = np.asarray(_coefficient(friction, r)), float(friction.static)
     ax.axhline(0, color="0.7", linewidth=0.6)
     ax.axvline(0, color="0.7", linewidth=0.6)
+    known, beyond = r <= end, r >= end
     for sign in (1, -1):
-        ax.plot(sign * r, sign * mu, color="black", linewidth=1.4)
+        ax.plot(sign * r[known], sign * mu[known], color="black", linewidth=1.4)
+        if end < speed:
+            style: dict[str, Any] = {"color": "black", "linewidth": 1.4, "linestyle": (0, (2, 1.5))}
+            style["label"] = "extrapolated" if sign > 0 else None
+            ax.plot(sign * r[beyond], sign * mu[beyond], **style)
+            ax.axvline(sign * end, color="0.5", linewidth=0.7, linestyle=":")
     ax.plot([0, 0], [-static, static], color="black", linewidth=1.4)
     ax.set_xlim(-speed, speed)
     symbol = "R" if unit else r"\nu_{\mathrm{R}}"
     ax.set_xlabel(f"relative velocity ${symbol}$" + f" ({unit})" * bool(unit))
     ax.set_ylabel(rf"friction coefficient $\mu\,\mathrm{{sgn}}\,{symbol}$")
+    if is_new:
+        add_key(ax)
     return ax
 
 

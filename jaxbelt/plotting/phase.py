@@ -301,7 +301,6 @@ def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
     left, right = ax.get_xlim()
     outside: list[tuple[float, int]] = []
     levels: list[float] = []
-    slides = False
     for i, belt in enumerate(osc.belts):
         level = float(belt.velocity / osc.omega)
         ends = np.clip([float(belt.lower), float(belt.upper)], left, right)
@@ -316,15 +315,12 @@ def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
         x1 = np.linspace(ends[0], ends[1], 1201)
         sticks = _sliding_set(osc, jnp.asarray(x1), jnp.full(x1.size, belt.velocity / osc.omega), i)
         band = np.where(sticks, level, np.nan)
-        ax.plot(x1, band, color=colour, zorder=1.2, **SLIDING_SET)
-        slides |= bool(np.any(sticks))
+        label = "sliding set" if np.any(sticks) else None
+        ax.plot(x1, band, color=colour, zorder=1.2, label=label, **SLIDING_SET)
         if ends[1] == right:
             outside.append((level, i))
         else:
             _name_boundary(ax, i, (ends[0], level), (3, 2.5), "left", "bottom")
-    if slides:
-        # In no belt's colour, for the key: it stands for the sets of all.
-        ax.plot([], [], color="black", label="sliding set", **SLIDING_SET)
     _name_boundaries_outside(ax, outside)
     _draw_edges(ax, osc)
     return ax

@@ -89,9 +89,11 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     finally:
         if before is not None:
             before.join()
+    # Axes do not tell which functional, parameter or result they show.
     expected = (
-        "a picture with an axis of time, displacement, velocity, amplitude or period (that of a "
-        "sweep is jb.plot_sweep(jb.in_si(dataset, machine), ...))"
+        "a picture with an axis of time, displacement, velocity, amplitude or period, or what it "
+        "shows itself: jb.plot_in_si(diagram, machine, quantity=jb.stick_fraction), "
+        "jb.plot_sweep(jb.in_si(dataset, machine), ...)"
     )
     fits = is_done or isinstance(result, AlongParameter)
     require(fits, "result", expected, f"axes of {', '.join(shown)}")

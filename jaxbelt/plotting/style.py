@@ -12,6 +12,8 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerTuple
+from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
 from ..checks import require_value
@@ -89,12 +91,14 @@ def journal_figure(width: float, height: float) -> Figure:
 
 
 def key_entries(axes: Sequence[Axes]) -> dict[str, Any]:
-    """What axes label, each thing once, with how it is drawn: what a phase portrait holds comes
-    last, in the order of `KEY_ORDER`."""
-    found: dict[str, Any] = {}
+    """What axes label, each thing once, with how it is drawn, side by side in each of its colours:
+    what a phase portrait holds comes last, in the order of `KEY_ORDER`."""
+    drawn: dict[str, dict[Any, Any]] = {}
     for one in axes:
         for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
+            colour = handle.get_color() if isinstance(handle, Line2D) else None
+            drawn.setdefault(label, {}).setdefault(colour, handle)
+    found = {name: tuple(one.values()) for name, one in drawn.items()}
     known = [label for label in KEY_ORDER if label in found]
     return {label: found[label] for label in [*(x for x in found if x not in known), *known]}
 
@@ -106,6 +110,7 @@ def draw_key(figure: Figure, note: str = "", *, leave_out: Axes | None = None) -
     figure.legend(
         entries.values(),
         entries.keys(),
+        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.0)},
         loc="outside lower center",
         ncols=key_columns(72 * figure.get_size_inches()[0], list(entries)),
         frameon=False,
@@ -137,6 +142,7 @@ def add_key(ax: Axes) -> None:
     ax.legend(
         entries.values(),
         entries.keys(),
+        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.0)},
         loc="upper center",
         bbox_to_anchor=(0.5, 0.0),
         bbox_transform=ax.transAxes + below,

@@ -33,11 +33,15 @@ from .style import (
 
 #: Axes of datasets that are no parameters.
 COUNTED = ("belt", "attractor")
+#: Axes of datasets along which starts differ.
+AXES_OF_STARTS = ("x1", "x2")
 #: What is 0 of an attractor that is no cycle, though it has no loop.
 OF_LOOPS = ("stick_duration", "d_stick_duration")
 
 
-def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Axes:
+def plot_sweep(
+    dataset: xr.Dataset, variable: str, ax: Axes | None = None, *, share: str | None = None
+) -> Axes:
     """A variable of a sweep over its two axes longer than one, or along its one.
 
     dataset: what `sweep` or `attractors` returned, also as `in_si` gives it; variable: a name in
@@ -46,7 +50,9 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     runs have; the rest is "other" (along one axis, the numbers of the categories where their words
     are long). Along one axis a variable of each belt, or of each attractor, is as many lines. What
     is not done of a store whose sweep is not finished is left white, and in stick durations what is
-    no cycle. Returns the axes.
+    no cycle. A sweep of attractors that asked one start at each point says so in its title: others
+    may lead elsewhere. share: a word of a category, such as "cycle" of "kind", of a sweep with axes
+    x1 or x2; drawn is then the share of the starts along them that have it. Returns the axes.
     `ValueError` if there is no such variable, or if its axes are not one or two: choose with
     `dataset.isel(belt=0)` and the like.
     """
@@ -54,6 +60,8 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     require_value(known, "dataset", "an xarray.Dataset, such as sweep(...) returns", dataset)
     require_one_of(variable, map(str, dataset.data_vars), "variable")
     require_axes(ax)
+    if share is not None:
+        dataset, variable = _shares_of(dataset, variable, share), "share"
     told = dataset[variable].attrs
     is_category = variable == "kind" or "flag_meanings" in told
     # Signatures get their numbers when all are known.
@@ -70,6 +78,11 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
     ax = new_axes() if ax is None else ax
     names = [_axis_label(dataset[name]) for name in map(str, values.dims)]
     label = _with_unit(told.get("long_name", variable), told)
+    if dataset.attrs.get("observe") == "attractor" and not {*AXES_OF_STARTS} & {
+        *map(str, dataset.dims)
+    }:
+        start = str(dataset.attrs.get("start", "")).partition(": of several")[0]
+        ax.set_title(f"from one start, {start}", fontsize="medium")
     if are_lines:
         x, lines = dataset[values.dims[0]], values.values.reshape(values.shape[0], -1).T
         for i, line in enumerate(lines):
@@ -78,6 +91,10 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
             if len(lines) > 1:
                 style |= {"color": belt_colour(i), "label": f"{last} {i}"}
             ax.plot(x, line, linestyle=("-", "--", ":", "-.")[i % 4], **style)
+        # All that was swept is shown, also where there is nothing to draw.
+        ends = [float(x.min()), float(x.max())]
+        ax.update_datalim(np.column_stack([ends, ends]), updatey=False)
+        ax.autoscale_view(scaley=False)
         ax.set(xlabel=names[0], ylabel=label)
         add_key(ax)
         return ax
@@ -89,6 +106,20 @@ def plot_sweep(dataset: xr.Dataset, variable: str, ax: Axes | None = None) -> Ax
         figure_of(ax).colorbar(mesh, ax=ax, label=label)
     ax.set(xlabel=names[0], ylabel=names[1])
     return ax
+
+
+def _shares_of(dataset: xr.Dataset, variable: str, word: str) -> xr.Dataset:
+    """The share of the starts of which a category has this word, as the variable `share`."""
+    starts = [name for name in AXES_OF_STARTS if name in dataset[variable].dims]
+    expected = "None, or asked of a sweep with axes x1 or x2 for several starts"
+    require(starts, "share", expected, f"{word!r} of one without")
+    known = dataset[variable].attrs.get("flag_meanings", "").split()
+    require_one_of(word, known or ["None"], "share")
+    is_it = (decoded(dataset[[variable]])[variable] == word).astype(float)
+    share = is_it.where(dataset.status >= 0).mean(starts)
+    share.attrs["long_name"] = f"share of starts: {word.replace('_', ' ')}"
+    # What it was a sweep of starts of is told by the label.
+    return xr.Dataset({"share": share})
 
 
 def _numbers_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:

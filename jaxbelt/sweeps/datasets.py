@@ -37,6 +37,8 @@ STATUS = Variable(
 #: Status of runs that are yet to be done, and the word for them in every category.
 NOT_RUN = -1
 NOT_DONE = "not_done"
+#: Names that a store has for things of its own.
+TAKEN = ("ledger",)
 
 
 def decoded(dataset: "xarray.Dataset") -> "xarray.Dataset":
@@ -103,6 +105,21 @@ class Table:
             for name in names:
                 if np.issubdtype(self.variable(name).dtype, np.floating):
                     self.shapes[f"d_{name}_d_{by}"] = self.layout[name]
+
+    def check_names(self) -> None:
+        """Raise a `ValueError` where two things of the dataset have one name, or a name has none in
+        a store."""
+        axes, results = [*self.grid.axes], [*self.shapes]
+        dimensions = {name for result in results for name in self.dims(result)[len(axes) :]}
+        others = "a dimension, or ledger, and without /"
+        for name in axes:
+            taken = {*results, *dimensions, *TAKEN}
+            expected = f"named otherwise than a result, {others}"
+            require_value(name not in taken and "/" not in name, "axes", expected, name)
+        for name in results:
+            expected = f"an observable whose results are named otherwise than {others}"
+            taken = {*dimensions, *TAKEN}
+            require_value(name not in taken and "/" not in name, "observe", expected, name)
 
     def variable(self, name: str) -> Variable:
         """What is known of a variable."""

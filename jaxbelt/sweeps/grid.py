@@ -1,6 +1,5 @@
 """The grid of a sweep: its points, the oscillators there, and the blocks in which it is done."""
 
-import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -23,7 +22,7 @@ from ..identity import fingerprint_or_none_like_it
 from ..kernel.lanes import Observer, Program
 from ..model.oscillator import Oscillator, check_scalars, its_oscillator
 from ..model.own_units import in_units_of_run
-from ..numerics.compiling import power_of_two
+from ..numerics.compiling import jit, power_of_two
 
 #: Rows that are made of a few runs, too, so that few shapes are compiled.
 FEWEST_ROWS = 2**14
@@ -47,7 +46,6 @@ class Grid:
             name: np.asarray(as_array(v, f"axis {name}", (None,))) for name, v in axes.items()
         }
         for name, values in self.axes.items():
-            require(name != "belt", "axes", "without the name belt, a dimension of results", name)
             require(values.size > 0, f"axis {name}", "at least one value", "none")
         start = as_array(y0, "y0", (2,))
         check_finite(start, "y0")
@@ -122,7 +120,7 @@ class Grid:
         return np.asarray(table)[:, :, : len(runs)]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4, 5))
+@jit
 def _rows(make, made_of, names, mapped, start, derivatives, values):
     def row(values):
         leaves = jax.tree.leaves(in_units_of_run(make(**{name: values[name] for name in names})))

@@ -72,7 +72,9 @@ class Question:
             require(name in grid.axes, "derivatives", f"names of axes, {known}", came)
         if not isinstance(observe, str | Observer):
             check_reducer(observe, grid.example)
-        return cls(grid, observe, numbers, tuple(wanted))
+        question = cls(grid, observe, numbers, tuple(wanted))
+        question.table.check_names()
+        return question
 
     def arguments(self) -> tuple[Any, ...]:
         """The arguments of `of`: what another process needs to ask the same."""

@@ -31,7 +31,7 @@ from ..kernel.step import take_step, window_of
 from ..model.modes import without_edges
 from ..model.own_units import OwnOscillator, in_units
 from ..model.rest import start_at_focus
-from ..numerics.compiling import one_kernel
+from ..numerics.compiling import jit, one_kernel
 from ..numerics.derivatives import in_directions
 from ..results import Status
 
@@ -78,7 +78,7 @@ class Stream(eqx.Module):
     ones: Array
 
 
-@functools.partial(jax.jit, static_argnums=(0, 2, 3))
+@jit
 def idle(program: Program, shared, width: int, columns: int) -> Stream:
     """A stream whose lanes have nothing to do."""
     rows = tuple(jnp.zeros(width) for _ in range(columns))

@@ -41,6 +41,8 @@ def check_reducer(reducer: Any, osc: Oscillator) -> None:
     require(isinstance(results, Mapping), "observe.finish", expected, shape_in_words(results))
     strange = [name for name in results if not isinstance(name, str)]
     require(not strange, "observe.finish", f"{expected} by their names", strange)
+    without = f"{expected} without status, which is the run's own"
+    require("status" not in results, "observe.finish", without, "one with it")
 
 
 def check_sections(moments: Sequence[Any], osc: Oscillator) -> None:

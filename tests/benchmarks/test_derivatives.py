@@ -145,6 +145,7 @@ def first_calls():
     """In fresh interpreters, where nothing is compiled yet."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+        patch.setenv("JAXBELT_CACHE", "0")
         for name, call in FIRST_CALLS.items():
             command = [sys.executable, "-c", FIRST_CALL % call]
             out = subprocess.run(command, capture_output=True, check=True)

@@ -24,21 +24,27 @@ from .outcome import Outcome, summed
 #: Of which module each campaign is.
 CAMPAIGNS = {
     **dict.fromkeys(("final", "simulate", "derivatives", "attractors", "grazing"), "runs"),
-    **{name: name for name in ("paths", "refine", "portraits", "shocks", "fractions", "maps")},
+    **{
+        name: name
+        for name in ("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep")
+    },
 }
 #: What can be asked of each campaign beside `--results`.
 PLAIN = frozenset({"seed", "runs"})
-RUNS = PLAIN | {"threads", "extreme_share", "structure", "tol", "table"}
+RUNS = PLAIN | {"threads", "extreme_share", "heavy", "structure", "tol", "table"}
 KNOWN = {
     **dict.fromkeys(("paths", "refine", "portraits", "shocks"), PLAIN),
     "maps": frozenset(),
+    "steep": PLAIN,
     "fractions": PLAIN | {"threads"},
     **dict.fromkeys(("final", "simulate", "attractors"), RUNS),
     "derivatives": RUNS | {"by"},
-    "grazing": RUNS - {"extreme_share"} | {"by"},
+    "grazing": RUNS - {"extreme_share", "heavy"} | {"by"},
 }
 #: What is not told.
-DEFAULTS = dict(seed=0, runs=2000, extreme_share=0.0, by="simulate", threads=os.cpu_count())
+DEFAULTS = dict(
+    seed=0, runs=2000, extreme_share=0.0, heavy=False, by="simulate", threads=os.cpu_count()
+)
 #: Seconds between two lines where everything agrees.
 QUIET = 15.0
 #: Lines printed of one case; the file has all of them.
@@ -232,6 +238,12 @@ def _parser():
     )
     parser.add_argument("--results", type=Path, help="file of results, which a later call goes on")
     parser.add_argument("--extreme-share", type=_share, help="of runs, of 0.5 at random (0)")
+    parser.add_argument(
+        "--heavy",
+        action="store_const",
+        const=True,
+        help="loads of 1e-6 to 1e6 beside one another, half of the cases on round numbers",
+    )
     parser.add_argument(
         "--by",
         choices=("simulate", "sweep", "find_cycle"),

@@ -302,6 +302,31 @@ def _special_start(rng, osc, number):
     return x1, x2
 
 
+# ---------------------------------------------------------------- heavy and light belts
+
+
+def heavy_case(rng, structure, T=50.0):
+    """A random or a rational case with loads of 1e-6 to 1e6 beside one another.
+
+    A mass on a heavy belt sticks to it for as long as the run lasts, unless an edge is on its way:
+    so a run in four begins near a slip onset or an equilibrium.
+    """
+    is_round = rng.random() < 0.5
+    case = (rational_case if is_round else random_case)(rng, structure, T)
+    belts = []
+    for belt in case.oscillator.belts:
+        load = float(rng.choice([1, 2, 5])) * 10.0 ** int(rng.integers(-6, 6))
+        load = load if is_round else float(10 ** rng.uniform(-6, 6))
+        belts.append(replace(belt, load=load))
+    osc, y0 = replace(case.oscillator, belts=tuple(belts)), case.y0
+    if rng.random() < 0.25:
+        beside = float(rng.integers(-4, 5)) / 2 if is_round else rng.uniform(-2, 2)
+        y0 = (float(rng.choice(special_positions(osc))) + beside, y0[1])
+    return replace(
+        case, oscillator=osc, y0=y0, kind="heavy, rational" if is_round else "heavy, random"
+    )
+
+
 # ---------------------------------------------------------------- grazing
 
 

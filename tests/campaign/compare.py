@@ -27,8 +27,12 @@ STEPS = 30
 DISTURBED = 6
 #: Statuses of runs that came to an end.
 ORDINARY = (engine.OK, engine.STUCK_FOREVER, engine.PSEUDO_FOCUS)
-#: The package's statuses of runs that take too many segments or steps.
+#: The package's statuses of runs that take too many segments or steps, and the engine's.
 GAVE_UP = (3, 4)
+ENGINE_GAVE_UP = (engine.BUDGET, engine.CORNER, engine.STEPS)
+#: Events and steps of a second try of the engine; and events of one, where the package can be asked
+#: for less of the run.
+MANY_EVENTS, MANY_STEPS, ENOUGH = 2_000_000, 20_000_000, 50_000
 GOOD = ("same", "tolerance", "corner")
 
 
@@ -102,8 +106,8 @@ def difference(case, told, mine, tol):
     if told.status != mine.status and focus in (told.status, mine.status):
         # Both may be right: one tells sooner than the other that a run converges.
         return _focus_difference(case, told, mine)
-    if told.status in GAVE_UP and mine.status == engine.BUDGET:
-        return None  # too many events for both, and both say so
+    if told.status in GAVE_UP and mine.status in ENGINE_GAVE_UP:
+        return None  # too much for both, and both say so
     if told.status != mine.status:
         return f"status {told.status}, not {mine.status}"
     if mine.status == engine.NOT_FINITE:
@@ -193,12 +197,19 @@ def _same_kind(r, mine, value):
     return value if r.sequence == mine.sequence and r.status == mine.status else None
 
 
-def judge(case, told, tol):
-    """The verdict on a final state or a trajectory, and the engine's run."""
+def judge(case, told, tol, again=None):
+    """The verdict on a final state or a trajectory, and the engine's run.
+
+    again(case, tol): asks for another run; that is as long as the engine can follow it.
+    """
     # Its own error is amplified near grazing as much as the other's, and has to be the smaller one.
     mine = run(case, tol=min(1e-13, 0.01 * tol))
-    if mine.status == engine.BUDGET and told.status in ORDINARY:
-        mine = run(case, max_events=2_000_000)
+    if mine.status in (engine.BUDGET, engine.STEPS) and told.status in ORDINARY:
+        events = ENOUGH if again else MANY_EVENTS
+        mine = run(case, max_events=events, max_steps=MANY_STEPS)
+        if again and mine.status == engine.BUDGET:
+            shorter = replace(case, T=0.9 * mine.t_end)
+            return judge(shorter, again(shorter, tol), tol)
     what = difference(case, told, mine, tol)
     if what is None:
         return "same", mine

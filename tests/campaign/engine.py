@@ -57,11 +57,33 @@ _ROUNDING = 1e-7
 
 # ---------------------------------------------------------------- problems
 
+#: Speeds and coefficients of the law "table", with the unit 1.
+TABLE = (
+    (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0, 256.0, 1024.0, 4096.0, 16384.0, 65536.0),
+    (1.0, 0.93, 0.87, 0.8, 0.733, 0.68, 0.644, 0.6235, 0.606, 0.602, 0.6, 0.6, 0.6, 0.6),
+)
+
+
+def _hardy(speeds, coefficients):
+    """Widths and weights of the multiquadrics through the points, and the level."""
+    r, gaps = np.array(speeds), np.diff(speeds)
+    n = len(r)
+    widths = np.minimum(np.append(gaps[0], gaps), np.append(gaps, gaps[-1]))
+    matrix = np.ones((n + 1, n + 1))
+    matrix[:n, :n] = np.sqrt((r[:, None] - r[None]) ** 2 + widths[None] ** 2)
+    matrix[n, n] = 0.0
+    *weights, level = np.linalg.solve(matrix, np.append(coefficients, 0.0))
+    return r, widths, np.array(weights), float(level)
+
+
+_TABLE_R, _TABLE_H, _TABLE_W, _TABLE_LEVEL = _hardy(*TABLE)
+
 
 @dataclass(frozen=True)
 class Belt:
-    """law: ("conti", mus, p1, p3, p2), ("coulomb", static, kinetic) or ("stribeck", static,
-    kinetic, velocity)."""
+    """law: ("conti", mus, p1, p3, p2), ("coulomb", static, kinetic), ("stribeck", static, kinetic,
+    velocity), ("peak", static, kinetic, velocity, viscous), or ("table", static, unit): the curve
+    through the points `TABLE`, at unit times the speed."""
 
     velocity: float
     law: tuple
@@ -77,20 +99,25 @@ class Oscillator:
     omega: float = 1.0
 
     def table(self):
-        """The belts as rows: velocity, load, lower, upper, static, form, c0, c1, c2, c3.
+        """The belts as rows: velocity, load, lower, upper, static, form, c0, c1, c2, c3, c4.
 
-        mu(r) = c0 f(c1 r) + c2 + c3 r^2 with f(x) = 1/(1 + x) (form 0) or exp(-x) (form 1).
+        mu(r) = c0 f(c1 r) + c2 + c3 r^2 + c4 r with f(x) = 1/(1 + x) (form 0), exp(-x) (form 1),
+        exp(-x^2) (form 2), or Hardy's curve through `TABLE` (form 3).
         """
         rows = []
         for b in self.belts:
             name, static, *p = b.law
             if name == "conti":
                 p1, p3, p2 = (*p, 0.0) if len(p) == 2 else p
-                law = (static, 0, static - p1, p3, p1, p2)
+                law = (static, 0, static - p1, p3, p1, p2, 0.0)
             elif name == "coulomb":
-                law = (static, 0, 0.0, 0.0, p[0], 0.0)
+                law = (static, 0, 0.0, 0.0, p[0], 0.0, 0.0)
+            elif name == "stribeck":
+                law = (static, 1, static - p[0], 1 / p[1], p[0], 0.0, 0.0)
+            elif name == "peak":
+                law = (static, 2, static - p[0], 1 / p[1], p[0], 0.0, p[2])
             else:
-                law = (static, 1, static - p[0], 1 / p[1], p[0], 0.0)
+                law = (static, 3, 1.0, p[0], _TABLE_LEVEL, 0.0, 0.0)
             rows.append((b.velocity, b.load, b.lower, b.upper, *law))
         return np.array(rows, dtype=float)
 
@@ -130,6 +157,7 @@ def simulate(
     extrema=False,
     capture=True,
     max_events=20_000,
+    max_steps=1_000_000,
 ):
     """The run from y0 over [0, T].
 
@@ -137,6 +165,7 @@ def simulate(
     atol; every step of length h is disturbed by noise (1 + |y|) h, the state after every event by
     noise (1 + |y|), at random. turns, extrema: record the zeros of x2 (belt 0: a maximum of x1, 1:
     a minimum), the extrema of x2. capture: end, at rest, where the run converges to a pseudo-focus.
+    max_steps: beside a thousand for each unit of time.
     """
     n = len(osc.belts)
     given = np.full(n, 9, np.int64) if mode is None else np.array(mode, np.int64)
@@ -154,6 +183,7 @@ def simulate(
         noise,
         seed,
         flags,
+        max_steps,
         out,
     )
     rows = out[:count]
@@ -176,18 +206,76 @@ def simulate(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def _product(a, b, c, d):
+    p, q, r, t = a * c, a * d, b * c, b * d
+    return min(min(p, q), min(r, t)), max(max(p, q), max(r, t))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def _mu(row, r):
-    f = np.exp(-row[7] * r) if row[5] == 1 else 1 / (1 + row[7] * r)
-    return row[6] * f + row[8] + row[9] * r * r
+    x = row[7] * r
+    f = 0.0
+    if row[5] == 0:
+        f = 1 / (1 + x)
+    elif row[5] == 1:
+        f = np.exp(-x)
+    elif row[5] == 2:
+        f = np.exp(-x * x)
+    else:
+        for i in range(_TABLE_R.size):
+            f += _TABLE_W[i] * np.sqrt((x - _TABLE_R[i]) ** 2 + _TABLE_H[i] ** 2)
+    return row[6] * f + row[8] + row[9] * r * r + row[10] * r
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _mu_slope(row, r):
-    if row[5] == 1:
-        f = -row[7] * np.exp(-row[7] * r)
+    x = row[7] * r
+    f = 0.0
+    if row[5] == 0:
+        f = -1 / (1 + x) ** 2
+    elif row[5] == 1:
+        f = -np.exp(-x)
+    elif row[5] == 2:
+        f = -2 * x * np.exp(-x * x)
     else:
-        f = -row[7] / (1 + row[7] * r) ** 2
-    return row[6] * f + 2 * row[9] * r
+        for i in range(_TABLE_R.size):
+            away = x - _TABLE_R[i]
+            f += _TABLE_W[i] * away / np.sqrt(away * away + _TABLE_H[i] ** 2)
+    return row[6] * row[7] * f + 2 * row[9] * r + row[10]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _law_interval(row, ra, rb):
+    """Bounds of c0 f(c1 r), and of its slope, for ra <= r <= rb."""
+    xa, xb = row[7] * ra, row[7] * rb
+    if row[5] <= 1:  # monotone, and so is the slope
+        f = (1 / (1 + xa), 1 / (1 + xb)) if row[5] == 0 else (np.exp(-xa), np.exp(-xb))
+        g = (-f[0] * f[0], -f[1] * f[1]) if row[5] == 0 else (-f[0], -f[1])
+        f_low, f_high, g_low, g_high = min(f), max(f), min(g), max(g)
+    elif row[5] == 2:
+        f_low, f_high = np.exp(-max(xa * xa, xb * xb)), np.exp(-min(xa * xa, xb * xb))
+        if xa <= 0 <= xb:
+            f_high = 1.0
+        g = -2 * xa * np.exp(-xa * xa), -2 * xb * np.exp(-xb * xb)
+        g_low, g_high = min(g), max(g)
+        steepest = np.sqrt(0.5)
+        if xa <= steepest <= xb:
+            g_low = -np.sqrt(2.0) * np.exp(-0.5)
+        if xa <= -steepest <= xb:
+            g_high = np.sqrt(2.0) * np.exp(-0.5)
+    else:
+        f_low = f_high = g_low = g_high = 0.0
+        for i in range(_TABLE_R.size):
+            w, r, h = _TABLE_W[i], _TABLE_R[i], _TABLE_H[i]
+            pa, pb = np.sqrt((xa - r) ** 2 + h * h), np.sqrt((xb - r) ** 2 + h * h)
+            p, q = _product(w, w, h if xa <= r <= xb else min(pa, pb), max(pa, pb))
+            f_low, f_high = f_low + p, f_high + q
+            p, q = _product(w, w, (xa - r) / pa, (xb - r) / pb)
+            g_low, g_high = g_low + p, g_high + q
+    f_low, f_high = _product(row[6], row[6], f_low, f_high)
+    slope = row[6] * row[7]
+    g_low, g_high = _product(slope, slope, g_low, g_high)
+    return f_low, f_high, g_low, g_high
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -236,6 +324,21 @@ def _advance(z, w, B, s, x1, x2, a, h, V, K):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def _jumps(w, B, s, V):
+    """Whether a step goes further, in the speed of a belt, than the law's own scale and the
+    smallest speed allow: its error tells nothing of a narrow layer between two stages."""
+    low, high = V[0], V[0]
+    for j in range(_N + 1):
+        low, high = min(low, V[j]), max(high, V[j])
+    for i in range(B.shape[0]):
+        if (s[i] == 1 or s[i] == -1) and B[i, 7] > 0:
+            nearest = min(s[i] * (B[i, 0] - w * low), s[i] * (B[i, 0] - w * high))
+            if w * (high - low) > 0.5 / B[i, 7] + max(nearest, 0.0):
+                return True
+    return False
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def _error(x1, x2, y1, y2, h, tol, V, K):
     """The error of the step over the tolerance, as Hairer, Norsett and Wanner combine it."""
     c1 = tol * (1 + max(abs(x1), abs(y1)))
@@ -262,12 +365,6 @@ def mu(row, r):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _product(a, b, c, d):
-    p, q, r, t = a * c, a * d, b * c, b * d
-    return min(min(p, q), min(r, t)), max(max(p, q), max(r, t))
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
 def _force_interval(z, w, B, s, l1, u1, l2, u2):
     """Bounds of x2' and of d x2'/d x2 over a box; NaN where a law is far beyond its boundary."""
     p, q = _product(-z, -z, l2, u2)
@@ -281,18 +378,16 @@ def _force_interval(z, w, B, s, l1, u1, l2, u2):
             ra, rb = rb, ra
         if B[i, 7] * ra < -0.25:
             return np.nan, np.nan, np.nan, np.nan
-        # Without its quadratic part a law is monotone, and so is its slope.
-        fa, fb = _mu(B[i], ra) - B[i, 9] * ra * ra, _mu(B[i], rb) - B[i, 9] * rb * rb
+        f_low, f_high, g_low, g_high = _law_interval(B[i], ra, rb)
         q_high = max(ra * ra, rb * rb)
         q_low = 0.0 if ra <= 0 <= rb else min(ra * ra, rb * rb)
         p, q = _product(B[i, 9], B[i, 9], q_low, q_high)
-        p, q = p + min(fa, fb), q + max(fa, fb)
+        l_low, l_high = _product(B[i, 10], B[i, 10], ra, rb)
+        p, q = p + f_low + B[i, 8] + l_low, q + f_high + B[i, 8] + l_high
         p, q = _product(s[i] * B[i, 1], s[i] * B[i, 1], p, q)
         low, high = low + p, high + q
-        ga = _mu_slope(B[i], ra) - 2 * B[i, 9] * ra
-        gb = _mu_slope(B[i], rb) - 2 * B[i, 9] * rb
         p, q = _product(2 * B[i, 9], 2 * B[i, 9], ra, rb)
-        p, q = p + min(ga, gb), q + max(ga, gb)
+        p, q = p + g_low + B[i, 10], q + g_high + B[i, 10]
         p, q = _product(-w * B[i, 1], -w * B[i, 1], p, q)
         t_low, t_high = t_low + p, t_high + q
     return low, high, t_low, t_high
@@ -589,7 +684,7 @@ def _contraction(z, w, B, left, right, edge):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
+def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, max_steps, out):
     n = B.shape[0]
     turns, extrema, capture = flags % 2 == 1, flags // 2 % 2 == 1, flags < 4
     s, old = given.copy(), given.copy()
@@ -615,7 +710,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
         if count >= out.shape[0] - 2:
             status = BUDGET
             break
-        if steps > 1000 * T + 1_000_000:
+        if steps > 1000 * T + max_steps:
             status = STEPS
             break
         kind = 0
@@ -679,7 +774,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
             hit, h_hit, m1, m2 = -1, 0.0, 0.0, 0.0
             while t < T:
                 steps += 1
-                if steps > 1000 * T + 1_000_000:
+                if steps > 1000 * T + max_steps:
                     break
                 last = h >= T - t
                 if last:
@@ -693,6 +788,9 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, out):
                 if abs(y1) + abs(y2) > 1e9:
                     status = NOT_FINITE
                     break
+                if _jumps(w, B, s, V) and h > _SHORTEST:
+                    h *= 0.5
+                    continue
                 # What is near enough to be looked at.
                 low2 = high2 = x2
                 for j in range(_N + 1):

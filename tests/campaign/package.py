@@ -8,17 +8,48 @@ import functools
 from dataclasses import dataclass
 from unittest import mock
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxbelt as jb
 from jaxbelt.model.events import of_one_loop
+from jaxbelt.model.own_units import in_units_of_run
 from jaxbelt.sweeps import question
 
+from . import engine
+
+
 #: The module, whose name in the package is that of its function.
+class Peak(jb.AbstractFriction):
+    """mu(r) = kinetic + (static - kinetic) exp(-(r/velocity)^2) + viscous r, a law of one's own."""
+
+    static: jax.Array
+    kinetic: jax.Array
+    velocity: jax.Array
+    viscous: jax.Array
+
+    def mu(self, speed):
+        falls = (self.static - self.kinetic) * jnp.exp(-((speed / self.velocity) ** 2))
+        return self.kinetic + falls + self.viscous * speed
+
+
+def _peak(*values):
+    return Peak(*(jnp.asarray(value, float) for value in values))
+
+
+_TABLE = jb.Tabulated(*engine.TABLE)
+
+
+def _table(static, unit):
+    law = eqx.tree_at(lambda law: law.static, _TABLE, jnp.asarray(static, float))
+    return law.in_units_of(jnp.asarray(unit, float))
+
+
 _LAWS = {"conti": jb.Conti, "coulomb": jb.Coulomb, "stribeck": jb.Stribeck}
-_SIZES = {"conti": 4, "coulomb": 2, "stribeck": 3}
+_LAWS |= {"peak": _peak, "table": _table}
+_SIZES = {"conti": 4, "coulomb": 2, "stribeck": 3, "peak": 4, "table": 2}
 _KINDS = ("equilibrium", "cycle", "stuck")
 
 
@@ -36,7 +67,9 @@ def as_code(case):
     osc = case.oscillator
     belts = []
     for b in osc.belts:
-        law = f"jb.{b.law[0].capitalize()}({', '.join(repr(float(v)) for v in b.law[1:])})"
+        own = b.law[0] in ("peak", "table")
+        name = f"package._{b.law[0]}" if own else f"jb.{b.law[0].capitalize()}"
+        law = f"{name}({', '.join(repr(float(v)) for v in b.law[1:])})"
         edges = "".join(
             f", {name}={value!r}"
             for name, value in (("lower", b.lower), ("upper", b.upper))
@@ -87,14 +120,18 @@ def _from_numbers(structure, row):
 # ---------------------------------------------------------------- sweep
 
 
-def _leaves(structure, table):
-    """Rows of numbers in the order of the oscillator's leaves."""
+def _leaves(structure, table, moves=None):
+    """Rows of numbers in the order of the leaves of the oscillators that the kernel takes; with
+    `moves`, their derivatives along these."""
 
     def leaves(row):
-        osc = _from_numbers(structure, row)
+        osc = in_units_of_run(_from_numbers(structure, row))
         return jnp.stack([jnp.asarray(leaf, float) for leaf in jax.tree.leaves(osc)])
 
-    return np.asarray(jax.vmap(leaves)(jnp.asarray(table)))
+    if moves is None:
+        return np.asarray(jax.vmap(leaves)(jnp.asarray(table)))
+    along = jax.vmap(lambda row, move: jax.jvp(leaves, (row,), (move,))[1])
+    return np.asarray(along(jnp.asarray(table), jnp.asarray(moves)))
 
 
 def swept(cases, observe, directions=None, **options):
@@ -111,7 +148,7 @@ def swept(cases, observe, directions=None, **options):
         options["derivatives"] = "case"
         pairs = [tangent(case, direction) for case, direction in zip(cases, directions)]
         rows, moves = (np.array(part) for part in zip(*pairs))
-        tables.append(np.column_stack([moves, _leaves(structure, rows)]))
+        tables.append(np.column_stack([moves, _leaves(structure, table, rows)]))
 
     class Cases(question.Grid):
         def rows(self, runs, derivatives=()):

@@ -17,7 +17,9 @@ BATCH = 4096
 
 
 def settings(options):
-    names = ("runs", "by", "structure", "tol", "extreme_share")
+    names = ["runs", "by", "structure", "tol", "extreme_share"]
+    # Files of results that were written before there were any have no such setting.
+    names += ["heavy"] if options.heavy else []
     return {name: getattr(options, name) for name in names}
 
 
@@ -33,6 +35,8 @@ def outcome(options, number):
     judge = compare.judge_label if labels else compare.judge
     if labels and options.by != "find_cycle":
         judge = functools.partial(judge, again=lambda case, tol: package.labels([case], tol)[0])
+    elif options.heavy and options.what == "final":
+        judge = functools.partial(judge, again=lambda case, tol: package.finals([case], tol)[0])
     one, right = Outcome(f"{count} runs"), []
     told = _ask(batch, options)
     for case, answer, (verdict, mine) in zip(batch, told, _judged(judge, batch, told, options)):
@@ -94,6 +98,8 @@ def _case(rng, structure, options):
         if options.by == "find_cycle":
             return cases.grazing_cycle(rng, smallest)
         return cases.grazing_case(rng, structure, smallest)
+    if options.heavy:
+        return cases.heavy_case(rng, structure)
     chance = rng.random()
     if chance < 0.5:
         return cases.rational_case(rng, structure)
