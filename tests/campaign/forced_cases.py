@@ -548,7 +548,7 @@ def _numbers(case):
 def moved(case, direction, by=1.0):
     """The case with its numbers moved along a direction."""
     values, _ = _numbers(case)
-    # What is infinite stays.
+    # What is infinite stays so.
     rest = iter(np.where(np.isfinite(values), values + by * np.asarray(direction), values).tolist())
     y0, damping, omega = (next(rest), next(rest)), next(rest), next(rest)
 
@@ -561,6 +561,9 @@ def moved(case, direction, by=1.0):
     for b in case.oscillator.belts:
         velocity, load = take(b.velocity), take(b.load)
         law = (b.law[0], next(rest), *b.law[2:])
+        if law[0] == "coulomb" and b.law[1] == b.law[2]:
+            # The static limit does not come below the kinetic friction.
+            law = ("coulomb", law[1], law[1])
         belts.append(Belt(velocity, law, load, next(rest), next(rest)))
     forces = tuple(Harmonic(next(rest), next(rest), next(rest)) for _ in case.oscillator.forces)
     return replace(case, oscillator=Oscillator(damping, tuple(belts), forces, omega), y0=y0)
