@@ -355,16 +355,6 @@ class BifurcationPoint(eqx.Module):
     status: Array
     member: ArrayLike = 0
 
-    def in_units_of(self, variation: Variation) -> "BifurcationPoint":
-        """A point that was found in own units, in those of whoever gave what is varied."""
-        if variation.units is None:
-            return self
-        given, length, (unit,) = variation.own
-        value = self.value * unit
-        osc = given.oscillator(np.asarray(value)[None] if is_concrete(value) else value[None])
-        found = rescaled(self, length, lambda _: osc)
-        return replace(found, value=value, error=self.error * unit)
-
     @property
     def _own(self) -> "BifurcationPoint":
         """In own units, in which its condition knows it."""
@@ -468,6 +458,17 @@ class BifurcationPoint(eqx.Module):
             f"residual {float(self.residual):.1e}, {int(self.iterations)} iterations, "
             f"error < {float(self.error):.1e})"
         )
+
+
+def given_point(point: BifurcationPoint, variation: Variation) -> BifurcationPoint:
+    """A point that was found in own units, in those of whoever gave what is varied."""
+    if variation.units is None:
+        return point
+    given, length, (unit,) = variation.units
+    value = point.value * unit
+    osc = given.oscillator(np.asarray(value)[None] if is_concrete(value) else value[None])
+    found = rescaled(point, length, lambda _: osc)
+    return replace(found, value=value, error=point.error * unit)
 
 
 class Unexplained(AbstractCondition):

@@ -74,15 +74,6 @@ class BifurcationCurve(eqx.Module):
     def __len__(self) -> int:
         return len(self.values)
 
-    def in_units_of(self, variation: Variation) -> "BifurcationCurve":
-        """A curve that was found in own units, in those of whoever gave what is varied."""
-        if variation.units is None:
-            return self
-        _, length, units = variation.own
-        special = tuple(one.measured_in(units) for one in self.special)
-        found = rescaled(self, length)
-        return replace(found, values=self.values * units, special=special)
-
     @property
     def kinds(self) -> tuple[str, ...]:
         """Names of the conditions that hold, a row each."""
@@ -153,6 +144,16 @@ class BifurcationCurve(eqx.Module):
         )
 
 
+def given_curve(curve: BifurcationCurve, variation: Variation) -> BifurcationCurve:
+    """A curve that was found in own units, in those of whoever gave what is varied."""
+    if variation.units is None:
+        return curve
+    _, length, units = variation.units
+    special = tuple(one.measured_in(units) for one in curve.special)
+    found = rescaled(curve, length)
+    return replace(found, values=curve.values * units, special=special)
+
+
 @announced("bifurcation_curve")
 @outside_of_traces
 def bifurcation_curve(
@@ -211,7 +212,7 @@ def bifurcation_curve(
     require(inside, "span", f"around the point {known.tolist()}", limits.tolist())
     limits = limits / units[:, None]
     curve = follow_point(variation, point, start, limits, step=step, max_points=max_points)
-    return curve.in_units_of(variation)
+    return given_curve(curve, variation)
 
 
 def _varied_by_two(osc: Oscillator, where: Any, at: Any, limits: np.ndarray) -> Variation:

@@ -32,7 +32,7 @@ from ..model.own_units import quantity, rescaled
 from ..numerics.compiling import jit
 from ..results import Status, draw
 from ..tables import per_belt, table_of
-from .base import BifurcationPoint
+from .base import BifurcationPoint, given_point
 from .cells import in_plane_of_paper, region_name
 from .labels import Label
 from .path import ParameterPath
@@ -230,7 +230,7 @@ def bifurcation_diagram(
     branches = rescaled(tuple(_joined(pieces, list(special.values()))), length)
     at_ends = [given.oscillator(np.array([unit * v])) for v in (path.first, *middles, path.last)]
     return BifurcationDiagram(
-        points=tuple(point.in_units_of(path.variation) for point in points),
+        points=tuple(given_point(point, path.variation) for point in points),
         branches=tuple(replace(one, values=one.values * unit) for one in branches),
         regions=tuple(
             (a * float(unit), b * float(unit), name)

@@ -22,7 +22,7 @@ from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
 from ..numerics.compiling import is_outermost
 from ..results import Status
-from .base import AbstractCondition, BifurcationPoint
+from .base import AbstractCondition, BifurcationPoint, given_point
 from .path import ParameterPath
 from .scan import search
 
@@ -86,8 +86,8 @@ def refine(
     variation, near, value = _begun(condition, osc, where, at)
     point = condition.point(variation, near, value, room or condition.room)
     if not is_outermost(near, value, point):
-        return point.in_units_of(variation)
-    point = _bracketed(point, variation, value).in_units_of(variation)
+        return given_point(point, variation)
+    point = given_point(_bracketed(point, variation, value), variation)
     warn_of_extrapolation([point.cycle])
     return point
 

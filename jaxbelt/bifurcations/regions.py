@@ -36,7 +36,7 @@ from ..results import draw
 from ..tables import table_of
 from .bounds import Bounds, Pair
 from .cells import in_plane_of_paper, look_at
-from .curves import BifurcationCurve
+from .curves import BifurcationCurve, given_curve
 from .faces import Faces
 
 if TYPE_CHECKING:
@@ -226,7 +226,7 @@ def region_map(
         label, motions, on_line = seen.result()
     uncovered = bounds.search_between(motions, on_line) if lines else ()
     bounds.name_ends()
-    curves = tuple(curve.in_units_of(variation) for curve in bounds.curves)
+    curves = tuple(given_curve(curve, variation) for curve in bounds.curves)
     cycles = _cycles_of_examples(make, span, values, label)
     between = _names_between(own, span, values, label, on_line, curves, own_starts)
     pair = values[0], values[1]

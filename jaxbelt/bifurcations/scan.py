@@ -26,7 +26,13 @@ from ..cycles.cycle import as_loop, warn_of_extrapolation
 from ..model.oscillator import Oscillator
 from ..numerics.newton import NEWTON_STEPS
 from ..results import Status
-from .base import UNNAMED, AbstractCondition, BifurcationPoint, point_without_cycle
+from .base import (
+    UNNAMED,
+    AbstractCondition,
+    BifurcationPoint,
+    given_point,
+    point_without_cycle,
+)
 from .connections import SaddleConnection
 from .crossings import CrossingSliding, SlidingExchange
 from .edge_rests import BoundaryEquilibrium, PseudoHopf
@@ -94,7 +100,7 @@ def scan(
     resolution = as_whole(resolution, "resolution")
     path = ParameterPath(osc, where, span, conditions)
     points = search(path, resolution)
-    points = tuple(point.in_units_of(path.variation) for point in points)
+    points = tuple(given_point(point, path.variation) for point in points)
     warn_of_extrapolation((point.cycle for point in points), depth=5)
     return points
 

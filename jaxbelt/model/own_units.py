@@ -127,7 +127,7 @@ def in_own_units(osc: Oscillator, unit: Any = None) -> OwnOscillator:
     length: Any = own_length(osc) if unit is None else unit
     known = is_concrete((osc.omega, length))
     omega: Any = np.asarray(osc.omega) if known else osc.omega
-    if known and length == 1 and omega == 1:
+    if known and bool(length == 1) and bool(omega == 1):
         return _unchecked(OwnOscillator, **vars(osc), units=_units_of_one())
     units = _known_units(length, omega * length) if known else OwnUnits(length, omega * length)
     fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=jnp.ones(()))
