@@ -163,9 +163,11 @@ class ParameterPath:
         # Not nearer in a short span: a loop counts as repeated when it does so to 1e-7.
         distance = CLOSE * (self.unit + self.length)
         far = value - 30.0 * distance, value + 30.0 * distance
-        # Loops around a pseudo-focus with a velocity below 1e-5 are lost in rounding.
-        if slow or (value in self.breaks and any(map(self._has_pseudo_focus, far))):
+        if slow:
             return far
+        # Loops around a pseudo-focus with a velocity below some 1e-5 are lost in rounding.
+        if value in self.breaks and any(map(self._has_pseudo_focus, far)):
+            return value - 100.0 * distance, value + 100.0 * distance
         return value - distance, value + distance
 
     def _has_pseudo_focus(self, value: float) -> bool:
