@@ -131,7 +131,7 @@ def simulate(
             t1,
             ts=np.array([t1 * i / (samples - 1) for i in range(samples)]),
             rtol=tolerance,
-            atol=tolerance,
+            atol=None if tolerance == 1e-10 else tolerance,
             formulation=formulation,
             v_star=v_star,
             eps=eps,

@@ -148,7 +148,11 @@ def sweep(
         if t1 is None and observe != "attractor":
             t1 = 100.0
         asked: dict[str, Any] = dict(
-            y0=start, t1=t1, rtol=tolerance, atol=tolerance, observe=observe
+            y0=start,
+            t1=t1,
+            rtol=tolerance,
+            atol=None if tolerance == 1e-8 else tolerance,
+            observe=observe,
         )
         if dry_run:
             told = jb.explain(make, values, **asked)

@@ -394,12 +394,13 @@ class Variation:
         """The same oscillators in one unit of length, and the parameters in units of their own.
 
         rows: values of the parameters, [k] each; the unit of length is the largest of the own ones
-        of the oscillators there, and that of a parameter is by how much it changes a number of the
+        of the oscillators there (of several but the first), and that of a parameter is by how much it changes a number of the
         first of these by one, rounded down to a power of two.
         """
         if self.units is not None:
             return self
-        lengths = [own_length(self.oscillator(values)) for values in rows]
+        # Between the ends of a path there may be no possible oscillator.
+        lengths = [own_length(self.oscillator(values)) for values in rows[1:] or rows]
         one: Any = np if is_concrete(lengths) else jnp
         return self.in_units(functools.reduce(one.maximum, lengths), rows[0])
 
