@@ -393,9 +393,9 @@ class Variation:
     def in_own_units(self, *rows: Any) -> "Variation":
         """The same oscillators in one unit of length, and the parameters in units of their own.
 
-        rows: values of the parameters, [k] each; the unit of length is the largest of the own ones
-        of the oscillators there (of several but the first), and that of a parameter is by how much it changes a number of the
-        first of these by one, rounded down to a power of two.
+        rows: values of the parameters, [k] each. The unit of length is the largest of the own ones
+        of the oscillators there, of several but the first; that of a parameter is by how much it
+        changes a number of the first of these by one, rounded down to a power of two.
         """
         if self.units is not None:
             return self
