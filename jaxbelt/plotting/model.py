@@ -28,7 +28,7 @@ def plot_friction_law(
     speed: float | None = None,
     unit: str | None = None,
 ) -> Axes:
-    """Friction coefficient mu(|nu_R|) sgn(nu_R) over the relative velocity nu_R, up to `speed`.
+    """Friction coefficient `mu(|nu_R|) sgn(nu_R)` over the relative velocity nu_R, up to `speed`.
 
     friction: the law; or a `PhysicalBelt`, whose law takes speeds in m/s. speed: None: to where the
     table of a `Tabulated` ends, and 1 for another law; what is drawn beyond such an end is dashed,
