@@ -18,7 +18,7 @@ from ..checks import (
     require_value,
     traceable,
 )
-from ..identity import fingerprint_or_none_like_it
+from ..identity import fingerprint_or_unique
 from ..kernel.lanes import Observer, Program
 from ..model.oscillator import Oscillator, check_scalars, its_oscillator
 from ..model.own_units import in_units_of_run
@@ -41,7 +41,7 @@ class Grid:
             axes,
         )
         self.make = make
-        self.made_of = fingerprint_or_none_like_it(make)
+        self.made_of = fingerprint_or_unique(make)
         self.axes = {
             name: np.asarray(as_array(v, f"axis {name}", (None,))) for name, v in axes.items()
         }
@@ -90,7 +90,7 @@ class Grid:
             for belt, which in zip(self.example.belts, leaves.belts, strict=True)
             for varies, value in ((which.lower, belt.lower), (which.upper, belt.upper))
         )
-        made_of = fingerprint_or_none_like_it((self.structure, observer))
+        made_of = fingerprint_or_unique((self.structure, observer))
         return Program(self.structure, self.mapped, observer, bool(edges), made_of=made_of)
 
     def length(self) -> float:
