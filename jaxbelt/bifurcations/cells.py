@@ -24,7 +24,7 @@ from ..sweeps.attractor import CYCLE, UNDECIDED, Attractor, signature
 from ..sweeps.fractions import PLACE
 from ..sweeps.grid import Grid
 from ..sweeps.question import LONG_ENOUGH
-from ..sweeps.shares import told_apart
+from ..sweeps.shares import numbers_of_attractors
 from ..sweeps.work import results_of
 from .guesses import starts as starts_of_scan
 from .labels import Label
@@ -211,7 +211,7 @@ def _cycles_at(make, names, points, still: _Still, more: np.ndarray):
     places = np.stack([told[name] for name in PLACE], axis=-1)
     runs = Runs(places, signatures[which.reshape(kinds.shape)], RUN * RUN_TOLERANCE)
     cycles = np.where(kinds == CYCLE, kinds, UNDECIDED)
-    labels = told_apart(
+    labels = numbers_of_attractors(
         cycles, sticks, runs, lambda point: make(**_arguments(names, points[point]))
     )
     codes = sticks @ 2 ** np.arange(belts)
