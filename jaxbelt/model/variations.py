@@ -367,7 +367,7 @@ class Variation:
             units = UnitsOfVariation(given, known.length, known.parameters[[free]])
         return Variation(make, (self.names[free],), line, units=units)
 
-    def measured_in(self, units: np.ndarray) -> "Variation":
+    def measured_in(self, units: Any) -> "Variation":
         """The same with its parameters in these units, [k]."""
         if is_concrete(units) and np.all(units == 1.0):
             return self
