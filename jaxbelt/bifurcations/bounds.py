@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..activity import tell
+from ..activity import note_progress
 from ..model.variations import Variation
 from ..numerics.continuation import Stop
 from ..results import Status
@@ -96,7 +96,9 @@ class Bounds:
             # Far from curves that are known, and so from points of codimension two on them.
             at = int(np.argmax(away))
             row, column, along = rows[at].tolist()
-            tell(f"{len(self.curves)} curves, {int(untried.sum())} pairs of cells without one")
+            note_progress(
+                f"{len(self.curves)} curves, {int(untried.sum())} pairs of cells without one"
+            )
             fixed = float(self.values[1 - along][(row, column)[1 - along]])
             first = (row, column)[along]
             ends = self.values[along][first : first + 2]
@@ -133,7 +135,7 @@ class Bounds:
     ) -> None:
         """Follow the curves of points that are on none that is known."""
         for point in points:
-            tell(f"{len(self.curves)} curves from {told}")
+            note_progress(f"{len(self.curves)} curves from {told}")
             pair = np.empty(2)
             pair[along], pair[1 - along] = float(point.value), fixed
             if point.status == Status.OK and not any(

@@ -15,7 +15,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ..activity import announced, tell
+from ..activity import announced, note_progress
 from ..checks import (
     as_array,
     as_positive,
@@ -260,7 +260,7 @@ def _cycles_of_examples(make, names, values, label) -> dict[str, tuple[Cycle, ..
     """The cycles in the example of each region."""
     cycles = {}
     for name in sorted(set(np.unique(label).tolist()) - {""}):
-        tell(f"the portrait of region {name}")
+        note_progress(f"the portrait of region {name}")
         found = portrait(_at(make, names, _example(values, label == name)))
         cycles[name] = (*found.cycles, *found.unstable)
     return cycles
