@@ -32,6 +32,7 @@ from ..cycles.portrait import portrait
 from ..model.oscillator import Oscillator
 from ..model.own_units import in_own_units
 from ..model.variations import Variation
+from ..numerics.widths import as_here
 from ..results import draw
 from ..tables import table_of
 from .bounds import Bounds, Pair
@@ -220,7 +221,7 @@ def region_map(
 
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:
-        seen = beside.submit(_look_at_all, own, span, values, own_starts)
+        seen = beside.submit(as_here(_look_at_all), own, span, values, own_starts)
         if lines:
             bounds.search_lines(lines)
         label, motions, on_line = seen.result()
