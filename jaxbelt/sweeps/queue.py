@@ -28,8 +28,7 @@ from ..kernel.events import pass_events
 from ..kernel.lanes import Lanes, Observer, Program, are_finite, choose
 from ..kernel.rounds import STEPS_PER_ROUND, lanes_at_start
 from ..kernel.step import take_step, window_of
-from ..model.modes import without_edges
-from ..model.own_units import OwnOscillator, in_units
+from ..model.own_units import OwnOscillator, in_units, without_edges
 from ..model.rest import start_at_focus
 from ..numerics.compiling import jit, one_kernel
 from ..numerics.derivatives import in_directions
