@@ -28,8 +28,7 @@ from ..kernel.events import pass_events
 from ..kernel.lanes import Lanes, Observer, Program, are_finite, choose
 from ..kernel.rounds import STEPS_PER_ROUND, lanes_at_start
 from ..kernel.step import take_step, window_of
-from ..model.modes import without_edges
-from ..model.own_units import OwnOscillator, in_units
+from ..model.own_units import OwnOscillator, in_units, without_edges
 from ..model.rest import start_at_focus
 from ..numerics.compiling import jit, one_kernel
 from ..numerics.derivatives import in_directions
@@ -39,8 +38,8 @@ from ..results import Status
 #: Looks at the events between two refills: a refill costs about as much as a step, and a lane that
 #: waits for one is idle.
 ROUNDS_PER_PASS = 4
-#: Passes between two looks at whether there is more to do. An accelerator waits for the host at each
-#: look, and else at none: passes that find nothing to do change nothing.
+#: Passes between two looks at whether there is more to do. An accelerator waits for the host at
+#: each look, and else at none: passes that find nothing to do change nothing.
 PASSES_PER_LOOK = SideBySide(on_cpu=1, elsewhere=4)
 
 #: The default absolute tolerance of a step, in own units.
