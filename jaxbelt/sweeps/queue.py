@@ -39,8 +39,8 @@ from ..results import Status
 #: Looks at the events between two refills: a refill costs about as much as a step, and a lane that
 #: waits for one is idle.
 ROUNDS_PER_PASS = 4
-#: Passes between two looks at whether there is more to do. An accelerator waits for the host at each
-#: look, and else at none: passes that find nothing to do change nothing.
+#: Passes between two looks at whether there is more to do. An accelerator waits for the host at
+#: each look, and else at none: passes that find nothing to do change nothing.
 PASSES_PER_LOOK = SideBySide(on_cpu=1, elsewhere=4)
 
 #: The default absolute tolerance of a step, in own units.
