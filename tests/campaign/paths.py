@@ -26,9 +26,10 @@ from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import place_of
 
-from . import engine, package, units
+from . import engine, package
 from .cases import random_case, rational_case, structures
 from .outcome import Outcome
+from .units import ENGINES, Units, drawn
 
 #: Programs, one for each combination of laws, that a campaign compiles.
 PROGRAMS = 6
@@ -72,7 +73,7 @@ class Case:
     parameter: tuple[int, str]
     span: tuple[float, float]
     kind: str
-    units: units.Units = units.ENGINES
+    units: Units = ENGINES
 
     def at(self, value: float) -> engine.Oscillator:
         """The engine's oscillator there."""
@@ -626,7 +627,7 @@ def case_of(seed: int, number: int) -> Case:
         case = random_path(rng, kinds[number // 2 % len(kinds)], rational=number % 2 == 1)
         if _changes(case):
             break
-    return replace(case, units=units.drawn(rng, exact=case.kind == "rational"))
+    return replace(case, units=drawn(rng, exact=case.kind == "rational"))
 
 
 def _changes(case: Case) -> bool:
