@@ -464,7 +464,7 @@ def given_point(point: BifurcationPoint, variation: Variation) -> BifurcationPoi
     """A point that was found in own units, in those of whoever gave what is varied."""
     if variation.units is None:
         return point
-    given, length, (unit,) = variation.units
+    given, length, (unit,), _ = variation.units
     value = point.value * unit
     osc = given.oscillator(np.asarray(value)[None] if is_concrete(value) else value[None])
     found = rescaled(point, length, lambda _: osc)

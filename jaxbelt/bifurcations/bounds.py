@@ -16,6 +16,7 @@ import numpy as np
 from ..activity import note_progress
 from ..model.variations import Variation
 from ..numerics.continuation import Stop
+from ..numerics.widths import as_here
 from ..results import Status
 from .base import BifurcationPoint
 from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
@@ -76,7 +77,8 @@ class Bounds:
         # The next lines are searched while curves are followed from those before.
         with ThreadPoolExecutor(1) as ahead:
             searches = [
-                (line, ahead.submit(self._points, *line, self.limits[line[0]])) for line in across
+                (line, ahead.submit(as_here(self._points), *line, self.limits[line[0]]))
+                for line in across
             ]
             for count, ((along, fixed), found) in enumerate(searches, 1):
                 told = f"{count} of {len(across)} lines"

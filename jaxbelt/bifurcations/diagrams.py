@@ -226,7 +226,7 @@ def bifurcation_diagram(
         warn_of_fast_loops(fast, depth=5)
     pieces = [*_equilibrium_pieces(path, nodes), *_cycle_pieces(path, nodes, labels)]
     names = [region_name(path.at(v), label) for v, label in zip(middles, labels, strict=True)]
-    given, length, (unit,) = path.variation.own
+    given, length, (unit,), _ = path.variation.own
     branches = rescaled(tuple(_joined(pieces, list(special.values()))), length)
     at_ends = [given.oscillator(np.array([unit * v])) for v in (path.first, *middles, path.last)]
     return BifurcationDiagram(

@@ -216,7 +216,7 @@ def basin_fractions(
     starts = [starts_in(corners, n, jax.random.fold_in(key, row)) for row in range(rows)]
     # From here on in own units.
     variation = given.in_own_units(*np.array([[0.5 * (first + last)], [first], [last]]))
-    _, length, (unit,) = variation.own
+    length, (unit,) = variation.own.length, variation.own.parameters
     if numbers["atol"] is not None:
         numbers["atol"] /= float(length)
     found = _found_along(variation, values / unit, np.stack(starts) / length, numbers)

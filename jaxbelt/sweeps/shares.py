@@ -54,8 +54,8 @@ def attractors(
     Returns:
         A dataset over the other axes and `attractor`. Its variables are fraction, of the starts
         that lead there, and kind, signature, sticks, period, stick_duration, n_events and the
-        extrema, of one of its runs. Where there are fewer attractors than elsewhere the fraction is 0 and the
-        kind undecided. Fractions add up to 1 minus the share of undecided runs.
+        extrema, of one of its runs. Where there are fewer attractors than elsewhere the fraction
+        is 0 and the kind undecided. Fractions add up to 1 minus the share of undecided runs.
 
     Raises:
         ValueError: If the dataset is not of such a sweep, or if `make` is needed and not given.
