@@ -1,7 +1,7 @@
-"""States along an arc, however long it lasts, and arcs cut into pieces that a mesh can take.
+"""States along an arc of any duration, and arcs cut into pieces that a mesh can take.
 
-An arc may creep: to a node on the boundary of a belt, say, near which it stays for a hundred times
-as long as it moved, while steps of integration stay as short as the law is steep there.
+An arc may creep: to a node on the boundary of a belt, for example, near which it stays for a
+hundred times as long as it moved, while integration steps stay as short as the steep law needs.
 """
 
 from collections.abc import Callable
@@ -22,27 +22,31 @@ from ..numerics.compiling import each, jit, power_of_two
 from .chains import Loop
 from .shooting import flow
 
-#: Steps of integration, of order 12, in an arc at most.
+#: Largest number of integration steps, of order 12, in an arc.
 STEPS_ALONG = 100_000
-#: The integral of the density of steps over a piece at most, so that a mesh of 16 steps takes it.
+#: Largest integral of the density of steps over a piece; a mesh of 16 steps takes it.
 PIECE = 8.0
 #: Pieces that are cut off each arc in one compiled call.
 CUT_AT_ONCE = 32
-#: Rows of the arrays of arcs and pieces, at least, so that few shapes are compiled.
+#: Least number of rows of the arrays of arcs and pieces, so that few shapes are compiled.
 FEWEST = 16
 
 
 def places_along(
     osc: Oscillator, codes: Array, y: Array, duration: Array, rate: Callable, marks: Array
 ) -> tuple[Array, Array]:
-    """Times since the entry of an arc, and states, [n] and [n, 2], where the integral of a rate, a
-    function of the state, comes to each of the marks in order, or else where the arc ends."""
+    """Times since the entry of an arc, and states, [n] and [n, 2], at which an integral reaches
+    marks.
+
+    rate: the integrand, a function of the state; marks: in order. Marks that are not reached are at
+    the end of the arc.
+    """
     mode = mode_of(codes)
 
     def to(carry, mark):
         def before(carry):
             _, left, total = carry
-            # Where there is no rate, NaN, it is the end of the arc.
+            # Where there is no rate, NaN, the arc ends.
             return (left > 0) & ~(total >= mark)
 
         def step(carry):
@@ -64,9 +68,9 @@ def places_along(
 def arc_samples(
     osc: Oscillator, codes: Array, y: Array, exit_: Array, duration: Array, n: int
 ) -> tuple[Array, Array]:
-    """Times and states of n samples of an arc, the last at its end: three quarters of them evenly
-    along its way in the plane, the others evenly in time.
+    """Times and states of n samples of an arc, the last at its end.
 
+    Three quarters of them are spread evenly along its way in the plane, the others evenly in time.
     x1 and x2 are monotone, as extrema end arcs: |dx1| + |dx2| of the arc is the integral of that of
     its steps.
     """
@@ -82,8 +86,10 @@ def arc_samples(
 
 
 def cut_finely(osc: Oscillator, loop: Loop) -> Loop:
-    """Arcs one after another, those that want more steps than a PIECE takes cut into pieces; one
-    that is not the last of its arc ends by nothing ("unused")."""
+    """Arcs in a row, those that need more steps than a PIECE cut into pieces.
+
+    A piece that is not the last of its arc has no end event ("unused").
+    """
     count = len(loop.ends)
     padded = pick(loop, np.minimum(np.arange(power_of_two(count, FEWEST)), count - 1))
     entries, left = map(np.array, (padded.entries, padded.durations))
@@ -103,13 +109,13 @@ def cut_finely(osc: Oscillator, loop: Loop) -> Loop:
         if not own:  # an arc of no duration
             own.append((entry, 0.0))
     rows = np.repeat(np.arange(count), [len(own) for own in pieces])
-    told = pick(loop, rows)
+    cut_loop = pick(loop, rows)
     is_last = np.append(rows[1:] != rows[:-1], True)
-    ends = np.where(is_last, np.asarray(told.ends), Ends(len(osc.belts)).unused)
+    ends = np.where(is_last, np.asarray(cut_loop.ends), Ends(len(osc.belts)).unused)
     begins = np.stack([begin for own in pieces for begin, _ in own])
     durations = np.array([duration for own in pieces for _, duration in own])
     columns = jax.device_put((ends, begins, durations))
-    return eqx.tree_at(lambda a: (a.ends, a.entries, a.durations), told, columns)
+    return eqx.tree_at(lambda a: (a.ends, a.entries, a.durations), cut_loop, columns)
 
 
 @jit

@@ -1,9 +1,9 @@
 """The shortest way between two curves, in any direction or along x2: `shortest_between`.
 
-x1 and x2 are monotone on every piece, for arcs end at extrema. So a part of a piece lies in the box
-between its ends, and two boxes bound the distance between what is in them from below and from
-above. Only pairs of parts that may be nearest are looked at more closely: the shortest way between
-them is where two equations hold (see `Meeting`), which Newton's method solves.
+x1 and x2 are monotone on every piece, as arcs end at extrema. So a part of a piece lies in the box
+between its ends, and two boxes bound the distance between their contents from below and from above.
+Only pairs of parts that may be nearest are examined: the shortest way between them is where two
+equations hold (see `Meeting`), which Newton's method solves.
 """
 
 from typing import NamedTuple
@@ -24,21 +24,21 @@ from .outlines import Outline, Pieces, place_on
 PARTS, PAIRS, PIECES = 16, 64, 32
 #: Newton steps within a pair of parts, and the longest, in parts.
 WITHIN, LONGEST_IN_PARTS = 16, 2.0
-#: The last step is no longer, as a fraction of the piece, nor is the error in x1 along x2 larger.
+#: Largest last step, as a fraction of the piece; also the largest error in x1 along x2.
 FOUND = 1e-9
-#: A solution that is so far beyond its parts is taken, too: in parts.
+#: A solution that is so far beyond its parts is accepted, too: in parts.
 BEYOND = 0.25
 
 
 class Meeting(eqx.Module):
     """Where two curves are nearest to one another.
 
-    pieces: the number of the piece of each, [2]; fractions: where on it, [2]; fixed: whether that
-    is an end of the piece, where the curve may have a corner, [2].
-
     With P on the first curve, Q on the second and d = P - Q two equations hold. In any direction: d
     is normal to either curve, where that is not in a corner. Along x2: d1 = 0, and where neither is
     in a corner, the curves are parallel; or both are in corners, where one curve ends in the other.
+
+    pieces: number of the piece of each, [2]; fractions: places on these, [2]; fixed: whether that
+    is an end of the piece, where the curve may have a corner, [2].
     """
 
     pieces: Array
@@ -47,8 +47,11 @@ class Meeting(eqx.Module):
 
 
 class _PieceParts(NamedTuple):
-    """Parts of pieces: the piece of each, where on it they begin, how long they are, both as
-    fractions, and the corners of their boxes, [parts, 2]."""
+    """Parts of pieces.
+
+    piece: the piece of each; begin, width: where on it they begin and their length, as fractions;
+    low, high: corners of their boxes, [parts, 2].
+    """
 
     piece: np.ndarray
     begin: np.ndarray
@@ -58,8 +61,11 @@ class _PieceParts(NamedTuple):
 
 
 class _Tries(NamedTuple):
-    """Where Newton's method begins: the parts of both curves, fractions and what is fixed, [n, 2]
-    each; least: no such way is shorter."""
+    """Guesses for Newton's method.
+
+    parts: of both curves, [n, 2]; fractions; fixed: which of these are fixed; least: lower bound of
+    the distance.
+    """
 
     parts: np.ndarray
     fractions: np.ndarray
@@ -68,7 +74,7 @@ class _Tries(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """A curve where it is at one oscillator, and the parts of its pieces; see `sampled_curve`."""
+    """A curve at one oscillator, and the parts of its pieces; see `sampled_curve`."""
 
     pieces: Pieces
     parts: _PieceParts
@@ -80,7 +86,7 @@ def shortest_between(
     """The shortest way from one curve to another, and where it is; inf and None if there is none.
 
     along_x2: only ways between points with one x1. NaN and None where Newton's method finds none
-    that is as short as it is known to be.
+    that is as short as the known bound.
     """
     parts = first.parts, second.parts
     tries, limit = _tries_of(*parts, along_x2)
@@ -112,7 +118,7 @@ def sampled_curve(osc: Oscillator, outline: Outline) -> Sampled:
 
 
 def end_of_way(osc: Oscillator, second: Sampled, meeting: Meeting) -> np.ndarray:
-    """Where a shortest way ends on its second curve, [2]."""
+    """End of a shortest way on its second curve, [2]."""
     piece = jax.tree.map(lambda leaf: leaf[meeting.pieces[1]], second.pieces)
     return np.asarray(_place_of_row(osc, piece, meeting.fractions[1]))
 
@@ -134,7 +140,7 @@ def sampled_point(osc: Oscillator, y: np.ndarray) -> Sampled:
 def _parts_of(osc: Oscillator, pieces: Pieces) -> _PieceParts:
     durations, lengths = np.asarray(pieces.durations), np.asarray(pieces.lengths)
     is_point = (durations == 0) & (lengths == 0)
-    # Of a curve, not of a point, pieces without an extent are none.
+    # Pieces without an extent are left out, unless the curve is a point.
     used = np.ones(1, bool) if len(is_point) == 1 else ~is_point
     states = []
     for begin in range(0, len(used), PIECES):
@@ -168,8 +174,10 @@ def _states_of(osc: Oscillator, pieces: Pieces) -> Array:
 
 
 def _tries_of(one: _PieceParts, other: _PieceParts, along_x2: bool) -> tuple[_Tries, float]:
-    """What is to be tried, that which is likely to be nearest first, and a length that the shortest
-    way does not exceed, inf where there is none."""
+    """Pairs of parts to solve for, likely ones first, and an upper bound of the distance.
+
+    The bound is inf where there are none.
+    """
     apart = one.low[:, None] - other.high, other.low - one.high[:, None]
     least = np.maximum(np.maximum(*apart), 0.0)
     most = np.maximum(other.high - one.low[:, None], one.high[:, None] - other.low)
@@ -197,8 +205,10 @@ def _tries_of(one: _PieceParts, other: _PieceParts, along_x2: bool) -> tuple[_Tr
 
 
 def _choices(parts: _PieceParts, rows: np.ndarray) -> list[tuple[np.ndarray, ...]]:
-    """Where on its piece a point of each of these parts may be: somewhere in the part, or at an end
-    of the piece. A fraction, whether it is fixed, and whether that is a choice."""
+    """Possible places of the nearest point: somewhere in the part, or at an end of the piece.
+
+    Returns a fraction, whether it is fixed, and whether it is a choice.
+    """
     begin, width = parts.begin[rows], parts.width[rows]
     none, whole = np.zeros(len(rows), bool), np.ones(len(rows), bool)
     return [
@@ -212,8 +222,10 @@ def _choices(parts: _PieceParts, rows: np.ndarray) -> list[tuple[np.ndarray, ...
 
 
 def places_on(osc: Oscillator, first: Pieces, second: Pieces, fractions: Array):
-    """`place_on` for a row of each curve, at two fractions, [2]: three arrays [2, 2], of which the
-    first rows are of the first curve."""
+    """`place_on` for a row of each curve, at two fractions, [2]: three arrays [2, 2].
+
+    The first rows of these are of the first curve.
+    """
     steps = max(piece.mesh.shape[-1] for piece in (first, second))
     # Steps that are added are of length zero. One program does both.
     first, second = (
@@ -227,9 +239,9 @@ def places_on(osc: Oscillator, first: Pieces, second: Pieces, fractions: Array):
 def equations_of(places: tuple[Array, Array, Array], stay: Array, fixed: Array, along_x2: bool):
     """The two equations of a `Meeting`, [2], and their derivatives by the fractions, [2, 2].
 
-    places: what `places_on` gives. A fraction that is fixed is an equation by itself, along x2 in
-    the place of the second one, in any direction in that of its own; fixed: which are, [2]; stay:
-    how far they are from where they are to be, [2].
+    places: result of `places_on`. A fixed fraction is an equation alone: along x2 it replaces the
+    second one, in any direction its own; fixed: which fractions are, [2]; stay: their distances
+    from their values, [2].
     """
     (p, q), (dp, dq), (ddp, ddq) = places
     d, unit = p - q, jnp.eye(2)
@@ -263,8 +275,11 @@ def _solved_for(
     numbers: np.ndarray,
     along_x2: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fractions where the equations hold, [n, 2], and how long the ways are: inf where there is
-    none in these parts. numbers: of the pieces, [n, 2]."""
+    """Fractions where the equations hold, [n, 2], and the lengths of the ways, inf where there is
+    none.
+
+    numbers: of the pieces, [n, 2].
+    """
     n = len(numbers)
     rows = np.minimum(np.arange(PAIRS), n - 1)
     columns = [(curve.parts.begin, curve.parts.width) for curve in curves]
@@ -279,7 +294,7 @@ def _solved_for(
     found = _newton_in_parts(osc, *both, *jax.device_put((start, fixed, width)), along_x2)
     fractions, d, last = (np.asarray(one) for one in found)
     low, high = begin - BEYOND * width, begin + (1 + BEYOND) * width
-    # Where a piece ends above the other curve, as on an edge, rounding says on which side of it.
+    # Where a piece ends above the other curve, as on an edge, rounding decides on which side of it.
     inside = np.maximum(low, -FOUND) <= fractions
     inside &= fractions <= np.minimum(high, 1.0 + FOUND)
     good = np.all(inside | fixed, axis=1) & (last < FOUND)
@@ -309,7 +324,7 @@ def _newton_in_parts(
             step = solved_step(values, rows)
             longest = jnp.max(jnp.abs(step) / jnp.where(width > 0, width, 1.0))
             step = step * jnp.minimum(1.0, LONGEST_IN_PARTS / jnp.where(longest > 0, longest, 1.0))
-            # Arcs do not go far beyond where they end.
+            # Arcs do not continue far beyond their ends.
             new = jnp.clip(fractions + step, -0.1, 1.1)
             return jnp.where(fixed, start, new), jnp.max(jnp.abs(step))
 
@@ -335,7 +350,7 @@ class ShortestWay(eqx.Module):
     along_x2: bool = eqx.field(static=True)
 
     def ends(self, osc: Oscillator) -> tuple[Array, Array]:
-        """Where it begins and ends, [2] each, with first derivatives by every parameter."""
+        """Beginning and end of the way, [2] each, with first derivatives by every parameter."""
         return _ends_of(osc, self)
 
 

@@ -1,12 +1,13 @@
 """Curves of the phase plane in smooth pieces, as functions of the oscillator: `Outline`.
 
-A cycle, a separatrix and a segment of equilibria are such curves. An outline keeps what is discrete
-of one, the modes and the ends of its arcs, which do not change where the oscillator does a little;
-where the curve is follows from the oscillator, and so do its derivatives: of a cycle those of the
-shooting equations, of a separatrix those of its arcs one after another, each of which ends where
-the guard of its end vanishes.
+A cycle, a separatrix and a segment of equilibria are such curves. An outline keeps the discrete
+data of a curve, the modes and the ends of its arcs, which do not change when the oscillator changes
+a little; the place of the curve follows from the oscillator, and so do its derivatives: for a cycle
+those of the shooting equations, for a separatrix those of its arcs one after another, each of which
+ends where the guard of its end vanishes.
 
-A point of a curve has the number of its piece and a fraction, from 0 where the piece begins to 1.
+A point of a curve is given by the number of its piece and a fraction, from 0 at the beginning of
+the piece to 1.
 """
 
 from typing import Any
@@ -49,9 +50,9 @@ class Pieces(eqx.Module):
     """Pieces of curves, a row each: arcs of orbits, or straight lines along the x1 axis.
 
     way: 1, or -1 for an arc of the oscillator reversed in time, the x2 of which is reversed, too;
-    codes: contact codes, [pieces, belts]; mesh: steps as fractions, [pieces, steps]; entries: where
-    it begins, (x1, x2) or (x1, -x2), [pieces, 2]; durations: of the arc, 0 of a line; lengths: of
-    the line, 0 of an arc.
+    codes: contact codes, [pieces, belts]; mesh: steps as fractions, [pieces, steps]; entries:
+    beginning, (x1, x2) or (x1, -x2), [pieces, 2]; durations: of the arc, 0 for a line; lengths: of
+    the line, 0 for an arc.
     """
 
     way: Array
@@ -63,7 +64,7 @@ class Pieces(eqx.Module):
 
 
 def moved_in_time(osc: Oscillator, way: Array) -> Oscillator:
-    """The oscillator, or for way = -1 that reversed in time, see `backwards`."""
+    """The oscillator, or for way = -1 the one reversed in time, see `backwards`."""
     return eqx.tree_at(
         lambda o: [o.damping, *(b.velocity for b in o.belts), *(b.load for b in o.belts)],
         osc,
@@ -72,8 +73,10 @@ def moved_in_time(osc: Oscillator, way: Array) -> Oscillator:
 
 
 def place_on(osc: Oscillator, piece: Pieces, fraction: Array) -> tuple[Array, Array, Array]:
-    """A point (x1, x2) of a piece, one row of `Pieces`, and its first and second derivatives by the
-    fraction, [2] each."""
+    """A point (x1, x2) of a piece, and its first and second derivatives by the fraction, [2] each.
+
+    piece: one row of `Pieces`.
+    """
     moving, mode = moved_in_time(osc, piece.way), mode_of(piece.codes)
     y = flow(moving, piece.codes, piece.mesh, piece.entries, fraction * piece.durations)
 
@@ -97,12 +100,12 @@ class Outline(eqx.Module):
     """A curve that moves with the oscillator; see the module."""
 
     def pieces(self, osc: Oscillator) -> Pieces:
-        """Where its pieces are, with derivatives by every parameter."""
+        """Its pieces, with derivatives by every parameter."""
         raise NotImplementedError
 
 
 class Rest(Outline):
-    """Where the mass can rest at one place: a point, or the line of a segment.
+    """A state of rest, a point, or the line of a segment.
 
     first, last: numbers of its rows in `equilibria`.
     """
@@ -115,7 +118,7 @@ class Rest(Outline):
         x1 = rests.x1_lower[self.first]
         return Pieces(
             way=jnp.ones(1),
-            # Of belts that do not touch there is nothing to compute.
+            # Belts that do not touch need no computation.
             codes=jnp.full((1, len(osc.belts)), float(ABOVE)),
             mesh=jnp.ones((1, 1)),
             entries=jnp.stack([x1, jnp.zeros_like(x1)])[None],
@@ -125,10 +128,10 @@ class Rest(Outline):
 
 
 class JumpOutline(Outline):
-    """Of the boundary of a belt whose static limit exceeds mu(0) a piece where a mass that is stuck
-    is held, though the friction of one that slips is too weak for that: see `jumps`.
+    """A piece of a boundary on which only a static limit that exceeds mu(0) holds the mass.
 
-    upper: whether it is the one where the needed force, in the belt's direction, is the largest.
+    A stuck mass is held there, though the friction of a slipping one is too weak: see `jumps`.
+    upper: whether it is the piece where the needed force, in the belt's direction, is the largest.
     """
 
     belt: int = eqx.field(static=True)
@@ -150,9 +153,12 @@ class JumpOutline(Outline):
 
 @jit
 def _jumps_of(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
-    """Of the boundary of a belt, in each zone between contact edges, the x1 between which a mass is
-    held though friction at rest, mu(0), would not do, [2, zones] each, where that pulls to the left
-    and to the right; NaN where there are none; and the x2 of the boundary."""
+    """For each zone between contact edges, the pieces of a belt's boundary where only static
+    friction holds.
+
+    Returns the x1 of their ends, [2, zones] each, for friction at rest, mu(0), to the left and to
+    the right, NaN where there are none; and the x2 of the boundary.
+    """
     v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
     positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
     low, high = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
@@ -174,8 +180,8 @@ def _jumps_of(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
 
 
 def jumps(osc: Oscillator) -> list[tuple[int, int, bool]]:
-    """The pieces of boundaries that part motions themselves: belt, zone between contact edges, and
-    whether it is the upper one of the two there.
+    """The pieces of boundaries that divide motions: belt, zone between contact edges, and whether
+    upper.
 
     Where the static limit of a belt exceeds mu(0) a mass that comes to its boundary from one side
     is held up to the static limit, and one that is on the other side slips away.
@@ -209,11 +215,11 @@ def _solved_anew(osc: Oscillator, chain: Chain, z: Array) -> Array:
 class OpenOutline(Outline):
     """A stable separatrix, followed backwards from its point.
 
-    chain: its arcs, or pieces of them: one that ends by nothing ("unused") goes on in the next, and
-    the last one may be cut off so; durations: theirs. origin: of which sort its point is and
-    numbers that say which: "edge", its number; "segment", the row of `equilibria`, and 0 for its
-    lower and 1 for its upper end; "boundary", the belt, and the zone between edges; "corner", the
-    belt, and the edge.
+    chain: its arcs, or pieces of them: one without an end event ("unused") continues in the next,
+    and the last one may be cut off; durations: of these. origin: the sort of its point and numbers
+    that identify it: "edge", its number; "segment", the row of `equilibria`, and 0 for its lower
+    and 1 for its upper end; "boundary", the belt, and the zone between edges; "corner", the belt,
+    and the edge.
     """
 
     chain: Chain
@@ -246,7 +252,7 @@ class OpenOutline(Outline):
 
 @jit
 def _one_after_another(osc: Oscillator, chain: Chain, durations: Array, y: Array):
-    """Entries and durations of the arcs of a chain that is open, from where it begins.
+    """Entries and durations of the arcs of an open chain, from its beginning.
 
     Known durations are good to rounding. One Newton step gives each its first derivative.
     """

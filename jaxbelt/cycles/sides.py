@@ -1,7 +1,8 @@
-"""What lies beside the curves that part motions: to which attractors the starts there lead.
+"""Attractors on both sides of the curves that divide motions.
 
 On the axis x2 = 0 all cycles, separatrices and equilibria mark places, and all starts between two
-neighbouring places lead to one attractor. So one start between them tells, far from what is slow.
+neighbouring places lead to one attractor. So one start between them, far from slow motions, is
+enough.
 """
 
 from collections.abc import Sequence
@@ -30,19 +31,23 @@ from .outlines import (
 )
 from .portrait import Portrait
 
-#: Starts that are followed in one batch, and how often, MOST_ARCS arcs each.
+#: Starts that are followed in one batch, and number of rounds, MOST_ARCS arcs each.
 STARTS_AT_ONCE, ROUNDS = 16, 32
-#: x2 of places on the axis; of states that are the ends of arcs, good to 1e-9.
+#: Accuracy of x2 of places on the axis; states at ends of arcs are good to 1e-9.
 ON_AXIS = 1e-8
-#: A cycle that attracts weakly is known from as far off, relative to the distance from the origin.
+#: A cycle that attracts weakly is recognised from so far off, relative to the distance from the
+#: origin.
 KNOWN = 1e-3
-#: How far beside a curve that does not cross the axis starts are, and beside a boundary.
+#: Distance of starts from a curve that does not cross the axis, and from a boundary.
 ASIDE = 1e-6
 
 
 class Destination(NamedTuple):
-    """Where a start leads: what ("cycle", "equilibrium", "infinity" or "undecided"), and the number
-    in the portrait, of pieces of a segment that of the first, or -1."""
+    """Destination of a start.
+
+    what: "cycle", "equilibrium", "infinity" or "undecided"; number: in the portrait (for a segment
+    in pieces that of the first), or -1.
+    """
 
     what: str
     number: int
@@ -59,8 +64,8 @@ def destination_of_name(name: str) -> Destination:
 
 
 class Bound(NamedTuple):
-    """A curve that may part motions: what it is called, its outline, and where starts lead on its
-    two sides."""
+    """A curve that may divide motions: its name, its outline, and the destinations on its two
+    sides."""
 
     name: str
     outline: Outline
@@ -72,7 +77,7 @@ class Bound(NamedTuple):
 
 
 def bounds_of(portrait: Portrait) -> list[Bound]:
-    """All curves of a portrait that part motions which end differently, or may do so."""
+    """All curves of a portrait that divide motions with different ends, or may do so."""
     osc, places = portrait.oscillator, _places(portrait)
     found: list[tuple[str, Outline]] = []
     starts: list[np.ndarray] = []
@@ -101,7 +106,7 @@ def bounds_of(portrait: Portrait) -> list[Bound]:
 
 
 def _places(portrait: Portrait) -> np.ndarray:
-    """x1 of all that there is on the axis x2 = 0, from left to right."""
+    """x1 of everything on the axis x2 = 0, from left to right."""
     rests = portrait.equilibria
     found = [np.asarray(rests.x1_lower), np.asarray(rests.x1_upper)]
     found.append(np.asarray(jnp.stack(edges(portrait.oscillator))))
@@ -136,7 +141,7 @@ def _across(osc: Oscillator, outline: Outline) -> np.ndarray:
 
 
 def leads_to(portrait: Portrait, starts: np.ndarray) -> list[Destination]:
-    """Where starts lead, [n, 2], among what the portrait tells."""
+    """Destinations of starts, [n, 2], in a portrait."""
     ends: list[Destination | None] = [None] * len(starts)
     states = np.array(starts, float)
     for _ in range(ROUNDS):
@@ -144,8 +149,8 @@ def leads_to(portrait: Portrait, starts: np.ndarray) -> list[Destination]:
         for first in range(0, left.size, STARTS_AT_ONCE):
             batch = left[first : first + STARTS_AT_ONCE]
             filled = batch[np.minimum(np.arange(STARTS_AT_ONCE), batch.size - 1)]
-            told = _followed_on(portrait.oscillator, jax.device_put(states[filled]))
-            for i, status, top, rest, y in zip(batch, *map(np.asarray, told)):
+            followed = _followed_on(portrait.oscillator, jax.device_put(states[filled]))
+            for i, status, top, rest, y in zip(batch, *map(np.asarray, followed)):
                 ends[i] = _destination(portrait, int(status), float(top), float(rest), y)
                 states[i] = y
     return [Destination("undecided", -1) if end is None else end for end in ends]
@@ -153,7 +158,7 @@ def leads_to(portrait: Portrait, starts: np.ndarray) -> list[Destination]:
 
 @jit
 def _followed_on(osc: Oscillator, starts: Array):
-    """Of each start, [n, 2]: the status, the last top, where it rests, and where it is left."""
+    """For each start, [n, 2]: the status, the last top, the place of rest, and the last state."""
 
     def one(start):
         orbit = follow(osc, start, MOST_ARCS)
@@ -167,7 +172,7 @@ def _followed_on(osc: Oscillator, starts: Array):
 def _destination(
     portrait: Portrait, status: int, top: float, rest: float, y: np.ndarray
 ) -> Destination | None:
-    """Where an orbit has come to; None if that is not yet known."""
+    """Where an orbit has come to; None if that is not known yet."""
     if not np.isnan(rest):
         number = _row_of_rest(portrait, rest)
         return Destination("equilibrium", number) if number >= 0 else Destination("undecided", -1)
@@ -181,7 +186,7 @@ def _destination(
 
 
 def _row_of_rest(portrait: Portrait, x1: float) -> int:
-    """The first row of where the mass rests at x1, or -1."""
+    """The first row of the state of rest at x1, or -1."""
     lower, upper = (
         np.asarray(ends) for ends in (portrait.equilibria.x1_lower, portrait.equilibria.x1_upper)
     )
@@ -194,7 +199,7 @@ def _row_of_rest(portrait: Portrait, x1: float) -> int:
 
 
 def resting_places(portrait: Portrait) -> Sequence[Rest]:
-    """Where the mass can rest: points, and segments with all their pieces."""
+    """States of rest: points, and segments with all their pieces."""
     rests = portrait.equilibria
     kinds, lower, upper = map(np.asarray, (rests.kind, rests.x1_lower, rests.x1_upper))
     found: list[Rest] = []
