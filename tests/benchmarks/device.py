@@ -272,34 +272,43 @@ def kernel_alone(axes, options, events: float) -> dict[str, Any]:
     asked = Question.of(
         jb.presets.class_b, axes, options["y0"], options["t1"], 1e-8, None, "final", ()
     )
-    grid, counted = asked.grid, Counted()
-    table = grid.rows(np.arange(grid.runs))
-    with counted.counting(), Timed() as timed:
-        threads.run(
-            asked.program,
-            grid.shared,
-            lambda first, last: table[..., first:last],
-            grid.runs,
-            lambda *_: None,
-            **asked.numbers,
-        )
+    grid = asked.grid
+    table, told, lane_passes, seconds = grid.rows(np.arange(grid.runs)), {}, 0, math.nan
+    # Does a device gain where one thread makes queues while the lanes of another are at work?
+    for each in (1, 2):
+        counted = Counted()
+        with counted.counting(), Timed() as timed:
+            threads.run(
+                asked.program,
+                grid.shared,
+                lambda first, last: table[..., first:last],
+                grid.runs,
+                lambda *_: None,
+                threads=each * threads.workers(),
+                **asked.numbers,
+            )
+        if each > 1:
+            told[f"kernel: runs/s, {each} times the threads"] = grid.runs / timed.seconds
+        else:
+            lane_passes, seconds = counted.lane_passes, timed.seconds
     operations, moved = cost_of_pass(asked.program, grid.shared)
     rate, memory = peaks()
     bounds = {
-        "float64 operations": counted.lane_passes * operations / rate,
-        "memory": counted.lane_passes * moved / memory,
+        "float64 operations": lane_passes * operations / rate,
+        "memory": lane_passes * moved / memory,
     }
     bound = max(bounds, key=lambda name: bounds[name])
     return {
-        "kernel: runs/s": grid.runs / timed.seconds,
-        "kernel: returns/s": events * grid.runs / timed.seconds,
-        "kernel: steps of a lane a run": counted.lane_passes
+        "kernel: runs/s": grid.runs / seconds,
+        "kernel: returns/s": events * grid.runs / seconds,
+        **told,
+        "kernel: steps of a lane a run": lane_passes
         * (ROUNDS_PER_PASS * STEPS_PER_ROUND / grid.runs),
         "float64 operations/s of the device": rate,
         "bytes/s of the device": memory,
         "kernel: bound by": bound,
-        "kernel: share of the bound": bounds[bound] / timed.seconds,
-        "kernel: share of float64 operations": bounds["float64 operations"] / timed.seconds,
+        "kernel: share of the bound": bounds[bound] / seconds,
+        "kernel: share of float64 operations": bounds["float64 operations"] / seconds,
     }
 
 
