@@ -31,15 +31,11 @@ STEP_BUDGET = 400_000
 #: Runs that the kernel gets at once: enough that a call costs nothing beside them, and few enough
 #: that the threads end together.
 CHUNK = SideBySide(on_cpu=2**14, elsewhere=2**20)
-#: Number of lanes, large enough that a refill is cheap for each. A GPU has some 2**18 threads; with
-#: more lanes, more would wait for the last runs.
-WIDTH = SideBySide(on_cpu=128, elsewhere=2**18)
+#: Number of lanes, large enough that a refill is cheap for each.
+WIDTH = SideBySide(on_cpu=128, elsewhere=2**20)
 #: Few runs have fewer lanes, by powers of `COARSER`, so that few programs are compiled.
 LEAST_WIDTH = SideBySide(on_cpu=128, elsewhere=2**10)
-COARSER = 16
-#: Threads for each device other than a CPU: one makes queues and stores results while the lanes of
-#: the other are at work.
-THREADS_PER_DEVICE = 2
+COARSER = 32
 #: Seconds within which an interrupt takes effect; a call of the kernel takes half of that or less.
 PATIENCE = 0.5
 #: Passes of the first call, before it is known how long one takes: about a seventh of a second on
@@ -57,10 +53,9 @@ def compiled(program: Program) -> Callable:
 
 
 def workers() -> int:
-    """Number of threads that run the kernel: one for each core on the CPU, elsewhere some for
-    each device."""
+    """Number of threads that run the kernel: one for each core, or device other than a CPU."""
     if not is_cpu():
-        return THREADS_PER_DEVICE * jax.local_device_count()
+        return jax.local_device_count()
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
