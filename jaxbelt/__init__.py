@@ -21,7 +21,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     motion/         integrators arcs flights sensitivities sampling loops batches runs smoothing
     motion/         simulate
     cycles/         chains settling shooting orbits cycle attractors functionals
-    cycles/         backwards returns creeping separatrices portrait unstable
+    cycles/         backwards returns separatrices portrait unstable
     cycles/         outlines nearest sides shocks
     sweeps/         observers moments along reducers attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
