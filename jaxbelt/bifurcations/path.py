@@ -27,10 +27,11 @@ from jaxtyping import ArrayLike
 
 from ..checks import is_concrete, require
 from ..cycles.attractors import (
+    GOES_ON,
     LEAST_MOMENT,
-    SOLVED,
+    SAME,
     Itinerary,
-    apart,
+    distance,
     itinerary,
     place_of,
     sticks,
@@ -66,8 +67,6 @@ DIFFERENCE = 1e-3
 #: A cycle is where it is expected if it is no further from there, relative to its size, or than
 #: a third of the way that it is expected to go. Nearer to a square root, intervals get smaller.
 EXPECTED = 1e-3
-#: An unstable cycle goes on to one at the next value that is no farther off, relative to its size.
-BESIDE_ONE_ANOTHER = 0.3
 
 
 class ParameterPath:
@@ -365,7 +364,8 @@ class ParameterPath:
         if found is None or found.path != path:
             return None
         places = [place_of(one) for one in (loop, expected, found.loop)]
-        if apart(places[1], places[2]) > EXPECTED * (1 + 300 * apart(places[0], places[1])):
+        way = distance(places[0], places[1])
+        if distance(places[1], places[2]) > EXPECTED * (1 + 300 * way):
             return None
         at = _number_among(found, self.cycles[value])
         if at is None:
@@ -442,7 +442,7 @@ def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
 
 def _is_beside(cycle: Cycle, other: Cycle) -> bool:
     """Whether another cycle is found, and so near that one goes on to the other."""
-    return _is_found(other) and apart(place_of(cycle), place_of(other)) < BESIDE_ONE_ANOTHER
+    return _is_found(other) and distance(place_of(cycle), place_of(other)) < GOES_ON
 
 
 def _width(cycle: Cycle) -> float:
@@ -469,7 +469,7 @@ def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> i
             continue
         if other.path == cycle.path and sticks(cycle.path):
             return number
-        if apart(place, place_of(other.loop)) < SOLVED:
+        if distance(place, place_of(other.loop)) < SAME:
             return number
     return None
 
