@@ -13,7 +13,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     numerics/       spacing widths programs compiling
     checks          arguments, checked at the public edge
     tables          results as tables
-    numerics/       derivatives extrapolation newton continuation roots
+    numerics/       padding derivatives extrapolation newton continuation roots
     model/          friction forcing oscillator own_units machine parameters variations modes
     model/          pseudofocus transitions instants rest events equilibria far_out
     presets         the published systems

@@ -35,12 +35,6 @@ def pick(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def filled(tree: Any, rows: Any, size: int) -> Any:
-    """Some rows of a tree of known arrays, filled up to `size` with the last of them, so that few
-    shapes are compiled."""
-    return pick(tree, np.asarray(rows)[np.minimum(np.arange(size), len(rows) - 1)])
-
-
 def require(condition: Any, field: str, expected: str, got: Any) -> None:
     """Raises `ValueError("<field> must be <expected>, got <got>")` unless `condition` holds.
 

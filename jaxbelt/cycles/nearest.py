@@ -15,10 +15,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import filled
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
 from ..numerics.newton import Equations, solution, solve
+from ..numerics.padding import filled, longer
 from .outlines import Outline, Pieces, place_on
 
 #: Parts of a piece; pairs of parts that are solved for in one batch, and pieces that are sampled.
@@ -201,7 +201,7 @@ def _side_by_side(*two: Pieces) -> Pieces:
     """Two rows of `Pieces`, stacked. Steps that are added are of length zero."""
     steps = max(one.mesh.shape[-1] for one in two)
     padded = [
-        eqx.tree_at(lambda p: p.mesh, one, jnp.pad(one.mesh, (0, steps - one.mesh.shape[-1])))
+        eqx.tree_at(lambda p: p.mesh, one, longer(one.mesh, steps, axis=-1, fill=0.0))
         for one in two
     ]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)

@@ -16,7 +16,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import filled
 from ..model.equilibria import equilibria
 from ..model.modes import (
     ABOVE,
@@ -33,6 +32,7 @@ from ..model.transitions import contact
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import each, jit, power_of_two
+from ..numerics.padding import filled
 from .backwards import BackwardCycle, moved_in_time
 from .chains import Chain, Loop
 from .cycle import Cycle

@@ -12,11 +12,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import filled
 from ..model.equilibria import EquilibriumKind
 from ..model.modes import edges
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
+from ..numerics.padding import filled
 from ..results import Status
 from .orbits import MOST_ARCS, follow, place_of_rest
 from .outlines import ClosedOutline, Line, OpenOutline, Outline, jumps, place_on
