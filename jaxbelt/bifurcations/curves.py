@@ -26,7 +26,7 @@ from ..checks import (
     require,
     require_value,
 )
-from ..cycles.attractors import PLACE_DIMENSIONS
+from ..cycles.attractors import PLACE_DIMENSIONS, distance
 from ..model.oscillator import Oscillator
 from ..model.own_units import own_length, quantity, rescaled
 from ..model.parameters import leaf_index
@@ -294,9 +294,8 @@ def follow_point(
 
 
 def is_elsewhere(place: np.ndarray, other: np.ndarray, far: float) -> bool:
-    """Whether two places at most a step apart belong to two motions, as far as they are known."""
-    size = max(np.ptp(place[:4]), np.ptp(other[:4]), far)
-    return bool(np.max(np.abs(place - other)[:4]) > far * size)
+    """Whether two places a step or less apart are of two cycles, or fixed points, where known."""
+    return bool(distance(place[:4], other[:4], least=far) > far)
 
 
 # --- going along ----------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces, require
-from ..cycles.attractors import MOMENT
+from ..cycles.attractors import BESIDE, MOMENT, distance
 from ..cycles.chains import Loop, cut
 from ..cycles.cycle import Cycle, exactly, polish, warn_of_fast_loops
 from ..model.equilibria import candidates
@@ -41,8 +41,8 @@ from .scan import by_value, edges_touched, is_at_one_value, search
 if TYPE_CHECKING:
     import pandas
 
-#: Ends of two pieces of a branch count as one place if they differ by less, relative to their size.
-SAME = 1e-2
+#: Smallest size by which distances between ends of branches are measured.
+LEAST_SIZE = 0.1
 
 
 class Branch(eqx.Module):
@@ -480,11 +480,11 @@ def _joined(pieces: Sequence[_Piece], special: Sequence[list[BifurcationPoint]])
             if piece.stretch in (at, at + 1)
         ]
         pairs = sorted(
-            (_distance(a, b), i, j) for (i, a), (j, b) in combinations(enumerate(ends), 2)
+            (_between(a, b), i, j) for (i, a), (j, b) in combinations(enumerate(ends), 2)
         )
         taken: set[int] = set()
-        for distance, i, j in pairs:
-            if distance < SAME and not taken & {i, j}:
+        for away, i, j in pairs:
+            if away < BESIDE and not taken & {i, j}:
                 taken |= {i, j}
                 for a, b in ((ends[i], ends[j]), (ends[j], ends[i])):
                     partner[a.piece, a.right] = (b.piece, b.right)
@@ -508,11 +508,10 @@ def _end(number: int, piece: _Piece, *, right: bool) -> _End:
     return _End(number, right, (branch.kind, float(branch.x1_min[row]), float(branch.x1_max[row])))
 
 
-def _distance(a: _End, b: _End) -> float:
-    """Distance of two ends, relative to the size of the motion there."""
+def _between(a: _End, b: _End) -> float:
+    """How far apart two ends are, relative to the motion there."""
     (kind, *x), (other, *y) = a.place, b.place
-    size = max(x[1] - x[0], y[1] - y[0], 0.1)
-    return max(abs(x[0] - y[0]), abs(x[1] - y[1])) / size if kind == other else np.inf
+    return distance(x, y, least=LEAST_SIZE) if kind == other else np.inf
 
 
 def _reversed(branch: Branch) -> Branch:

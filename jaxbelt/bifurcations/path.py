@@ -28,10 +28,11 @@ from jaxtyping import ArrayLike
 
 from ..checks import is_concrete, require
 from ..cycles.attractors import (
+    GOES_ON,
     LEAST_MOMENT,
-    SOLVED,
+    SAME,
     Itinerary,
-    apart,
+    distance,
     itinerary,
     place_of,
     sticks,
@@ -67,9 +68,6 @@ DIFFERENCE = 1e-3
 #: A cycle is at its expected place if it is no farther from there than this, relative to its size,
 #: or than a third of its expected move. Closer to a square root, intervals get smaller.
 EXPECTED = 1e-3
-#: Largest distance of an unstable cycle from the one that it continues to at the next value,
-#: relative to its size.
-BESIDE_ONE_ANOTHER = 0.3
 
 
 class ParameterPath:
@@ -378,7 +376,8 @@ class ParameterPath:
         if found is None or found.path != path:
             return None
         places = [place_of(one) for one in (loop, expected, found.loop)]
-        if apart(places[1], places[2]) > EXPECTED * (1 + 300 * apart(places[0], places[1])):
+        way = distance(places[0], places[1])
+        if distance(places[1], places[2]) > EXPECTED * (1 + 300 * way):
             return None
         at = _number_among(found, self.cycles[value])
         if at is None:
@@ -454,8 +453,8 @@ def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
 
 
 def _is_beside(cycle: Cycle, other: Cycle) -> bool:
-    """Whether another cycle is found, and so near that one continues to the other."""
-    return _is_found(other) and apart(place_of(cycle), place_of(other)) < BESIDE_ONE_ANOTHER
+    """Whether another cycle is found, and so near that one goes on to the other."""
+    return _is_found(other) and distance(place_of(cycle), place_of(other)) < GOES_ON
 
 
 def _width(cycle: Cycle) -> float:
@@ -482,7 +481,7 @@ def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> i
             continue
         if other.path == cycle.path and sticks(cycle.path):
             return number
-        if apart(place, place_of(other.loop)) < SOLVED:
+        if distance(place, place_of(other.loop)) < SAME:
             return number
     return None
 

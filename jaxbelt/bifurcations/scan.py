@@ -21,7 +21,7 @@ import numpy as np
 
 from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces
-from ..cycles.attractors import SOLVED, apart, is_same, itinerary, place_of
+from ..cycles.attractors import SAME, distance, is_same, itinerary, place_of
 from ..cycles.cycle import as_loop, warn_of_extrapolation
 from ..model.oscillator import Oscillator
 from ..numerics.newton import NEWTON_STEPS
@@ -308,9 +308,9 @@ def _is_apart(point: BifurcationPoint, other: BifurcationPoint) -> bool:
 def _is_another(point: BifurcationPoint, other: BifurcationPoint) -> bool:
     """Whether two points at one value are of two cycles, or of two equilibria."""
     if all(int(one.cycle.status) == Status.OK for one in (point, other)):
-        return apart(place_of(point.cycle), place_of(other.cycle)) >= SOLVED
-    away = abs(float(point.x1) - float(other.x1))
-    return away > SOLVED * max(abs(float(point.x1)), abs(float(other.x1)), 1.0)
+        return distance(place_of(point.cycle), place_of(other.cycle)) >= SAME
+    places = ([float(one.x1), 0.0] for one in (point, other))
+    return distance(*places, least=1.0) > SAME
 
 
 def _first_found(

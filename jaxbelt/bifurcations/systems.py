@@ -29,6 +29,7 @@ from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.newton import HOLDS, STEP_ROUNDING, Equations, is_settled, newton, solve
+from ..numerics.padding import longer
 from ..results import Status
 
 #: Weight of the unknowns of a cycle in the length of a step along a curve, beside the two
@@ -256,9 +257,9 @@ class CycleSystem(AbstractSystem):
         error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
         is_tangent = chain.ends >= Ends(chain.codes.shape[-1]).tangent
         error = jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
-        mesh, others = chain.mesh, (PARTS_OF_ARC - 1) * chain.mesh.shape[-1]
+        mesh = chain.mesh
         fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
-        coarse = jnp.pad(mesh, [(0, 0), (0, others)])
+        coarse = longer(mesh, fine.shape[-1], axis=-1, fill=0.0)
         is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
         mesh = jnp.where(is_exact[:, None], coarse, fine)
         return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))

@@ -113,9 +113,8 @@ class Grid:
 
     def rows(self, runs: np.ndarray, derivatives: tuple[str, ...] = ()) -> np.ndarray:
         """Starts and varying parameters of some runs, [1 + derivatives, columns, runs]."""
-        padding = power_of_two(len(runs), FEWEST_ROWS) - len(runs)
-        padded = np.concatenate([runs, np.zeros(padding, runs.dtype)])
-        places = np.unravel_index(padded, self.shape)
+        size = power_of_two(len(runs), FEWEST_ROWS)
+        places = np.unravel_index(np.resize(runs, size), self.shape)
         values = {
             name: axis[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)
         }
