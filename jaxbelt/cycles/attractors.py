@@ -1,4 +1,4 @@
-"""When two motions are one attractor: `itinerary`, `place_of`, `distance` and `is_same`.
+"""Identity of attractors: `itinerary`, `place_of`, `distance` and `is_same`.
 
 The events of one loop do not identify a cycle: there may be two cycles with one sequence of events.
 Two properties do:
@@ -41,12 +41,12 @@ LEAST_MOMENT = 1e-16
 #: Distance below which two cycles that shooting solved for are the same: its equations hold to
 #: 1e-9, and beside a fold a cycle moves by ten thousand times that.
 SAME = 1e-5
-#: The same of runs of a sweep, times its tolerance: its errors are ten to a thousand times that.
+#: The same for runs of a sweep, times its tolerance: its errors are ten to a thousand times that.
 RUN = 1e3
 #: Distance below which two motions may be the same: ends of two pieces of one branch; runs whose
-#: distance or events leave it open, which shooting then tells.
+#: distance or events are not conclusive, for which shooting decides.
 BESIDE = 1e-2
-#: Distance below which an unstable cycle goes on to one at the next value of a parameter.
+#: Distance below which an unstable cycle continues to one at the next value of a parameter.
 GOES_ON = 0.3
 
 
@@ -120,7 +120,7 @@ def distance(place: ArrayLike, other: ArrayLike, least: float = 0.0) -> Any:
 
 
 def is_same(cycle: Cycle, other: Cycle) -> bool:
-    """Whether two cycles of one oscillator are one; both with status OK."""
+    """Whether two cycles of one oscillator are the same; both with status OK."""
     if int(cycle.status) != Status.OK or int(other.status) != Status.OK:
         return False
     modes, others = (itinerary(one.oscillator, one) for one in (cycle, other))
@@ -177,7 +177,7 @@ class Runs:
         return Runs(self.places[index], np.asarray(self.signatures[index]), self.error)
 
     def same(self, others: "Runs") -> tuple[np.ndarray, np.ndarray]:
-        """Which of two runs each lead to one cycle, and for which this does not tell."""
+        """Which pairs of runs lead to one cycle, and for which pairs this is not certain."""
         away = distance(self.places, others.places)
         fits = self.signatures == others.signatures
         same = fits & (away < self.error)

@@ -1,9 +1,9 @@
 """The shortest way between two curves, in any direction or along x2: `shortest_between`.
 
-x1 and x2 are monotone on every piece, for arcs end at extrema. So a part of a piece lies in the box
-between its ends, and two boxes bound the distance between what is in them from below and from
-above. Newton's method solves for the shortest way (see `Meeting`) between those pairs of parts only
-that these bounds leave.
+x1 and x2 are monotone on every piece, as arcs end at extrema. So a part of a piece lies in the box
+between its ends, and two boxes bound the distance between their contents from below and from above.
+Newton's method solves for the shortest way (see `Meeting`) only between pairs of parts that these
+bounds leave.
 """
 
 from typing import NamedTuple
@@ -49,8 +49,8 @@ class Normal(Equations):
     """The two equations of a `Meeting` in its fractions.
 
     With P on the first curve, Q on the second and d = P - Q: in any direction d is normal to both
-    curves; along x2 d1 = 0, and the curves are parallel. A fixed fraction is an equation by itself
-    and replaces its own, along x2 the second one; two of them replace both.
+    curves; along x2 d1 = 0, and the curves are parallel. A fixed fraction is an equation alone and
+    replaces its own, along x2 the second one; two of them replace both.
 
     given: oscillator; the two pieces, rows of `Pieces` stacked; the known fractions; fixed.
     """
@@ -140,7 +140,7 @@ def shortest_between(
         pieces = [filled(curves[k].pieces, number[:, k], PAIRS) for k in (0, 1)]
         found = _solved(osc, *pieces, *filled((fractions, fixed), now, PAIRS), along_x2)
         z, to, d, last = (np.asarray(one)[: now.size] for one in found)
-        # Where a piece ends above the other curve, as on an edge, rounding says on which side.
+        # Where a piece ends above the other curve, as on an edge, rounding decides on which side.
         inside = np.maximum(begin - BEYOND, -FOUND) <= z
         inside &= z <= np.minimum(begin + 1 / PARTS + BEYOND, 1 + FOUND)
         good = np.all(inside | fixed[now], axis=1) & (last < FOUND)
@@ -157,11 +157,10 @@ def shortest_between(
 
 
 def _tries_of(one: Sampled, other: Sampled, along_x2: bool) -> tuple[np.ndarray, ...]:
-    """Where Newton's method begins, that which is likely to be nearest first.
+    """Guesses for Newton's method, likely ones first.
 
-    Returns the parts of both curves, fractions, and which are fixed, [n, 2] each; the length that
-    no such way falls below, [n]; and one that the shortest way does not exceed, inf if there is
-    none.
+    Returns the parts of both curves, fractions, and which are fixed, [n, 2] each; lower bounds of
+    the lengths, [n]; and an upper bound of the shortest way, inf if there is none.
     """
     apart = one.low[:, None] - other.high, other.low - one.high[:, None]
     least = np.maximum(np.maximum(*apart), 0.0)

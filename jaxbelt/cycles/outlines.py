@@ -45,7 +45,7 @@ from .shooting import closed, end_guard, flow, meshed
 STEPS, PIECE = 16, 8.0
 #: Pieces that are cut off each arc in one compiled call.
 CUT_AT_ONCE = 32
-#: Rows of the arrays of arcs and pieces, at least, so that few shapes are compiled.
+#: Least number of rows of the arrays of arcs and pieces, so that few shapes are compiled.
 FEWEST = 16
 
 
@@ -71,7 +71,7 @@ class Pieces(eqx.Module):
 
 
 def straight(osc: Oscillator, x1: Array, to: Array, x2: Array) -> Pieces:
-    """A straight line along x1, or a point; there is nothing to compute for belts that are away."""
+    """A straight line along x1, or a point; belts that do not touch need no computation."""
     one, away = jnp.ones(1), jnp.full((1, len(osc.belts)), float(ABOVE))
     return Pieces(one, away, one[None], jnp.stack([x1, x2])[None], 0 * one, (to - x1) * one)
 
@@ -119,7 +119,7 @@ class Line(Outline):
 
 @jit
 def jumps(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
-    """Pieces of the boundary of a belt that part motions themselves.
+    """Pieces of the boundary of a belt that divide motions.
 
     Where the static limit of a belt exceeds mu(0) a mass that comes to its boundary from one side
     is held up to the static limit, and one that is on the other side slips away. There is one such
@@ -228,12 +228,11 @@ def _chain_of(osc: Oscillator, loop: Loop) -> Chain:
 
 
 def _cut_finely(osc: Oscillator, loop: Loop) -> Loop:
-    """The arcs of an orbit one after another, those that need more than STEPS steps cut into
-    pieces; one that is not the last of its arc ends by nothing ("unused"). Rows that pad it are of
-    no duration.
+    """Arcs in a row, those that need more than STEPS steps cut into pieces.
 
-    An arc may creep: to a node on the boundary of a belt, say, near which it stays for a hundred
-    times as long as it moved.
+    A piece that is not the last of its arc has no end event ("unused"). Padding rows have no
+    duration. An arc may creep: to a node on the boundary of a belt, for example, near which it
+    stays for a hundred times as long as it moved.
     """
     count = len(loop.ends)
     padded = filled(loop, np.arange(count), power_of_two(count, FEWEST))

@@ -1,4 +1,4 @@
-"""Curves that part motions, and to which attractors the starts on their two sides lead.
+"""Curves that divide motions, and the attractors on both sides of them.
 
 On the axis x2 = 0 all cycles, separatrices and equilibria mark places, and all starts between two
 neighbouring places lead to one attractor. So one start between them, far from slow motions, is
@@ -35,10 +35,10 @@ ASIDE = 1e-6
 
 
 class Destination(NamedTuple):
-    """Where a start leads.
+    """Destination of a start.
 
-    what: "cycle", "equilibrium", "infinity" or "undecided"; number: in the portrait, of a segment
-    in pieces that of the first, or -1.
+    what: "cycle", "equilibrium", "infinity" or "undecided"; number: in the portrait (for a segment
+    in pieces that of the first), or -1.
     """
 
     what: str
@@ -58,8 +58,8 @@ UNDECIDED = Destination("undecided")
 
 
 class Bound(NamedTuple):
-    """A curve that may part motions: its name, its outline, and where starts on its two sides
-    lead."""
+    """A curve that may divide motions: its name, its outline, and the destinations on its two
+    sides."""
 
     name: str
     outline: Outline
@@ -132,7 +132,7 @@ def _across(osc: Oscillator, outline: Outline) -> np.ndarray:
 
 
 def leads_to(portrait: Portrait, starts: np.ndarray) -> list[Destination]:
-    """Where starts lead, [n, 2], among what the portrait tells."""
+    """Destinations of starts, [n, 2], in a portrait."""
     ends: dict[int, Destination] = {}
     states = np.array(starts, float)
     for _ in range(ROUNDS):
