@@ -127,7 +127,7 @@ def announced(name: str) -> Callable[[Callable], Any]:
     return decorate
 
 
-def tell(text: str) -> None:
+def note_progress(text: str) -> None:
     """Say how far the outermost activity is."""
     logger.debug(text)
     outermost = Activity.under_way[:1]
