@@ -51,6 +51,7 @@ def sweep(
     *,
     y0: ArrayLike | tuple = (3.0, 0.0),
     t1: ArrayLike | None = None,
+    t0: ArrayLike = 0.0,
     rtol: ArrayLike = 1e-8,
     atol: ArrayLike | None = None,
     observe: Any = "final",
@@ -114,7 +115,7 @@ def sweep(
     cannot be written.
     """
     with _ends_told() as known:
-        question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives)
+        question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives, t0)
         audit = float(as_array(audit, "audit"))
         require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
         require(

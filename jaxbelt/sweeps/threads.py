@@ -79,6 +79,7 @@ def run(
     t1: float,
     rtol: float,
     atol: float | None,
+    t0: float | None = None,
     derivatives: int = 0,
     budget: float = 1.0,
     threads: int | None = None,
@@ -88,7 +89,8 @@ def run(
 
     rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]: the starts and the
     parameters that vary, and their derivatives in so many directions. Starts and atol are in the
-    units in which the oscillators were given; atol None: the default, in own units. put(numbers,
+    units in which the oscillators were given; atol None: the default, in own units. t0: see
+    `queue.Common`. put(numbers,
     results) takes results [1 + derivatives, columns, runs] in any order, on any thread. budget: the
     share of `STEP_BUDGET` that a run may take.
 
@@ -101,7 +103,8 @@ def run(
         return
     largest = np.iinfo(np.int32).max
     require(runs <= largest, "axes", f"{largest} runs or fewer in one call", runs)
-    limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
+    span = t1 - (t0 or 0.0)
+    limit = int(budget * STEP_BUDGET * max(1.0, span / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
     limit = min(limit, largest)
     threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
@@ -109,7 +112,7 @@ def run(
     width = lanes_for(-(-runs // threads))
     most = CHUNK.here * width // WIDTH.here
     team = _Team(
-        functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit))),
+        functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit), t0)),
         functools.partial(_first_streams, program, shared, width, columns, derivatives),
         rows_of,
         put,
