@@ -31,10 +31,10 @@ STEP_BUDGET = 400_000
 #: Runs that the kernel is given at once: enough that a call costs nothing beside them, and few
 #: enough that the threads end together.
 CHUNK = SideBySide(on_cpu=2**14, elsewhere=2**20)
-#: Lanes, so many that a refill is cheap for each; and for few runs fewer, by factors of `COARSER`,
-#: so that few programs are compiled. A GPU has some 2**18 threads; with four times as many lanes the
-#: last runs would keep more of them waiting.
+#: Lanes, so many that a refill is cheap for each. A GPU has some 2**18 threads; of more lanes more
+#: would wait for the last runs.
 WIDTH = SideBySide(on_cpu=128, elsewhere=2**18)
+#: Few runs have fewer lanes, by powers of `COARSER`, so that few programs are compiled.
 LEAST_WIDTH = SideBySide(on_cpu=128, elsewhere=2**10)
 COARSER = 16
 #: Threads for each device that is no CPU: one makes queues and keeps results while the lanes of the
