@@ -269,7 +269,9 @@ def _meeting(points, doubt, rounding, ends, h, room, reach, number) -> _Meeting:
     falls = slope < 0
     near = jnp.abs(value) * jnp.maximum(-slope, SLOW * jnp.abs(bend)) <= reach * slope * slope
     straight = value * value * jnp.abs(bend) * h <= room * slope * slope
-    near = near & falls & straight
+    # Where it only touches, within rounding, no Taylor step leads to it.
+    depth = jnp.where(bend > 0, 0.5 * slope * slope / jnp.where(bend > 0, bend, 1.0), jnp.inf)
+    near = near & falls & straight & (value - depth < -rounding)
     delta = -value / jnp.where(near, slope, 1.0)
     delta = delta - 0.5 * bend * delta * delta / jnp.where(near, slope, 1.0)
     return _Meeting(
@@ -342,15 +344,14 @@ def _meetings(osc, clock: StepClock, window: Window, lanes: Lanes, new: _Attempt
         lambda: _limits(osc, clock, window, lanes, new, room, reach),
         [_no_meeting(h, 3 * n + i) for i in range(2)],
     )
+    asked = stuck & (lanes.status != Status.STUCK_FOREVER.value)
     for limit in limits:
-        found.append(
-            replace(
-                limit,
-                once=limit.once & stuck,
-                cut=limit.cut & stuck,
-                delta=jnp.where(stuck, limit.delta, NEVER),
-            )
+        once, cut, delta = (
+            limit.once & asked,
+            limit.cut & asked,
+            jnp.where(asked, limit.delta, NEVER),
         )
+        found.append(replace(limit, once=once, cut=cut, delta=delta))
     return found
 
 
