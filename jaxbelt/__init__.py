@@ -14,8 +14,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     checks          arguments, checked at the public edge
     tables          results as tables
     numerics/       derivatives extrapolation newton continuation roots
-    model/          friction oscillator own_units machine parameters variations modes pseudofocus
-    model/          transitions rest events equilibria far_out
+    model/          friction forcing oscillator own_units machine parameters variations modes
+    model/          pseudofocus transitions rest events equilibria far_out
     presets         the published systems
     kernel/         lanes marks step events rounds
     motion/         integrators arcs flights sensitivities sampling loops batches runs smoothing

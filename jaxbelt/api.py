@@ -48,7 +48,8 @@ from .inverse.design import Design, design, distance_to
 from .inverse.fit import Fit, fit
 from .inverse.margins import distance_to_basin_boundary
 from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
-from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck, Tabulated
+from .model.forcing import AbstractForce, BaseMotion, Harmonic, Oscillating
+from .model.friction import AbstractFriction, Conti, Coulomb, Cubic, Stribeck, Tabulated
 from .model.machine import Machine, PhysicalBelt, Units
 from .model.oscillator import Belt, Oscillator
 from .motion.simulate import Arcs, Events, Trajectory, simulate
@@ -71,12 +72,14 @@ if TYPE_CHECKING:
     from .plotting.sweeps import plot_basins, plot_sweep
 
 __all__ = [
+    "AbstractForce",
     "AbstractFriction",
     "Arcs",
     "AtEvents",
     "AtExtrema",
     "AtSection",
     "AtTimes",
+    "BaseMotion",
     "BasinFractions",
     "BasinStability",
     "Basins",
@@ -90,6 +93,7 @@ __all__ = [
     "CornerCollision",
     "Coulomb",
     "CrossingSliding",
+    "Cubic",
     "Cycle",
     "Design",
     "EdgeExchange",
@@ -103,12 +107,14 @@ __all__ = [
     "FoldOfCycles",
     "GrazingEdge",
     "GrazingSliding",
+    "Harmonic",
     "Hopf",
     "HopfAtInfinity",
     "Machine",
     "MeetingEdges",
     "NonsmoothFold",
     "OrbitDiagram",
+    "Oscillating",
     "Oscillator",
     "PhysicalBelt",
     "Portrait",

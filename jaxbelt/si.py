@@ -30,7 +30,7 @@ from .model.equilibria import Equilibria
 from .model.friction import LawInUnits
 from .model.machine import Machine, Units
 from .model.modes import STUCK, mode_acceleration, mode_of
-from .model.oscillator import Oscillator
+from .model.oscillator import Oscillator, constant_force
 from .model.parameters import names_of
 from .motion.simulate import Trajectory
 from .results import EventKind, Status
@@ -270,7 +270,7 @@ def _friction_force(osc: Oscillator, codes: Array, ys: Array) -> Array:
     def at(codes, y):
         mode, (x1, x2) = mode_of(codes), y
         a = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
-        return a + x1 + osc.damping * x2
+        return sum((-push for push in constant_force(osc)), start=a + x1 + osc.damping * x2)
 
     return jax.vmap(at)(codes.astype(jnp.float64), ys)
 

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..model.modes import STUCK, Mode, capacity, mode_acceleration, select, stick_velocity
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, constant_force
 from ..model.transitions import contact
 from ..numerics.compiling import the_solvers
 from ..numerics.derivatives import forward_jacobian
@@ -66,6 +66,8 @@ def smooth_field(osc: Oscillator, y: tuple[Array, Array], eps: Array) -> tuple[A
     """
     x1, x2 = y
     force = -x1 - osc.damping * x2
+    for push in constant_force(osc):
+        force = force + push
     for belt in osc.belts:
         r = belt.velocity - osc.omega * x2
         touches = (belt.lower < x1) & (x1 < belt.upper)

@@ -31,7 +31,7 @@ from ..cycles.separatrices import Separatrix
 from ..model.equilibria import Equilibria, EquilibriumKind, stability
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.modes import mode_acceleration
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, constant_force
 from ..model.transitions import mode_of_state
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
@@ -398,7 +398,8 @@ def _window(osc, paths, equilibria, xlim, ylim):
     if not paths:
         # Nothing but the oscillator: every fixed point lies within the reach of friction.
         reach = 1 + sum(float(b.load) * float(b.friction.static) for b in osc.belts)
-        x1 += [-reach, reach]
+        middle = float(sum(constant_force(osc)))
+        x1 += [middle - reach, middle + reach]
     x1 += [float(e) for b in osc.belts for e in (b.lower, b.upper) if np.isfinite(float(e))]
     x2 = [0.0, *(float(b.velocity) / float(osc.omega) for b in osc.belts)]
     x2 += [x for path in paths for x in (path[:, 1].min(), path[:, 1].max())]
