@@ -15,11 +15,11 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     tables          results as tables
     numerics/       derivatives extrapolation newton continuation roots
     model/          friction forcing oscillator own_units machine parameters variations modes
-    model/          pseudofocus transitions rest events equilibria far_out
+    model/          pseudofocus transitions instants rest events equilibria far_out
     presets         the published systems
     kernel/         lanes marks step events rounds
-    motion/         integrators arcs flights sensitivities sampling loops batches runs smoothing
-    motion/         simulate
+    motion/         integrators arcs flights sensitivities sampling loops batches timed runs
+    motion/         smoothing simulate
     cycles/         chains settling shooting orbits cycle attractors functionals
     cycles/         backwards returns creeping separatrices portrait unstable
     cycles/         outlines nearest sides shocks

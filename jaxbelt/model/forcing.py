@@ -251,6 +251,11 @@ class Oscillating(_Wave):
         """Its derivative by the time."""
         return -self.amplitude * self.frequency * jnp.sin(self.frequency * t + self.phase)
 
+    def derivative(self, t: Array, order: int) -> Array:
+        """Its derivative of that order, 1 or more, by the time."""
+        angle = self.frequency * t + self.phase + order * 0.5 * jnp.pi
+        return self.amplitude * self.frequency**order * jnp.cos(angle)
+
     def integral(self, start: Array, duration: Array) -> Array:
         """Its integral over a time from `start` on, exact for small frequencies, too."""
         half = 0.5 * self.frequency * duration
