@@ -353,6 +353,24 @@ def states_along(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration:
     return jnp.concatenate([y[None], states])
 
 
+@jit
+def guards_along(osc: Oscillator, chain: TimedChain, z: Array) -> tuple[Array, Array, Array]:
+    """Of all arcs the states at the ends of steps, [N, steps + 1, 3], and the guards of their modes
+    there and how fast these change, [N, steps + 1, guards]."""
+
+    def one(osc, codes, mesh, unknown):
+        mode = mode_of(codes)
+
+        def at(y):
+            found = course(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+            return found.value, found.slope
+
+        states = states_along(osc, codes, mesh, unknown[:3], unknown[3])
+        return states, *jax.vmap(at)(states)
+
+    return arc_by_arc(one)((osc,), (chain.codes, chain.mesh, z))
+
+
 def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array) -> Array:
     """The least value that a guard of its mode has along an arc, up to rounding.
 

@@ -5,12 +5,12 @@ which `clocked` solves for the motion that repeats after them.
 """
 
 import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -28,7 +28,7 @@ from ..checks import (
 )
 from ..model.events import Signature, signature_name
 from ..model.modes import BELOW, STUCK, mode_of, stick_velocity
-from ..model.oscillator import Oscillator, at_time, check_oscillator, has_clock
+from ..model.oscillator import Oscillator, at_time, check_clock, check_oscillator
 from ..model.own_units import in_given_units, in_own_units, quantity
 from ..motion.arcs import Ends
 from ..motion.simulate import Arcs, simulate
@@ -313,7 +313,7 @@ def arcs_over(osc: Oscillator, y0: Any, turns: int) -> Followed:
     codes = np.array([row[3] for row in rows])
     ends = [
         names.period if then[1] else _end_between(names, now[3], then[3])
-        for now, then in zip(rows, rows[1:])
+        for now, then in itertools.pairwise(rows)
     ]
     starts = np.concatenate([[np.asarray(y0, float)], states[:reached]])
     columns = codes[:-1], np.array(ends, int), np.array(found)[:-1], lengths
@@ -358,12 +358,18 @@ def _polished(osc: Oscillator, chain: TimedChain, guess: Array) -> tuple[Periodi
     residual = jnp.max(jnp.abs(values[0]))
     fine = (residual < HOLDS) & (settled < HOLDS)
     status = jnp.where(fine, Status.OK.value, Status.NO_CONVERGENCE.value)
-    inside = timed_admissible(still, chain, at)
-    status = jnp.where(fine & ~inside, Status.NOT_ADMISSIBLE.value, status)
     # Where it sticks all along, no place is better than another.
     always = jnp.all(jnp.any(chain.codes == STUCK, axis=-1) | ~chain.used)
     status = jnp.where(always, Status.NEUTRAL.value, status)
-    return _motion(osc, chain, z, residual, solved.iterations, status), error
+    return motion_at(osc, chain, z, residual, solved.iterations, status), error
+
+
+def motion_at(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
+    """The motion with the unknowns z, NaN with a status where it is none."""
+    inside = timed_admissible(*lax.stop_gradient((osc, chain, z)))
+    fails = (status == Status.OK) & ~inside
+    status = jnp.where(fails, Status.NOT_ADMISSIBLE.value, status)
+    return _motion(osc, chain, z, residual, iterations, status)
 
 
 def _motion(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
@@ -488,17 +494,12 @@ def periodic(osc: Oscillator, guess: ArrayLike | tuple, *, periods: int = 1) -> 
         motion.multipliers, motion.stable, motion.start
     """
     check_oscillator(osc)
-    _check_clock(osc, "periodic", "jb.find_cycle or jb.unstable_cycle")
+    check_clock(osc, "periodic", "jb.find_cycle or jb.unstable_cycle")
     guess = as_array(guess, "guess", (2,))
     check_finite(guess, "guess")
     periods = as_whole(periods, "periods")
     require(periods <= PERIODS_AT_ONCE, "periods", f"at most {PERIODS_AT_ONCE}", periods)
     return _differentiable(osc, guess, lambda o, y, turns: periodic_from(o, y, periods, turns))
-
-
-def _check_clock(osc: Oscillator, name: str, instead: str) -> None:
-    expected = f"with a clock: {name} is for oscillators that are forced; use {instead}"
-    require(has_clock(osc), "osc", expected, "one without forcing")
 
 
 def _differentiable(osc: Oscillator, y: Array, find: Any) -> PeriodicMotion:
