@@ -556,7 +556,7 @@ def _repeated(
     return None
 
 
-def cycle_with_clock(osc: Oscillator, y0: Array) -> PeriodicMotion:
+def motion_reached(osc: Oscillator, y0: Array) -> PeriodicMotion:
     """What `find_cycle` returns of an oscillator with a clock."""
     return _differentiable(osc, y0, attracted)
 
