@@ -83,7 +83,7 @@ class NoEdge(float):
 jax.tree_util.register_pytree_node(NoEdge, lambda edge: ((), float(edge)), lambda at, _: NoEdge(at))
 
 
-def scaled_edge(edge: Array, factor: ArrayLike) -> Array:
+def scaled_edge(edge: Array | NoEdge, factor: ArrayLike) -> Array | NoEdge:
     """An edge in another unit, without a slope where it is at infinity, in reverse mode neither."""
     if is_concrete(edge):
         return edge if np.isinf(edge) else edge * factor
