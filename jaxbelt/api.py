@@ -1,7 +1,7 @@
-"""The public names, with all that is behind them.
+"""The public names, and everything behind them.
 
-`import jaxbelt` alone imports nothing: the package takes its names from here when the first of them
-is asked for, so that the command line answers at once what it can answer without computing.
+`import jaxbelt` alone imports nothing: the package takes its names from here when the first one is
+used, so that the command line answers at once what it can answer without computing.
 """
 
 import inspect
@@ -48,7 +48,8 @@ from .inverse.design import Design, design, distance_to
 from .inverse.fit import Fit, fit
 from .inverse.margins import distance_to_basin_boundary
 from .model.equilibria import Equilibria, EquilibriumKind, equilibria, lyapunov_coefficient
-from .model.friction import AbstractFriction, Conti, Coulomb, Stribeck, Tabulated
+from .model.forcing import AbstractForce, BaseMotion, Harmonic, Oscillating
+from .model.friction import AbstractFriction, Conti, Coulomb, Cubic, Stribeck, Tabulated
 from .model.machine import Machine, PhysicalBelt, Units
 from .model.oscillator import Belt, Oscillator
 from .motion.simulate import Arcs, Events, Trajectory, simulate
@@ -71,12 +72,14 @@ if TYPE_CHECKING:
     from .plotting.sweeps import plot_basins, plot_sweep
 
 __all__ = [
+    "AbstractForce",
     "AbstractFriction",
     "Arcs",
     "AtEvents",
     "AtExtrema",
     "AtSection",
     "AtTimes",
+    "BaseMotion",
     "BasinFractions",
     "BasinStability",
     "Basins",
@@ -90,6 +93,7 @@ __all__ = [
     "CornerCollision",
     "Coulomb",
     "CrossingSliding",
+    "Cubic",
     "Cycle",
     "Design",
     "EdgeExchange",
@@ -103,12 +107,14 @@ __all__ = [
     "FoldOfCycles",
     "GrazingEdge",
     "GrazingSliding",
+    "Harmonic",
     "Hopf",
     "HopfAtInfinity",
     "Machine",
     "MeetingEdges",
     "NonsmoothFold",
     "OrbitDiagram",
+    "Oscillating",
     "Oscillator",
     "PhysicalBelt",
     "Portrait",
@@ -185,7 +191,7 @@ class _Words:
 
 
 def _let_help_be_read(function: Callable) -> None:
-    """Let `help` say ArrayLike, not what that is, which takes more room than all the rest."""
+    """Makes `help` show ArrayLike by its name instead of the long union that it is."""
     signature = inspect.signature(function)
     arrays = inspect.formatannotation(ArrayLike).removeprefix("Union[").removesuffix("]")
 

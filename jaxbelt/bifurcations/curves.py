@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from ..activity import announced, tell
+from ..activity import announced, note_progress
 from ..checks import (
     as_array,
     as_interval,
@@ -305,7 +305,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
     rows: list[_Row] = []
     special: list[SpecialPoint] = []
     while True:
-        tell(f"{len(rows)} points on one side")
+        note_progress(f"{len(rows)} points on one side")
         points, found, beyond, end = _leg(problem, track, u, direction, origin)
         rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
         special += found

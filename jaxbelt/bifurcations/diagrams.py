@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..activity import announced, tell
+from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces, require
 from ..cycles.attractors import MOMENT
 from ..cycles.chains import Loop, cut
@@ -213,7 +213,7 @@ def bifurcation_diagram(
     path.look(np.concatenate(nodes))
     middles = [float(values[len(values) // 2]) for values in nodes]
     labels = [path.label(value) for value in middles]
-    tell(f"branches between {len(points)} points")
+    note_progress(f"branches between {len(points)} points")
     for stretch, around in _separated(labels):
         found = edges_touched(path, nodes[stretch], around)
         points = by_value([*points, *found])

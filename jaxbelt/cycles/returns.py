@@ -32,7 +32,7 @@ from ..model.equilibria import Equilibria, EquilibriumKind, side_pulls
 from ..model.far_out import contraction_far_out, is_bounded
 from ..model.friction import AbstractFriction
 from ..model.modes import edges
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, constant_force
 from ..numerics.compiling import each, jit
 from ..results import Status
 from .attractors import distinct
@@ -459,6 +459,7 @@ def reach_of(osc: Oscillator) -> float:
     frequency = np.sqrt(max(1 - zeta**2 / 4, 0.0))
     decay = np.exp(-np.pi * abs(zeta) / (2 * frequency)) if frequency > 0 else 0.0
     friction = sum(_largest_pull(belt) for belt in osc.belts)
+    friction += abs(float(sum(constant_force(osc))))
     bound = friction * (1 + decay) / max(1 - decay, 1e-12)
     # Equilibria and all that may be an end of an interval lie within.
     inner = [friction, *(abs(edge) for edge in map(float, edges(osc)) if np.isfinite(edge))]

@@ -44,7 +44,7 @@ from ..model.modes import (
     select,
 )
 from ..model.modes import edges as edge_positions
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, constant_force
 from ..model.rest import is_at_rest
 from ..numerics.compiling import the_solvers
 from .lanes import Lanes, choose, materialise
@@ -172,6 +172,8 @@ def _quotient(osc: Oscillator, window: _Window, ones: Array, x1: Array, x2: Arra
 @jax.custom_jvp
 def _as_quotient(osc: Oscillator, signs, pulls, ones: Array, x1: Array, x2: Array) -> Array:
     numerator, denominator = -x1 - osc.damping * x2, ones
+    for push in constant_force(osc):
+        numerator = numerator + push
     for belt, sign, pull in zip(osc.belts, signs, pulls, strict=True):
         top, bottom = belt.friction.fraction(sign * (belt.velocity - osc.omega * x2))
         numerator = numerator * bottom + pull * top * denominator
@@ -185,7 +187,8 @@ def _(primals, tangents):
     more division keeps their sum."""
     osc, signs, pulls, ones, _, x2 = primals
     d_osc, _, d_pulls, _, d_x1, d_x2 = tangents
-    total = _sum_of_changes((-1.0, d_x1), (-osc.damping, d_x2), (-x2, d_osc.damping))
+    pushes = [(1.0, d_push) for d_push in constant_force(d_osc)]
+    total = _sum_of_changes((-1.0, d_x1), (-osc.damping, d_x2), (-x2, d_osc.damping), *pushes)
     forces = zip(osc.belts, d_osc.belts, signs, pulls, d_pulls, strict=True)
     for belt, d_belt, sign, pull, d_pull in forces:
         law, speed = belt.friction, sign * (belt.velocity - osc.omega * x2)

@@ -52,7 +52,7 @@ class AbstractFriction(eqx.Module):
 
     @abc.abstractmethod
     def mu(self, speed: Array) -> Array:
-        """Kinetic friction coefficient at sliding speed |nu_R| (dimensionless, any shape).
+        """Kinetic friction coefficient at sliding speed `|nu_R|` (dimensionless, any shape).
 
         Must be smooth for speed >= 0 and stay finite and smooth slightly below 0; 0 <= mu(0) <=
         static, and the latter two are equal for a law without a jump.
@@ -298,7 +298,7 @@ class Conti(AbstractFriction):
     def mu(self, speed: Array) -> Array:
         """Kinetic friction coefficient mu(r), eq. (7) of the paper.
 
-        speed: |nu_R| = |nu - omega x2| >= 0, dimensionless, any shape. Returns the same shape.
+        speed: `|nu_R| = |nu - omega x2|` >= 0, dimensionless, any shape. Returns the same shape.
         """
         numerator, denominator = self.fraction(speed)
         return numerator / denominator
@@ -355,6 +355,38 @@ class Stribeck(AbstractFriction):
         # Cut off below the boundary like Conti's: an exponential overflows there.
         decay = jnp.exp(-jnp.maximum(speed / self.velocity, -1.0))
         return self.kinetic + (self.static - self.kinetic) * decay
+
+
+class Cubic(AbstractFriction):
+    """A cubic law: mu(r) = a0 - a1 r + a3 r^3, so mu(0) = a0, the static coefficient.
+
+    Arguments, dimensionless scalars: a0 >= 0, a1, a3. `ValueError` for anything else. Used by M. di
+    Bernardo, P. Kowalczyk and A. Nordmark, Sliding bifurcations: a novel mechanism for the sudden
+    onset of chaos in dry friction oscillators, Int. J. Bifurcation Chaos 13 (2003) 2935-2948, with
+    a0 = a1 = 1.5 and a3 = 0.45.
+    """
+
+    a0: Float[Array, ""] = eqx.field(converter=_scalar("a0"))
+    a1: Float[Array, ""] = eqx.field(converter=_scalar("a1"))
+    a3: Float[Array, ""] = eqx.field(converter=_scalar("a3"))
+
+    def __check_init__(self):
+        self.check("Cubic")
+
+    # The law's own: a copy would be a parameter of its own.
+    @property
+    def static(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.a0
+
+    def rules(self) -> list[Rule]:
+        return be_nonnegative("a0", self.a0) + be_finite("a1", self.a1) + be_finite("a3", self.a3)
+
+    def in_units_of(self, speed: Array) -> AbstractFriction:
+        return Cubic(self.a0, self.a1 * speed, self.a3 * speed**3)
+
+    def mu(self, speed: Array) -> Array:
+        """Kinetic friction coefficient mu(r) at speed r >= 0, dimensionless, any shape."""
+        return self.a0 + speed * (self.a3 * speed**2 - self.a1)
 
 
 def _of_static_and_kinetic(static: ArrayLike, kinetic: ArrayLike) -> list[Rule]:

@@ -1,6 +1,7 @@
 """A machine in SI units, and the dimensionless oscillator that it is.
 
-    m X'' = -k X - c X' + sum over touching belts of  N_i mu_i(|R_i|) sgn(R_i),    R_i = V_i - X'
+    m X'' = -k X - c X' + sum over touching belts of  N_i mu_i(|R_i|) sgn(R_i) + sum of P_j(t),
+    R_i = V_i - X'
 
 One unit of time is sqrt(m/k); one of length is the deflection of the spring under the largest
 normal force, max N_i / k; velocity, force and energy follow from these. So the oscillator has
@@ -28,8 +29,18 @@ from ..checks import (
     require_value,
 )
 from ..spelling import refuse_other_names
+from .forcing import AbstractForce, Oscillating, as_forcing, as_velocity, number_or_oscillating
 from .friction import AbstractFriction, as_friction
-from .oscillator import Belt, Oscillator, as_belts, as_edge, check_oscillator, scaled_edge
+from .oscillator import (
+    Belt,
+    Oscillator,
+    as_belts,
+    as_edge,
+    check_oscillator,
+    number_or_wave,
+    scaled_edge,
+)
+from .own_units import in_unit
 
 
 class Units(eqx.Module):
@@ -73,15 +84,17 @@ class PhysicalBelt(eqx.Module):
     """A belt of a `Machine`, in SI units; it touches the mass while lower < X < upper.
 
     Arguments, scalars: velocity V in m/s; friction, a law that takes speeds in m/s (`Conti`'s
-    steepness is then in s/m, `Stribeck`'s velocity in m/s); normal_force N >= 0 in newtons; lower
-    and upper, displacements in m from where the spring is at rest (default unbounded).
-    `ValueError` names a value that is not possible.
+    steepness is then in s/m, `Stribeck`'s velocity in m/s); normal_force N >= 0 in newtons (it and
+    the velocity may be `Oscillating`, with an angular frequency in rad/s); lower and upper,
+    displacements in m from where the spring is at rest (default unbounded). `ValueError` names a
+    value that is not possible.
     """
 
-    velocity: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "velocity"))
+    # Scalar arrays, or `Oscillating`.
+    velocity: Any = eqx.field(converter=as_velocity)
     friction: AbstractFriction = eqx.field(converter=as_friction)
-    normal_force: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_array(value, "normal_force")
+    normal_force: Any = eqx.field(
+        converter=lambda value: number_or_oscillating(value, "normal_force")
     )
     lower: Float[Array, ""] = eqx.field(
         converter=lambda value: as_edge(value, "lower"), default=-float("inf")
@@ -95,8 +108,13 @@ class PhysicalBelt(eqx.Module):
         return super().__new__(cls)
 
     def __check_init__(self):
-        check_finite(self.velocity, "velocity")
-        check_nonnegative(self.normal_force, "normal_force")
+        for name, check in (("velocity", check_finite), ("normal_force", check_nonnegative)):
+            value = getattr(self, name)
+            if isinstance(value, Oscillating):
+                for rule in value.rules_as(name):
+                    rule.enforce("")
+            else:
+                check(value, name)
         if is_concrete((self.lower, self.upper)):
             require(not np.isnan(self.lower), "lower", "a number", self.lower)
             ordered = np.asarray(self.lower) < np.asarray(self.upper)
@@ -104,8 +122,9 @@ class PhysicalBelt(eqx.Module):
 
     def __repr__(self) -> str:
         return (
-            f"PhysicalBelt(velocity={number(self.velocity)} m/s, friction={self.friction!r}, "
-            f"normal_force={number(self.normal_force)} N, lower={number(self.lower)} m, "
+            f"PhysicalBelt(velocity={number_or_wave(self.velocity)} m/s, "
+            f"friction={self.friction!r}, "
+            f"normal_force={number_or_wave(self.normal_force)} N, lower={number(self.lower)} m, "
             f"upper={number(self.upper)} m)"
         )
 
@@ -114,7 +133,9 @@ class Machine(eqx.Module):
     """A mass on a spring and a dashpot, in contact with one belt or more, in SI units.
 
     Arguments: mass m in kg, stiffness k in N/m, damping c in N s/m, belts (one `PhysicalBelt` or
-    more). `ValueError` names a value that is not possible.
+    more), forcing (a force or a tuple of them, default none: of a `Harmonic` the amplitude is in N
+    and the angular frequency in rad/s, of a `BaseMotion` the amplitude in m; a force of one's own
+    takes s and gives N). `ValueError` names a value that is not possible.
 
     `oscillator` is the dimensionless `Oscillator`, which all of this package takes; `units` what
     one of its time, length, velocity, force and energy is; `start(x, v)` and `tau(t)` are what a
@@ -128,6 +149,7 @@ class Machine(eqx.Module):
     belts: tuple[PhysicalBelt, ...] = eqx.field(
         converter=lambda belts: as_belts(belts, "PhysicalBelt")
     )
+    forcing: tuple[AbstractForce, ...] = eqx.field(converter=as_forcing, default=())
 
     def __new__(cls, *_: Any, **given: Any):
         _check_fields(cls, given)
@@ -140,10 +162,12 @@ class Machine(eqx.Module):
         require(len(self.belts) > 0, "belts", "at least one PhysicalBelt", "none")
         for i, belt in enumerate(self.belts):
             require(isinstance(belt, PhysicalBelt), f"belts[{i}]", "a PhysicalBelt", repr(belt))
+        for i, force in enumerate(self.forcing):
+            AbstractForce.check(force, f"forcing[{i}]")
 
     @property
     def units(self) -> Units:
-        largest = jnp.max(jnp.stack([belt.normal_force for belt in self.belts]))
+        largest = jnp.max(jnp.stack([_largest(belt.normal_force) for belt in self.belts]))
         # Without any force on a belt no length stands out.
         length = jnp.where(largest > 0, largest / self.stiffness, 1.0)
         time, force = jnp.sqrt(self.mass / self.stiffness), self.stiffness * length
@@ -154,15 +178,18 @@ class Machine(eqx.Module):
         units = self.units
         belts = [
             Belt(
-                belt.velocity / units.velocity,
+                in_unit(belt.velocity, units.velocity, units.time),
                 belt.friction.in_units_of(units.velocity),
-                belt.normal_force / units.force,
+                in_unit(belt.normal_force, units.force, units.time),
                 scaled_edge(belt.lower, 1 / units.length),
                 scaled_edge(belt.upper, 1 / units.length),
             )
             for belt in self.belts
         ]
-        return Oscillator(self.damping / jnp.sqrt(self.stiffness * self.mass), belts)
+        damping = self.damping / jnp.sqrt(self.stiffness * self.mass)
+        scales = units.force, units.length, units.time
+        forcing = tuple(force.in_units_of(*scales) for force in self.forcing)
+        return Oscillator(damping, belts, forcing=forcing)
 
     def start(self, displacement: ArrayLike, velocity: ArrayLike) -> tuple[Array, Array]:
         """The dimensionless state (x1, x2) of a displacement in m and a velocity in m/s."""
@@ -189,23 +216,35 @@ class Machine(eqx.Module):
         units = self.units
         belts = [
             PhysicalBelt(
-                belt.velocity * units.velocity,
+                in_unit(belt.velocity, 1 / units.velocity, 1 / units.time),
                 belt.friction.in_units_of(1 / units.velocity),
-                belt.load * units.force,
+                in_unit(belt.load, 1 / units.force, 1 / units.time),
                 scaled_edge(belt.lower, units.length),
                 scaled_edge(belt.upper, units.length),
             )
             for belt in osc.belts
         ]
         damping = osc.damping * jnp.sqrt(self.stiffness * self.mass)
-        return Machine(self.mass, self.stiffness, damping, belts)
+        scales = 1 / units.force, 1 / units.length, 1 / units.time
+        forcing = tuple(force.in_units_of(*scales) for force in osc.forcing)
+        return Machine(self.mass, self.stiffness, damping, belts, forcing)
 
     def __repr__(self) -> str:
         belts = ", ".join(map(repr, self.belts))
         return (
             f"Machine(mass={number(self.mass)} kg, stiffness={number(self.stiffness)} N/m, "
-            f"damping={number(self.damping)} N s/m, belts=({belts},))"
+            f"damping={number(self.damping)} N s/m, belts=({belts},){_forcing_text(self.forcing)})"
         )
+
+
+def _forcing_text(forcing: tuple[AbstractForce, ...]) -> str:
+    return f", forcing=({', '.join(map(repr, forcing))},)" if forcing else ""
+
+
+def _largest(normal_force: Any) -> Array:
+    if isinstance(normal_force, Oscillating):
+        return normal_force.mean + jnp.abs(normal_force.amplitude)
+    return normal_force
 
 
 def _si_numbers(value: Any, field: str) -> Array:

@@ -25,7 +25,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from .oscillator import NoEdge, Oscillator, acceleration, has_edges, interval_ends
+from .oscillator import (
+    MovingBelt,
+    NoEdge,
+    Oscillator,
+    acceleration,
+    has_edges,
+    interval_ends,
+)
 
 Tree = TypeVar("Tree")
 STUCK, BELOW, ABOVE = 0.0, -2.0, 2.0
@@ -103,7 +110,17 @@ def mode_of(codes: Array) -> Mode:
 
 def mode_acceleration(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     """x2' of a slip mode; of a mode with stuck belts, the force `needed` that they have to hold."""
-    return acceleration(osc, mode.signs, x1, x2)
+    a = acceleration(osc, mode.signs, x1, x2)
+    if not any(isinstance(belt, MovingBelt) for belt in osc.belts):
+        return a
+    # The mass is carried along at the rate of the belt that it is stuck to.
+    return a - stick_rate(osc, mode) / osc.omega
+
+
+def stick_rate(osc: Oscillator, mode: Mode) -> Array:
+    """The rate at which the velocity of the belts that are stuck changes, 0 where none is."""
+    rates = [belt.rate if isinstance(belt, MovingBelt) else jnp.zeros(()) for belt in osc.belts]
+    return foremost(osc, mode.stuck, rates, jnp.zeros(()))
 
 
 def fastest_rate(a_by_x2: Array) -> Array:

@@ -5,7 +5,8 @@ State y = (x1, x2), displacement and velocity, in the dimensionless time tau = o
     x1' = x2
     x2' = -x1 - zeta x2 + sum over touching belts of  u0_i mu_i(|r_i|) sgn(r_i)
 
-with the relative velocity r_i = nu_i - omega x2 of belt i. The paper's symbols, and ours:
+with the relative velocity r_i = nu_i - omega x2 of belt i; forces on the mass, and belts whose
+velocity or load oscillates, stand in `forcing`. The paper's symbols, and ours:
 
 | symbol | here | meaning |
 |---|---|---|
@@ -17,6 +18,10 @@ with the relative velocity r_i = nu_i - omega x2 of belt i. The paper's symbols,
 | mus, p1, p2, p3 | `Conti.static, residual, quadratic, steepness` | eqs. (7), (16) |
 
 What happens where the field is not smooth is told in `modes`.
+
+An oscillator that knows the time, see `has_clock`, has no field of (x1, x2) alone. At an instant it
+is one without a clock, with a constant force and belts of constant velocity and load: `at_time`
+gives that one, and everything that asks for forces, guards or modes at an instant takes it.
 """
 
 import functools
@@ -45,6 +50,7 @@ from ..checks import (
     require_value,
 )
 from ..numerics.compiling import traced_once
+from .forcing import AbstractForce, ConstantForce, Oscillating, as_forcing, as_load, as_velocity
 from .friction import AbstractFriction, as_friction
 
 
@@ -83,7 +89,7 @@ class NoEdge(float):
 jax.tree_util.register_pytree_node(NoEdge, lambda edge: ((), float(edge)), lambda at, _: NoEdge(at))
 
 
-def scaled_edge(edge: Array | NoEdge, factor: ArrayLike) -> Array | NoEdge:
+def scaled_edge(edge: Any, factor: ArrayLike) -> Any:
     """An edge in another unit, without a slope where it is at infinity, in reverse mode neither."""
     if is_concrete(edge):
         return edge if np.isinf(edge) else edge * factor
@@ -92,18 +98,19 @@ def scaled_edge(edge: Array | NoEdge, factor: ArrayLike) -> Array | NoEdge:
 
 
 class Belt(eqx.Module):
-    """A rough belt that moves at constant velocity and touches the mass while lower < x1 < upper.
+    """A rough belt that touches the mass while lower < x1 < upper.
 
     Arguments, dimensionless scalars: velocity (nu), friction (a law), load (u0 = Fn/k >= 0,
     default 1), lower and upper (edges of the contact interval, default unbounded; one at infinity
     has no derivative. Write it `jnp.inf`: of `jnp.inf / L` the reverse derivative by L is NaN under
-    `jit`, in JAX). `ValueError` for non-finite, negative or wrongly shaped values or an interval
-    turned round.
+    `jit`, in JAX). Velocity and load may be `Oscillating`. `ValueError` for non-finite, negative or
+    wrongly shaped values or an interval turned round.
     """
 
-    velocity: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "velocity"))
+    # A scalar array, or `Oscillating`.
+    velocity: Any = eqx.field(converter=as_velocity)
     friction: AbstractFriction = eqx.field(converter=as_friction)
-    load: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "load"), default=1.0)
+    load: Any = eqx.field(converter=as_load, default=1.0)
     lower: Float[Array, ""] = eqx.field(
         converter=lambda value: as_edge(value, "lower"), default=-float("inf")
     )
@@ -128,17 +135,33 @@ class Belt(eqx.Module):
             Rule("lower", (self.lower, self.upper), operator.lt, "< upper = {1}"),
         ]
         return [
-            *be_finite("velocity", self.velocity),
-            *be_nonnegative("load", self.load),
+            *_rules_of(self.velocity, "velocity", be_finite),
+            *_rules_of(self.load, "load", be_nonnegative),
             *(rule._replace(field=f"{rule.field} of friction") for rule in law),
             *(interval if not isinstance(self.lower, NoEdge) else []),
         ]
 
     def __repr__(self) -> str:
+        velocity, load = map(number_or_wave, (self.velocity, self.load))
         return (
-            f"Belt(velocity={number(self.velocity)}, friction={self.friction!r}, "
-            f"load={number(self.load)}, lower={number(self.lower)}, upper={number(self.upper)})"
+            f"Belt(velocity={velocity}, friction={self.friction!r}, "
+            f"load={load}, lower={number(self.lower)}, upper={number(self.upper)})"
         )
+
+
+def _rules_of(value: Any, field: str, rules: Any) -> list[Rule]:
+    return value.rules_as(field) if isinstance(value, Oscillating) else rules(field, value)
+
+
+def number_or_wave(value: Any) -> str:
+    """A velocity or a load as a text, see `number`."""
+    return repr(value) if isinstance(value, Oscillating) else number(value)
+
+
+class MovingBelt(Belt):
+    """A belt whose velocity oscillates, at an instant; rate: the derivative of its velocity."""
+
+    rate: Array = eqx.field(kw_only=True)
 
 
 def as_belts(belts: Any, kind: str = "Belt") -> tuple:
@@ -157,7 +180,8 @@ class Oscillator(eqx.Module):
     """A mass on a spring and a dashpot, in contact with one belt or more.
 
     Arguments: damping (zeta = c/sqrt(k m)), belts (one `Belt` or more), omega (sqrt(k/m) > 0,
-    default 1); scalars, dimensionless. `ValueError` for anything else. For batches build it
+    default 1); scalars, dimensionless; forcing (a force on the mass such as `Harmonic`, or a tuple
+    of them; default none). `ValueError` for anything else. For batches build it
     inside `jax.vmap`. A negative damping is possible; starts far out may then go to infinity,
     which `portrait(osc).escapes` tells.
     """
@@ -167,6 +191,7 @@ class Oscillator(eqx.Module):
     omega: Float[Array, ""] = eqx.field(
         converter=lambda value: as_array(value, "omega"), default=1.0
     )
+    forcing: tuple[AbstractForce, ...] = eqx.field(converter=as_forcing, default=())
 
     def __check_init__(self):
         self.check()
@@ -187,6 +212,8 @@ class Oscillator(eqx.Module):
                 hint = "; the Oscillator of a Machine is machine.oscillator" * is_physical
                 require(False, f"belts[{i}]", "a Belt", in_words(belt) + hint)
             Belt.check(belt, f"belt {i}")
+        for i, force in enumerate(osc.forcing):
+            AbstractForce.check(force, f"forcing[{i}]")
 
     def rules(self) -> list[Rule]:
         """What its parameters have to be, but for those of its belts."""
@@ -195,7 +222,87 @@ class Oscillator(eqx.Module):
     def __repr__(self) -> str:
         belts = ", ".join(map(repr, self.belts))
         damping, omega = number(self.damping), number(self.omega)
-        return f"Oscillator(damping={damping}, belts=({belts},), omega={omega})"
+        forces = ", ".join(map(repr, self.forcing))
+        forcing = f", forcing=({forces},)" if self.forcing else ""
+        return f"Oscillator(damping={damping}, belts=({belts},), omega={omega}{forcing})"
+
+
+def has_clock(osc: Oscillator) -> bool:
+    """Whether the oscillator knows the time; told by its structure, in a trace, too."""
+    forced = any(not isinstance(force, ConstantForce) for force in osc.forcing)
+    waves = [wave for belt in osc.belts for wave in (belt.velocity, belt.load)]
+    return forced or any(isinstance(wave, Oscillating) for wave in waves)
+
+
+def refuse_clock(osc: Any, name: str, instead: str = "") -> None:
+    """Raise where an oscillator knows the time and `name` is for those that do not.
+
+    instead: what else to use, such as "jb.sweep(...)".
+    """
+    if isinstance(osc, Oscillator) and has_clock(osc):
+        hint = f"; use {instead}" if instead else ""
+        expected = f"without a clock: {name} is for oscillators that do not know the time{hint}"
+        require(False, "osc", expected, "one with forcing")
+
+
+def frequencies(osc: Oscillator) -> list[Array]:
+    """The angular frequencies of all that knows the time: forces, then velocities and loads."""
+    forces = [one.frequency for one in osc.forcing if not isinstance(one, ConstantForce)]
+    waves = [wave for belt in osc.belts for wave in (belt.velocity, belt.load)]
+    return forces + [wave.frequency for wave in waves if isinstance(wave, Oscillating)]
+
+
+def fastest(osc: Oscillator) -> Array:
+    """The highest frequency of what knows the time, 1, the natural frequency, at least."""
+    forces = [one.fastest for one in osc.forcing if not isinstance(one, ConstantForce)]
+    waves = frequencies(osc)[len(forces) :]
+    return functools.reduce(jnp.maximum, map(jnp.abs, forces + waves), jnp.ones(()))
+
+
+def value_at(wave: Any, t: Array) -> Any:
+    """A velocity or a load at the time t."""
+    return wave.value(t) if isinstance(wave, Oscillating) else wave
+
+
+def at_time(osc: Oscillator, t: Array) -> Oscillator:
+    """The oscillator without a clock that it is at the time t; without a clock, itself.
+
+    Its forces are constant and its belts have the velocity and load of that time; those whose
+    velocity oscillates are `MovingBelt`s. Derivatives by t are those of the numbers.
+    """
+    if not has_clock(osc):
+        return osc
+    total = functools.reduce(
+        operator.add, [force.on_mass(t, osc.damping) for force in osc.forcing], jnp.zeros_like(t)
+    )
+    force, still = object.__new__(ConstantForce), object.__new__(Oscillator)
+    object.__setattr__(force, "amplitude", total)
+    belts = tuple(_belt_at(belt, t) for belt in osc.belts)
+    fields = dict(damping=osc.damping, belts=belts, omega=osc.omega, forcing=(force,))
+    for name, value in fields.items():
+        object.__setattr__(still, name, value)
+    return still
+
+
+def _belt_at(belt: Belt, t: Array) -> Belt:
+    moves = isinstance(belt.velocity, Oscillating)
+    made = object.__new__(MovingBelt if moves else Belt)
+    fields = vars(belt) | {
+        "velocity": value_at(belt.velocity, t),
+        "load": value_at(belt.load, t),
+    }
+    if moves:
+        fields["rate"] = belt.velocity.rate(t)
+    for name, value in fields.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+def constant_force(osc: Oscillator) -> list[Array]:
+    """The constant forces on the mass, each; a `TypeError` for one that has a clock."""
+    if not all(isinstance(force, ConstantForce) for force in osc.forcing):
+        raise TypeError("the forces of an oscillator with a clock are those of `at_time`")
+    return [force.amplitude for force in osc.forcing if isinstance(force, ConstantForce)]
 
 
 def check_oscillator(osc: Any, field: str = "osc") -> None:
@@ -230,6 +337,7 @@ def has_possible_numbers(osc: Oscillator) -> Array:
     Under `jit` and `vmap` nothing raises: a run of an impossible oscillator is NOT_FINITE.
     """
     rules = Oscillator.rules(osc) + [rule for belt in osc.belts for rule in Belt.rules(belt)]
+    rules += [rule for force in osc.forcing for rule in type(force).rules(force)]
     return functools.reduce(operator.and_, (jnp.asarray(rule.holds()) for rule in rules))
 
 
@@ -256,6 +364,8 @@ def acceleration(osc: Oscillator, signs: tuple[Array, ...], x1: Array, x2: Array
     belt 0 this is the force that the stuck contact has to hold.
     """
     force = -x1 - osc.damping * x2
+    for push in constant_force(osc):
+        force = force + push
     for belt, sign in zip(osc.belts, signs, strict=True):
         speed = belt.velocity - osc.omega * x2
         speed = jnp.where(sign == 0, jnp.abs(speed), sign * speed)

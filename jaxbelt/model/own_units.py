@@ -27,6 +27,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import is_concrete
+from .forcing import Oscillating
 from .oscillator import Belt, NoEdge, Oscillator, has_edges, scaled_edge
 
 #: Contact edges cut the motion off where a belt could pull the mass farther than this many times
@@ -72,7 +73,13 @@ def own_length(osc: Oscillator) -> Any:
         """A leaf without derivatives; in NumPy where it is known, which compiles nothing."""
         return np.asarray(leaf) if is_concrete(leaf) else lax.stop_gradient(leaf)
 
-    loads = [number(belt.load) for belt in osc.belts]
+    def largest(wave: Any) -> Any:
+        """The largest size of a velocity or a load."""
+        if isinstance(wave, Oscillating):
+            return abs(number(wave.mean)) + abs(number(wave.amplitude))
+        return number(wave)
+
+    loads = [largest(belt.load) for belt in osc.belts]
     pulls = [load * number(belt.friction.static) for load, belt in zip(loads, osc.belts)]
     one: Any = np if is_concrete(pulls) else jnp
     force = functools.reduce(one.maximum, pulls)
@@ -91,9 +98,11 @@ def own_length(osc: Oscillator) -> Any:
             one.where(cut, one.abs(edge), 0.0) for cut, (_, edge) in zip(cuts, edges, strict=True)
         ]
         speeds = [
-            one.where(load > 0, one.abs(number(belt.velocity)) / number(osc.omega), 0.0)
+            one.where(load > 0, one.abs(largest(belt.velocity)) / number(osc.omega), 0.0)
             for load, belt in zip(loads, osc.belts)
         ]
+        pushes = [number(force.bound(osc.damping)) for force in osc.forcing]
+        lengths += [one.where(one.isfinite(push), push, 0.0) for push in pushes]
         inner = functools.reduce(one.maximum, [*lengths, *speeds])
         is_cut = functools.reduce(operator.or_, cuts, np.asarray(False))
         is_inner = (is_cut & (HEAVY * inner < force)) | ~(force > 0)
@@ -134,7 +143,8 @@ def in_own_units(osc: Oscillator, unit: Any = None, *, edges: bool | None = None
         return own if edges else without_edges(own)
     units = _known_units(length, omega * length) if known else OwnUnits(length, omega * length)
     fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=jnp.ones(()))
-    own = _unchecked(OwnOscillator, **fields, units=units)
+    forcing = _scaled_forces(osc.forcing, units)
+    own = _unchecked(OwnOscillator, **fields, forcing=forcing, units=units)
     return own if edges else without_edges(own)
 
 
@@ -195,14 +205,23 @@ def _scaled(belts: tuple[Belt, ...], units: OwnUnits) -> tuple[Belt, ...]:
     return tuple(
         _unchecked(
             Belt,
-            velocity=belt.velocity / units.velocity,
+            velocity=in_unit(belt.velocity, units.velocity),
             friction=belt.friction.in_units_of(units.velocity),
-            load=belt.load / units.length,
+            load=in_unit(belt.load, units.length),
             lower=scaled_edge(belt.lower, 1 / units.length),
             upper=scaled_edge(belt.upper, 1 / units.length),
         )
         for belt in belts
     )
+
+
+def in_unit(wave: Any, unit: Any, time: Any = 1.0) -> Any:
+    """A velocity or a load in a unit of its own, and in one of time."""
+    return wave.in_units_of(unit, time) if isinstance(wave, Oscillating) else wave / unit
+
+
+def _scaled_forces(forcing: tuple[Any, ...], units: OwnUnits) -> tuple[Any, ...]:
+    return tuple(force.in_units_of(units.length, units.length, 1.0) for force in forcing)
 
 
 def _unchecked(kind: type, /, **fields: Any) -> Any:
@@ -300,6 +319,8 @@ def in_units_of_user(own: Oscillator) -> Oscillator:
     if units.is_given:
         fields = {name: value for name, value in vars(own).items() if name != "units"}
         return _unchecked(Oscillator, **fields | dict(belts=_with_leaves(own.belts)))
-    belts = _scaled(_with_leaves(own.belts), OwnUnits(1 / units.length, 1 / units.velocity))
+    back = OwnUnits(1 / units.length, 1 / units.velocity)
+    belts, forcing = _scaled(_with_leaves(own.belts), back), _scaled_forces(own.forcing, back)
     omega = units.velocity / units.length
-    return _unchecked(Oscillator, damping=own.damping, belts=belts, omega=omega)
+    fields = dict(damping=own.damping, belts=belts, omega=omega, forcing=forcing)
+    return _unchecked(Oscillator, **fields)

@@ -105,6 +105,17 @@ def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Ar
     belt that it was stuck to is left, slip on.
     """
     speed = stick_velocity(osc, mode, osc.omega * x2)
+    # Slip may have set in just before; a belt of that very velocity that arrives asks anew.
+    after = codes_past_edge(osc, mode, edge, speed, rightward)
+    velocity = stick_velocity(osc, after, jnp.full_like(edge, jnp.nan))
+    return settle(osc, _held_by(osc, after, velocity), edge, x2)
+
+
+def codes_past_edge(
+    osc: Oscillator, mode: Mode, edge: Array, speed: Array, rightward: Array
+) -> Mode:
+    """The contact codes beyond an edge that the mass passes at omega x2 = speed, before it is asked
+    which belts hold it."""
     codes = []
     for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
         at_lower, at_upper = belt.lower == edge, belt.upper == edge
@@ -112,10 +123,7 @@ def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Ar
         leaves = touches & jnp.where(rightward, at_upper, at_lower)
         code = jnp.where(arrives, _slip_sign(belt.velocity, speed), code)
         codes.append(jnp.where(leaves, jnp.where(rightward, ABOVE, BELOW), code))
-    # Slip may have set in just before; a belt of that very velocity that arrives asks anew.
-    after = Mode(tuple(codes))
-    velocity = stick_velocity(osc, after, jnp.full_like(edge, jnp.nan))
-    return settle(osc, _held_by(osc, after, velocity), edge, x2)
+    return Mode(tuple(codes))
 
 
 def _slip_sign(velocity: Array, speed: Array) -> Array:

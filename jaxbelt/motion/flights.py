@@ -100,8 +100,8 @@ def steps_of(osc: Oscillator, arc: Arc, ones: Array) -> Steps:
     osc, arc = lax.stop_gradient((osc, arc))
     mode, duration, y, end = arc.mode, arc.duration, arc.entry, arc.end
     # Of both places at once, which takes half as long to compile.
-    wanted = jax.vmap(lambda x1, x2: density(osc, mode, x1, x2))(
-        jnp.stack([y[0], end[0]]), jnp.stack([y[1], end[1]])
+    wanted = jax.vmap(lambda *y: density(osc, mode, *y))(
+        *(jnp.stack(pair) for pair in zip(y, end, strict=True))
     )
     first, last = materialise(jnp.clip(jnp.nan_to_num(wanted, nan=1.0), 1.0, DENSEST), ones)
     is_even = jnp.abs(last - first) < 1e-3 * first
@@ -133,7 +133,7 @@ def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, steps: Steps) 
         if not groups:
             h = duration * (place(passed + 1) - place(passed))
             (change,) = increments(field, y, h, _ORDER_12)
-            return y[0] + change[0], y[1] + change[1]
+            return tuple(a + b for a, b in zip(y, change, strict=True))
         size, *parts = groups
 
         def some(i, y):
@@ -147,14 +147,14 @@ def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, steps: Steps) 
         # Made again, not kept, where a derivative of a derivative comes back through them.
         return lax.fori_loop(0, size, jax.checkpoint(some, prevent_cse=False), y)
 
-    x1, x2 = advance(0, y, GROUPS)
+    end = advance(0, y, GROUPS)
     known = jnp.where(number <= MOST_STEPS, 1.0, jnp.nan)
-    return x1 * known, x2 * known
+    return tuple(part * known for part in end)
 
 
-def _flown_again(osc: Oscillator, arc: Arc, steps: Steps, x1: Array, x2: Array) -> State:
+def _flown_again(osc: Oscillator, arc: Arc, steps: Steps, *y: Array) -> State:
     """The end of an arc that is known, where it slips, by oscillator and entry near those of it."""
-    return flown(osc, arc.mode, (x1, x2), jnp.where(arc.mode.any_stuck, 0.0, arc.duration), steps)
+    return flown(osc, arc.mode, y, jnp.where(arc.mode.any_stuck, 0.0, arc.duration), steps)
 
 
 # --- many runs side by side -----------------------------------------------------------------------
@@ -202,14 +202,14 @@ def largest_power(number: int) -> int:
 
 
 def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
-    """Derivatives of flights, arrays [flights, 3 + varied] for each number of the result: by x1 and
-    x2 of the entry, by a time, and by the parameters.
+    """Derivatives of flights, arrays [flights, d + 1 + varied] for each number of the result: by
+    the d parts of the entry, by a time, and by the parameters.
 
     result(osc, arc, end, y, time): of one flight, scalars, by its end; arcs: the flights, their
     leaves arrays [flights, ..]; times, and whether each is wanted: arrays [flights], a power of two
     of them; run: to which run each belongs. Those of about as many steps are made side by side.
     """
-    flights, count = times.size, 3 + sum(sizes_of(by_run, varied))
+    flights, count = times.size, len(arcs.entry) + 1 + sum(sizes_of(by_run, varied))
     own, shared = eqx.partition((varied, rest), by_run)
     own = jax.tree.map(lambda leaf: leaf[run], own)
     # In one array, because XLA gathers, and takes the part of each group from, one at a time.
@@ -218,9 +218,10 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     number, is_even, ratio = _all_steps(by_run, shared, table, unpack)
     short = jnp.clip(jnp.nan_to_num(number), 0, MOST_STEPS).astype(jnp.int32) + 1
     short = jnp.where(wanted, short, 0)
+    numbers = jnp.arange(flights, dtype=jnp.int32)
     # Sorted with their places as one number: a sort of pairs takes ten times as long.
-    order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32)) % flights
-    places = jnp.zeros_like(order).at[order].set(jnp.arange(flights, dtype=jnp.int32))
+    order = jnp.sort(short * flights + numbers) % flights
+    places = jnp.zeros_like(order).at[order].set(numbers, unique_indices=True)
     # A few groups at least, for all of a group wait for the longest.
     most = min(FLOWN_AT_ONCE.here, largest_power(max(1, LARGEST.here // count)))
     size = min(most, max(1, flights // LEAST_GROUPS.here))
@@ -294,9 +295,9 @@ def _packed(tree) -> tuple[Array, Callable]:
 
 
 def _slopes_together(result, by_run, varied, rest, arcs: Arc, times, steps: Steps):
-    """The derivatives of flights that are made together, arrays [3 + varied, flights], see
+    """The derivatives of flights that are made together, arrays [d + 1 + varied, flights], see
     `slopes_of`."""
-    axes = axes_of(by_run)
+    axes, parts_of_entry = axes_of(by_run), len(arcs.entry)
 
     def each(function, varied, *rows):
         def of_one(varied, rest, *rows):
@@ -304,18 +305,20 @@ def _slopes_together(result, by_run, varied, rest, arcs: Arc, times, steps: Step
 
         return jax.vmap(of_one, (*axes, *[0] * len(rows)))(varied, rest, *rows)
 
-    def ends(varied, x1, x2):
-        return each(_flown_again, varied, arcs, steps, x1, x2)
+    def ends(varied, *y):
+        return each(_flown_again, varied, arcs, steps, *y)
 
-    def results(varied, end, x1, x2, times):
-        def of_one(osc, arc, end, x1, x2, time):
-            return result(osc, arc, end, (x1, x2), time)
+    def results(varied, end, *y_and_times):
+        def of_one(osc, arc, end, *y_and_time):
+            *y, time = y_and_time
+            return result(osc, arc, end, tuple(y), time)
 
-        return each(of_one, varied, arcs, end, x1, x2, times)
+        return each(of_one, varied, arcs, end, *y_and_times)
 
     def parts(direction):
-        by_entry = [jnp.full_like(a, 1.0) * b for a, b in zip(arcs.entry, direction[:2])]
-        return _directed(by_run[0], varied, direction[2:]), *by_entry
+        of_entry, of_parameters = direction[:parts_of_entry], direction[parts_of_entry:]
+        by_entry = [jnp.full_like(a, 1.0) * b for a, b in zip(arcs.entry, of_entry)]
+        return _directed(by_run[0], varied, of_parameters), *by_entry
 
     def flight(direction):
         return jax.jvp(ends, (varied, *arcs.entry), parts(direction))
@@ -326,15 +329,15 @@ def _slopes_together(result, by_run, varied, rest, arcs: Arc, times, steps: Step
         return jax.jvp(results, (varied, end, *arcs.entry, times), slopes)[1]
 
     # The time has no part in the flight itself.
-    directions = jnp.eye(2 + sum(sizes_of(by_run, varied)))
+    directions = jnp.eye(parts_of_entry + sum(sizes_of(by_run, varied)))
     end, moved = jax.vmap(flight, out_axes=(None, 0))(directions)
 
     def with_time(leaf, own):
         row = jnp.broadcast_to(own, (1, *leaf.shape[1:]))
-        return jnp.concatenate([leaf[:2], row, leaf[2:]])
+        return jnp.concatenate([leaf[:parts_of_entry], row, leaf[parts_of_entry:]])
 
     moved = jax.tree.map(lambda leaf: with_time(leaf, 0.0), moved)
-    is_time = jnp.where(jnp.arange(len(directions) + 1) == 2, 1.0, 0.0)
+    is_time = jnp.where(jnp.arange(len(directions) + 1) == parts_of_entry, 1.0, 0.0)
     return jax.vmap(column)(moved, with_time(directions, 0.0), is_time)
 
 

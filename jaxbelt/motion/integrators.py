@@ -6,7 +6,7 @@ An integrator is a class with two methods: `march` goes from a state until it ha
 `Graded` makes steps that are short where the friction law bends; orbits that are followed in search
 of a cycle use it, because shooting solves for the cycle afterwards.
 
-A state is a tuple of scalars, (x1, x2), and a field a function of it.
+A state is a tuple of scalars, (x1, x2), with a clock (x1, x2, t), and a field a function of it.
 """
 
 import abc
@@ -20,12 +20,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..model.instants import field_at
 from ..model.modes import Mode, fastest_rate, mode_acceleration
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, at_time, fastest, has_clock
 from ..numerics.compiling import the_solvers
 from ..numerics.extrapolation import increments, scheme
 
-State = tuple[Array, Array]
+State = tuple[Array, ...]
 Field = Callable[[Any], State]
 
 #: Longest and first step of `Adaptive`, as fractions of its span.
@@ -69,11 +70,14 @@ class AbstractIntegrator(eqx.Module):
     def step(self, field: Field, y: State, h: Array) -> State:
         """The state one step of size h after y, as accurate as a step of `march`."""
         (change,) = increments(field, y, h, _ORDER_8)
-        return y[0] + change[0], y[1] + change[1]
+        return tuple(a + b for a, b in zip(y, change, strict=True))
 
 
 def slip_field(osc: Oscillator, mode: Mode, y: State) -> State:
-    """The field (x1', x2') of a slip mode."""
+    """The field (x1', x2') of a slip mode; with a clock (x1', x2', t'), of a stuck one, too."""
+    if has_clock(osc):
+        x1, x2, t = y
+        return field_at(osc, mode, (x1, x2, t))
     x1, x2 = y
     return x2, mode_acceleration(osc, mode, x1, x2)
 
@@ -141,8 +145,8 @@ class Adaptive(AbstractIntegrator):
 
     def flow(self, field: Field, y: State) -> State:
         """The state after the time `span`; no events are looked for."""
-        _, (_, x1, x2), _ = self._integrate(field, y, None)
-        return x1, x2
+        _, (_, *end), _ = self._integrate(field, y, None)
+        return tuple(end)
 
     def _integrate(self, field, y, ends_outside):
         """The last step's beginning and end, (t, x1, x2) each, t as a fraction of the span, and
@@ -158,7 +162,8 @@ class Adaptive(AbstractIntegrator):
 
         def norm(y):
             # A lane that has nothing to do, and may be NaN, must not keep a batch waiting.
-            return jnp.where(self.span > 0, jnp.maximum(*(jnp.abs(part) for part in y)), 0.0)
+            largest = functools.reduce(jnp.maximum, [jnp.abs(part) for part in y])
+            return jnp.where(self.span > 0, largest, 0.0)
 
         dfx = the_solvers()
         # Where no event is looked for, a step may be as long as its error allows.
@@ -191,8 +196,10 @@ class Adaptive(AbstractIntegrator):
 THIN = 30.0
 
 
-def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
+def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array, *t: Array) -> Array:
     """How many steps per unit of time an orbit wants: more where the friction law bends.
+
+    With a clock, at the time t, also as many as the fastest wave wants.
 
     The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0. That of a
     steep law tells nothing until the orbit is in its layer at r = 0, which a step of its own length
@@ -201,6 +208,8 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     disturbances change in the linearised field: of that, the motion itself tells nothing where it
     is small.
     """
+    waves = [fastest(osc)] if has_clock(osc) else []
+    osc = at_time(osc, *t) if waves else osc
     a, a_by_x2 = jax.jvp(
         lambda x2: mode_acceleration(osc, mode, x1, x2), (x2,), (jnp.ones_like(x2),)
     )
@@ -219,7 +228,7 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
         bend = bend + jnp.where(jnp.abs(code) == 1, jnp.maximum(here, nearing), 0.0)
     near_extremum = jnp.sqrt(bend * jnp.abs(osc.omega * x2))  # where x2' = 0, x2'' = -x2
     wanted = 1 + 0.4 * bend * jnp.abs(osc.omega * a) + near_extremum
-    return jnp.maximum(wanted, 0.5 * fastest_rate(a_by_x2))
+    return functools.reduce(jnp.maximum, [wanted, 0.5 * fastest_rate(a_by_x2), *waves])
 
 
 class Graded(AbstractIntegrator):

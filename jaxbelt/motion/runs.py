@@ -7,6 +7,7 @@ stick arc is known in closed form. Who follows it depends on what is asked:
   integrated by diffrax (`integrators.Adaptive`);
 - a batch, under `vmap` (`_together`): lanes of the kernel, see `batches` and `kernel.step`, at one
   tolerance for all, the smallest;
+- with a clock: a run by itself, of arcs of `timed`, and a batch as many of them;
 - derivatives (the rule of `arcs_of_run`): the arcs that are known, flown once more, see
   `sensitivities`.
 
@@ -31,8 +32,9 @@ from jaxtyping import Array
 
 from ..kernel.marks import LoopSearch
 from ..model.events import event_between
+from ..model.instants import begun
 from ..model.modes import Mode, mode_acceleration, select
-from ..model.oscillator import Oscillator, has_possible_numbers
+from ..model.oscillator import Oscillator, has_clock, has_possible_numbers
 from ..model.rest import is_at_rest
 from ..model.transitions import at_focus, mode_of_state
 from ..numerics.compiling import any_lane, more_rows, of_lane, one_kernel, with_batches
@@ -42,7 +44,16 @@ from .batches import BOOK, LANES_AT_ONCE, PAGE, Batch, Group, blank_book, follow
 from .integrators import Adaptive, State
 from .loops import RepeatedLoop
 from .sampling import arcs_at, sampled
-from .sensitivities import Arc, Sensitivity, in_one_row, sensitivities, split, with_derivatives
+from .sensitivities import (
+    Arc,
+    Sensitivity,
+    columns_of,
+    in_one_row,
+    sensitivities,
+    split,
+    with_derivatives,
+)
+from .timed import TimedArc, timed_arc
 
 #: Local errors of an arc that is followed to its end are kept below this fraction of the tolerance,
 #: because near-grazing events amplify them.
@@ -125,6 +136,8 @@ def stacked_codes(mode: Mode) -> Array:
 
 
 def _segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[RunState, ArcRecord]:
+    if has_clock(osc):
+        return _timed_segment(osc, state, t1, rtol, atol)
     stuck = state.mode.any_stuck
     # Under vmap both branches run; lanes that are stuck or done then have no slip arc to follow.
     slip_until = jnp.where(stuck | state.done, state.t, t1)
@@ -133,9 +146,28 @@ def _segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[RunState
         lambda: _stick_segment(osc, state, t1),
         lambda: _slip_segment(osc, state, slip_until, rtol, atol),
     )
+    return _after_arc(state, end, done, t1)
+
+
+@one_kernel
+def _timed_arc(osc, mode, y, until, rtol, atol) -> TimedArc:
+    return timed_arc(osc, mode, y, until, rtol, atol)
+
+
+def _timed_segment(osc: Oscillator, state: RunState, t1, rtol, atol):
+    """`_segment` with a clock."""
+    x1, x2, t = state.y
+    until = jnp.where(state.done, state.t, t1)
+    arc = _timed_arc(osc, state.mode, (x1, x2, t), until, SAFETY * rtol, SAFETY * atol)
+    return _after_arc(state, arc.end, arc.done, t1)
+
+
+def _after_arc(state: RunState, end: ArcEnd, done: Array, t1) -> tuple[RunState, ArcRecord]:
     kind, belt = event_between(state.mode.codes, end.mode.codes)
     # At t1 itself, where no event is before: the sum of the arcs may be short of it by rounding.
     t = jnp.where(done & (kind == 0), t1, state.t + end.duration)
+    if len(end.y) == 3:
+        end = replace(end, y=(*end.y[:2], t))
     record = ArcRecord(
         t=state.t,
         y=jnp.stack(state.y),
@@ -174,23 +206,33 @@ class Rules(NamedTuple):
 def _followed_arcs(
     osc: Oscillator, y0, t0, t1, rtol, atol, rules: Rules
 ) -> tuple[RunState, ArcRecord, RepeatedLoop]:
-    y = (y0[0], y0[1])
-    mode = mode_of_state(osc, *y)
+    y: State = (y0[0], y0[1])
+    ones = jnp.ones_like(y0[0])
+    if has_clock(osc):
+        y = (*y, t0)
+        mode, rests = begun(osc, (y0[0], y0[1], t0))
+    else:
+        mode, rests = mode_of_state(osc, *y), at_focus(osc, *y)
     finite = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
-    status = jnp.where(at_focus(osc, *y), Status.PSEUDO_FOCUS.value, Status.OK.value)
+    status = jnp.where(rests, Status.PSEUDO_FOCUS.value, Status.OK.value)
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
-    start = RunState(t0, y, mode, signs_after(osc, mode, y), status, status != Status.OK)
+    signs = (ones, ones) if has_clock(osc) else signs_after(osc, mode, y)
+    start = RunState(t0, y, mode, signs, status, status != Status.OK)
 
     def segment(given, carry):
         (osc, t1, rtol, atol), (state, repeat) = given, carry
-        blank = _unused(len(osc.belts))
+        blank = _unused(len(osc.belts), len(y))
 
         def advance():
             new, record = _segment(osc, state, t1, rtol, atol)
+            keep = functools.partial(jnp.where, state.done)
+            if has_clock(osc):
+                # Forces do not repeat as the mass does.
+                after = jax.tree.map(keep, state, new), repeat
+                return after, jax.tree.map(keep, blank, record)
             ended = replace(repeat, number=repeat.number + 1)
             released = state.mode.any_stuck & ~new.mode.any_stuck & ~new.done
             found, t = ended.advanced(new, released, t1, jnp.ones(()), rules.max_segments)
-            keep = functools.partial(jnp.where, state.done)
             after = jax.tree.map(keep, carry, (replace(new, t=t), found))
             return after, jax.tree.map(keep, blank, record)
 
@@ -200,7 +242,8 @@ def _followed_arcs(
     # In blocks, because stepping over what is left of the budget is not free.
     length = min(BLOCK, rules.followed)
     blank = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (length, *leaf.shape)), _unused(len(osc.belts))
+        lambda leaf: jnp.broadcast_to(leaf, (length, *leaf.shape)),
+        _unused(len(osc.belts), len(y)),
     )
 
     @one_kernel
@@ -218,7 +261,7 @@ def _followed_arcs(
     (final, repeat), records = lax.scan(block, (start, LoopSearch.none(t0)), length=blocks)
     records = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), records)
     # A run that begins at a pseudo-focus has one arc, of duration zero.
-    blank, zero = _unused(len(osc.belts)), jnp.zeros(())
+    blank, zero = _unused(len(osc.belts), len(y)), jnp.zeros(())
     rest = replace(blank, t=t0, y=jnp.stack(y), mode=stacked_codes(mode), duration=zero)
     at_rest = start.status == Status.PSEUDO_FOCUS
     records = jax.tree.map(
@@ -353,6 +396,8 @@ def arcs_of_run(osc: Oscillator, y0, t0, t1, ts, rtol, atol, rules: Rules):
     followed, NaN where unused, the `RepeatedLoop`, and the states at the times ts, [samples, 2],
     without derivatives (those past the end are not told)."""
     numbers = map(jnp.asarray, (y0, t0, t1, ts, rtol, atol))
+    if has_clock(osc):
+        return _alone(osc, *numbers, rules=rules)
     return _followed_by(rules)(osc, *numbers)
 
 
@@ -370,8 +415,8 @@ def _(primals, tangents):
     behind = jnp.arange(1, used.size + 1)
     again = jnp.where(behind == loop.last, loop.loops, 0)
     arcs = Arc(
-        entry=(records.y[:, 0], records.y[:, 1]),
-        end=(records.event_y[:, 0], records.event_y[:, 1]),
+        entry=columns_of(records.y),
+        end=columns_of(records.event_y),
         codes=records.mode,
         duration=records.duration,
         ended_by=records.ended_by,
@@ -402,8 +447,11 @@ def _(primals, tangents):
         known = ~jnp.isnan(records.t)
         return jnp.where(known.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0.0)
 
+    def parts(one):
+        return (one.x1, one.x2, one.t)[: records.y.shape[1]]
+
     def states(one):
-        return jnp.stack([one.x1, one.x2], axis=1)
+        return jnp.stack(parts(one), axis=1)
 
     def places(run):
         final, records, *_ = run
@@ -411,14 +459,14 @@ def _(primals, tangents):
         return final.t, final.y, records.t, records.y, records.duration, *events
 
     moved = [entries.t, states(entries), ends.t - entries.t, ends.t, states(ends)]
-    moved = last.t, (last.x1, last.x2), *map(rows, moved)
+    moved = last.t, parts(last), *map(rows, moved)
     moved = eqx.tree_at(places, nothing, moved, is_leaf=lambda leaf: leaf is None)
     return (final, records, loop, samples), moved
 
 
-def _unused(belts: int) -> ArcRecord:
-    """The record of a segment that is not needed."""
-    nan, pair, none = jnp.full((), jnp.nan), jnp.full(2, jnp.nan), jnp.zeros((), int)
+def _unused(belts: int, parts: int = 2) -> ArcRecord:
+    """The record of a segment that is not needed; parts: of a state, three with a clock."""
+    nan, pair, none = jnp.full((), jnp.nan), jnp.full(parts, jnp.nan), jnp.zeros((), int)
     mode = jnp.zeros(belts, jnp.int8)
     return ArcRecord(
         t=nan,
@@ -456,7 +504,7 @@ def states_at(
 def _afterwards(final: RunState) -> Array:
     """The state past the end of the last arc: the run rests there, with a reason, or is unknown."""
     rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
-    return jnp.where(rests, jnp.stack(final.y), jnp.nan)
+    return jnp.where(rests, jnp.stack(final.y[:2]), jnp.nan)
 
 
 def state_at_end(final: RunState, records: ArcRecord, loop: RepeatedLoop, t1: Array):
@@ -464,4 +512,4 @@ def state_at_end(final: RunState, records: ArcRecord, loop: RepeatedLoop, t1: Ar
     beyond = t1 > final.t
     arcs, *_ = arcs_at(records, loop.followed(t1[None], records.event_t))
     mode = jnp.where(beyond, stacked_codes(final.mode), arcs.mode[0])
-    return jnp.where(beyond, _afterwards(final), jnp.stack(final.y)), mode
+    return jnp.where(beyond, _afterwards(final), jnp.stack(final.y[:2])), mode

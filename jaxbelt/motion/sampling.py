@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..model.instants import carried
 from ..model.modes import Mode, select, stick_velocity
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, has_clock
 from ..numerics.compiling import one_kernel
 from .integrators import Adaptive, slip_field
 
@@ -51,12 +52,15 @@ def _flown_in_pieces(osc: Oscillator, rtol, atol, numbers, arcs, since, stuck) -
 
     def at(osc, rtol, atol, arc, since, stuck, goes_on, before, y):
         mode = Mode(tuple(arc.mode[j].astype(float) for j in range(len(osc.belts))))
-        start = select(goes_on, (y[0], y[1]), (arc.y[0], arc.y[1]))
+        entry = tuple(arc.y[i] for i in range(y.size))
+        start = select(goes_on, tuple(y[i] for i in range(y.size)), entry)
         duration = jnp.where(stuck, 0.0, since - jnp.where(goes_on, before, 0.0))
         flown = _slip_flow(osc, mode, start, Adaptive(duration, rtol, atol))
+        if has_clock(osc):
+            return jnp.stack(select(stuck, carried(osc, mode, entry, since), flown))
         v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
-        carried = arc.y[0] + v * since, v
-        return jnp.stack(select(stuck, carried, flown))
+        moved = arc.y[0] + v * since, v
+        return jnp.stack(select(stuck, moved, flown))
 
     # As many pieces of the times as lanes. Each lane goes from one of its samples to the next, or
     # from where the next one's arc begins; so, too, where under a trace the times do not increase.
@@ -73,5 +77,7 @@ def _flown_in_pieces(osc: Oscillator, rtol, atol, numbers, arcs, since, stuck) -
         y = some(osc, rtol, atol, *row, y)
         return y, y
 
-    _, ys = lax.scan(advance, jnp.zeros((SAMPLED, 2)), rows)
-    return jnp.swapaxes(ys, 0, 1).reshape(-1, 2)
+    parts = arcs.y.shape[1]
+    _, ys = lax.scan(advance, jnp.zeros((SAMPLED, parts)), rows)
+    ys = jnp.swapaxes(ys, 0, 1).reshape(-1, parts)
+    return ys if parts == 2 else ys[:, :2]

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..model.instants import TimedState, carried, field_at, guards_at, on_guard_at
 from ..model.modes import (
     Mode,
     boundary_guards,
@@ -28,7 +29,7 @@ from ..model.modes import (
     select,
     stick_velocity,
 )
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, has_clock
 from ..model.rest import is_slow
 from ..model.transitions import on_guard
 from ..numerics.compiling import LARGEST, any_lane, axes_of, one_kernel
@@ -66,6 +67,8 @@ def _carried(osc: Oscillator, arc: Arc, end: State, y: State, since: Array) -> S
 
     end: as `_flown_again` gives it.
     """
+    if has_clock(osc):
+        return _later(osc, arc, _timed_end(osc, arc, end, y), since - arc.duration)
     mode = arc.mode
     late, slopes = since - arc.duration, slip_field(osc, mode, end)
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
@@ -79,6 +82,8 @@ def _passed(osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array) -
     As functions of the oscillator, of the entry y, and of the time left, near those of the arc;
     end: as `_flown_again` gives it.
     """
+    if has_clock(osc):
+        return _passed_in_time(osc, arc, end, y, remaining)
     mode = arc.mode
     stuck = mode.any_stuck
     # The numbers of the run itself, so that the field is the same here and at the next entry.
@@ -105,6 +110,43 @@ def _passed(osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array) -
     return select(stuck, (*phase.y, phase.duration), slipped)
 
 
+def _timed_end(osc: Oscillator, arc: Arc, end: State, y: State) -> TimedState:
+    """With a clock: the end of an arc, stuck or not, see `_carried`."""
+    x1, x2, t = select(arc.mode.any_stuck, carried(osc, arc.mode, _timed(y), arc.duration), end)
+    return x1, x2, t
+
+
+def _timed(y: State) -> TimedState:
+    x1, x2, t = y
+    return x1, x2, t
+
+
+def _later(osc: Oscillator, arc: Arc, y: TimedState, late: Array) -> TimedState:
+    """The state that little later, to first order."""
+    slopes = field_at(osc, arc.mode, y)
+    x1, x2, t = (part + late * slope for part, slope in zip(y, slopes, strict=True))
+    return x1, x2, t
+
+
+def _passed_in_time(
+    osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array
+) -> tuple[Array, ...]:
+    """`_passed` with a clock: of a stick phase, too, the guard that ended it tells its duration."""
+    mode = arc.mode
+    found = _timed_end(osc, arc, end, y)
+    known = [_with_numbers_of(a, b) for a, b in zip(_timed(arc.end), found, strict=True)]
+
+    def fired_guard(*y):
+        guards = guards_at(osc, mode, _timed(y))
+        return jnp.sum(jnp.where(jnp.arange(guards.size) == arc.ended_by, guards, 0.0))
+
+    guard, slope = jax.jvp(fired_guard, known, [*field_at(osc, mode, _timed(known))])
+    late = (lax.stop_gradient(guard) - guard) / jnp.where(slope == 0, 1.0, slope)
+    late = jnp.where(arc.in_time, remaining - arc.duration, late)
+    x1, x2, _ = on_guard_at(osc, mode, arc.ended_by, _later(osc, arc, _timed(known), late))
+    return x1, jnp.where(arc.captured, 0.0, x2), arc.duration + late
+
+
 def _with_numbers_of(known: Array, found: Array) -> Array:
     """The known number, with the derivatives of the one that was found."""
     return lax.stop_gradient(known) + (found - lax.stop_gradient(found))
@@ -112,6 +154,9 @@ def _with_numbers_of(known: Array, found: Array) -> Array:
 
 def _creep(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array, Array]:
     """Whether the mass slips but hardly moves, see `rest.is_slow`; and the field, (x2, x2')."""
+    if has_clock(osc):
+        # Where a mass hardly moves for an instant, forces go on.
+        return mode.any_stuck & False, x2, x2
     _, a = slip_field(osc, mode, (x1, x2))
     return ~mode.any_stuck & is_slow(x2, a), x2, a
 
@@ -120,6 +165,11 @@ def split(osc: Oscillator, slopes) -> tuple[Oscillator, Oscillator]:
     """The leaves of the oscillator that have a slope, and the others, each with None elsewhere."""
     moves = jax.tree.map(lambda slope: slope is not None, slopes, is_leaf=_is_none)
     return eqx.partition(osc, moves)
+
+
+def columns_of(states: Array) -> State:
+    """The parts of states, [rows, parts]."""
+    return tuple(states[:, i] for i in range(states.shape[1]))
 
 
 def _is_none(leaf) -> bool:
@@ -217,7 +267,7 @@ def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, carry: Carry):
     axes = axes_of(by_run)
 
     def creep(parts, arc):
-        return _creep(eqx.combine(*parts), arc.mode, *arc.entry)
+        return _creep(eqx.combine(*parts), arc.mode, *arc.entry[:2])
 
     creeps = jax.vmap(creep, (axes, 0))(of_runs, arcs)
     slopes = slopes_of(_passed, by_run, varied, rest, run, arcs, remaining, arcs.used)
@@ -247,10 +297,13 @@ def _past_rows(carry: Carry, rows):
         is_t1 = jnp.where(jnp.arange(before.t.shape[1]) == 3, 1.0, 0.0)[None]
 
         def through(slopes):
+            d = 3 + slopes.shape[1] - before.t.shape[1]
             by_entry = slopes[:, :1] * before.x1 + slopes[:, 1:2] * before.x2
+            if d == 3:
+                by_entry = by_entry + slopes[:, 2:3] * before.t
             nothing = jnp.zeros((slopes.shape[0], 4))
-            by_parameters = jnp.concatenate([nothing, slopes[:, 3:]], axis=1)
-            return by_entry + slopes[:, 2:3] * (is_t1 - before.t) + by_parameters
+            by_parameters = jnp.concatenate([nothing, slopes[:, d + 1 :]], axis=1)
+            return by_entry + slopes[:, d : d + 1] * (is_t1 - before.t) + by_parameters
 
         x1, x2, duration = (through(part) for part in slopes)
         after = select(used[:, None], Sensitivity(x1, x2, before.t + duration), before)
@@ -280,7 +333,8 @@ def with_derivatives(
     osc: Oscillator, entries: Array, since: Array, numbers: Array, codes: Array, states: Array
 ):
     """The states, [samples, 2], with derivatives: each is reached in the mode of its codes,
-    [belts], in the arc of that number, from its entry, (x1, x2), after a time since then."""
+    [belts], in the arc of that number, from its entry, (x1, x2) or with a clock (x1, x2, t), after
+    a time since then."""
     return states
 
 
@@ -296,22 +350,27 @@ def _(primals, tangents):
         entries_along = jnp.zeros_like(entries)
     if since_along is None:
         since_along = jnp.zeros_like(since)
+    d = entries.shape[1]
+    reached = states
+    if d == 3:
+        reached = jnp.concatenate([states, (entries[:, 2] + since)[:, None]], axis=1)
     # Where the mass hardly moves, a later entry is as good as another start.
     modes = mode_of(jnp.moveaxis(codes.astype(float), -1, 0))
     creeps, *field = _creep(osc, modes, entries[:, 0], entries[:, 1])
     earlier = jnp.where(creeps, since_along, 0.0)
-    entries_along = entries_along + jnp.stack(field, axis=1) * earlier[:, None]
+    if d == 2:
+        entries_along = entries_along + jnp.stack(field, axis=1) * earlier[:, None]
     since_along = since_along - earlier
     # From the sample before, where it lies in the same arc: the way is shorter.
     before = jnp.roll(since, 1)
     goes_on = (numbers == jnp.roll(numbers, 1)) & (before <= since)
     goes_on = goes_on.at[0].set(False)
-    starts = jnp.where(goes_on[:, None], jnp.roll(states, 1, axis=0), entries)
+    starts = jnp.where(goes_on[:, None], jnp.roll(reached, 1, axis=0), entries)
     times = since - jnp.where(goes_on, before, 0.0)
     times_along = since_along - jnp.where(goes_on, jnp.roll(since_along, 1), 0.0)
-    rows = starts, times, codes, lax.stop_gradient(states)
+    rows = starts, times, codes, lax.stop_gradient(reached)
     slopes = of_one_run(_slopes_of_samples, varied, rest, *rows)
-    by_start, by_time, by_parameters = slopes[..., :2], slopes[..., 2], slopes[..., 3:]
+    by_start, by_time, by_parameters = slopes[..., :d], slopes[..., d], slopes[..., d + 1 :]
     moved = by_time * times_along[:, None]
     if by_parameters.shape[2]:
         moved = moved + by_parameters @ in_one_row(along)
@@ -321,13 +380,13 @@ def _(primals, tangents):
         after = by_start @ jnp.where(goes_on, before, entry) + moved
         return after, after
 
-    _, moved = lax.scan(advance, jnp.zeros(2), (goes_on, entries_along, by_start, moved))
-    return states, moved
+    _, moved = lax.scan(advance, jnp.zeros(d), (goes_on, entries_along, by_start, moved))
+    return states, moved if d == 2 else moved[:, :2]
 
 
 def _slopes_of_samples(by_run, varied, rest, starts: Array, since: Array, codes: Array, ends):
-    """Derivatives of samples, [runs, samples, 2, 3 + parameters]: by the state that each is reached
-    from, the time since then, and the parameters."""
+    """Derivatives of samples, [runs, samples, d, d + 1 + parameters]: by the state that each is
+    reached from, the time since then, and the parameters; d: 2, with a clock 3."""
     runs, samples = since.shape
     total = runs * samples
     size = min(MOST_FLIGHTS.here, largest_power(2 * total - 1))
@@ -344,8 +403,8 @@ def _slopes_of_samples(by_run, varied, rest, starts: Array, since: Array, codes:
         known = ~jnp.isnan(since)
         never = jnp.zeros_like(known)
         arcs = Arc(
-            entry=(starts[:, 0], starts[:, 1]),
-            end=(ends[:, 0], ends[:, 1]),
+            entry=columns_of(starts),
+            end=columns_of(ends),
             codes=codes,
             duration=since,
             ended_by=jnp.full(since.shape, -1),

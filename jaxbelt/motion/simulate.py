@@ -23,7 +23,14 @@ from ..checks import (
     require,
 )
 from ..model.modes import has_edges
-from ..model.oscillator import Oscillator, check_oscillator, has_possible_numbers
+from ..model.oscillator import (
+    Oscillator,
+    at_time,
+    check_oscillator,
+    fastest,
+    has_clock,
+    has_possible_numbers,
+)
 from ..model.own_units import (
     in_given_units,
     in_units,
@@ -158,7 +165,7 @@ SIMULATION_TOLERANCE, BAND_WIDTH = 1e-10, 1e-3
 @jit
 def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resolution) -> Trajectory:
     """A trajectory of the switch or the smooth formulation: samples without events or arcs."""
-    osc = in_units_of_run(given)
+    own = osc = in_units_of_run(given)
     y0 = y0 / osc.units.length
     atol = in_units(atol, osc.units.length, SIMULATION_TOLERANCE)
     width = in_units(width, osc.units.velocity, BAND_WIDTH)
@@ -168,7 +175,8 @@ def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resoluti
     possible = has_possible_numbers(osc)
     ys = jnp.where(possible, integrate(field, osc, width, y0, t0, ts, rtol, atol), jnp.nan)
 
-    def mode_at(y):
+    def mode_at(y, *t):
+        osc = at_time(own, *t) if t else own
         if formulation == "switch":
             return stacked_codes(switch_mode(osc, y[0], y[1], width))
         return stacked_codes(contact(osc, y[0], y[1], rightward=True))
@@ -180,7 +188,7 @@ def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resoluti
     found = Trajectory(
         ts,
         ys,
-        jax.vmap(mode_at)(ys),
+        jax.vmap(mode_at)(ys, ts) if has_clock(own) else jax.vmap(mode_at)(ys),
         Events(jnp.zeros(0), states, integers, integers),
         Arcs(jnp.zeros(0), states, jnp.zeros((0, len(osc.belts)), jnp.int8), jnp.zeros(0)),
         jnp.where(known, Status.OK.value, failure),
@@ -199,7 +207,8 @@ def _filippov(
         wanted_times = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)[:-1]
     else:
         wanted_times = ts[:-1] if ends_at_t1 else ts
-    y0 = jnp.stack(start_at_focus(osc, *y0))
+    if not has_clock(osc):
+        y0 = jnp.stack(start_at_focus(osc, *y0))
     final, records, loop, samples = arcs_of_run(osc, y0, t0, t1, wanted_times, rtol, atol, rules)
     _, period = loop.end(records.event_t)
     count = jnp.cumsum(records.kind > 0)
@@ -208,7 +217,7 @@ def _filippov(
     rows, later = loop.place(wanted, count)
     events = Events(
         t=jnp.where(happened, records.event_t[rows] + later * period, jnp.nan),
-        y=jnp.where(happened[:, None], records.event_y[rows], jnp.nan),
+        y=jnp.where(happened[:, None], _without_clock(records.event_y)[rows], jnp.nan),
         kind=jnp.where(happened, records.kind[rows], 0),
         belt=jnp.where(happened, records.belt[rows], -1),
     )
@@ -218,7 +227,7 @@ def _filippov(
     numbers = jnp.arange(1, max(rules.max_segments, count.size) + 1)
     rows, later = loop.place(numbers, numbers[: count.size])
     t = records.t[rows] + later * period
-    arcs = Arcs(t, records.y[rows], records.mode[rows], records.duration[rows])
+    arcs = Arcs(t, _without_clock(records.y)[rows], records.mode[rows], records.duration[rows])
     rows = wanted_times, ys, modes
     if ends_at_t1:
         # The last row stands by itself: where it alone is used, no other sample is made.
@@ -238,6 +247,11 @@ def _filippov(
         rows = jax.tree.map(lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, ends)
     ts, ys, modes = rows
     return in_given_units(Trajectory(ts, ys, modes, events, arcs, status), given, osc)
+
+
+def _without_clock(states: Array) -> Array:
+    """States [rows, 2], of those with a clock without it."""
+    return states if states.shape[1] == 2 else states[:, :2]
 
 
 def _merged(first: Array, second: Array) -> Array:
@@ -269,11 +283,11 @@ def simulate(
     """The motion of the oscillator from y0 over [t0, t1].
 
     osc: `Oscillator`. y0: start (x1, x2), shape [2]. t0 < t1: time span (dimensionless time
-    tau = omega t). ts: the times wanted, increasing, shape [n]; None gives an even grid with the
-    ends of all arcs in it, and t1 last. For the reverse mode of a function of the final state alone
-    give ts=[t1]: else it makes the derivatives of every sample. rtol, atol: tolerances of the
-    integrator per step, atol a length (None: 1e-10 of the oscillator's own size, see
-    `own_units`); in a batch the smallest ones hold for all.
+    tau = omega t; that of the cosines where there is forcing). ts: the times wanted, increasing,
+    shape [n]; None gives an even grid with the ends of all arcs in it, and t1 last. For the reverse
+    mode of a function of the final state alone give ts=[t1]: else it makes the derivatives of every
+    sample. rtol, atol: tolerances of the integrator per step, atol a length (None: 1e-10 of the
+    oscillator's own size, see `own_units`); in a batch the smallest ones hold for all.
 
     formulation: "filippov", the exact event-driven motion; "switch", the paper's switch model,
     eqs. (21)-(23), with a band of half-width v_star around each boundary; "smooth", with
@@ -323,7 +337,8 @@ def simulate(
         return _smoothed(osc, *given, width=width, **fixed)
     padded = not is_concrete((osc, given))
     edges = has_edges(osc)
-    rules, max_events = _budgets(max_segments, max_events, span, len(osc.belts), edges, padded)
+    busy = span * _busyness(osc)
+    rules, max_events = _budgets(max_segments, max_events, busy, len(osc.belts), edges, padded)
     ends_at_t1 = ts is None or (
         is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
     )
@@ -336,6 +351,13 @@ def simulate(
         ends_at_t1=ends_at_t1,
     )
     return _without_padding(trajectory, trim_samples=ts is None)
+
+
+def _busyness(osc: Oscillator) -> float:
+    """How many times as many arcs there may be as without a clock, by its fastest wave."""
+    if not has_clock(osc):
+        return 1.0
+    return float(fastest(osc)) if is_concrete(osc) else 2.0
 
 
 def _budgets(

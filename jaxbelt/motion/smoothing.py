@@ -13,8 +13,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import STUCK, Mode, capacity, mode_acceleration, select, stick_velocity
-from ..model.oscillator import Oscillator
+from ..model.modes import (
+    STUCK,
+    Mode,
+    capacity,
+    mode_acceleration,
+    select,
+    stick_rate,
+    stick_velocity,
+)
+from ..model.oscillator import Oscillator, at_time, constant_force, has_clock
 from ..model.transitions import contact
 from ..numerics.compiling import the_solvers
 from ..numerics.derivatives import forward_jacobian
@@ -49,29 +57,36 @@ def switch_mode(osc: Oscillator, x1: Array, x2: Array, v_star: Array) -> Mode:
     return mode
 
 
-def switch_field(osc: Oscillator, y: tuple[Array, Array], v_star: Array) -> tuple[Array, Array]:
-    """(x1', x2') of the switch model, eqs. (21)-(23) of the paper."""
-    x1, x2 = y
+def switch_field(osc: Oscillator, y: tuple[Array, ...], v_star: Array) -> tuple[Array, ...]:
+    """(x1', x2') of the switch model, eqs. (21)-(23) of the paper; with a clock (x1', x2', t')."""
+    x1, x2, *t = y
+    osc = at_time(osc, *t) if t else osc
     mode = switch_mode(osc, x1, x2, v_star)
     velocity = stick_velocity(osc, mode, osc.omega * x2)
     x1_dot = velocity / osc.omega
     x2_dot = (velocity - osc.omega * x2) / osc.omega
-    return x1_dot, jnp.where(mode.any_stuck, x2_dot, mode_acceleration(osc, mode, x1, x2))
+    if t:
+        x2_dot = x2_dot + stick_rate(osc, mode) / osc.omega
+    x2_dot = jnp.where(mode.any_stuck, x2_dot, mode_acceleration(osc, mode, x1, x2))
+    return x1_dot, x2_dot, *map(jnp.ones_like, t)
 
 
-def smooth_field(osc: Oscillator, y: tuple[Array, Array], eps: Array) -> tuple[Array, Array]:
-    """(x1', x2') with tanh(r/eps) in place of sgn(r).
+def smooth_field(osc: Oscillator, y: tuple[Array, ...], eps: Array) -> tuple[Array, ...]:
+    """(x1', x2') with tanh(r/eps) in place of sgn(r); with a clock (x1', x2', t').
 
     A static coefficient above mu(0) plays no part here: the law jumps nowhere.
     """
-    x1, x2 = y
+    x1, x2, *t = y
+    osc = at_time(osc, *t) if t else osc
     force = -x1 - osc.damping * x2
+    for push in constant_force(osc):
+        force = force + push
     for belt in osc.belts:
         r = belt.velocity - osc.omega * x2
         touches = (belt.lower < x1) & (x1 < belt.upper)
         friction = belt.load * belt.friction.mu(jnp.abs(r)) * jnp.tanh(r / eps)
         force = force + jnp.where(touches, friction, 0.0)
-    return x2, force
+    return x2, force, *map(jnp.ones_like, t)
 
 
 @forward_jacobian
@@ -109,4 +124,6 @@ def integrate(field, osc: Oscillator, width: Array, y0, t0, ts, rtol, atol) -> A
         y = tuple(jnp.where(goes, part, jnp.nan) for part in y)
         return (t, y), jnp.stack(y)
 
-    return lax.scan(advance, (t0, (y0[0], y0[1])), ts)[1]
+    start = (y0[0], y0[1], t0) if has_clock(osc) else (y0[0], y0[1])
+    ys = lax.scan(advance, (t0, start), ts)[1]
+    return ys[:, :2] if has_clock(osc) else ys

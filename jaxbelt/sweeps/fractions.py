@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..activity import announced, tell
+from ..activity import announced, note_progress
 from ..checks import as_positive, as_whole, outside_of_traces
 from ..cycles.attractors import APART, Runs, error_of_runs, place_of
 from ..cycles.cycle import cycle_from
@@ -233,7 +233,7 @@ def _found_along(
             )
 
         told = results_of(program, grid.shared, rows_of, len(part) * n, **numbers)
-        tell("telling the attractors apart")
+        note_progress("telling the attractors apart")
         for row in range(len(part)):
             here = {name: column[row * n : (row + 1) * n] for name, column in told.items()}
             value = values[first + row : first + row + 1]

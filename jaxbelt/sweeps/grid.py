@@ -18,7 +18,7 @@ from ..checks import (
     require_value,
     traceable,
 )
-from ..identity import fingerprint_or_none_like_it
+from ..identity import fingerprint_or_unique
 from ..kernel.lanes import Observer, Program
 from ..model.oscillator import (
     Oscillator,
@@ -47,7 +47,7 @@ class Grid:
             axes,
         )
         self.make = make
-        self.made_of = fingerprint_or_none_like_it(make)
+        self.made_of = fingerprint_or_unique(make)
         self.axes = {
             name: np.asarray(as_array(v, f"axis {name}", (None,))) for name, v in axes.items()
         }
@@ -95,7 +95,7 @@ class Grid:
         return tuple(found)
 
     def program(self, observer: Observer) -> Program:
-        made_of = fingerprint_or_none_like_it((self.structure, observer))
+        made_of = fingerprint_or_unique((self.structure, observer))
         return Program(self.structure, self.mapped, observer, self.edges, made_of=made_of)
 
     def length(self) -> float:

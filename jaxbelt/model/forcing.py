@@ -1,0 +1,366 @@
+"""Forcing: what knows the time, forces on the mass, and belts and loads that oscillate.
+
+The mass may be pushed by forces F_j(tau) that depend on the dimensionless time tau = omega t alone,
+
+    x2' = -x1 - zeta x2 + (friction of the touching belts) + sum of F_j(tau),
+
+and a belt's velocity and load may oscillate. Forces are measured like loads, over the stiffness, so
+they are lengths. Frequencies are angular ones in the time tau: the natural frequency is 1.
+
+A force of one's own is a subclass of `AbstractForce` with `frequency` and `force(t)`. A frequency
+that is known to be 0 makes a constant force, or a constant velocity or load; then the oscillator
+has no clock, and all of this package takes it.
+"""
+
+import abc
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ..checks import (
+    Rule,
+    as_array,
+    be_finite,
+    be_nonnegative,
+    is_concrete,
+    number,
+    require_one_float,
+    require_value,
+    traceable,
+)
+
+
+def _scalar(name: str) -> Callable[[Any], Array]:
+    return lambda value: as_array(value, name)
+
+
+class _Wave(eqx.Module):
+    """What all classes of this module have: rules, and a text that makes them again."""
+
+    def rules(self) -> list[Rule]:
+        """What its parameters have to be; a force of one's own may add to them."""
+        named = [(name, value) for name, value in vars(self).items() if eqx.is_inexact_array(value)]
+        return [
+            rule
+            for name, value in named
+            for rule in (be_nonnegative if name == "frequency" else be_finite)(name, value)
+        ]
+
+    def check(self, owner: str) -> None:
+        """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
+        for rule in type(self).rules(self):
+            rule.enforce(f" of {owner}")
+
+    def __repr__(self) -> str:
+        values = ", ".join(
+            f"{name}={number(value) if eqx.is_array(value) else repr(value)}"
+            for name, value in vars(self).items()
+        )
+        return f"{type(self).__name__}({values})"
+
+
+class AbstractForce(_Wave):
+    """A periodic force on the mass: subclass it with `frequency` and `force` for one of your own.
+
+    `frequency` is that of its period 2 pi / frequency, an angular frequency in the time tau.
+
+    Example:
+        class Pulses(jb.AbstractForce):
+            size: jax.Array
+            frequency: jax.Array
+
+            def force(self, t):
+                return self.size * jnp.exp(3 * (jnp.cos(self.frequency * t) - 1))
+    """
+
+    frequency: eqx.AbstractVar[Array]
+
+    @abc.abstractmethod
+    def force(self, t: Array) -> Array:
+        """The force over the stiffness at the time t, a scalar; smooth, and made of `jax.numpy`."""
+
+    @property
+    def fastest(self) -> Array:
+        """The highest frequency in it that counts; steps are short against its period."""
+        return 8.0 * self.frequency
+
+    def bound(self, damping: ArrayLike) -> Array:
+        """A bound of |force| for all times; inf where none is known."""
+        return jnp.asarray(jnp.inf)
+
+    def on_mass(self, t: Array, damping: Array) -> Array:
+        """The force at the time t on a mass with this damping."""
+        return self.force(t)
+
+    def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> "AbstractForce":
+        """The same force where these are the units of forces, of lengths and of time."""
+        return ForceInUnits(self, force, time)
+
+
+class ForceInUnits(AbstractForce):
+    """A force of one's own in other units: force(t) is that of `own` at time t, over unit."""
+
+    own: AbstractForce
+    unit: Array
+    time: Array
+
+    def __init__(self, own: AbstractForce, unit: Any, time: Any):
+        self.own, self.unit, self.time = own, jnp.asarray(unit), jnp.asarray(time)
+
+    # The force's own: a copy would be a parameter of its own.
+    @property
+    def frequency(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.own.frequency * self.time
+
+    @property
+    def fastest(self) -> Array:
+        return self.own.fastest * self.time
+
+    def bound(self, damping: ArrayLike) -> Array:
+        return self.own.bound(damping) / self.unit
+
+    def force(self, t: Array) -> Array:
+        """The force over the unit at the time t."""
+        return self.own.force(self.time * t) / self.unit
+
+    def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> AbstractForce:
+        return ForceInUnits(self.own, self.unit * force, self.time * time)
+
+    def rules(self) -> list[Rule]:
+        return type(self.own).rules(self.own)
+
+
+class ConstantForce(AbstractForce):
+    """A constant force, as of an incline: what `Harmonic` is with the frequency 0. No clock."""
+
+    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
+
+    @property
+    def frequency(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return jnp.zeros(())
+
+    def force(self, t: Array) -> Array:
+        """The force over the stiffness, at every time."""
+        return self.amplitude
+
+    def bound(self, damping: ArrayLike) -> Array:
+        return jnp.abs(self.amplitude)
+
+    def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> AbstractForce:
+        return _made(ConstantForce, amplitude=self.amplitude / force)
+
+    def __repr__(self) -> str:
+        return f"Harmonic(amplitude={number(self.amplitude)}, frequency=0)"
+
+
+class Harmonic(AbstractForce):
+    """A harmonic force, amplitude cos(frequency tau + phase).
+
+    Arguments, dimensionless scalars: amplitude F (force over stiffness, a length), frequency >= 0
+    (angular, in the time tau = omega t; 0 makes a constant force), phase (default 0). `ValueError`
+    for anything else.
+    """
+
+    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=_scalar("frequency"))
+    phase: Float[Array, ""] = eqx.field(converter=_scalar("phase"), default=0.0)
+
+    def __check_init__(self):
+        self.check("Harmonic")
+
+    @property
+    def fastest(self) -> Array:
+        return self.frequency
+
+    def bound(self, damping: ArrayLike) -> Array:
+        return jnp.abs(self.amplitude)
+
+    def force(self, t: Array) -> Array:
+        """The force over the stiffness at the time t, any shape."""
+        return self.amplitude * jnp.cos(self.frequency * t + self.phase)
+
+    def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> AbstractForce:
+        amplitude, frequency = self.amplitude / force, self.frequency * time
+        return _made(Harmonic, amplitude=amplitude, frequency=frequency, phase=self.phase)
+
+
+class BaseMotion(AbstractForce):
+    """A support that moves by amplitude cos(frequency tau + phase); spring and dashpot end in it.
+
+    On the mass this is the force X cos(theta) - zeta Omega X sin(theta), of the amplitude
+    X sqrt(1 + zeta^2 Omega^2) and the phase phi + atan(zeta Omega). x1 and x2 stay in the frame of
+    the ground, and so do the belts.
+
+    Arguments, dimensionless scalars: amplitude X (a length), frequency Omega >= 0 (0: a support
+    that stands elsewhere), phase phi (default 0). `ValueError` for anything else.
+    """
+
+    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=_scalar("frequency"))
+    phase: Float[Array, ""] = eqx.field(converter=_scalar("phase"), default=0.0)
+
+    def __check_init__(self):
+        self.check("BaseMotion")
+
+    @property
+    def fastest(self) -> Array:
+        return self.frequency
+
+    def bound(self, damping: ArrayLike) -> Array:
+        return jnp.abs(self.amplitude) * jnp.sqrt(1 + (damping * self.frequency) ** 2)
+
+    def force(self, t: Array, damping: ArrayLike = 0.0) -> Array:
+        """The force over the stiffness at the time t, any shape, on a mass with that damping."""
+        angle = self.frequency * t + self.phase
+        return self.amplitude * (jnp.cos(angle) - damping * self.frequency * jnp.sin(angle))
+
+    def on_mass(self, t: Array, damping: Array) -> Array:
+        return self.force(t, damping)
+
+    def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> AbstractForce:
+        amplitude, frequency = self.amplitude / length, self.frequency * time
+        return _made(BaseMotion, amplitude=amplitude, frequency=frequency, phase=self.phase)
+
+
+class Oscillating(_Wave):
+    """A velocity or a load of a belt that oscillates: mean + amplitude cos(frequency tau + phase).
+
+    Arguments, dimensionless scalars: mean and amplitude (as the velocity or the load), frequency
+    >= 0 (angular, in the time tau; 0 makes a constant), phase (default 0). `ValueError` for
+    anything else.
+    """
+
+    mean: Float[Array, ""] = eqx.field(converter=_scalar("mean"))
+    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=_scalar("frequency"))
+    phase: Float[Array, ""] = eqx.field(converter=_scalar("phase"), default=0.0)
+
+    def __check_init__(self):
+        self.check("Oscillating")
+
+    def value(self, t: Array) -> Array:
+        """What it is at the time t."""
+        return self.mean + self.amplitude * jnp.cos(self.frequency * t + self.phase)
+
+    def rate(self, t: Array) -> Array:
+        """Its derivative by the time."""
+        return -self.amplitude * self.frequency * jnp.sin(self.frequency * t + self.phase)
+
+    def derivative(self, t: Array, order: int) -> Array:
+        """Its derivative of that order, 1 or more, by the time."""
+        angle = self.frequency * t + self.phase + order * 0.5 * jnp.pi
+        return self.amplitude * self.frequency**order * jnp.cos(angle)
+
+    def integral(self, start: Array, duration: Array) -> Array:
+        """Its integral over a time from `start` on, exact for small frequencies, too."""
+        half = 0.5 * self.frequency * duration
+        middle = jnp.cos(self.frequency * start + half + self.phase)
+        return duration * (self.mean + self.amplitude * middle * jnp.sinc(half / jnp.pi))
+
+    def in_units_of(self, unit: ArrayLike, time: ArrayLike) -> "Oscillating":
+        """The same where these are the units of what oscillates and of time."""
+        mean, amplitude, frequency = self.mean / unit, self.amplitude / unit, self.frequency * time
+        fields = dict(mean=mean, amplitude=amplitude, frequency=frequency, phase=self.phase)
+        return _made(Oscillating, **fields)
+
+    def rules_as(self, field: str) -> list[Rule]:
+        """Its rules as a part of a belt; a load is never negative."""
+        rules = [rule._replace(field=f"{rule.field} of {field}") for rule in self.rules()]
+        if field in ("load", "normal_force"):
+            given = self.mean, self.amplitude
+            least = Rule(f"mean of {field}", given, _is_never_negative, ">= |amplitude| = |{1}|")
+            rules.append(least)
+        return rules
+
+
+def _is_never_negative(mean: Any, amplitude: Any) -> Any:
+    return mean >= abs(amplitude)
+
+
+def _made(kind: type, /, **fields: Any) -> Any:
+    """A module without the checks of its numbers, which those of the user have passed."""
+    made = object.__new__(kind)
+    for name, value in fields.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+def _is_zero(frequency: Any) -> bool:
+    """Whether a frequency is known to be 0."""
+    return is_concrete(frequency) and bool(np.all(np.asarray(frequency) == 0))
+
+
+def as_velocity(value: Any) -> Any:
+    """`value` as the velocity of a belt: an array, or `Oscillating`; or a `ValueError`."""
+    return number_or_oscillating(value, "velocity")
+
+
+def as_load(value: Any) -> Any:
+    """`value` as the load of a belt: an array, or `Oscillating`; or a `ValueError`."""
+    return number_or_oscillating(value, "load")
+
+
+def number_or_oscillating(value: Any, field: str) -> Any:
+    """`value` as an array, or `Oscillating`; or a `ValueError`."""
+    if not isinstance(value, Oscillating):
+        is_other = isinstance(value, eqx.Module) and not eqx.is_array(value)
+        require_value(not is_other, field, "a number or jb.Oscillating(...)", value)
+        return as_array(value, field)
+    if not _is_zero(value.frequency):
+        return value
+    return as_array(value.mean + value.amplitude * _cosine(value.phase), field)
+
+
+def _cosine(phase: Array) -> Array:
+    if not is_concrete(phase):
+        return jnp.cos(phase)
+    with jax.ensure_compile_time_eval():
+        return jnp.cos(phase)
+
+
+def as_forcing(forcing: Any) -> tuple[AbstractForce, ...]:
+    """The forces as a tuple, constant ones as such; or a `ValueError`."""
+    expected = "a force such as jb.Harmonic(...), or a tuple of them"
+    if isinstance(forcing, AbstractForce):
+        forcing = (forcing,)
+    fits = isinstance(forcing, Iterable) and not isinstance(forcing, str | dict | eqx.Module)
+    require_value(fits, "forcing", expected, forcing)
+    forces = tuple(forcing)
+    for i, force in enumerate(forces):
+        name = f"forcing[{i}]"
+        require_value(isinstance(force, AbstractForce), name, expected, force)
+        _check_force(force)
+    return tuple(map(_without_frequency, forces))
+
+
+def _without_frequency(force: AbstractForce) -> AbstractForce:
+    if not isinstance(force, Harmonic | BaseMotion) or not _is_zero(force.frequency):
+        return force
+    return ConstantForce(force.amplitude * _cosine(force.phase))
+
+
+#: Forces of one's own whose `force` was traced.
+_traced: set[type] = set()
+
+
+def _check_force(force: AbstractForce) -> None:
+    """Raise a `ValueError` where `force` of one's own cannot be traced, once for each class."""
+    kind = type(force)
+    if kind.__module__ == __name__ or kind in _traced:
+        return
+    frequency = getattr(force, "frequency", None)
+    fits = eqx.is_array(frequency) or isinstance(frequency, float | int)
+    require_value(fits, f"frequency of {kind.__name__}", "a number", frequency)
+    time = jax.ShapeDtypeStruct((), jnp.float64)
+
+    def at_a_time() -> Any:
+        return jax.eval_shape(force.force, time)
+
+    found = traceable(at_a_time, f"force of {kind.__name__}", "a function of the time")
+    require_one_float(found, f"force of {kind.__name__}", "a function that returns one float64")
+    _traced.add(kind)

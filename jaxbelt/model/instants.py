@@ -1,0 +1,399 @@
+"""With a clock: what follows at an instant, and the smooth motion between such instants.
+
+A state is y = (x1, x2, t), t' = 1. At an instant the oscillator is that of `at_time`, and forces,
+guards and contacts are asked of it. What belts whose velocity or load oscillates add:
+
+- Belts are mates, and hold the mass together, only if their velocities are the same at all times;
+  of others that come to one velocity for an instant the mass may stick to one.
+- A mass that sticks follows the belt; its x1 is the integral of the belt's velocity.
+- A stick phase ends where capacity - needed or capacity + needed vanishes, at an edge, or where the
+  relative velocity of another touching belt passes zero, after which the mass sticks on, goes over
+  to that belt, or slips.
+
+`guards_at` has all of these, and those of slip modes, in one row: n boundaries, 2n edges, and the
+two limits.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .forcing import Oscillating
+from .modes import (
+    ABOVE,
+    BELOW,
+    STUCK,
+    Mode,
+    any_of,
+    boundary_guards,
+    bounds_rightward,
+    capacity,
+    edge_guards,
+    edges,
+    first_of,
+    foremost,
+    has_edges,
+    mode_acceleration,
+    select,
+    stick_rate,
+    stick_velocity,
+)
+from .oscillator import MovingBelt, Oscillator, at_time
+from .transitions import codes_past_edge
+
+#: A state with a clock, (x1, x2, t).
+TimedState = tuple[Array, Array, Array]
+#: A guard is zero up to rounding below this, times the size of what it is made of; velocities are
+#: equal at an instant up to this fraction.
+ROUNDING, SAME = 1e-14, 2e-15
+#: Slopes and curvatures of a limit below these are zero; then the limit is asked a little later.
+LEAST_SLOPE, LEAST_CURVATURE, LATER = 1e-12, 1e-10, 1e-3
+#: Speed at an edge below which loops around a point on it are rounding of x1.
+LOST_AT_EDGE = 1e-7
+
+
+def blur(t: Array) -> Array:
+    """How the rounding of waves grows with the time."""
+    return 1 + 0.1 * jnp.abs(t)
+
+
+# --- the smooth motion of a mode ------------------------------------------------------------------
+
+
+def field_at(osc: Oscillator, mode: Mode, y: TimedState) -> TimedState:
+    """The field (x1', x2', t') of a mode; the mass that sticks goes with its belt."""
+    x1, x2, t = y
+    now = at_time(osc, t)
+    rate = stick_rate(now, mode) / osc.omega
+    a = jnp.where(mode.any_stuck, rate, mode_acceleration(now, mode, x1, x2))
+    return x2, a, jnp.ones_like(t)
+
+
+def carried(osc: Oscillator, mode: Mode, y: TimedState, duration: Array) -> TimedState:
+    """The state a time later of a mass that sticks, in closed form."""
+    x1, _, t = y
+    now, later = at_time(osc, t), at_time(osc, t + duration)
+    ways = [
+        v.integral(t, duration) if isinstance(v, Oscillating) else v * duration
+        for v in (belt.velocity for belt in osc.belts)
+    ]
+    way = foremost(now, mode.stuck, ways, jnp.zeros(()))
+    velocity = stick_velocity(later, mode, jnp.zeros(()))
+    return x1 + way / osc.omega, velocity / osc.omega, t + duration
+
+
+def guards_at(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
+    """The guards of a mode, positive inside, inf where there is none: n boundaries (of a mass that
+    sticks those of the other belts), 2n edges, capacity - needed and capacity + needed."""
+    x1, x2, t = y
+    now = at_time(osc, t)
+    others = [*boundary_guards(now, mode, x2), *edge_guards(now, mode, x1)]
+    return jnp.stack([*others, *_limits(now, mode, x1, x2)])
+
+
+def _limits(now: Oscillator, mode: Mode, x1: Array, x2: Array) -> list[Array]:
+    needed, limit = mode_acceleration(now, mode, x1, x2), capacity(now, mode)
+    stuck = mode.any_stuck
+    return [jnp.where(stuck, limit + way * needed, jnp.inf) for way in (-1.0, 1.0)]
+
+
+class Course(NamedTuple):
+    """Values of guards, and their first two derivatives by the time along the motion."""
+
+    value: Array
+    slope: Array
+    curvature: Array
+
+
+def course(
+    osc: Oscillator, mode: Mode, guards: Callable[[TimedState], Array], y: TimedState
+) -> Course:
+    """Guards at a state and how they change in the motion of the mode."""
+
+    def rate(*y):
+        return jax.jvp(lambda *y: guards(y), y, field_at(osc, mode, y))
+
+    (value, slope), (_, curvature) = jax.jvp(rate, y, field_at(osc, mode, y))
+    return Course(value, slope, curvature)
+
+
+def guard_sizes(osc: Oscillator, y: TimedState) -> Array:
+    """The size of the numbers of which guards are made, with what the time adds to rounding."""
+    x1, x2, t = y
+    now = at_time(osc, t)
+    forces = [belt.load * belt.friction.static for belt in now.belts]
+    forces += [jnp.abs(belt.velocity) / osc.omega for belt in now.belts]
+    forces += [jnp.abs(force.force(t)) for force in now.forcing]
+    return blur(t) * (1 + jnp.abs(x1) + jnp.abs(x2) + functools.reduce(jnp.add, forces))
+
+
+# --- which belts hold -----------------------------------------------------------------------------
+
+
+def are_mates(osc: Oscillator, i: int, k: int) -> Array:
+    """Whether two belts have the same velocity at all times."""
+    if i == k:
+        return jnp.asarray(True)
+    one, other = (_numbers(osc.belts[j].velocity) for j in (i, k))
+    constant = (one[1] == 0) & (other[1] == 0)
+    alike = functools.reduce(jnp.logical_and, [a == b for a, b in zip(one[1:], other[1:])])
+    return (one[0] == other[0]) & (constant | alike)
+
+
+def _numbers(velocity) -> tuple[Array, ...]:
+    if isinstance(velocity, Oscillating):
+        return velocity.mean, velocity.amplitude, velocity.frequency, velocity.phase
+    return (velocity, *[jnp.zeros(())] * 3)
+
+
+def _is_faster(osc: Oscillator, i: int, k: int, t: Array) -> Array:
+    """1 where belt i is faster than belt k just after they had the same velocity, else -1."""
+    one, other = osc.belts[i].velocity, osc.belts[k].velocity
+    size = 1e-13 * (1 + sum(abs(x) for v in (one, other) for x in _numbers(v)[:2]))
+    sign = jnp.ones(())
+    for order in (3, 2, 1):
+        rates = [
+            v.derivative(t, order) if isinstance(v, Oscillating) else jnp.zeros(())
+            for v in (one, other)
+        ]
+        difference = rates[0] - rates[1]
+        sign = jnp.where(jnp.abs(difference) > size, jnp.sign(difference), sign)
+    return sign
+
+
+def _holds(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
+    """Whether the belts that are stuck in a mode hold the mass from now on.
+
+    At the limit itself the way that it goes from there decides.
+    """
+    now = at_time(osc, y[2])
+
+    def limits(y):
+        return jnp.stack(_limits(at_time(osc, y[2]), mode, *y[:2]))
+
+    value, slope, curvature = course(osc, mode, limits, y)
+    later = limits(carried(osc, mode, y, jnp.asarray(LATER)))
+    limit = capacity(now, mode)
+    rounding = ROUNDING * blur(y[2]) * (1 + jnp.abs(y[0]) + limit)
+    bends = jnp.where(jnp.abs(curvature) > LEAST_CURVATURE, curvature > 0, later >= value - 1e-13)
+    goes_in = jnp.where(jnp.abs(slope) > LEAST_SLOPE, slope > 0, bends)
+    held = jnp.where(jnp.abs(value) <= rounding, goes_in, value > 0)
+    return jnp.all(held) & (limit > 0)
+
+
+def resolved(
+    osc: Oscillator, mode: Mode, zero: Sequence[Array], first: Sequence[Array], y: TimedState
+) -> tuple[Mode, Array]:
+    """The mode from a state on in which some belts have r = 0, and x2' there.
+
+    zero: which touching belts; their codes in `mode` do not count. Each velocity among them is
+    tried: the belts of that velocity have to hold the mass, while the signs of the others are those
+    just afterwards. first: numbers of belts that are tried before the others, -1 for none. Where no
+    belt holds, the mass slips with the signs that agree with its acceleration.
+    """
+    n, t = len(osc.belts), y[2]
+    now = at_time(osc, t)
+    x2 = y[1]
+    mates = [[are_mates(osc, i, k) for k in range(n)] for i in range(n)]
+    faster = [[_is_faster(osc, i, k, t) for k in range(n)] for i in range(n)]
+
+    def with_signs(codes: Sequence[Array]) -> Mode:
+        rows = zip(zero, codes, mode.codes, strict=True)
+        return Mode(tuple(jnp.where(is_zero, new, old) for is_zero, new, old in rows))
+
+    sticks = [
+        with_signs([jnp.where(mates[i][k], STUCK, faster[i][k]) for i in range(n)])
+        for k in range(n)
+    ]
+    held = [zero[k] & _holds(osc, sticks[k], y) for k in range(n)]
+    # The acceleration of each belt, over omega, and of the mass if it slips.
+    rates = [
+        belt.rate / osc.omega if isinstance(belt, MovingBelt) else jnp.zeros(())
+        for belt in now.belts
+    ]
+    slips = [with_signs([jnp.ones(())] * n)]
+    slips += [
+        with_signs([jnp.where(mates[i][k] | (faster[i][k] < 0), -1.0, 1.0) for i in range(n)])
+        for k in range(n)
+    ]
+    best, after, a_after = jnp.inf, slips[0], mode_acceleration(now, slips[0], y[0], x2)
+    for number, slip in enumerate(slips):
+        a = mode_acceleration(now, slip, y[0], x2)
+        misses = [
+            jnp.where(is_zero, jnp.maximum(code * (a - rate), 0.0), 0.0)
+            for is_zero, code, rate in zip(zero, slip.codes, rates, strict=True)
+        ]
+        wrong = functools.reduce(jnp.maximum, misses)
+        wrong = jnp.where(zero[number - 1], wrong, jnp.inf) if number else wrong
+        better = wrong < best
+        best = jnp.where(better, wrong, best)
+        after, a_after = select(better, (slip, a), (after, a_after))
+    for k in reversed(range(n)):
+        after, a_after = select(held[k], (sticks[k], rates[k]), (after, a_after))
+    for number in reversed(first):
+        for k in range(n):
+            chosen = held[k] & (number == k)
+            after, a_after = select(chosen, (sticks[k], rates[k]), (after, a_after))
+    return after, a_after
+
+
+def at_zero(osc: Oscillator, mode: Mode, y: TimedState, k: Array) -> list[Array]:
+    """Which touching belts have r = 0; k: the number of one that has, -1 where none is known."""
+    _, x2, t = y
+    n = len(osc.belts)
+    now = at_time(osc, t)
+    velocity = first_of([k == i for i in range(n)], [b.velocity for b in now.belts], osc.omega * x2)
+    found = []
+    for i, (belt, touches) in enumerate(zip(now.belts, mode.touching, strict=True)):
+        mate = any_of([(k == j) & are_mates(osc, i, j) for j in range(n)])
+        size = jnp.abs(belt.velocity) + jnp.abs(velocity) + jnp.abs(_numbers_of(osc, i)[1])
+        near = jnp.abs(belt.velocity - velocity) <= SAME * blur(t) * size
+        found.append(touches & (mate | near))
+    return found
+
+
+def _numbers_of(osc: Oscillator, i: int) -> tuple[Array, ...]:
+    return _numbers(osc.belts[i].velocity)
+
+
+# --- starts ---------------------------------------------------------------------------------------
+
+
+def begun(osc: Oscillator, y: TimedState) -> tuple[Mode, Array]:
+    """The mode of a start, and whether it is a pseudo-focus: at rest on an edge to which it is
+    pushed from both sides."""
+    sides = [_side(osc, y, rightward) for rightward in (False, True)]
+    (left, a_left), (right, a_right) = sides
+    if not has_edges(osc):
+        return right, jnp.asarray(False)
+    same = functools.reduce(
+        jnp.logical_and, [a == b for a, b in zip(left.codes, right.codes, strict=True)]
+    )
+    rests = y[1] == 0
+    goes_right = (a_right > 0) | (a_right == 0) & right.any_stuck & (a_left >= 0)
+    to_right = jnp.where(rests, goes_right, y[1] > 0)
+    on_edge = any_of([y[0] == edge for edge in edges(osc)])
+    focus = on_edge & rests & ~same & (a_left > 0) & (a_right < 0)
+    return select(to_right, right, left), focus
+
+
+def _side(osc: Oscillator, y: TimedState, rightward: bool) -> tuple[Mode, Array]:
+    x1, x2, t = y
+    now = at_time(osc, t)
+    codes = []
+    for belt in now.belts:
+        sign = jnp.where(belt.velocity > osc.omega * x2, 1.0, -1.0)
+        if has_edges(osc):
+            is_below = x1 < belt.lower if rightward else x1 <= belt.lower
+            is_above = x1 >= belt.upper if rightward else x1 > belt.upper
+            sign = jnp.where(is_below, BELOW, jnp.where(is_above, ABOVE, sign))
+        codes.append(sign)
+    mode = Mode(tuple(codes))
+    zero = at_zero(osc, mode, y, jnp.asarray(-1))
+    return resolved(osc, mode, zero, [], y)
+
+
+# --- events ---------------------------------------------------------------------------------------
+
+
+class Instant(NamedTuple):
+    """How a motion goes on from an instant: state, mode, and whether it is lost at an edge."""
+
+    y: TimedState
+    mode: Mode
+    captured: Array
+
+
+def on_guard_at(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> TimedState:
+    """The state put exactly on the boundary or edge whose guard vanishes there."""
+    n = len(osc.belts)
+    x1, x2, t = y
+    now = at_time(osc, t)
+    velocities = [belt.velocity for belt in now.belts]
+    hit = [guard == i for i in range(n)]
+    x2_slip = jnp.where(any_of(hit), first_of(hit, velocities, velocities[0]) / osc.omega, x2)
+    x2 = stick_velocity(now, mode, osc.omega * x2_slip) / osc.omega
+    if not has_edges(osc):
+        return x1, jnp.where(mode.any_stuck, x2, x2_slip), t
+    at_edge = [guard == n + i for i in range(2 * n)]
+    x1 = first_of(at_edge, edges(osc), x1)
+    return x1, jnp.where(mode.any_stuck, x2, x2_slip), t
+
+
+def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> Instant:
+    """What follows where the guard of that number in `guards_at` vanishes; -1: nothing does.
+
+    y: put on the guard already, see `on_guard_at`.
+    """
+    n = len(osc.belts)
+    x2, t = y[1], y[2]
+    stuck = mode.any_stuck
+    held_by = first_of(mode.stuck, [jnp.asarray(i) for i in range(n)], jnp.asarray(-1))
+    # A boundary, or another belt's while it sticks: belts of that velocity ask anew.
+    at_boundary = (guard >= 0) & (guard < n)
+    k = jnp.where(stuck, held_by, guard)
+    zero = at_zero(osc, mode, y, k)
+    mates = [any_of([(guard == j) & are_mates(osc, i, j) for j in range(n)]) for i in range(n)]
+    rows = zip(zero, mates, mode.touching, strict=True)
+    zero = [one | mate & touches for one, mate, touches in rows]
+    met, _ = resolved(osc, mode, zero, [k, guard], y)
+    after = select(at_boundary, met, mode)
+    # A limit: friction opposed the force that was needed.
+    upper, lower = guard == 3 * n, guard == 3 * n + 1
+    sign = jnp.where(upper, -1.0, 1.0)
+    slip = Mode(tuple(jnp.where(code == STUCK, sign, code) for code in mode.codes))
+    after = select(upper | lower, slip, after)
+    captured = jnp.zeros_like(stuck)
+    if has_edges(osc):
+        at_edge = (guard >= n) & (guard < 3 * n)
+        hit = [guard == n + i for i in range(2 * n)]
+        flags = zip(hit, bounds_rightward(mode), strict=True)
+        rightward = any_of([one & right for one, right in flags])
+        beyond = codes_past_edge(at_time(osc, t), mode, y[0], osc.omega * x2, rightward)
+        # A sign for those with r = 0, which are resolved below.
+        beyond = Mode(tuple(jnp.where(code == STUCK, 1.0, code) for code in beyond.codes))
+        beyond = Mode(
+            tuple(
+                jnp.where(was_stuck & is_there, STUCK, code)
+                for was_stuck, is_there, code in zip(
+                    mode.stuck, beyond.touching, beyond.codes, strict=True
+                )
+            )
+        )
+        zero = at_zero(osc, beyond, y, jnp.where(stuck, held_by, -1))
+        arrived = any_of([one & ~touched for one, touched in zip(zero, mode.touching, strict=True)])
+        asks = stuck | arrived
+        zero = [one & asks for one in zero]
+        past, a_past = resolved(osc, beyond, zero, [held_by], y)
+        after = select(at_edge, past, after)
+        a = mode_acceleration(at_time(osc, t), mode, y[0], x2)
+        inward = jnp.where(rightward, 1.0, -1.0)
+        pushed = (a * inward > 0) & (a_past * inward < 0)
+        captured = at_edge & ~stuck & ~past.any_stuck & pushed & (jnp.abs(x2) < LOST_AT_EDGE)
+    return Instant((y[0], jnp.where(captured, 0.0, x2), t), after, captured)
+
+
+def is_held_for_ever(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
+    """Whether a mass stays stuck whatever the clock says: on belts at rest, and other touching
+    belts constant, while what is needed with all forces at their largest is within the capacity.
+
+    Where that is not known the answer is no.
+    """
+    now = at_time(osc, y[2])
+    still, limit = mode.any_stuck, jnp.zeros(())
+    for belt, touches, stuck in zip(osc.belts, mode.touching, mode.stuck, strict=True):
+        v, load = belt.velocity, belt.load
+        rests = (v == 0) if not isinstance(v, Oscillating) else (v.mean == 0) & (v.amplitude == 0)
+        constant = not isinstance(v, Oscillating) and not isinstance(load, Oscillating)
+        still = still & (~touches | jnp.where(stuck, rests, jnp.asarray(constant)))
+        least = load.mean - jnp.abs(load.amplitude) if isinstance(load, Oscillating) else load
+        limit = limit + jnp.where(stuck, least * belt.friction.static, 0.0)
+    pushes = [force.amplitude for force in now.forcing]
+    rest = mode_acceleration(now, mode, y[0], y[1]) - functools.reduce(jnp.add, pushes)
+    bounds = [force.bound(osc.damping) for force in osc.forcing]
+    largest = jnp.abs(rest) + functools.reduce(jnp.add, bounds, jnp.zeros(()))
+    return still & (largest <= limit * (1 + ROUNDING)) & (limit > 0)

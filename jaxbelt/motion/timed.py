@@ -1,0 +1,231 @@
+"""One arc with a clock: from a state to the first guard that vanishes, and how it goes on there.
+
+Without a clock the extrema of x2 and of x1 tell how often a guard can vanish, see `arcs`; with one
+they do not: x2'' is not -x2 where x2' = 0, and boundaries move. So each step has to show that none
+of its guards vanishes within, by what all guards are at its ends: value, slope and curvature along
+the motion, by derivatives of the field. A quintic has these values; in the basis of Bernstein it
+lies within its six control points. Where these, less the error of the quintic, are positive, the
+guard is. Where the guard is negative at the end and the control points fall, it has one root.
+Otherwise the step is halved. The error of the quintic is at most |g''''''| h^6/46080; steps are
+half a radian of the fastest wave or shorter, and there `SHARE` of its distance from the cubic with
+the same values and slopes, about |g''''| h^4/480 at the control points, is more: for a wave of
+frequency Omega the ratio of the two is (Omega h)^2/96, or 1/400. Slip and stick phases are proved
+in the same way; in stick phases the state is in closed form. A double root, where control points
+are negative by rounding only, is touched, and the arc goes on.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..model.instants import (
+    ROUNDING,
+    Course,
+    TimedState,
+    carried,
+    course,
+    field_at,
+    guard_sizes,
+    guards_at,
+    is_held_for_ever,
+    on_guard_at,
+    passed_guard,
+)
+from ..model.modes import Mode, select
+from ..model.oscillator import Oscillator, fastest
+from ..numerics.extrapolation import increments, scheme
+from ..numerics.roots import first_root
+from .arcs import ArcEnd
+
+#: Longest step, times the highest frequency; the first one of an arc.
+LONGEST, FIRST = 0.5, 0.05
+#: Steps are not halved below this; what is not decided there is rounding.
+SHORTEST = 1e-8
+#: Part of the distance between cubic and quintic that bounds the error of the quintic.
+SHARE = 0.25
+#: A guard above minus this, times `guard_sizes`, has not passed zero.
+TOUCH = 0.1 * ROUNDING
+#: Steps before an arc is given up.
+MOST_STEPS = 20_000
+#: Longest slip arc; longer ones are cut.
+MAX_ARC = 1.0
+_ORDER_8 = scheme((2, 4, 6, 8), (2, 4, 6))
+
+
+class _March(NamedTuple):
+    """Where a march is: the time passed, the state, guards there and what is added to those that
+    began at zero; the next step. hit: a guard vanishes within that step, which is then its length.
+    """
+
+    passed: Array
+    y: TimedState
+    at: Course
+    shifts: Array
+    h: Array
+    hit: Array
+    stops: Array
+    failed: Array
+    count: Array
+
+
+def _stepped(osc: Oscillator, mode: Mode, y: TimedState, h: Array):
+    """The state a time h later, and an estimate of its error in x1 and x2."""
+    field = functools.partial(field_at, osc, mode)
+    best, lower = increments(lambda y: field(y), y, h, _ORDER_8)
+    slipped = tuple(a + b for a, b in zip(y, best, strict=True))
+    errors = tuple(jnp.abs(a - b) for a, b in zip(best[:2], lower[:2], strict=True))
+    stuck = mode.any_stuck
+    zero = jnp.zeros_like(h)
+    return select(stuck, (carried(osc, mode, y, h), (zero, zero)), (slipped, errors))
+
+
+def _control_points(at: Course, end: Course, h: Array) -> tuple[Array, Array]:
+    """The control points of the quintics through both ends, [6, guards], and their error."""
+    b = [at.value, at.value + 0.2 * h * at.slope]
+    b += [at.value + 0.4 * h * at.slope + 0.05 * h**2 * at.curvature]
+    b += [end.value - 0.4 * h * end.slope + 0.05 * h**2 * end.curvature]
+    b += [end.value - 0.2 * h * end.slope, end.value]
+    # Those of the cubic in the middle.
+    p = [at.value, at.value + h * at.slope / 3, end.value - h * end.slope / 3, end.value]
+    third = (p[0] + 6 * p[1] + 3 * p[2]) / 10
+    fourth = (3 * p[1] + 6 * p[2] + p[3]) / 10
+    away = jnp.maximum(jnp.abs(b[2] - third), jnp.abs(b[3] - fourth))
+    return jnp.stack(b), SHARE * away
+
+
+def _finite(at: Course) -> Course:
+    """Guards that are not there as ones that stay positive."""
+    there = jnp.isfinite(at.value)
+    return Course(
+        jnp.where(jnp.isposinf(at.value), 1.0, at.value),
+        jnp.where(there, at.slope, 0.0),
+        jnp.where(there, at.curvature, 0.0),
+    )
+
+
+def first_guard(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, rtol, atol):
+    """The motion of a mode until a guard vanishes, or for the time `longest`.
+
+    Returns its duration, its end, the number of the guard in `guards_at` or -1, and whether it was
+    given up. A slip arc also ends, with -1, behind a minimum of the distance to a boundary, where
+    friction bends most: so that arcs have one bend, at an end.
+    """
+    n = len(osc.belts)
+    most = LONGEST / fastest(osc)
+    sizes = guard_sizes(osc, y)
+    stuck = mode.any_stuck
+
+    def look(y):
+        return _finite(course(osc, mode, lambda y: guards_at(osc, mode, y), y))
+
+    def unfinished(state: _March):
+        going = (state.passed < longest) & ~state.hit & ~state.stops & ~state.failed
+        return going & (state.count < MOST_STEPS)
+
+    def advance(state: _March) -> _March:
+        rest = longest - state.passed
+        h = jnp.minimum(state.h, rest)
+        y, errors = _stepped(osc, mode, state.y, h)
+        end = look(y)
+        larger = [jnp.maximum(jnp.abs(a), jnp.abs(b)) for a, b in zip(state.y[:2], y[:2])]
+        terms = [e / (atol + rtol * size) for e, size in zip(errors, larger, strict=True)]
+        error = functools.reduce(jnp.maximum, terms)
+        accurate = (error <= 1) | (h <= SHORTEST) & jnp.isfinite(error)
+        # Whether guards vanish within the step.
+        shifted = state.at.value + state.shifts, end.value + state.shifts
+        points, astray = _control_points(
+            state.at._replace(value=shifted[0]), end._replace(value=shifted[1]), h
+        )
+        none = jnp.min(points, axis=0) - astray > -TOUCH * sizes
+        falls = jnp.max(jnp.diff(points, axis=0), axis=0) + 2 * astray < 0
+        tiny = h <= SHORTEST
+        negative = shifted[1] < -TOUCH * sizes
+        once = ~none & negative & (falls | tiny)
+        clear = none | once | tiny
+        good = accurate & jnp.all(clear)
+        hit = good & jnp.any(once)
+        moves = good & ~hit
+        # Behind a minimum of a distance to a boundary.
+        turned = (state.at.slope[:n] < 0) & (end.slope[:n] > 0)
+        stops = moves & ~stuck & jnp.any(turned)
+        growth = jnp.clip(0.9 * jnp.maximum(error, 1e-8) ** (-1 / 7), 0.2, 2.0)
+        growth = jnp.where(jnp.isfinite(growth), growth, 0.25)
+        shorter = jnp.where(accurate, 0.5, jnp.minimum(growth, 0.8))
+        h_next = jnp.where(good, jnp.minimum(h * growth, most), h * shorter)
+        # The last step is made once more, for its root.
+        h_next = jnp.where(hit, h, h_next)
+        passed = jnp.where(moves, jnp.where(h >= rest, longest, state.passed + h), state.passed)
+        shifts = jnp.where(moves & (end.value > state.shifts), 0.0, state.shifts)
+        return _March(
+            passed,
+            select(moves, y, state.y),
+            select(moves, end, state.at),
+            shifts,
+            h_next,
+            hit,
+            stops,
+            ~accurate & (h <= SHORTEST),
+            state.count + 1,
+        )
+
+    at = look(y)
+    shifts = jnp.where(jnp.abs(at.value) <= ROUNDING * sizes, 2 * ROUNDING * sizes, 0.0)
+    no = jnp.asarray(False)
+    start = _March(jnp.zeros(()), y, at, shifts, FIRST * most, no, no, no, jnp.asarray(0))
+    last = lax.while_loop(unfinished, advance, start)
+    length = jnp.where(last.hit, last.h, 0.0)
+
+    def guards(h):
+        y, _ = _stepped(osc, mode, last.y, h)
+        at = look(y)
+        return at.value + last.shifts, at.slope
+
+    values, slopes = guards(length)
+    at_end = jnp.where(last.hit, values, jnp.inf), slopes
+    at_start = last.at.value + last.shifts, last.at.slope
+    h, number = first_root(guards, at_start, length, at_end, extrema=0)
+    number = jnp.where(last.hit, number, -1)
+    h = jnp.where(number >= 0, h, length)
+    y, _ = _stepped(osc, mode, last.y, h)
+    y = select(last.hit, y, last.y)
+    failed = last.failed | (last.count >= MOST_STEPS)
+    return last.passed + h, y, number, failed
+
+
+class TimedArc(eqx.Module):
+    """How an arc ends, and whether the run ends with it: as `arcs.ArcEnd`."""
+
+    end: ArcEnd
+    done: Array
+
+
+def timed_arc(osc: Oscillator, mode: Mode, y: TimedState, t1: Array, rtol, atol) -> TimedArc:
+    """The arc from y, up to t1, and how the orbit goes on."""
+    stuck = mode.any_stuck
+    remaining = t1 - y[2]
+    forever = stuck & is_held_for_ever(osc, mode, y)
+    # Cut where slip arcs are followed once more for their derivatives.
+    longest = jnp.where(stuck, remaining, jnp.minimum(remaining, MAX_ARC))
+    looked = jnp.where(forever, 0.0, longest)
+    duration, y_end, number, failed = first_guard(osc, mode, y, looked, rtol, atol)
+    y_end = select(forever, carried(osc, mode, y, remaining), y_end)
+    duration = jnp.where(forever, remaining, duration)
+    y_end = on_guard_at(osc, mode, number, y_end)
+    after = passed_guard(osc, mode, number, y_end)
+    in_time = (number < 0) & (duration >= remaining)
+    ones = jnp.ones_like(remaining)
+    end = ArcEnd(
+        duration=duration,
+        y=after.y,
+        mode=after.mode,
+        signs=(ones, ones),
+        ended_by=number,
+        captured=after.captured,
+        forever=forever,
+        failed=failed,
+    )
+    return TimedArc(end, in_time | after.captured)
