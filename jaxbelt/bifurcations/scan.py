@@ -11,6 +11,7 @@ Labels describe attractors. Points where the unstable cycle in a diagram touches
 found in the same way from its signature, see `edges_touched`.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise, takewhile
@@ -22,8 +23,10 @@ import numpy as np
 from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces
 from ..cycles.attractors import SAME, distance, is_same, itinerary, place_of
+from ..cycles.chains import blank_loop
 from ..cycles.cycle import as_loop, warn_of_extrapolation
 from ..model.oscillator import Oscillator
+from ..numerics.compiling import compiled_beside
 from ..numerics.newton import NEWTON_STEPS
 from ..results import Status
 from .base import (
@@ -41,7 +44,7 @@ from .folds import FoldOfCycles
 from .infinity import HopfAtInfinity
 from .meetings import EdgeExchange, MeetingEdges
 from .path import ROOM, ParameterPath
-from .rests import BeltAtRest, Hopf, SuddenSliding
+from .rests import ANY, BeltAtRest, Hopf, SuddenSliding
 from .tangencies import GrazingSliding
 
 #: Kinds that are searched, likelier ones first, and those whose programs compile sooner.
@@ -114,12 +117,41 @@ def scan(
 
 
 def search(
-    path: ParameterPath, resolution: int = 96, near: float = NEAR
+    path: ParameterPath,
+    resolution: int = 96,
+    near: float = NEAR,
+    ahead: Sequence[Callable[[], Any]] = (),
 ) -> tuple[BifurcationPoint, ...]:
     """Every bifurcation point on a path, in order; the path keeps its labels.
 
     near: points are solved for from the ends of intervals narrower than this fraction of the path.
+    ahead: calls for the programs that are needed afterwards, see `compiled_beside`.
     """
+    calls = [*_calls_ahead(path), *ahead]
+    with compiled_beside(f"path {len(ahead)}", path.at(path.first), calls):
+        return _searched(path, resolution, near)
+
+
+def _calls_ahead(path: ParameterPath) -> list[Callable[[], Any]]:
+    """Calls that compile what nearly every path needs: of what happens to belts' velocities on this
+    one, of Hopf points, and of cycles that begin to stick."""
+    belts = len(path.at(path.first).belts)
+    at_breaks = [
+        (condition, value, None)
+        for value in path.breaks
+        for pair in path.coinciding(value)
+        for kind in LOOKED_FOR
+        for condition in kind.at_coincidence(pair)
+    ]
+    value = path.inside(path.first)
+    anywhere = [(Hopf(), value, ANY), (GrazingSliding(0), value, blank_loop(ROOM, belts))]
+    return [
+        functools.partial(condition.solved_from, path.variation, value, beginning)
+        for condition, value, beginning in (*at_breaks, *anywhere)
+    ]
+
+
+def _searched(path: ParameterPath, resolution: int, near: float) -> tuple[BifurcationPoint, ...]:
     points = [point for at in path.breaks for point in _at_break(path, at)]
     first, last = path.inside(path.first), path.inside(path.last)
     ends = [first, *(v for at in path.breaks for v in path.beside(at)), last]

@@ -23,9 +23,11 @@ from ..model.events import signature_name
 from ..model.modes import edges
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.own_units import OwnOscillator, in_given_units, in_own_units, quantity
+from ..numerics.compiling import compiled_beside
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .cycle import Cycle, warn_of_extrapolation
+from .chains import SIZES, blank_loop
+from .cycle import Cycle, polish, warn_of_extrapolation
 from .returns import Returns, reach_of
 from .separatrices import Separatrix, TracedSeparatrix, branches
 
@@ -171,7 +173,10 @@ def portrait(osc: Oscillator) -> Portrait:
 
 def _portrait(osc: OwnOscillator) -> Portrait:
     points = equilibria(osc)
-    found, map_ = branches_and_returns(osc, points)
+    # Its cycles are polished when the returns of orbits are known.
+    loop, ok = blank_loop(SIZES[0], len(osc.belts)), jnp.asarray(Status.OK.value)
+    with compiled_beside("portrait", osc, [lambda: polish(osc, loop, ok)]):
+        found, map_ = branches_and_returns(osc, points)
     reach = map_.reach
     cycles = tuple(cycle for cycle in map_.cycles if abs(float(cycle.multiplier)) < 1)
     unstable = tuple(cycle for cycle in map_.cycles if float(cycle.multiplier) > 1)

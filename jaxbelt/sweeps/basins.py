@@ -38,6 +38,7 @@ from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.own_units import in_given_units, in_own_units, in_units_of_run
+from ..numerics.compiling import compiled_beside
 from ..results import Status, draw
 from ..tables import table_of
 from .attractor import KINDS, Attractor
@@ -321,19 +322,22 @@ def basins(
     axes = {name: _starts_along(values, name) for name, values in (("x1", x1), ("x2", x2))}
     require_wish(progress, "progress")
     with Activity("basins", progress):
-        dataset = sweep(
-            lambda: oscillator,
-            axes,
-            t1=t1,
-            rtol=rtol,
-            atol=atol,
-            observe="attractor",
-        )
+        own = in_own_units(oscillator)
+        start = jnp.asarray(np.zeros(2))
+        ahead = [lambda: cycle_from(own, start), lambda: from_starts(own)]
+        with compiled_beside("basins", own, ahead):
+            dataset = sweep(
+                lambda: oscillator,
+                axes,
+                t1=t1,
+                rtol=rtol,
+                atol=atol,
+                observe="attractor",
+            )
         note_progress("telling the attractors apart")
         labels, attractors, cycles = _labels(oscillator, dataset)
         # With one attractor there is hardly an unstable cycle, and a search among all cycles takes
         # time.
-        own = in_own_units(oscillator)
         boundary = (unstable_cycle if len(attractors) > 1 else from_starts)(own)
         boundary = in_given_units(boundary, oscillator, own)
     dataset["label"] = (
