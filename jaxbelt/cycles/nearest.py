@@ -25,7 +25,8 @@ from .outlines import Outline, Pieces, place_on
 PARTS, PAIRS, PIECES = 16, 64, 32
 #: Longest Newton step, as a fraction of a piece: two parts.
 LONGEST = 2 / PARTS
-#: Largest last step, as a fraction of a piece, and largest error in x1 along x2, of a solution.
+#: How far a solution may still move, as a fraction of a piece, and its largest error in x1 along
+#: x2.
 FOUND = 1e-9
 #: A solution that is so far beyond its part is accepted, too, as a fraction of a piece.
 BEYOND = 0.25 / PARTS
@@ -90,7 +91,9 @@ class Sampled(NamedTuple):
 def sampled(osc: Oscillator, pieces: Pieces) -> Sampled:
     """A curve of a known oscillator, cut into parts of its pieces."""
     has_extent = (np.asarray(pieces.durations) != 0) | (np.asarray(pieces.lengths) != 0)
-    has_extent[0] |= not np.any(has_extent)  # a point
+    # A point is one piece, of one part.
+    is_point = not np.any(has_extent)
+    has_extent[0] |= is_point
     numbers = np.flatnonzero(has_extent)
     states = np.concatenate(
         [
@@ -100,7 +103,8 @@ def sampled(osc: Oscillator, pieces: Pieces) -> Sampled:
     )[: len(numbers)]
     ends = np.stack([states[:, :-1], states[:, 1:]]).reshape(2, -1, 2)
     begin = np.tile(np.arange(PARTS) / PARTS, len(numbers))
-    return Sampled(pieces, numbers.repeat(PARTS), begin, ends.min(axis=0), ends.max(axis=0))
+    parts = numbers.repeat(PARTS), begin, ends.min(axis=0), ends.max(axis=0)
+    return Sampled(pieces, *(column[: 1 if is_point else None] for column in parts))
 
 
 @jit
@@ -139,11 +143,11 @@ def shortest_between(
         begin = np.stack([curves[k].begin[parts[now, k]] for k in (0, 1)], axis=1)
         pieces = [filled(curves[k].pieces, number[:, k], PAIRS) for k in (0, 1)]
         found = _solved(osc, *pieces, *filled((fractions, fixed), now, PAIRS), along_x2)
-        z, to, d, last = (np.asarray(one)[: now.size] for one in found)
+        z, to, d, moves = (np.asarray(one)[: now.size] for one in found)
         # Where a piece ends above the other curve, as on an edge, rounding says on which side.
         inside = np.maximum(begin - BEYOND, -FOUND) <= z
         inside &= z <= np.minimum(begin + 1 / PARTS + BEYOND, 1 + FOUND)
-        good = np.all(inside | fixed[now], axis=1) & (last < FOUND)
+        good = np.all(inside | fixed[now], axis=1) & (moves < FOUND)
         good &= (np.abs(d[:, 0]) < FOUND) | (not along_x2)
         lengths = np.where(good, np.abs(d[:, 1]) if along_x2 else np.hypot(*d.T), np.inf)
         row = int(np.argmin(lengths))
@@ -186,13 +190,13 @@ def _tries_of(one: Sampled, other: Sampled, along_x2: bool) -> tuple[np.ndarray,
 
 @jit
 def _solved(osc: Oscillator, first: Pieces, second: Pieces, start: Array, fixed: Array, along_x2):
-    """For each row: fractions, the end of the way there, d, and the length of the last step."""
+    """For each row: fractions, the end of the way there, d, and how far fractions still move."""
 
     def one(first, second, start, fixed):
         pieces = _side_by_side(first, second)
         found = solve(Normal(along_x2), (osc, pieces, start, fixed), start, longest=LONGEST)
         (p, q), _ = places_on(osc, pieces, found.z)
-        return found.z, q, p - q, found.last_two[0]
+        return found.z, q, p - q, found.unsettled
 
     return each(one)(first, second, start, fixed)
 
