@@ -1,8 +1,8 @@
 """The shortest way between two curves, in any direction or along x2: `shortest_between`.
 
-x1 and x2 are monotone on every piece, for arcs end at extrema. So a part of a piece lies in the box
-between its ends, and two boxes bound the distance between what is in them from below and from
-above. Newton's method solves for the shortest way (see `Meeting`) between those pairs of parts only
+x1 and x2 are monotone on every piece, as arcs end at extrema. So a part of a piece lies in the box
+between its ends, and two boxes bound the distance between their contents from below and from above.
+Newton's method solves for the shortest way (see `Meeting`) between those pairs of parts only
 that these bounds leave.
 """
 
@@ -144,7 +144,7 @@ def shortest_between(
         pieces = [filled(curves[k].pieces, number[:, k], PAIRS) for k in (0, 1)]
         found = _solved(osc, *pieces, *filled((fractions, fixed), now, PAIRS), along_x2)
         z, to, d, moves = (np.asarray(one)[: now.size] for one in found)
-        # Where a piece ends above the other curve, as on an edge, rounding says on which side.
+        # Where a piece ends above the other curve, as on an edge, rounding decides on which side.
         inside = np.maximum(begin - BEYOND, -FOUND) <= z
         inside &= z <= np.minimum(begin + 1 / PARTS + BEYOND, 1 + FOUND)
         good = np.all(inside | fixed[now], axis=1) & (moves < FOUND)
@@ -227,7 +227,7 @@ class ShortestWay(eqx.Module):
     along_x2: bool = eqx.field(static=True)
 
     def ends(self, osc: Oscillator) -> tuple[Array, Array]:
-        """Where it begins and ends, [2] each, with first derivatives by every parameter."""
+        """Beginning and end of the way, [2] each, with first derivatives by every parameter."""
         return _ends_of(osc, self)
 
 

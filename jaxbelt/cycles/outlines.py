@@ -1,12 +1,13 @@
 """Curves of the phase plane in smooth pieces, as functions of the oscillator: `Outline`.
 
-A cycle, a separatrix and a segment of equilibria are such curves. An outline keeps what is discrete
-of one, the modes and the ends of its arcs, which do not change where the oscillator does a little;
-where the curve is follows from the oscillator, and so do its derivatives: of a cycle those of the
-shooting equations, of a separatrix those of its arcs one after another, each of which ends where
-the guard of its end vanishes.
+A cycle, a separatrix and a segment of equilibria are such curves. An outline keeps the discrete
+data of a curve, the modes and the ends of its arcs, which do not change when the oscillator changes
+a little; the place of the curve follows from the oscillator, and so do its derivatives: for a cycle
+those of the shooting equations, for a separatrix those of its arcs one after another, each of which
+ends where the guard of its end vanishes.
 
-A point of a curve has the number of its piece and a fraction, from 0 where the piece begins to 1.
+A point of a curve is given by the number of its piece and a fraction, from 0 at the beginning of
+the piece to 1.
 """
 
 import equinox as eqx
@@ -90,7 +91,7 @@ class Outline(eqx.Module):
     """A curve that moves with the oscillator; see the module."""
 
     def pieces(self, osc: Oscillator) -> Pieces:
-        """Where its pieces are, with derivatives by every parameter."""
+        """Its pieces, with derivatives by every parameter."""
         raise NotImplementedError
 
 
@@ -118,7 +119,7 @@ class Line(Outline):
 
 @jit
 def jumps(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
-    """Pieces of the boundary of a belt that part motions themselves.
+    """Pieces of the boundary of a belt that divide motions.
 
     Where the static limit of a belt exceeds mu(0) a mass that comes to its boundary from one side
     is held up to the static limit, and one that is on the other side slips away. There is one such
@@ -171,8 +172,8 @@ class OpenOutline(Outline):
     """A stable separatrix, followed backwards from its point.
 
     Attributes:
-        chain: Its arcs, or pieces of them. One that ends by nothing ("unused") goes on in the next,
-            and the last one may be cut off so.
+        chain: Its arcs, or pieces of them. One without an end event ("unused") continues in the
+            next, and the last one may be cut off.
         durations: Their durations.
         origin: Row of its point among `end_points`.
     """
@@ -199,7 +200,7 @@ class OpenOutline(Outline):
 
 @jit
 def _one_after_another(osc: Oscillator, chain: Chain, durations: Array, y: Array):
-    """Entries and durations of the arcs of a chain that is open, from where it begins.
+    """Entries and durations of the arcs of an open chain, from its beginning.
 
     Known durations are good to rounding. One Newton step gives each its first derivative.
     """
@@ -227,12 +228,11 @@ def _chain_of(osc: Oscillator, loop: Loop) -> Chain:
 
 
 def _cut_finely(osc: Oscillator, loop: Loop) -> Loop:
-    """The arcs of an orbit one after another, those that need more than STEPS steps cut into
-    pieces; one that is not the last of its arc ends by nothing ("unused"). Rows that pad it are of
-    no duration.
+    """Arcs in a row, those that need more than STEPS steps cut into pieces.
 
-    An arc may creep: to a node on the boundary of a belt, say, near which it stays for a hundred
-    times as long as it moved.
+    A piece that is not the last of its arc has no end event ("unused"). Rows that pad it have no
+    duration. An arc may creep: to a node on the boundary of a belt, for example, near which it
+    stays for a hundred times as long as it moved.
     """
     count = len(loop.ends)
     padded = filled(loop, np.arange(count), power_of_two(count, FEWEST))
