@@ -14,10 +14,11 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     checks          arguments, checked at the public edge
     tables          results as tables
     numerics/       padding derivatives extrapolation newton continuation roots
+    numerics/       control_points
     model/          friction forcing oscillator own_units machine parameters variations modes
     model/          pseudofocus transitions instants rest events equilibria far_out
     presets         the published systems
-    kernel/         lanes marks step events rounds
+    kernel/         lanes marks step events rounds waves clocked
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
     motion/         smoothing simulate
     cycles/         chains settling shooting orbits cycle attractors functionals

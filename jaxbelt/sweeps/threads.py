@@ -77,6 +77,7 @@ def run(
     t1: float,
     rtol: float,
     atol: float | None,
+    t0: float | None = None,
     derivatives: int = 0,
     budget: float = 1.0,
     threads: int | None = None,
@@ -99,6 +100,7 @@ def run(
         put: put(numbers, results) takes results [1 + derivatives, columns, runs] in any order, on
             any thread.
         t1: End of the runs.
+        t0: Time at which they begin, see `queue.Common`.
         rtol: Relative tolerance of a step.
         atol: Absolute tolerance of a step, in the given units; None: the default, in own units.
         derivatives: Number of directions of derivatives.
@@ -110,7 +112,8 @@ def run(
         return
     largest = np.iinfo(np.int32).max
     require(runs <= largest, "axes", f"{largest} runs or fewer in one call", runs)
-    limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
+    span = t1 - (t0 or 0.0)
+    limit = int(budget * STEP_BUDGET * max(1.0, span / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
     limit = min(limit, largest)
     threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
@@ -118,7 +121,7 @@ def run(
     width = lanes_for(-(-runs // threads))
     most = CHUNK.here * width // WIDTH.here
     team = _Team(
-        functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit))),
+        functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit), t0)),
         functools.partial(_first_streams, program, shared, width, columns, derivatives),
         rows_of,
         put,
