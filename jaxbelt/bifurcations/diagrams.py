@@ -22,7 +22,7 @@ import numpy as np
 
 from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces, require
-from ..cycles.attractors import BESIDE, MOMENT, distance
+from ..cycles.attractors import MAYBE_SAME, MOMENT, distance
 from ..cycles.chains import Loop, cut
 from ..cycles.cycle import Cycle, exactly, polish, warn_of_fast_loops
 from ..cycles.unstable import from_starts
@@ -486,7 +486,7 @@ def _joined(pieces: Sequence[_Piece], special: Sequence[list[BifurcationPoint]])
         )
         taken: set[int] = set()
         for away, i, j in pairs:
-            if away < BESIDE and not taken & {i, j}:
+            if away < MAYBE_SAME and not taken & {i, j}:
                 taken |= {i, j}
                 for a, b in ((ends[i], ends[j]), (ends[j], ends[i])):
                     partner[a.piece, a.right] = (b.piece, b.right)

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces
-from ..cycles.attractors import SAME, distance, is_same, itinerary, place_of
+from ..cycles.attractors import SAME_CYCLE, distance, is_same, itinerary, place_of
 from ..cycles.chains import blank_loop
 from ..cycles.cycle import as_loop, warn_of_extrapolation
 from ..model.oscillator import Oscillator
@@ -340,9 +340,9 @@ def _is_apart(point: BifurcationPoint, other: BifurcationPoint) -> bool:
 def _is_another(point: BifurcationPoint, other: BifurcationPoint) -> bool:
     """Whether two points at one value are of two cycles, or of two equilibria."""
     if all(int(one.cycle.status) == Status.OK for one in (point, other)):
-        return distance(place_of(point.cycle), place_of(other.cycle)) >= SAME
+        return distance(place_of(point.cycle), place_of(other.cycle)) >= SAME_CYCLE
     places = ([float(one.x1), 0.0] for one in (point, other))
-    return distance(*places, least=1.0) > SAME
+    return distance(*places, least=1.0) > SAME_CYCLE
 
 
 def _first_found(

@@ -1,27 +1,28 @@
 """Orbits that bound basins, from the points in which they end: `Separatrix`.
 
-On an edge x1 = sigma the velocity is x1' = x2 on both sides, so at (sigma, 0) orbits turn: those of
+On an edge x1 = sigma the velocity is x1' = x2 on both sides, so orbits turn at (sigma, 0): those of
 a side that pulls away from the edge touch it there. Where neither side draws the mass in, orbits
-that pass the edge just below that point, or above it, go on, and those that miss it turn. They part
-at the orbit that ends in the point, one from each side: the stable separatrices, reached in finite
-time. Where a side pushes away an orbit leaves from the point, an unstable separatrix. Where both do
-the point is a saddle; where a belt at rest holds the mass on one side, a segment ends in it.
+that pass the edge just below that point, or above it, go on, and those that miss it turn. The orbit
+that ends in the point, one from each side, separates them: the stable separatrices, reached in
+finite time. Where a side pushes away an orbit leaves from the point, an unstable separatrix. Where
+both do the point is a saddle; where a belt at rest holds the mass on one side, a segment ends in
+it.
 
 Where a segment ends elsewhere, at the limit of what belts at rest hold, orbits that stop within it
-stay, and those that stop beyond turn back. These are caught, too, if only they stop near enough,
-unless friction falls so steeply that the end is an unstable node of the field in which they turn,
-or the static limit exceeds mu(0). Then the orbit that arrives in the end bounds the basin.
+stay, and those that stop beyond turn back. These are caught, too, if they stop near enough, unless
+friction falls so steeply that the end is an unstable node of the field in which they turn, or the
+static limit exceeds mu(0). Then the orbit that arrives in the end bounds the basin.
 
-Where the static limit of a belt exceeds mu(0) an orbit that touches its boundary parts those that
-pass by from those that stick, for these do so until the static limit. It ends in the point where
-it touches, and goes on as both.
+Where the static limit of a belt exceeds mu(0) an orbit that touches its boundary separates those
+that pass by from those that stick, as these stick until the static limit. It ends in the point
+where it touches, and continues as both.
 
 Stable separatrices are followed backwards: in reversed time, t -> -t and x2 -> -x2, an oscillator
-with the signs of its damping, loads and velocities changed. Backwards, too, an orbit goes on in one
-way as long as it slips, for it comes to a boundary only where orbits cross it: the mass leaves a
-stick phase in one place only, slip onset. With a law whose static limit exceeds mu(0), orbits leave
-upwards or downwards all along a piece of the boundary beyond slip; then the separatrix ends there,
-and that piece of the boundary itself parts the motions.
+with the signs of its damping, loads and velocities changed. Backwards, too, an orbit continues in
+one way as long as it slips, for it comes to a boundary only where orbits cross it: the mass leaves
+a stick phase in one place only, slip onset. With a law whose static limit exceeds mu(0), orbits
+leave upwards or downwards all along a piece of the boundary beyond slip; then the separatrix ends
+there, and that piece of the boundary itself divides the motions.
 """
 
 from collections.abc import Callable
@@ -68,30 +69,35 @@ if TYPE_CHECKING:
 #: Arcs for which a separatrix is followed, some 40 loops; and a stable one that still grows then,
 #: as where damping is weak and loops pass many edges.
 SEPARATRIX_ARCS, MORE_ARCS = 256, 2048
-#: Tops that move on by less, relative to the distance from the origin, are settling.
+#: Tops that move by less, relative to the distance from the origin, are converging.
 SETTLING = 1e-6
 #: Samples of each arc; steps of integration, of order 12, between them at most.
 ARC_SAMPLES, STEPS_ALONG = 32, 100_000
 
 
 class Separatrix(eqx.Module):
-    """An orbit that leaves, or ends in, a point: (sigma, 0) of a contact edge, an end of a segment,
-    where it touches the boundary of a belt whose static limit exceeds mu(0), or where an edge cuts
-    off the piece of such a boundary on which only that limit holds the mass.
+    """An orbit that leaves, or ends in, a point that divides motions.
 
-    - point: (x1, x2). side: "left" or "right", on which side of it the orbit is there. stable:
-      whether it ends in the point, and so may bound basins, or leaves it.
-    - ts: times, 0 at the point, [samples]; ys: states (x1, x2), [samples, 2]; both in the order of
-      time, and good to 1e-9. Ends of arcs are among the samples.
-    - end: what its other end is, where an unstable one leads to and a stable one comes from:
-      "equilibrium" (or an end of a segment), "cycle", "outside" (of `|x1|`, `|x2|` < reach, see
-      `Portrait`), "boundary" (of a belt whose static limit exceeds mu(0): it leaves this boundary
-      beside a piece where the mass sticks), or "unsettled" (it approaches what it comes from, or
-      leads to, too slowly).
-    - to: the number of that equilibrium, or of that attracting or unstable cycle, in the portrait;
-      else -1.
-    - arcs: as it was followed from its point, arc by arc; where it is stable backwards, in the
-      oscillator reversed in time. What ends the last one, if it was left there, is "unused".
+    The point is (sigma, 0) of a contact edge, an end of a segment, a point where the orbit touches
+    the boundary of a belt whose static limit exceeds mu(0), or one where an edge cuts off the piece
+    of such a boundary on which only that limit holds the mass.
+
+    Attributes:
+        point: The point (x1, x2).
+        side: "left" or "right": the side of the point on which the orbit is there.
+        stable: Whether it ends in the point, and so may bound basins, or leaves it.
+        ts: Times, 0 at the point, in order, [samples].
+        ys: States (x1, x2), [samples, 2], good to 1e-9. Ends of arcs are among the samples.
+        end: The other end, where an unstable one leads to and a stable one comes from:
+            "equilibrium" (or an end of a segment), "cycle", "outside" (of `|x1|`, `|x2|` < reach,
+            see `Portrait`), "boundary" (of a belt whose static limit exceeds mu(0): it leaves this
+            boundary beside a piece where the mass sticks), or "unsettled" (it approaches its end
+            too slowly).
+        to: Number of that equilibrium, or of that attracting or unstable cycle, in the portrait;
+            else -1.
+        arcs: The arcs as it was followed from its point; for a stable one backwards, in the
+            oscillator reversed in time. The end of the last arc, if it is not an event, is
+            "unused".
     """
 
     point: Array = eqx.field(metadata=quantity("length", "velocity"))
@@ -104,13 +110,19 @@ class Separatrix(eqx.Module):
     arcs: Loop
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each sample, in the order of time: t, x1, x2."""
+        """Returns a row for each sample, in the order of time; columns: t, x1, x2."""
         x1, x2 = np.asarray(self.ys).T
         return table_of({"t": self.ts, "x1": x1, "x2": x2})
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw it in the phase plane, with its point, into the axes `ax` (None: new ones), which
-        are returned."""
+        """Draws the separatrix in the phase plane, with its point.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -125,9 +137,9 @@ class Separatrix(eqx.Module):
 class TracedSeparatrix(NamedTuple):
     """A separatrix as it was followed: backwards, with x2 reversed, where it is stable.
 
-    tops: its maxima of x1 in the order in which it came to them; y: where it was left; rest: x1
-    where it came to rest, else NaN; status: of the orbit; cut: whether it came to a piece of a
-    boundary where the mass sticks; arcs: see `Separatrix`.
+    tops: its maxima of x1 in the order in which it reached them; y: its last state; rest: x1 where
+    it came to rest, else NaN; status: of the orbit; cut: whether it came to a piece of a boundary
+    where the mass sticks; arcs: see `Separatrix`.
     """
 
     point: tuple[float, float]
@@ -144,8 +156,10 @@ class TracedSeparatrix(NamedTuple):
 
 
 def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[TracedSeparatrix]:
-    """All separatrices of an oscillator, followed as long as |x1| and |x2| are < reach; rests:
-    where the mass can rest."""
+    """All separatrices of an oscillator, followed as long as |x1| and |x2| are < reach.
+
+    rests: states of rest.
+    """
     positions = np.asarray(jnp.stack(edges(osc)))
     found: list[TracedSeparatrix | None] = []
     parting: list[float] = []
@@ -179,8 +193,10 @@ def _as_arrays(*numbers: float | int | bool) -> list[Array]:
 
 @jit
 def _orbits_part(osc: Oscillator, x1: Array) -> Array:
-    """Whether orbits part at an edge, x1 [1]: one side pushes away, the other one, too, or a belt
-    holds the mass there. A fixed point that lies on the edge, but for rounding, does not part them.
+    """Whether an edge, x1 [1], divides orbits: one side pushes away, the other one, too, or a belt
+    holds.
+
+    A fixed point that lies on the edge, up to rounding, does not divide them.
     """
     (left, a_left), (right, a_right) = (
         at_rest_beside(osc, x1, rightward=side) for side in (False, True)
@@ -219,11 +235,11 @@ def _leaves(osc: Oscillator, x1: Array, rightward: Array) -> tuple[Array, Array]
 
 @jit
 def tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
-    """Where orbits touch the boundary of a belt whose static limit exceeds mu(0), one point for
-    each zone between contact edges, [zones, 2], NaN where there is none; and the modes of these
-    orbits, [zones, belts].
+    """Points where orbits touch the boundary of a belt whose static limit exceeds mu(0).
 
-    x2'' = -x2 there, so they are orbits that slip with the sign of the belt's velocity.
+    One point for each zone between contact edges, [zones, 2], NaN where there is none; and the
+    modes of these orbits, [zones, belts]. x2'' = -x2 there, so they are orbits that slip with the
+    sign of the belt's velocity.
     """
     v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
     lower, upper = zone_ends(osc)
@@ -240,12 +256,13 @@ def tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
 
 @jit
 def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
-    """Where a contact edge cuts off a piece of a belt's boundary on which only a static limit that
-    exceeds mu(0) holds the mass, where the mass comes in: one point for each zone between edges,
-    [zones, 2], NaN where there is none; and the modes of the orbits that come to them, [zones,
-    belts].
+    """Points where a contact edge cuts off a piece of a belt's boundary that only static friction
+    holds.
 
-    On one side of such an orbit the mass comes to be held, on the other it slips away.
+    On that piece only a static limit that exceeds mu(0) holds the mass. One point where the mass
+    comes in for each zone between edges, [zones, 2], NaN where there is none; and the modes of the
+    orbits that come to them, [zones, belts]. On one side of such an orbit the mass is held, on the
+    other it slips away.
     """
     v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
     lower, upper = zone_ends(osc)
@@ -315,14 +332,18 @@ def _at_rest(
 def places_along(
     osc: Oscillator, codes: Array, y: Array, duration: Array, rate: Callable, marks: Array
 ) -> tuple[Array, Array]:
-    """Times since the entry of an arc, and states, [n] and [n, 2], where the integral of a rate, a
-    function of the state, comes to each of the marks in order, or else where the arc ends."""
+    """Times since the entry of an arc, and states, [n] and [n, 2], at which an integral reaches
+    marks.
+
+    rate: the integrand, a function of the state; marks: in order. Marks that are not reached are at
+    the end of the arc.
+    """
     mode = mode_of(codes)
 
     def to(carry, mark):
         def before(carry):
             _, left, total = carry
-            # Where there is no rate, NaN, it is the end of the arc.
+            # Where there is no rate, NaN, the arc ends.
             return (left > 0) & ~(total >= mark)
 
         def step(carry):
@@ -344,9 +365,9 @@ def places_along(
 def arc_samples(
     osc: Oscillator, codes: Array, y: Array, exit_: Array, duration: Array, n: int
 ) -> tuple[Array, Array]:
-    """Times and states of n samples of an arc, the last at its end: three quarters of them evenly
-    along its way in the plane, the others evenly in time.
+    """Times and states of n samples of an arc, the last at its end.
 
+    Three quarters of them are spread evenly along its way in the plane, the others evenly in time.
     x1 and x2 are monotone, as extrema end arcs: |dx1| + |dx2| of the arc is the integral of that of
     its steps.
     """
@@ -363,8 +384,10 @@ def arc_samples(
 
 @jit
 def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array, budget: int):
-    """The orbit from a state in a mode, where it comes to rest, and of each of its arcs times since
-    its entry, [arcs, samples], and states there."""
+    """The orbit from a state in a mode, its place of rest, and samples of its arcs.
+
+    Samples are times since the entry, [arcs, samples], and states there.
+    """
     orbit = follow_finely(osc, mode_of(codes), y, budget, reach)
     rest = place_of_rest(osc, orbit)
     used = jnp.arange(budget) < orbit.count
@@ -429,7 +452,7 @@ def _branch(
     # The last arc was left, unless it came to where the mass sticks.
     known = np.arange(count) < count - (not was_cut)
     ends = np.where(known, orbit.ends[:count], Ends(len(osc.belts)).unused)
-    # An arc that creeps is one, though followed in pieces.
+    # An arc that creeps is one, though it was followed in pieces.
     whole = min(count, int(np.argmax(np.append(ends, -1) < 0)) + 1)
     durations = np.append(since[: whole - 1, -1], np.sum(since[whole - 1 : count, -1]))
     ends = np.where(ends < 0, Ends(len(osc.belts)).unused, ends)

@@ -1,7 +1,8 @@
-"""Curves that part motions, and to which attractors the starts on their two sides lead.
+"""Curves that divide motions, and the attractors on both of their sides.
 
 On the axis x2 = 0 all cycles, separatrices and equilibria mark places, and all starts between two
-neighbouring places lead to one attractor. So one start between them tells, far from what is slow.
+neighbouring places lead to one attractor. So one start between them, far from slow motions, is
+enough.
 """
 
 from typing import NamedTuple
@@ -16,24 +17,25 @@ from ..model.equilibria import EquilibriumKind
 from ..model.modes import edges
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
-from ..numerics.padding import filled
+from ..numerics.padding import filled_up
 from ..results import Status
 from .orbits import MOST_ARCS, follow, place_of_rest
-from .outlines import ClosedOutline, Line, OpenOutline, Outline, jumps, place_on
+from .outlines import ClosedOutline, OpenOutline, Outline, StraightOutline, jumps, place_on
 from .portrait import Portrait
 
-#: Starts that are followed in one batch, and how often, MOST_ARCS arcs each.
+#: Starts that are followed in one batch, and number of rounds, MOST_ARCS arcs each.
 STARTS_AT_ONCE, ROUNDS = 16, 32
-#: x2 of places on the axis; of states that are the ends of arcs, good to 1e-9.
+#: Accuracy of x2 of places on the axis; states at ends of arcs are good to 1e-9.
 ON_AXIS = 1e-8
-#: A cycle that attracts weakly is known from as far off, relative to the distance from the origin.
+#: A cycle that attracts weakly is recognised from so far off, relative to the distance from the
+#: origin.
 KNOWN = 1e-3
-#: How far beside a curve that does not cross the axis starts are, and beside a boundary.
+#: Distance of starts from a curve that does not cross the axis, and from a boundary.
 ASIDE = 1e-6
 
 
 class Destination(NamedTuple):
-    """Where a start leads.
+    """Destination of a start.
 
     what: "cycle", "equilibrium", "infinity" or "undecided"; number: in the portrait, of a segment
     in pieces that of the first, or -1.
@@ -52,12 +54,12 @@ class Destination(NamedTuple):
         return cls(what, int(row) if row else -1)
 
 
-UNDECIDED = Destination("undecided")
+NOT_KNOWN = Destination("undecided")
 
 
 class Bound(NamedTuple):
-    """A curve that may part motions: its name, its outline, and where starts on its two sides
-    lead."""
+    """A curve that may divide motions: its name, its outline, and the destinations on its two
+    sides."""
 
     name: str
     outline: Outline
@@ -69,7 +71,7 @@ class Bound(NamedTuple):
 
 
 def bounds_of(portrait: Portrait) -> list[Bound]:
-    """All curves of a portrait that part motions which end differently, or may do so."""
+    """All curves of a portrait that divide motions with different ends, or may do so."""
     osc, places = portrait.oscillator, _places(portrait)
     found: list[tuple[str, Outline, np.ndarray]] = []
     for number, cycle in enumerate(portrait.unstable):
@@ -83,18 +85,18 @@ def bounds_of(portrait: Portrait) -> list[Bound]:
             found.append((f"separatrix {number}", outline, starts))
     for belt in range(len(osc.belts)):
         for row in np.flatnonzero(np.isfinite(jumps(osc, jnp.asarray(np.array(belt)))[0])):
-            outline = Line(belt, int(row), int(row))
+            outline = StraightOutline(belt, int(row), int(row))
             found.append((f"boundary of belt {belt}", outline, _across(osc, outline)))
     ends = leads_to(portrait, np.array([starts for *_, starts in found]).reshape(-1, 2))
     bounds = [
         Bound(name, outline, (ends[2 * i], ends[2 * i + 1]))
         for i, (name, outline, _) in enumerate(found)
     ]
-    return [one for one in bounds if one.sides[0] != one.sides[1] or one.sides[0] == UNDECIDED]
+    return [one for one in bounds if one.sides[0] != one.sides[1] or one.sides[0] == NOT_KNOWN]
 
 
 def _places(portrait: Portrait) -> np.ndarray:
-    """x1 of all that there is on the axis x2 = 0, from left to right."""
+    """x1 of everything on the axis x2 = 0, from left to right."""
     rests = portrait.equilibria
     found = [np.asarray(rests.x1_lower), np.asarray(rests.x1_upper)]
     found.append(np.asarray(jnp.stack(edges(portrait.oscillator))))
@@ -121,7 +123,7 @@ def _around(places: np.ndarray, x1: float) -> np.ndarray:
 def _across(osc: Oscillator, outline: Outline) -> np.ndarray:
     """Starts on both sides of the middle of the first piece, [2, 2]."""
     piece = jax.tree.map(lambda leaf: leaf[0], outline.pieces(osc))
-    place, slope = map(np.asarray, place_on(osc, piece, jnp.asarray(0.5)))
+    place, slope, _ = map(np.asarray, place_on(osc, piece, jnp.asarray(0.5)))
     normal = np.array([-slope[1], slope[0]]) / np.hypot(*slope)
     return place + ASIDE * (1 + np.abs(place).max()) * np.array([normal, -normal])
 
@@ -130,25 +132,25 @@ def _across(osc: Oscillator, outline: Outline) -> np.ndarray:
 
 
 def leads_to(portrait: Portrait, starts: np.ndarray) -> list[Destination]:
-    """Where starts lead, [n, 2], among what the portrait tells."""
+    """Destinations of starts, [n, 2], in a portrait."""
     ends: dict[int, Destination] = {}
     states = np.array(starts, float)
     for _ in range(ROUNDS):
         left = np.array([i for i in range(len(starts)) if i not in ends], int)
         for first in range(0, left.size, STARTS_AT_ONCE):
             batch = left[first : first + STARTS_AT_ONCE]
-            told = _followed_on(portrait.oscillator, filled(states, batch, STARTS_AT_ONCE))
-            for i, status, top, rest, y in zip(batch.tolist(), *map(np.asarray, told)):
+            followed = _followed_on(portrait.oscillator, filled_up(states, batch, STARTS_AT_ONCE))
+            for i, status, top, rest, y in zip(batch.tolist(), *map(np.asarray, followed)):
                 states[i] = y
                 end = _destination(portrait, int(status), float(top), float(rest), y)
                 if end is not None:
                     ends[i] = end
-    return [ends.get(i, UNDECIDED) for i in range(len(starts))]
+    return [ends.get(i, NOT_KNOWN) for i in range(len(starts))]
 
 
 @jit
 def _followed_on(osc: Oscillator, starts: Array):
-    """Of each start, [n, 2]: the status, the last top, where it rests, and where it is left."""
+    """For each start, [n, 2]: the status, the last top, the place of rest, and the last state."""
 
     def one(start):
         orbit = follow(osc, start, MOST_ARCS)
@@ -162,16 +164,16 @@ def _followed_on(osc: Oscillator, starts: Array):
 def _destination(
     portrait: Portrait, status: int, top: float, rest: float, y: np.ndarray
 ) -> Destination | None:
-    """Where an orbit has come to; None if that is not yet known."""
+    """Where an orbit has come to; None if that is not known yet."""
     if not np.isnan(rest):
         return _resting_at(portrait, rest)
     if status == Status.OK:
         away = [abs(float(cycle.x1_max) - top) for cycle in portrait.cycles]
         near = len(away) and min(away) < KNOWN * (1 + abs(top))
-        return Destination("cycle", int(np.argmin(away))) if near else UNDECIDED
+        return Destination("cycle", int(np.argmin(away))) if near else NOT_KNOWN
     if not np.all(np.abs(y) < 10 * portrait.reach):
-        return Destination("infinity") if portrait.escapes else UNDECIDED
-    return None if status == Status.NOT_SETTLED else UNDECIDED
+        return Destination("infinity") if portrait.escapes else NOT_KNOWN
+    return None if status == Status.NOT_SETTLED else NOT_KNOWN
 
 
 def _resting_at(portrait: Portrait, x1: float) -> Destination:
@@ -181,7 +183,7 @@ def _resting_at(portrait: Portrait, x1: float) -> Destination:
     away = np.maximum(away, 0.0)
     away[np.asarray(rests.kind) == EquilibriumKind.SADDLE] = np.inf
     if not np.min(away, initial=np.inf) < KNOWN * (1 + abs(x1)):
-        return UNDECIDED
+        return NOT_KNOWN
     row = int(np.argmin(away))
     return Destination("equilibrium", max(i for i, _ in segments_of(portrait) if i <= row))
 

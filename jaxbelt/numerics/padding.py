@@ -10,7 +10,7 @@ from jaxtyping import Array
 from ..checks import pick
 
 
-def filled(tree: Any, rows: Any, size: int) -> Any:
+def filled_up(tree: Any, rows: Any, size: int) -> Any:
     """Some rows of a tree of known arrays, filled up to `size` with the last of them."""
     return pick(tree, np.asarray(rows)[np.minimum(np.arange(size), len(rows) - 1)])
 

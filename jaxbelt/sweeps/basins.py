@@ -84,6 +84,7 @@ class Basins(eqx.Module):
 
     @property
     def label(self) -> "xarray.DataArray":
+        """Number of the attractor of each start, -1 for undecided ones."""
         return self.dataset["label"]
 
     def entropy(self, side: int | tuple[int, int]) -> BasinEntropy:

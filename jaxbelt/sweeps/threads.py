@@ -31,12 +31,12 @@ STEP_BUDGET = 400_000
 #: Runs that the kernel gets at once: enough that a call costs nothing beside them, and few enough
 #: that the threads end together.
 CHUNK = SideBySide(on_cpu=2**14, elsewhere=2**20)
-#: Lanes, so many that a refill is cheap for each.
+#: Number of lanes, large enough that a refill is cheap for each.
 WIDTH = SideBySide(on_cpu=128, elsewhere=2**20)
 #: Few runs have fewer lanes, by powers of `COARSER`, so that few programs are compiled.
 LEAST_WIDTH = SideBySide(on_cpu=128, elsewhere=2**10)
 COARSER = 32
-#: Seconds in which an interrupt is to be heard; a call of the kernel takes half of that or less.
+#: Seconds within which an interrupt takes effect; a call of the kernel takes half of that or less.
 PATIENCE = 0.5
 #: Passes of the first call, before it is known how long one takes: about a seventh of a second on
 #: the CPU; with derivatives, or where there are more lanes, a pass takes longer.
@@ -53,7 +53,7 @@ def compiled(program: Program) -> Callable:
 
 
 def workers() -> int:
-    """Threads that run the kernel: one a core on the CPU, one a device elsewhere."""
+    """Number of threads that run the kernel: one for each core, or device other than a CPU."""
     if not is_cpu():
         return jax.local_device_count()
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
