@@ -1,9 +1,9 @@
 """The documentation, built by Sphinx: `sphinx-build -W --keep-going docs site`.
 
 It needs no network, neither to be built nor to be read: no font or script comes from elsewhere, and
-equations are MathML (see `mathml`), which browsers draw themselves. Pages are Markdown. What the
-pages of public names say comes from the docstrings, see `reference`; notebooks are shown with the
-outputs stored in them.
+equations are MathML (see `mathml`), which browsers draw themselves. Pages are Markdown. Those of
+public names show their docstrings, which are in Google style (autodoc and napoleon); notebooks are
+shown with the outputs stored in them.
 """
 
 import base64
@@ -13,6 +13,13 @@ import struct
 import sys
 from pathlib import Path
 
+from docutils.nodes import Element
+from jaxtyping import ArrayLike
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.util.typing import stringify_annotation
+
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 sys.path[:0] = [str(HERE), str(ROOT)]
@@ -21,7 +28,15 @@ project = "jaxbelt"
 copyright = "the jaxbelt developers"
 html_title = "jaxbelt"
 
-extensions = ["myst_nb", "sphinx_copybutton", "mathml", "reference"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "links",
+    "mathml",
+]
 exclude_patterns = ["costs.md"]
 
 # Markdown, and the notebooks as they were stored.
@@ -29,27 +44,17 @@ myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist
 myst_heading_anchors = 3
 nb_execution_mode = "off"
 
+# Docstrings. Backticks mark code; `links` makes links of public names.
+default_role = "code"
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+autosummary_generate = False
+napoleon_use_ivar = True
+napoleon_use_rtype = False
+
 # Every reference has to lead somewhere; types of other packages have no page here.
 nitpicky = True
-nitpick_ignore = [
-    ("py:class", name)
-    for name in (
-        "AbstractCondition",
-        "Array",
-        "ArrayLike",
-        "Axes",
-        "BasinEntropy",
-        "BasinMargin",
-        "ClosedOrbit",
-        "Explorer",
-        "Path",
-        "Rule",
-        "np.ndarray",
-        "pandas.DataFrame",
-        "xarray.Dataset",
-        "xr.Dataset",
-    )
-]
+nitpick_ignore_regex = [("py:class", r"(?!jaxbelt\.).*")]
 
 html_theme = "furo"
 html_static_path = ["_static"]
@@ -101,3 +106,33 @@ def _width(output: dict) -> int:
 
 
 take_notebooks()
+
+
+def setup(app: Sphinx) -> None:
+    """Adjusts what autodoc makes of annotations."""
+    app.connect("autodoc-process-signature", shorten)
+    app.connect("missing-reference", public_class)
+
+
+def shorten(app, what, name, thing, options, signature: str | None, returns: str | None):
+    """Writes ArrayLike by its name, not as the union of types that it is."""
+    if not signature:
+        return None
+    union = stringify_annotation(ArrayLike, "smart")
+    return signature.replace(union, "ArrayLike").replace("NoneType", "None"), returns
+
+
+def public_class(
+    app: Sphinx, env: BuildEnvironment, node: pending_xref, content: Element
+) -> Element | None:
+    """Links an annotation, `jaxbelt.cycles.cycle.Cycle`, to the page of `jaxbelt.Cycle`.
+
+    Classes that are not public have no page: their names stay as they are.
+    """
+    target = node.get("reftarget", "")
+    if not target.startswith("jaxbelt.") or target.count(".") == 1:
+        return None
+    public = f"jaxbelt.{target.rpartition('.')[2]}"
+    python = env.get_domain("py")
+    link = python.resolve_xref(env, node["refdoc"], app.builder, "obj", public, node, content)
+    return link or content

@@ -6,10 +6,10 @@ Everything a user needs is `import jaxbelt as jb`. Turn 64-bit floats on first:
 Inside, data goes one way: parameters, modes, motion, cycles, bifurcations, pictures. The code is a
 ladder that shows it. Read from top to bottom, a module imports only what stands before it:
 
-    spelling        what was perhaps meant by a word
-    results         status codes and what to do about them
-    activity        what takes long says what it does
-    identity        what a value or a function is made of, as a short text
+    spelling        suggestions for unknown words
+    results         status codes and advice
+    activity        progress of functions that take long
+    identity        fingerprints of values and functions
     numerics/       spacing widths programs compiling
     checks          arguments, checked at the public edge
     tables          results as tables
@@ -35,7 +35,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     plotting/       inverse model draw si explorer
     paper           the paper's table and figures
     api             the public names
-    __init__        the same, imported when the first of them is used
+    __init__        the public names, imported when the first one is used
     commands/       options reproduce simulate diagram map sweep basins verify warm
     commands/       cache
     cli             the command line
@@ -56,7 +56,7 @@ def __getattr__(name: str) -> Any:
         import importlib.metadata
 
         return importlib.metadata.version("jaxbelt")
-    # A module is no public name; its import asks for it here before it is done.
+    # Submodules are not public names; while `api` is imported, Python asks for it here.
     if name == "api" or (name.startswith("__") and name != "__all__"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from . import api
@@ -84,7 +84,7 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     from . import api
 
-    # What completion offers: the public names, without what this file imports.
+    # Names for completion: the public ones, without what this file imports.
     return [*api.__all__, *(name for name in globals() if name.startswith("__"))]
 
 
@@ -101,7 +101,7 @@ draw_with(_with_matplotlib)
 
 
 def _before_fork() -> None:
-    """Have it noted in the child that JAX was in use, though nothing of jaxbelt was until then."""
+    """Records for the child that JAX was in use, even if nothing of jaxbelt was until then."""
     if "jax" in sys.modules:
         from .numerics import compiling as compiling
 

@@ -1,8 +1,8 @@
-"""What takes long says what it does, on a terminal or in a notebook, after a second.
+"""Progress of functions that take long, on a terminal or in a notebook, after a second.
 
-Functions that may take long are `announced`; inside of them `tell` says how far they are. Of those
-that call one another the outermost one has the line. Elsewhere, in scripts and pipes, nothing is
-shown; the logger "jaxbelt" is told in any case: of ends at the level INFO, of the rest at DEBUG.
+Such functions are `announced`; inside of them `note_progress` reports how far they are. If they
+call one another, the outermost one has the line. Elsewhere, in scripts and pipes, nothing is shown.
+The logger "jaxbelt" gets everything in any case: ends at the level INFO, the rest at DEBUG.
 """
 
 import functools
@@ -18,8 +18,8 @@ from rich.progress import Progress, ProgressColumn, SpinnerColumn, TextColumn, T
 
 from .spelling import refuse_other_names
 
-#: Seconds before anything is shown that nobody asked for. A busy machine may take another one, and
-#: nobody is to see nothing for more than two.
+#: Seconds before a line is shown without a request. On a busy machine it may take another second,
+#: and no call should be silent for more than two.
 SHOWN_AFTER = 1.0
 
 logger = logging.getLogger("jaxbelt")
@@ -30,10 +30,16 @@ _wanted: bool | None = None
 
 
 def show_progress(wanted: bool | None = None) -> None:
-    """Whether functions that take long show what they do.
+    """Sets whether functions that take long show their progress.
 
-    wanted: True, always; False, never; None, on a terminal and in a notebook, which is the default.
-    What `sweep` and `basins` are told by `progress` comes first.
+    The argument `progress` of `sweep` and `basins` comes first.
+
+    Args:
+        wanted: True: always; False: never; None: on a terminal and in a notebook, which is the
+            default.
+
+    Raises:
+        ValueError: If `wanted` is anything else.
     """
     if not (wanted is None or isinstance(wanted, bool)):
         raise ValueError(f"wanted must be True, False or None, got {wanted!r}")
@@ -42,24 +48,25 @@ def show_progress(wanted: bool | None = None) -> None:
 
 
 def is_wanted() -> bool:
-    """Whether what takes long is to be shown, though a call does not say so."""
+    """Whether progress is shown where a call does not decide it."""
     return (_console.is_terminal or _console.is_jupyter) if _wanted is None else _wanted
 
 
 def progress_line(*columns: ProgressColumn, transient: bool = False) -> Progress:
-    """A line, not shown yet, for what takes long; transient: whether it goes when it ends."""
+    """A progress line, not shown yet; transient: whether it disappears when it ends."""
     return Progress(*columns, console=_console, transient=transient)
 
 
 class Activity:
-    """Something that may take long, while it lasts; its line is shown if it does.
+    """Something that may take long; a line shows it if it does.
 
-    name: what it is; wanted: whether it is shown: at once, never, or (None) as everything is.
+    name: its name; wanted: whether to show the line: at once, never, or (None) by the general
+    setting.
     """
 
-    #: Those that have begun and not ended, the outermost one first.
+    #: Activities that have begun and not ended, the outermost one first.
     under_way: ClassVar[list["Activity"]] = []
-    #: The names of those that ended well before: what they do is compiled.
+    #: Names of those that ended well before, so that their programs are compiled.
     known: ClassVar[set[str]] = set()
     lock: ClassVar[Any] = threading.RLock()
 
@@ -91,7 +98,7 @@ class Activity:
         return f"{self.name}: {self.text}" if self.text else self.name
 
     def say(self, text: str) -> None:
-        """From now on this is what it does."""
+        """Sets the text of the line."""
         with self.lock:
             self.text = text
             if self.line is not None:
@@ -110,8 +117,10 @@ class Activity:
 
 
 def announced(name: str) -> Callable[[Callable], Any]:
-    """Makes a function one that says what it does while it takes long, and that tells its arguments
-    where one has another name; name: of the function."""
+    """Decorates a function with an `Activity`, and with a check of the names of its arguments.
+
+    name: of the function, for the line and for messages.
+    """
 
     def decorate(function: Callable) -> Callable:
         names = list(inspect.signature(function).parameters)
@@ -127,8 +136,8 @@ def announced(name: str) -> Callable[[Callable], Any]:
     return decorate
 
 
-def tell(text: str) -> None:
-    """Say how far the outermost activity is."""
+def note_progress(text: str) -> None:
+    """Reports the progress of the outermost activity."""
     logger.debug(text)
     outermost = Activity.under_way[:1]
     for activity in outermost:

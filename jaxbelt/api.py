@@ -1,7 +1,7 @@
-"""The public names, with all that is behind them.
+"""The public names, and everything behind them.
 
-`import jaxbelt` alone imports nothing: the package takes its names from here when the first of them
-is asked for, so that the command line answers at once what it can answer without computing.
+`import jaxbelt` alone imports nothing: the package takes its names from here when the first one is
+used, so that the command line answers at once what it can answer without computing.
 """
 
 import inspect
@@ -191,7 +191,7 @@ class _Words:
 
 
 def _let_help_be_read(function: Callable) -> None:
-    """Let `help` say ArrayLike, not what that is, which takes more room than all the rest."""
+    """Makes `help` show ArrayLike by its name instead of the long union that it is."""
     signature = inspect.signature(function)
     arrays = inspect.formatannotation(ArrayLike).removeprefix("Union[").removesuffix("]")
 

@@ -1,4 +1,4 @@
-"""What a user may pass in, checked once at the public edge.
+"""Checks of arguments, made once at the public edge.
 
 Every check runs before tracing and raises a `ValueError` that names the field, what was expected
 and what came (see `in_words`), in one line. Under `jit`, `vmap` and derivatives values are not
@@ -27,18 +27,19 @@ TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
 
 
 def pick(tree: Any, index: Any) -> Any:
-    """The tree with every array indexed; where it is known in NumPy, which compiles nothing."""
+    """The tree with every array indexed; known arrays are indexed in NumPy, which compiles
+    nothing."""
     if is_concrete((tree, index)):
-        # Put there as they are: jnp.asarray compiles a program for every shape.
+        # device_put, because jnp.asarray compiles a program for every shape.
         return jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree))
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def require(condition: Any, field: str, expected: str, got: Any) -> None:
-    """Raise `ValueError("<field> must be <expected>, got <got>")` unless `condition` holds.
+    """Raises `ValueError("<field> must be <expected>, got <got>")` unless `condition` holds.
 
-    got: words, or any other value, which is put `in_words`. Where `expected` tells a number, ask
-    first: to print an array takes longer than to check it.
+    got: words, or any other value, which is put `in_words`. If `expected` has a number to format,
+    check the condition first: printing an array takes longer than checking it.
     """
     if not condition:
         came = got if isinstance(got, str) else in_words(got)
@@ -46,18 +47,18 @@ def require(condition: Any, field: str, expected: str, got: Any) -> None:
 
 
 def require_value(condition: Any, field: str, expected: str, value: Any) -> None:
-    """`require` where `value` is what came itself, which may be a text."""
+    """`require` for a value that came itself, which may be a text."""
     if not condition:
         require(False, field, expected, in_words(value))
 
 
-#: What came is told in no more letters than this.
+#: Largest number of letters that describe a value in a message.
 LONGEST = 100
 
 
 def in_words(value: Any) -> str:
-    """What came, in one line: numbers as they are, arrays with many by their shape, functions and
-    classes by their names."""
+    """A value in one line: numbers as they are, long arrays by their shape, functions and
+    classes by name."""
     if isinstance(value, Tracer):
         return f"a traced {type(value).__name__} of shape {np.shape(value)}"
     if isinstance(value, np.ndarray | np.generic | jax.Array):
@@ -77,7 +78,7 @@ def in_words(value: Any) -> str:
 
 
 def shape_in_words(tree: Any) -> str:
-    """What a function returned where it was tried on shapes."""
+    """What a function returned when it was called on shapes, in words."""
     if isinstance(tree, jax.ShapeDtypeStruct):
         return f"an array of {tree.dtype} of shape {tree.shape}"
     return f"a {type(tree).__name__} of {len(jax.tree.leaves(tree))} arrays"
@@ -99,7 +100,7 @@ def _is_row(value: Any) -> bool:
 
 
 def require_one_of(value: Any, names: Iterable[str], field: str, more: str = "") -> None:
-    """Raise unless `value` is one of some words; what was perhaps meant is told.
+    """Raises unless `value` is one of some words; suggests one.
 
     more: what else is allowed, such as " or a reducer".
     """
@@ -112,25 +113,25 @@ def require_one_of(value: Any, names: Iterable[str], field: str, more: str = "")
 
 
 def check_belt(value: Any, belts: int, field: str = "belt", more: str = "") -> None:
-    """Raise unless `value` is the number of one of so many belts; more: what else is allowed."""
+    """Raises unless `value` is the number of one of the belts; more: what else is allowed."""
     there = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < belts
     expected = f"0 to {belts - 1}{more}" if belts > 1 else f"0{more}: there is one belt"
     require_value(there, field, expected, value)
 
 
 def require_callable(value: Any, field: str, expected: str) -> None:
-    """Raise unless `value` can be called."""
+    """Raises unless `value` can be called."""
     require_value(callable(value), field, expected, value)
 
 
 def require_wish(value: Any, field: str) -> None:
-    """Raise unless `value` is True, False or None, which leaves it open."""
+    """Raises unless `value` is True, False or None (undecided)."""
     is_wish = value is None or isinstance(value, bool)
     require_value(is_wish, field, "True, False or None", value)
 
 
 def as_whole(value: Any, field: str, least: int = 1) -> int:
-    """`value` as an integer that is `least` or more, or a `ValueError`."""
+    """`value` as an integer >= `least`, or a `ValueError`."""
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= least
     kinds = {0: "an integer >= 0", 1: "a positive integer"}
     require_value(fits, field, kinds.get(least, f"an integer >= {least}"), value)
@@ -151,7 +152,8 @@ def as_interval(value: Any, field: str) -> tuple[float, float]:
 
 
 def refuse_interval(values: Any, field: str) -> None:
-    """Raise where an interval came, (first, last), and all values are wanted: they would be two."""
+    """Raises if an interval (first, last) came where all values are needed: it would be read as
+    two values."""
     if isinstance(values, tuple) and len(values) == 2:
         first, last = map(in_words, values)
         # Values have to increase: two that do not would be refused as well.
@@ -175,9 +177,9 @@ def as_path(value: Any, field: str) -> Path:
 
 
 def check_arguments(make: Any, names: Sequence[str], field: str, others: str = "") -> None:
-    """Raise unless `make` is a function that can be called with arguments of these names alone.
+    """Raises unless `make` is a function that can be called with these arguments alone.
 
-    others: names beside those of `make` that stand for something else, in words.
+    others: in words, further names that stand for something else than arguments of `make`.
     """
     expected = "a function that returns an Oscillator, such as jb.presets.class_b"
     require_callable(make, field, expected)
@@ -208,9 +210,9 @@ def check_arguments(make: Any, names: Sequence[str], field: str, others: str = "
 
 
 def traceable(function: Callable[[], Any], field: str, expected: str) -> Any:
-    """What `function` gives, which calls a user's; a `ValueError` where that fails as it is traced.
+    """Returns `function()`, which calls a user's function; a `ValueError` if that cannot be traced.
 
-    What jaxbelt itself refuses is told as it is.
+    An error that jaxbelt itself raises passes unchanged.
     """
     try:
         return function()
@@ -223,15 +225,17 @@ def traceable(function: Callable[[], Any], field: str, expected: str) -> Any:
 
 
 def require_one_float(found: Any, field: str, expected: str) -> None:
-    """`ValueError` unless what `jax.eval_shape` gave is one float64."""
+    """Raises a `ValueError` unless the result of `jax.eval_shape` is one float64."""
     fits = isinstance(found, jax.ShapeDtypeStruct) and found.shape == ()
     require(fits and found.dtype == np.float64, field, expected, found)
 
 
 def outside_of_traces(function: Callable, instead: str = "") -> Any:
-    """Makes an entry one that refuses to be called under `jit`, `vmap` or derivatives, by what is
-    traced: how much there is in its numbers decides what it computes; and that tells its arguments
-    where one has another name. instead: what else to do in a trace, the end of the message."""
+    """Decorates a public function that cannot be called under `jit`, `vmap` or derivatives.
+
+    The numbers decide how much such a function computes. A call with traced arguments raises, and
+    so does an argument with an unknown name. instead: end of the message, what to do in a trace.
+    """
     name, signature = function.__name__, inspect.signature(function)
 
     @functools.wraps(function)
@@ -258,7 +262,7 @@ def _is_known(value: Any) -> bool:
 
 
 def require_usable_jax() -> None:
-    """Raise in a forked process, and unless JAX is set to 64-bit floats.
+    """Raises in a forked process, and unless JAX is set to 64-bit floats.
 
     Event times are meaningless in 32 bits.
     """
@@ -273,8 +277,8 @@ def require_usable_jax() -> None:
 def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array:
     """`value` as a float64 array of the given shape (None: any length), or a `ValueError`.
 
-    Python numbers and integer arrays are converted; a 32-bit float is refused, because the digits
-    that it lacks are not there to be restored. What is known stays known inside a trace.
+    Python numbers and integer arrays are converted; a 32-bit float is refused, because its missing
+    digits cannot be restored. Known values stay known inside a trace.
     """
     numbers = as_numbers(value, field, shape)
     if isinstance(numbers, Tracer):
@@ -284,14 +288,15 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
 
 
 def as_positive_number(value: Any, field: str) -> Array | np.ndarray:
-    """`value` as a number that is > 0 as far as it is known, see `as_numbers`."""
+    """`value` as a number, > 0 as far as it is known, see `as_numbers`."""
     number = as_numbers(value, field)
     check_positive(number, field)
     return number
 
 
 def as_size(value: Any, field: str) -> Array | np.ndarray:
-    """The same of a size in the user's units; NaN in place of None: the oscillator's own."""
+    """The same for a size in the user's units; None becomes NaN, which stands for the
+    oscillator's own."""
     return np.asarray(np.nan) if value is None else as_positive_number(value, field)
 
 
@@ -308,7 +313,7 @@ def as_tolerance(value: Any, field: str) -> float | None:
 
 
 def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array | np.ndarray:
-    """As `as_array`, but left in NumPy if it is known, for what goes into a compiled function."""
+    """Like `as_array`, but known values stay in NumPy; for arguments of compiled functions."""
     require_usable_jax()
     given, wanted = value, "a number" if shape == () else "numbers"
     dtype = getattr(value, "dtype", None)
@@ -362,10 +367,13 @@ def _of_other_library(value: Any, field: str, wanted: str) -> np.ndarray:
 
 
 class Rule(NamedTuple):
-    """What a parameter has to be.
+    """A condition on a parameter.
 
-    given: the parameter, and what it depends on beside it; judge(*given): whether it holds, an
-    array; expected: in words, {1} being given[1].
+    Attributes:
+        field: Name of the parameter.
+        given: The parameter, and what the condition depends on besides it.
+        judge: judge(*given) says whether the condition holds, an array.
+        expected: The condition in words, {1} being given[1].
     """
 
     field: str
@@ -374,7 +382,8 @@ class Rule(NamedTuple):
     expected: str
 
     def enforce(self, owner: str) -> None:
-        """Raise a `ValueError` where it is known not to hold; owner: words after the field."""
+        """Raises a `ValueError` if the condition is known not to hold; owner: words after the
+        field."""
         if any(isinstance(one, Tracer) for one in self.given):
             return
         given = tuple(map(np.asarray, self.given))
@@ -382,7 +391,7 @@ class Rule(NamedTuple):
             require(False, self.field + owner, self.expected.format(*given), given[0])
 
     def holds(self) -> Any:
-        """Whether it holds, an array, traced where something given is."""
+        """Whether the condition holds, an array; traced if something given is traced."""
         return self.judge(*self.given)
 
 
@@ -406,17 +415,17 @@ def be_positive(field: str, value: Any) -> list[Rule]:
 
 
 def check_finite(value: Any, field: str) -> None:
-    """Raise unless every known number of the array `value` is finite."""
+    """Raises unless every known number of the array `value` is finite."""
     _enforce(be_finite(field, value))
 
 
 def check_nonnegative(value: Any, field: str) -> None:
-    """Raise unless every known number of `value` is finite and >= 0."""
+    """Raises unless every known number of `value` is finite and >= 0."""
     _enforce(be_nonnegative(field, value))
 
 
 def check_positive(value: Any, field: str) -> None:
-    """Raise unless every known number of `value` is finite and > 0."""
+    """Raises unless every known number of `value` is finite and > 0."""
     _enforce(be_positive(field, value))
 
 
@@ -426,7 +435,7 @@ def _enforce(rules: Sequence[Rule]) -> None:
 
 
 def number(value: Any) -> str:
-    """A number as a short text for a repr; what is traced or batched is shown by its type."""
+    """A number as a short text for a repr; traced or batched values are shown by their type."""
     if is_concrete(value) and np.ndim(value) == 0:
         return f"{float(value):.12g}"
     return f"{value.dtype}{list(np.shape(value))}"

@@ -21,17 +21,17 @@ from .spelling import near
 
 
 class Command(TyperCommand):
-    """A command that tells which option was perhaps meant, and that `sweep` has axes for some."""
+    """A command that suggests an option for an unknown one, and an axis of `sweep` for some."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         given = list(args)
         try:
             rest = super().parse_args(ctx, args)
         except Exception as error:
-            # Whose class it is depends on the version of typer.
+            # The module of this class depends on the version of typer.
             if type(error).__name__ == "NoSuchOption":
                 name = error.__dict__["option_name"]
-                # Of -nu0 this is -n.
+                # For -nu0 the name is -n.
                 words = [name] if name.startswith("--") else [one for one in given if name in one]
                 error.__dict__["possibilities"] = self._meant(words[0] if words else name)
             raise
@@ -43,7 +43,7 @@ class Command(TyperCommand):
         return rest
 
     def _meant(self, word: str) -> list[str]:
-        """By the letters behind the dashes: every option has these."""
+        """Similar options, compared without dashes, which all options have."""
         names = [name for one in self.params for name in one.opts]
         known = {name[2:]: name for name in names if name.startswith("--")}
         if "--damping" in names:
@@ -58,7 +58,7 @@ app = typer.Typer(name="jaxbelt", no_args_is_help=True, rich_markup_mode="markdo
 
 
 def show_version(wanted: bool) -> bool:
-    """Print the version and end, where that is wanted."""
+    """Prints the version and exits, for `--version`."""
     if wanted:
         print(f"jaxbelt {jaxbelt.__version__}")
         raise typer.Exit

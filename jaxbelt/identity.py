@@ -1,10 +1,11 @@
-"""What a value is made of, as a short text: the same text, the same behaviour.
+"""Fingerprints of values and code: equal fingerprints mean equal behaviour.
 
-Results that are kept on disk, and compiled programs, belong to the code that made them. Of a
-user's function or class this is its bytecode and constants and, recursively, all that it reaches:
-defaults, closure cells, the globals that it reads by name, the functions that it calls, base
-classes. Code of installed packages and of Python counts by name and version. What such code
-reads from files, the clock or the environment does not count: it cannot be told beforehand.
+Results that are kept on disk, and compiled programs, belong to the code that made them. The
+fingerprint of a user's function or class covers its bytecode and constants and, recursively, all
+that it reaches: defaults, closure cells, the globals that it reads by name, the functions that it
+calls, base classes. Code of installed packages and of Python counts by name and version. What such
+code reads from files, the clock or the environment does not count, as it cannot be known
+beforehand.
 """
 
 import builtins
@@ -35,25 +36,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-#: Values that their type and repr tell.
-TOLD_BY_REPR = (type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented))
+#: Types of values that their repr determines.
+REPR_TYPES = (type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented))
 #: Builtins that read what the code does not name.
 READS_ANYTHING = ("eval", "exec", "globals", "open", "input", "__import__")
-#: Attributes of a class that tell nothing of what it does.
+#: Attributes of a class that do not affect what it does.
 BOOKKEEPING = ("_abc_impl", "__doc__", "__module__", "__dict__", "__weakref__")
 
 
 class FingerprintError(ValueError):
-    """What a value is made of cannot be told."""
+    """Raised for a value that has no fingerprint."""
 
 
 def fingerprint(value: Any, name: str = "a function or object of one's own") -> str:
-    """What a value is made of, as a text of 32 letters, the same in every process.
+    """Fingerprint of a value: a text of 32 letters, the same in every process.
 
     Args:
         value: A number, text, array, container, function, class, or an object of any class whose
             state `pickle` would find: dataclasses, Equinox modules, tree definitions, partials.
-        name: What the value is to the user, for the message of the error.
+        name: Words for the value in the message of the error.
 
     Returns:
         A text. It changes with the code of a user's functions, their constants and what they reach,
@@ -61,16 +62,17 @@ def fingerprint(value: Any, name: str = "a function or object of one's own") -> 
         and with the Python whose bytecode it is; not with names of functions, lines and comments.
 
     Raises:
-        FingerprintError: If it cannot be told, as of a generator, an open file, or a module of the
-            user's own that is handed around as a value.
+        FingerprintError: If there is none, as for a generator, an open file, or a module of the
+            user's own that is passed as a value.
     """
     return _Reading(name).digest(value, "")
 
 
-def fingerprint_or_none_like_it(value: Any) -> Any:
-    """The fingerprint; of what has none, an object that equals nothing else.
+def fingerprint_or_unique(value: Any) -> Any:
+    """Fingerprint of a value; without one, an object that equals nothing else.
 
-    For programs in memory: what cannot be told is compiled anew, and not mistaken for another.
+    For programs in memory: a value without a fingerprint is compiled again and not mistaken for
+    another.
     """
     try:
         return fingerprint(value)
@@ -79,18 +81,18 @@ def fingerprint_or_none_like_it(value: Any) -> Any:
 
 
 class _Reading:
-    """One call of `fingerprint`: what is known of the objects that were met."""
+    """One call of `fingerprint`: the digests of the objects that were met."""
 
     def __init__(self, name: str):
         self.name = name
         self.known: dict[int, str] = {}
         self.open: list[int] = []
-        # So that no id comes back as that of another object.
+        # Keeps objects alive, so that no id is used twice.
         self.alive: list[Any] = []
 
     def digest(self, value: Any, place: str) -> str:
         """place: where the value was met, for messages."""
-        if type(value) in TOLD_BY_REPR:
+        if type(value) in REPR_TYPES:
             return _digest_of(type(value).__name__, repr(value))
         key = id(value)
         if key in self.open:  # it reaches itself
@@ -105,7 +107,7 @@ class _Reading:
         return self.known[key]
 
     def parts(self, value: Any, place: str) -> Iterator[str]:
-        """What an object is made of, each part a text."""
+        """Parts of an object, each as a text."""
         name = _installed_name(value)
         if name:
             yield name
@@ -175,12 +177,12 @@ class _Reading:
     # --- functions
 
     def of_code(self, code: CodeType, place: str) -> Iterator[str]:
-        """What a compiled function does, without where it came from."""
+        """A compiled function without its place in the source."""
         yield f"python {sys.version_info[0]}.{sys.version_info[1]}"
         yield code.co_code.hex()
         yield code.co_exceptiontable.hex()
         counts = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount
-        flags = code.co_flags & ~inspect.CO_NESTED  # where it is written
+        flags = code.co_flags & ~inspect.CO_NESTED  # the flag depends on where it is written
         names = code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars
         yield repr((counts, flags, names))
         yield self.digest(code.co_consts, place)
@@ -196,7 +198,7 @@ class _Reading:
         cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
         names = {name: _content(cell) for name, cell in cells}
         if package:
-            # The code of a package is told by its version, what it was given is not.
+            # The version identifies the code of a package, but not what it was given.
             yield from (self.digest(value, f"{place}: ") for value in names.values())
             return
         for name, value in self.reads(function.__code__, function.__globals__, names, place):
@@ -205,7 +207,7 @@ class _Reading:
     def reads(
         self, code: CodeType, scope: dict[str, Any], cells: dict[str, Any], place: str
     ) -> Iterator[tuple[str, Any]]:
-        """What a function and those written in it look up by name, and the values of today."""
+        """Names that a function and its inner functions look up, with their present values."""
         instructions = list(dis.get_instructions(code))
         for i, one in enumerate(instructions):
             if one.opname == "IMPORT_NAME":
@@ -241,18 +243,18 @@ class _Reading:
         yield self.digest(type(kind), f"{place}: ")
         yield from (self.digest(base, f"{place}: ") for base in kind.__bases__)
         for name, value in vars(kind).items():
-            told = isinstance(value, FunctionType | staticmethod | classmethod | property)
-            if name not in BOOKKEEPING and (told or not _is_special(name)):
+            is_definition = isinstance(value, FunctionType | staticmethod | classmethod | property)
+            if name not in BOOKKEEPING and (is_definition or not _is_special(name)):
                 yield from (name, self.digest(value, f"{place}.{name}: "))
 
     def of_object(self, value: Any, place: str) -> Iterator[str]:
-        """An object is what `pickle` would need to make it again."""
+        """Covers what `pickle` would need to make the object again."""
         kind = type(value)
         place = f"{place}{kind.__qualname__}: "
         try:
             reduced = (copyreg.dispatch_table.get(kind) or _as_pickled)(value)
         except Exception as error:
-            self.refuse(place, f"a {kind.__name__}, of which cannot be told what it does", error)
+            self.refuse(place, f"a {kind.__name__}, whose behaviour cannot be known", error)
         if isinstance(reduced, str):
             module = pickle.whichmodule(value, reduced)  # pyright: ignore[reportAttributeAccessIssue]
             package = _package_of(module)
@@ -269,9 +271,9 @@ class _Reading:
         yield self.digest([*(items or ())], place)
 
 
-#: Functions that are compiled, by JAX or in C, and keep the one they were made of.
+#: Types of compiled functions, by JAX or in C, that keep the original function.
 COMPILED = type(jax.jit(lambda: 0)), type(functools.lru_cache(lambda: 0))
-#: Instructions of bytecode that look up names: globals, and variables of enclosing functions.
+#: Bytecode instructions that look up names: globals, and variables of enclosing functions.
 GLOBALS = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS")
 CELLS = ("LOAD_DEREF", "LOAD_CLASSDEREF", "LOAD_FROM_DICT_OR_DEREF")
 #: Stands for a name without a value.
@@ -298,18 +300,18 @@ def _content(cell: Any) -> Any:
 
 
 def _without_caches(kind: type, state: Any) -> Any:
-    """The state of an object without what was computed from the rest of it, or copied to it."""
+    """State of an object without what was computed from the rest of it, or copied to it."""
     if isinstance(state, tuple) and len(state) == 2 and isinstance(state[1], dict):
         return tuple(_without_caches(kind, part) for part in state)  # attributes, and slots
     if not isinstance(state, dict):
         return state
     cached = functools.cached_property
 
-    def is_told(name):
+    def is_state(name):
         special = isinstance(name, str) and _is_special(name)
         return not special and not isinstance(getattr(kind, str(name), None), cached)
 
-    return {name: value for name, value in state.items() if is_told(name)}
+    return {name: value for name, value in state.items() if is_state(name)}
 
 
 def _installed_name(value: Any) -> str:
@@ -331,7 +333,8 @@ def _installed_name(value: Any) -> str:
 
 
 def _package_of(module: Any) -> str | None:
-    """Name and version of what a module belongs to; None: it is the user's own, or not there."""
+    """Name and version of the package of a module; None for the user's own, or one that is not
+    loaded."""
     if not isinstance(module, str) or module not in sys.modules:
         return None
     file = getattr(sys.modules.get(module), "__file__", None)
@@ -340,7 +343,7 @@ def _package_of(module: Any) -> str | None:
 
 @functools.cache
 def _package_in(top: str, file: str | None) -> str | None:
-    """top: of the module's name, its first word."""
+    """Name and version of an installed package; top: first word of the module's name."""
     parents = Path(file).parents if file else ()
     if top == __name__.partition(".")[0]:  # also from a checkout
         return f"{top} {importlib.metadata.version(top)}"
@@ -349,7 +352,7 @@ def _package_in(top: str, file: str | None) -> str | None:
         folders = {Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")}
         if not file or folders & set(parents):
             return f"python {sys.version_info[0]}.{sys.version_info[1]}"
-    # One that is installed as a link to its sources changes without its version.
+    # A package that is installed as a link to its sources changes without its version.
     names = _distributions().get(top, ()) if is_installed else ()
     return (
         ", ".join(f"{one} {importlib.metadata.version(one)}" for one in sorted(set(names))) or None

@@ -1,8 +1,8 @@
 """The paper's table of critical velocities and its figures, recomputed: `jaxbelt reproduce`.
 
-`reproduce(folder)` finds the critical values, computes what the figures show, and draws them. What
-the phase portraits before, at and after a critical value show is said in one place, their line in
-`PORTRAITS`. The critical values come to all of them from one tuple, that of `critical_values`.
+`reproduce(folder)` finds the critical values, computes what the figures show, and draws them. The
+phase portraits before, at and after a critical value are defined in one place, their line in
+`PORTRAITS`. All of them take the critical values from one tuple, that of `critical_values`.
 """
 
 import json
@@ -45,9 +45,9 @@ from .presets import (
 )
 from .results import EventKind, Status
 
-#: Every portrait runs over this time (dimensionless), sampled at so many times.
+#: Duration of every portrait (dimensionless), and its number of samples.
 TIME_SPAN, SAMPLES = 60.0, 2401
-#: Room for the arcs of every run here: one program serves all.
+#: Room for the arcs of every run here, so that one program serves all.
 SEGMENTS = 512
 #: Transients that do not join a cycle are drawn until this time.
 TRANSIENT = 25.0
@@ -60,14 +60,14 @@ MISSING_REGION = (
     "Just below nu0 = 0 the exact cycle sticks on belt 0 only, Fig. 11 (c), until belt 1 joins in "
     "a grazing point at -0.0788: a region between 3a and 4c that the paper does not list."
 )
-#: What is to be said beside the table.
+#: Remarks beside the table.
 REMARKS = (MISPRINT, MISSING_REGION)
 
 
 # --- the table ----------------------------------------------------------------------------------
 
 
-#: What defines each critical value, exactly.
+#: The condition that defines each critical value exactly.
 CONDITIONS: dict[tuple[str, str], AbstractCondition] = {
     ("a", "nu_alpha"): NonsmoothFold(0),
     ("a", "nu_beta"): Hopf(),
@@ -79,15 +79,22 @@ CONDITIONS: dict[tuple[str, str], AbstractCondition] = {
     ("b", "nu_zeta"): GrazingSliding(0),
     ("b", "nu_eta"): NonsmoothFold(1),
 }
-#: Newton's method starts this far from the printed value.
+#: Distance of the guess for Newton's method from the printed value.
 AWAY = 0.02
 
 
 class CriticalValue(NamedTuple):
     """A critical velocity nu0 of the paper, recomputed.
 
-    computed: ours; residual: of the defining equations there; iterations: Newton steps from a
-    guess `AWAY` from the printed value; cycle: at the point, where there is one.
+    Attributes:
+        system: Class of the oscillator.
+        point: The paper's name of the point.
+        kind: Its kind, in the paper's words.
+        printed: The printed value.
+        computed: Our value.
+        residual: Residual of the defining equations there.
+        iterations: Newton steps from a guess `AWAY` from the printed value.
+        cycle: The cycle at the point, where there is one.
     """
 
     system: str
@@ -128,7 +135,7 @@ def _nu0(osc: Oscillator) -> Any:
 
 
 def table_as_json(values: Sequence[CriticalValue]) -> list[dict[str, Any]]:
-    """The table as it stands in critical_values.json."""
+    """The table as in critical_values.json."""
     return [
         {
             "class": value.system,
@@ -152,7 +159,7 @@ def paper_oscillator(system: str, nu0: Any) -> Oscillator:
 
 
 class Panel(NamedTuple):
-    """One phase portrait to be: its oscillator, starts of orbits, the cycle where it is known."""
+    """One phase portrait: its oscillator, starts of orbits, the cycle where it is known."""
 
     title: str
     oscillator: Oscillator
@@ -194,12 +201,12 @@ class Portraits(NamedTuple):
 
 
 def _shown(value: float) -> str:
-    """To five digits; those that are round, as 0.35 is, as they are."""
+    """A value with five digits; round ones, such as 0.35, without zeros."""
     return f"{value:g}" if abs(value - round(value, 2)) < 1e-9 else f"{value:.5f}"
 
 
 class SimulatedCycle(NamedTuple):
-    """The steady cycle in which a trajectory ends, as its states once around."""
+    """The steady cycle in which a trajectory ends: its states in one loop."""
 
     states: np.ndarray
     stable: bool = True
@@ -233,7 +240,7 @@ def _with_two_belts(osc: Oscillator) -> Oscillator:
 def steady_cycle(trajectory: Trajectory) -> SimulatedCycle | None:
     """The sticking cycle that a trajectory reaches, or None.
 
-    The state at slip onset is known in full, so where it comes back, the motion repeats.
+    The state at slip onset is known in full, so the motion repeats once it comes back.
     """
     onsets = _onsets(trajectory)
     if onsets.size < 2:
@@ -265,7 +272,7 @@ def _transient(trajectory: Trajectory, cycle: SimulatedCycle | None) -> Trajecto
 
 
 def find_unstable_cycles(panels: Sequence[Panel]) -> list[Cycle]:
-    """The unstable cycle of every panel, with the status of none where there is none."""
+    """The unstable cycle of every panel, with the status NO_UNSTABLE_CYCLE where there is none."""
     return [from_starts(_with_two_belts(panel.oscillator)) for panel in panels]
 
 
@@ -302,12 +309,13 @@ def draw_portraits(portraits: Portraits, panels: Sequence[Panel]) -> Figure:
 
 
 def _with_symbols(remark: str) -> str:
-    """A remark as for the terminal, where symbols are words, in symbols."""
+    """A remark with symbols in place of the words that a terminal shows."""
     return remark.replace("p3", "$p_3$").replace("nu0", r"$\nu_0$").replace(" -", " \N{MINUS SIGN}")
 
 
 def _rests_of(osc: Oscillator) -> Equilibria:
-    """Where the mass can rest. A subcritical Hopf point repels, whatever rounding says of it."""
+    """Equilibria of a panel. A subcritical Hopf point repels, whatever sign rounding gives its
+    rate."""
     found = equilibria(_with_two_belts(osc))
     attracts = np.asarray(found.stable) & ~(np.abs(np.asarray(found.rate)) < 1e-9)
     return eqx.tree_at(lambda rows: rows.stable, found, attracts)
@@ -391,7 +399,7 @@ def formulation_errors(
 
 
 class Study(NamedTuple):
-    """A formulation, what its band is called and its symbol, errors over widths, their order."""
+    """A formulation: its name and the symbol of its band, errors over widths, and their order."""
 
     formulation: str
     symbol: str
@@ -403,7 +411,7 @@ WIDTHS = np.logspace(-2, -5, 7)
 
 
 def study_formulations() -> list[Study]:
-    """How the switch and the smooth formulation approach the exact motion, over WIDTHS."""
+    """Errors of the switch and the smooth formulation against the exact motion, over WIDTHS."""
     return [
         Study(formulation, symbol, *formulation_errors(formulation, width, WIDTHS))
         for formulation, width, symbol in (
@@ -414,7 +422,7 @@ def study_formulations() -> list[Study]:
 
 
 def draw_formulations(studies: Sequence[Study]) -> Figure:
-    """The errors of both over the width of their band."""
+    """Draws the errors of both formulations over the width of their band."""
     figure = journal_figure(4.2, 3.2)
     curves = {
         f"{study.formulation}, {study.symbol}: order {study.order:.2f}": study.errors
@@ -425,20 +433,22 @@ def draw_formulations(studies: Sequence[Study]) -> Figure:
 
 
 def diagram_a() -> BifurcationDiagram:
-    """Of Fig. 3: equilibria and cycles of the oscillator with one belt, over its velocity."""
+    """Diagram of Fig. 3: equilibria and cycles of the oscillator with one belt, over its
+    velocity."""
     diagram = bifurcation_diagram(_with_two_belts(class_a(0.2)), _nu0, (0.0, 0.4))
-    # One belt only: the paper gives these regions no letter.
+    # With one belt only the paper gives these regions no letter.
     regions = tuple((first, last, name[:1]) for first, last, name in diagram.regions)
     return replace(diagram, regions=regions)
 
 
 def diagram_b() -> BifurcationDiagram:
-    """Of Fig. 7: the same with two belts, along nu1 = 0.35."""
+    """Diagram of Fig. 7: the same with two belts, along nu1 = 0.35."""
     return bifurcation_diagram(class_b(0.3, PUBLISHED_NU1), _nu0, (-0.7, 0.7))
 
 
 def map_b() -> RegionMap:
-    """Of Fig. 6: the plane of both velocities. No cell lies on the lines nu0 = nu1 and nu = 0."""
+    """Map of Fig. 6: the plane of both velocities. No cell lies on the lines nu0 = nu1 and nu =
+    0."""
     nu0, nu1 = np.linspace(-0.7, 0.7, 120), np.linspace(-0.7, 0.7, 118)
     return region_map(class_b, {"nu0": nu0, "nu1": nu1}, step=0.02, lines=4)
 
@@ -458,7 +468,7 @@ def draw_diagram(diagram: BifurcationDiagram, note: str) -> Figure:
     return figure
 
 
-#: The phase portraits of the paper, by the name of the file.
+#: The phase portraits of the paper, by file name.
 PORTRAITS: dict[str, Portraits] = {
     "fig04": Portraits(
         "a",
@@ -538,12 +548,12 @@ PORTRAITS: dict[str, Portraits] = {
 }
 
 
-#: Every figure, by the name of its file: those of the paper that can be drawn, and one of our own.
+#: File names of all figures: those of the paper that can be drawn, and one of our own.
 FIGURES = sorted([*PORTRAITS, "fig01", "fig02", "fig03", "fig06", "fig07", "formulations"])
 
 
 def steps() -> int:
-    """How many times `reproduce` reports progress."""
+    """Number of progress reports of `reproduce`."""
     return len(FIGURES) + 2
 
 
@@ -556,8 +566,8 @@ def reproduce(
     """
     folder.mkdir(parents=True, exist_ok=True)
     # From a cold start most of the time goes into compiling. Two threads use two cores: this one
-    # goes the longest way, to the region map; the other one does the rest, and all the drawing. The
-    # diagrams come last, because the map needs most of their programs before.
+    # computes the region map, which takes the longest; the other one does the rest, and all the
+    # drawing. The diagrams come last, because the map compiles most of their programs before.
     with ThreadPoolExecutor(1) as beside:
         drawings: list[Future] = []
 

@@ -30,18 +30,33 @@ def paper_friction() -> Conti:
 
 
 def class_a(nu0: ArrayLike) -> Oscillator:
-    """One belt, always touching: the paper's class (a), eqs. (2)-(4), section 3.2.
+    """One belt, always touching: the paper's class (a).
 
-    nu0: belt velocity, dimensionless scalar. zeta = 0.5, mus = 1, p1 = 0.6, p2 = 0 and p3 = 10:
-    the 3.0 that the paper prints for p3 in this class is a misprint, see the module's text.
+    Eqs. (2)-(4) and section 3.2 of the paper, with zeta = 0.5, mus = 1, p1 = 0.6, p2 = 0 and p3 =
+    10. The 3.0 that the paper prints for p3 in this class is a misprint: only p3 = 10 gives its
+    values and figures.
+
+    Args:
+        nu0: Belt velocity, dimensionless scalar.
+
+    Returns:
+        The `Oscillator`.
     """
     return Oscillator(DAMPING, (Belt(nu0, paper_friction()),))
 
 
 def class_b(nu0: ArrayLike, nu1: ArrayLike) -> Oscillator:
-    """Two belts, both always touching: the paper's class (b), eqs. (11)-(14), section 3.3.
+    """Two belts, both always touching: the paper's class (b).
 
-    nu0, nu1: belt velocities, dimensionless scalars. zeta = 0.5, mus = 1, p1 = 0.6, p3 = 10.
+    Eqs. (11)-(14) and section 3.3 of the paper, with zeta = 0.5, mus = 1, p1 = 0.6, p2 = 0 and p3 =
+    10.
+
+    Args:
+        nu0: Velocity of belt 0, dimensionless scalar.
+        nu1: Velocity of belt 1, likewise.
+
+    Returns:
+        The `Oscillator`.
     """
     return Oscillator(DAMPING, (Belt(nu0, paper_friction()), Belt(nu1, paper_friction())))
 
@@ -49,8 +64,16 @@ def class_b(nu0: ArrayLike, nu1: ArrayLike) -> Oscillator:
 def class_c(nu0: ArrayLike, nu1: ArrayLike, sigma: ArrayLike) -> Oscillator:
     """One belt at a time: belt 0 touches while x1 < sigma, belt 1 while x1 > sigma; class (c).
 
-    nu0, nu1, sigma: dimensionless scalars. The paper defines the class (section 2.2, Fig. 2c) and
-    leaves it to further research; the other constants are those of class (b).
+    The paper defines the class (section 2.2, Fig. 2c) and leaves it to further research; the other
+    constants are those of class (b).
+
+    Args:
+        nu0: Velocity of belt 0, dimensionless scalar.
+        nu1: Velocity of belt 1, likewise.
+        sigma: Edge between the belts, likewise.
+
+    Returns:
+        The `Oscillator`.
     """
     return class_d(nu0, nu1, sigma, sigma)
 
@@ -58,9 +81,20 @@ def class_c(nu0: ArrayLike, nu1: ArrayLike, sigma: ArrayLike) -> Oscillator:
 def class_d(nu0: ArrayLike, nu1: ArrayLike, sigma0: ArrayLike, sigma1: ArrayLike) -> Oscillator:
     """Overlapping contact: belt 0 touches while x1 < sigma1, belt 1 while x1 > sigma0; class (d).
 
-    nu0, nu1, sigma0 <= sigma1: dimensionless scalars; between sigma0 and sigma1 both touch. The
-    paper defines the class (section 2.2, Fig. 2d) and leaves it to further research; the other
-    constants are those of class (b). `ValueError` where sigma0 > sigma1.
+    Between sigma0 and sigma1 both touch. The paper defines the class (section 2.2, Fig. 2d) and
+    leaves it to further research; the other constants are those of class (b).
+
+    Args:
+        nu0: Velocity of belt 0, dimensionless scalar.
+        nu1: Velocity of belt 1, likewise.
+        sigma0: Edge from which belt 1 touches, likewise.
+        sigma1: Edge up to which belt 0 touches, likewise; sigma0 <= sigma1.
+
+    Returns:
+        The `Oscillator`.
+
+    Raises:
+        ValueError: If sigma0 > sigma1.
     """
     if is_concrete((sigma0, sigma1)):
         require(
@@ -77,7 +111,7 @@ def class_d(nu0: ArrayLike, nu1: ArrayLike, sigma0: ArrayLike, sigma1: ArrayLike
 
 
 class PublishedValue(NamedTuple):
-    """A critical belt velocity nu0 as the paper prints it, and what the paper calls it."""
+    """A critical belt velocity nu0 as the paper prints it, with the paper's name for it."""
 
     system: str
     point: str

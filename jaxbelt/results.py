@@ -1,7 +1,7 @@
-"""What all results share: status codes, kinds of events, and the way to their pictures.
+"""What all results share: status codes, kinds of events, and drawing.
 
-Nothing raises inside jit or vmap: every result says how it ended, and `describe(status)` gives a
-sentence of advice for a code.
+Nothing raises inside jit or vmap: every result has a status, and `describe(status)` returns a
+sentence of advice for it.
 """
 
 import enum
@@ -11,41 +11,42 @@ from typing import Any
 
 
 class Status(enum.IntEnum):
-    """How a computation ended; 0 is the ordinary end."""
+    """How a computation ended; 0 is the ordinary end. `describe` returns advice for each."""
 
-    OK = 0
-    # A run: `simulate`, `sweep`.
-    STUCK_FOREVER = 1
-    PSEUDO_FOCUS = 2
-    TOO_MANY_SEGMENTS = 3
-    TOO_MANY_STEPS = 4
-    # All of them.
-    NOT_FINITE = 5
-    # A cycle: `find_cycle`, `unstable_cycle`.
-    EQUILIBRIUM = 6
-    NOT_SETTLED = 7
-    TOO_MANY_ARCS = 8
-    NO_CONVERGENCE = 9  # and whatever else Newton's method solves for
-    NOT_ADMISSIBLE = 10  # the same
-    NO_UNSTABLE_CYCLE = 11
-    # A bifurcation point: `refine`, `scan`.
-    NOT_TOUCHED = 12
-    OTHER_KIND = 13
-    NO_FIXED_POINT = 14
-    UNEXPLAINED = 15
-    # A record: `fit`.
-    NOT_IDENTIFIED = 16
-    MISFIT = 17
+    OK = 0  #: computed to the end
+    # Runs: `simulate`, `sweep`.
+    STUCK_FOREVER = 1  #: the mass sticks to a belt at rest for good
+    PSEUDO_FOCUS = 2  #: the orbit converges to a pseudo-focus at a contact edge
+    TOO_MANY_SEGMENTS = 3  #: the budget of arcs or events was used up
+    TOO_MANY_STEPS = 4  #: the integrator used up its steps within one arc
+    # All computations.
+    NOT_FINITE = 5  #: a number is not finite, or a parameter is impossible
+    # Cycles: `find_cycle`, `unstable_cycle`.
+    EQUILIBRIUM = 6  #: the orbit comes to rest at an equilibrium
+    NOT_SETTLED = 7  #: no loop repeated within the budget
+    TOO_MANY_ARCS = 8  #: a loop has more arcs than there is room for
+    # All that Newton's method solves.
+    NO_CONVERGENCE = 9  #: Newton's method did not converge
+    NOT_ADMISSIBLE = 10  #: the solution of the equations leaves its modes
+    NO_UNSTABLE_CYCLE = 11  #: there is no unstable cycle
+    # Bifurcation points: `refine`, `scan`.
+    NOT_TOUCHED = 12  #: nothing comes near that boundary or edge
+    OTHER_KIND = 13  #: the point nearby is of another kind
+    NO_FIXED_POINT = 14  #: there is no fixed point in a smooth field
+    UNEXPLAINED = 15  #: something changes here, and no condition explains it
+    # Records: `fit`.
+    NOT_IDENTIFIED = 16  #: the record does not determine all parameters
+    MISFIT = 17  #: the best fit leaves more than noise
     # Targets: `design`.
-    UNREACHABLE = 18
-    # A bifurcation point.
-    NO_FOLD = 19
-    # A portrait, and shocks in it.
-    INCOMPLETE = 20
-    # A cycle, and a run of a sweep.
-    NEUTRAL = 21
-    # A bifurcation point.
-    DEGENERATE = 22
+    UNREACHABLE = 18  #: the targets cannot be reached within the bounds
+    # Bifurcation points.
+    NO_FOLD = 19  #: no two cycles meet nearby
+    # Portraits, and shocks in them.
+    INCOMPLETE = 20  #: something may be missing
+    # Cycles, and runs of a sweep.
+    NEUTRAL = 21  #: the orbit is one of a continuum of closed orbits
+    # Bifurcation points.
+    DEGENERATE = 22  #: the condition holds all along the parameter
 
 
 ADVICE = {
@@ -105,18 +106,18 @@ ADVICE = {
     Status.OTHER_KIND: (
         "The cycle does touch the boundary at a point near here, but the point is of another kind: "
         "a nonsmooth fold ends the cycle, at a grazing point it goes on to both sides. jb.scan "
-        "with a span around it tells every point there."
+        "with a span around it finds every point there."
     ),
     Status.NO_FOLD: (
         "No loop of the orbits around the equilibrium is extremal in its growth, or none that is "
-        "closes nearby: no two cycles meet near here. jb.scan with a span tells where they do."
+        "closes nearby: no two cycles meet near here. jb.scan with a span finds where they do."
     ),
     Status.NO_FIXED_POINT: (
         "There is no fixed point in a smooth field whose trace could vanish. Where there is one "
         "elsewhere, jb.scan with a span finds its points."
     ),
     Status.INCOMPLETE: (
-        "Not everything is told: in the gaps there may be cycles (a continuum of closed orbits, "
+        "Not everything is known: in the gaps there may be cycles (a continuum of closed orbits, "
         "cycles about to merge, orbits that settle too slowly), or a separatrix is missing, of a "
         "node on a contact edge, or is unsettled, or was not followed far enough for the shock "
         "asked for. Move away from the bifurcation point."
@@ -126,16 +127,16 @@ ADVICE = {
         "but one of a continuum, and which one depends on the start. simulate follows it."
     ),
     Status.DEGENERATE: (
-        "The condition holds here and beside it, all along the parameter as far as numbers tell: "
+        "The condition holds here and beside it, all along the parameter as far as numbers show: "
         "there is no one value at which it does. Vary another parameter, or shift one that makes "
-        "it hold, such as the edge that lies on an equilibrium. What else happens jb.scan tells."
+        "it hold, such as the edge that lies on an equilibrium. jb.scan finds what else happens."
     ),
     Status.UNEXPLAINED: (
         "What the oscillator does changes here, and no condition known to the search explains how. "
         "Simulate on both sides."
     ),
     Status.NOT_IDENTIFIED: (
-        "The record does not tell all of the parameters: those with a standard error that is "
+        "The record does not determine all of the parameters: those with a standard error that is "
         "infinite, or larger than they are, may have any value, alone or together with another. "
         "Fit fewer of them, tie some, or measure a motion that feels them: one that touches that "
         "belt, or slips at other speeds."
@@ -156,7 +157,17 @@ ADVICE = {
 
 
 def describe(status) -> str:
-    """The sentence that goes with a status code; status: a `Status`, or its number."""
+    """Returns a sentence of advice for a status code.
+
+    Args:
+        status: A `Status`, or its number.
+
+    Returns:
+        What happened, and what to do about it.
+
+    Raises:
+        ValueError: If there is no such status.
+    """
     try:
         return ADVICE[Status(operator.index(status))]
     except (TypeError, ValueError):
@@ -166,24 +177,24 @@ def describe(status) -> str:
 class EventKind(enum.IntEnum):
     """What happens at an event of a trajectory."""
 
-    STICK = 1  # the mass begins to stick to the belt
-    SLIP = 2  # slip onset: the belt no longer holds the mass
-    CROSS = 3  # the relative velocity changes its sign, and the mass goes on slipping
-    EDGE = 4  # the mass passes an end of the belt's contact interval
+    STICK = 1  #: the mass begins to stick to the belt
+    SLIP = 2  #: slip onset: the belt no longer holds the mass
+    CROSS = 3  #: the relative velocity changes its sign, and the mass goes on slipping
+    EDGE = 4  #: the mass passes an end of the belt's contact interval
 
 
-#: What draws results. It stands above everything that computes them, in `plotting`, and the package
-#: hands it down when it is imported.
+#: The function that draws results, set by `draw_with`. It is defined in `plotting`, which imports
+#: everything else, so `jaxbelt/__init__.py` passes it in.
 _drawing: Callable[..., Any] | None = None
 
 
 def draw_with(drawing: Callable[..., Any]) -> None:
-    """From now on results are drawn by `drawing(result, ax, **options)`."""
+    """Registers `drawing(result, ax, **options)` as the function that draws results."""
     global _drawing
     _drawing = drawing
 
 
 def draw(result: Any, ax: Any, **options: Any) -> Any:
-    """The one way from a result to its picture, taken by the method `plot` of every result."""
-    assert _drawing is not None, "jaxbelt/__init__.py hands it down"
+    """Draws a result; the method `plot` of every result calls this."""
+    assert _drawing is not None, "jaxbelt/__init__.py registers it"
     return _drawing(result, ax, **options)

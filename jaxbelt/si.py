@@ -1,7 +1,7 @@
 """Results in SI units: `in_si`.
 
-What a number is, is told by its name, as this package gives them. What has another name, such as a
-result of an observable of one's own, stays as it is.
+The name of a variable determines its dimension. Variables with other names, such as results of a
+user's observable, stay as they are.
 """
 
 import functools
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-#: What the variables of this package are, by their names.
+#: Dimensions of the variables of this package, by name.
 DIMENSIONS = {
     **dict.fromkeys(("t", "t_event", "period", "transient", "stick_duration"), "time"),
     **dict.fromkeys(("x1", "x1_event", "x1_end", "x1_min", "x1_max", "amplitude"), "length"),
@@ -53,17 +53,17 @@ DIMENSIONS = {
     "force": "force",
     "energy": "energy",
 }
-#: The same for the numbers of oscillators, by their fields: a unit, and what 1 is in it.
+#: Units of the numbers of oscillators, by field: the unit, and the value of 1 in it.
 UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "damping": ("N s m-1", lambda units: units.force / units.velocity),
     "velocity": ("m s-1", lambda units: units.velocity),
     "load": ("N", lambda units: units.force),
     **dict.fromkeys(("lower", "upper"), ("m", lambda units: units.length)),
 }
-#: A number of a friction law that goes with a power of the speed does so to 1e-12.
+#: Relative accuracy to which a number of a friction law has to follow a power of the unit of speed.
 POWER_ROUNDING = 1e-12
-#: Numbers of a machine's oscillator and of a result's that differ by less, relative to their size,
-#: are the same: those of the one may have been computed in another way.
+#: Relative difference up to which numbers of a machine's oscillator and of a result's count as
+#: equal: they may have been computed in different ways.
 SAME_MACHINE = 1e-9
 #: Results along a parameter.
 AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
@@ -72,7 +72,7 @@ SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energ
 
 #: Where the mass rests, at the end of the words for an attractor of `basins`.
 REST = re.compile(r"(?<=rest.at.)-?\d+(\.\d+)?(e[+-]\d+)?$")
-#: What else to do with a result that `in_si` does not take.
+#: Advice for results that `in_si` does not take.
 INSTEAD = {
     BifurcationPoint: "; its value is in the unit of the argument where a function was given in "
     "place of an oscillator, else multiply it by machine.units.velocity, say; for its cycle write "
@@ -103,48 +103,59 @@ def in_si(
 ) -> "xarray.Dataset":
     """A result in SI units, as a dataset whose variables carry their units.
 
-    result: of the machine's oscillator, a `Trajectory`, a `Cycle`, a `Portrait`, a `FatalShock`,
-    `Basins`, `BasinStability`, a `Fit`, a `BifurcationDiagram`, an `OrbitDiagram`,
-    `BasinFractions`, or the dataset of a sweep. machine: the `Machine`; where the sweep has axes
-    other than starts, or a function was given in place of an oscillator, a function of these that
-    returns it, for its units may be others in each run. `ValueError` where that of the machine is
-    not the oscillator of the result, but for what was fitted or varied. Trajectories, basin
-    stabilities and fractions, and datasets keep none: of the first only the velocity at which it
-    sticks is compared, of the others nothing. `machine.units` in place of the machine takes its
-    units alone and compares nothing, for an oscillator with other numbers in the same units; then
-    a trajectory comes without `force`.
+    The variables are, for
 
-    Of a trajectory: `t` in s, `x1` in m, `x2` in m/s, `force`, the friction on the mass, in N
-    (exact formulation only), and `mode` at each sample, those after the event where one falls on an
-    event (the limit of a jump of the force from the left is no sample); `t_event`, `x1_event`,
-    `x2_event`, `event_kind` and `event_belt`. Of a cycle: `period`, `stick_duration` of each belt,
-    `x1_min`, `x1_max`, `x2_min`, `x2_max`, `amplitude`, and `energy`, what friction and dashpot
-    turn into heat in one period. Of a portrait: over `row`, the columns of its `table()`, `rate` in
-    1/s. Of a shock: `x1` and `x2` of its start, `shock_x1`, `shock_x2`, and `distance`, in m/s
-    where it changes the velocity alone; of both, a distance in the dimensionless plane, it stays as
-    it is. Of a basin stability: its `table()`, which has no units. Of a fit: over `parameter`, the
-    names in its table, `estimate`, `standard_error`, `lower` and `upper` (the confidence interval
-    of 95 per cent), each in the `unit` beside it (a `load` is the normal force), and a parameter of
-    a law of one's own is in the power of m/s that its `in_units_of` tells, or stays as the law has
-    it, with the unit ""; over `t` the fitted motion, `x1` and `x2`, and `x1_residual` and
-    `x2_residual`, datum minus motion. Of a diagram, or of fractions: over `row`, the columns of its
-    `table()`; a special point is a row with the branch -1; `value`, of the parameter, is in m/s for
-    the velocity of a belt, in N for a load (the normal force), in m for a contact edge, in N s/m
-    for the damping, and that of a function's argument stays as the function takes it. Of a dataset:
-    its own variables, with derivatives by starts and parameters where the units are the same in all
-    runs; results of an observable of one's own stay dimensionless, and so does the attribute
-    `start`; the words for `label` of basins tell in m where the mass rests. `TypeError` for
-    anything else.
+    - a trajectory: `t` in s, `x1` in m, `x2` in m/s, `force`, the friction on the mass, in N (exact
+      formulation only), and `mode` at each sample, after the event where a sample falls on one (the
+      limit of a jump of the force from the left is no sample); `t_event`, `x1_event`, `x2_event`,
+      `event_kind` and `event_belt`.
+    - a cycle: `period`, `stick_duration` of each belt, `x1_min`, `x1_max`, `x2_min`, `x2_max`,
+      `amplitude`, and `energy`, which friction and dashpot turn into heat in one period.
+    - a portrait: over `row`, the columns of its `table()`, `rate` in 1/s.
+    - a shock: `x1` and `x2` of its start, `shock_x1`, `shock_x2`, and `distance`, in m/s where it
+      changes the velocity alone. A distance that combines both stays dimensionless.
+    - a basin stability: its `table()`, which has no units.
+    - a fit: over `parameter`, the names in its table, `estimate`, `standard_error`, `lower` and
+      `upper` (the confidence interval of 95 per cent), each in the `unit` beside it (a `load` is
+      the normal force). A parameter of a user's friction law is in the power of m/s that follows
+      from the law's `in_units_of`, or stays as the law has it, with the unit "". Over `t`: the
+      fitted motion, `x1` and `x2`, and `x1_residual` and `x2_residual`, datum minus motion.
+    - a diagram, or fractions: over `row`, the columns of its `table()`; a special point is a row
+      with the branch -1. `value`, of the parameter, is in m/s for the velocity of a belt, in N for
+      a load (the normal force), in m for a contact edge, in N s/m for the damping; the argument of
+      a function stays as the function takes it.
+    - a dataset: its own variables, with derivatives by starts and parameters where the units are
+      the same in all runs. Results of a user's observable stay dimensionless, and so does the
+      attribute `start`; the words for `label` of basins say in m where the mass rests.
 
     Where a function was given in place of an oscillator, the value of a `BifurcationPoint` and
     those of a `BifurcationCurve` are in the units of its arguments already; the cycle at a point is
     `in_si(point.cycle, machine(point.value))`. `Equilibria` are among the rows of
     `in_si(portrait(osc), machine)`. Under `jit`, `vmap` and derivatives multiply by `machine.units`
     instead.
+
+    Args:
+        result: A result for the machine's oscillator: a `Trajectory`, a `Cycle`, a `Portrait`, a
+            `FatalShock`, `Basins`, `BasinStability`, a `Fit`, a `BifurcationDiagram`, an
+            `OrbitDiagram`, `BasinFractions`, or the dataset of a sweep.
+        machine: The `Machine`. Where a sweep has axes other than starts, or a function was given in
+            place of an oscillator: a function of these that returns the machine, as its units may
+            differ from run to run. `machine.units` in place of the machine only converts and
+            compares nothing, for an oscillator with other numbers in the same units; a trajectory
+            then comes without `force`.
+
+    Returns:
+        The dataset, an `xarray.Dataset`.
+
+    Raises:
+        ValueError: If the oscillator of the machine is not that of the result, apart from what was
+            fitted or varied. Of a trajectory, which keeps no oscillator, only the velocity at which
+            it sticks is compared; of basin stabilities, fractions and datasets nothing.
+        TypeError: If the result is of any other type.
     """
     import xarray
 
-    one: Any = machine  # what it is, is asked where it is used
+    one: Any = machine  # its type is checked where it is used
     match result:
         case Trajectory():
             return _trajectory(result, one)
@@ -164,8 +175,8 @@ def in_si(
         case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
             return _along(result, machine)
         case xarray.Dataset():
-            told = {variable.attrs.get("units") for variable in result.variables.values()}
-            is_done = bool(told & set(SYMBOLS.values()))
+            present = {variable.attrs.get("units") for variable in result.variables.values()}
+            is_done = bool(present & set(SYMBOLS.values()))
             require(not is_done, "result", "dimensionless", "a dataset that is in SI units")
             return _dataset(result, machine)
     raise TypeError(
@@ -176,16 +187,17 @@ def in_si(
 
 
 def units_of(machine: Any) -> Units:
-    """The units of a machine, or these themselves; `ValueError` for anything else."""
+    """The units of a machine, or `machine` itself if it is units; a `ValueError` for anything
+    else."""
     if isinstance(machine, Machine | Units):
         return machine if isinstance(machine, Units) else machine.units
     along = "what is along an argument of it: a diagram, fractions, the dataset of a sweep"
-    told = f"; a function is for {along}" if callable(machine) else ""
-    raise ValueError(f"machine must be a Machine, got {in_words(machine)}{told}")
+    hint = f"; a function is for {along}" if callable(machine) else ""
+    raise ValueError(f"machine must be a Machine, got {in_words(machine)}{hint}")
 
 
 def rest_in_m(words: str, units: Units) -> str:
-    """The words for an attractor with where the mass rests in m, with the digits that are known."""
+    """The words for an attractor with the place of rest in m, to the digits that are known."""
 
     def in_m(found: re.Match) -> str:
         digits = len(found[0].partition("e")[0].replace(".", "").lstrip("-0"))
@@ -195,10 +207,12 @@ def rest_in_m(words: str, units: Units) -> str:
 
 
 def check_machine(result: Any, machine: Any) -> None:
-    """Raise a `ValueError` where a result keeps its oscillator, and that of the machine is another.
+    """Raises a `ValueError` if a result keeps its oscillator and that of the machine is another
+    one.
 
-    What was fitted, or varied along a path, may be; of a function the one at the first value is
-    compared; of a trajectory, which keeps none, the belts. Of units alone nothing is.
+    Parameters that were fitted, or varied along a path, may differ. For a function the oscillator
+    at the first value is compared; for a trajectory, which keeps none, the belts; for units alone
+    nothing.
     """
     free: set[str] = set()
     match result:
@@ -261,10 +275,9 @@ def _variable(dims: Any, values: Any, name: str, units: Units, long_name: str) -
 
 @jax.jit
 def _friction_force(osc: Oscillator, codes: Array, ys: Array) -> Array:
-    """The force of all belts on the mass, [samples], of modes [samples, belts], in k times length.
+    """Force of all belts on the mass, [samples], for modes [samples, belts], in k times length.
 
-    What sets the spring, the dashpot and the inertia in balance; nothing is accelerated where the
-    mass sticks.
+    It balances spring, dashpot and inertia; the acceleration is zero where the mass sticks.
     """
 
     def at(codes, y):
@@ -309,8 +322,10 @@ def _trajectory(run: Trajectory, machine: Machine | Units) -> "xarray.Dataset":
 
 
 def _check_belts(run: Trajectory, machine: Any) -> None:
-    """Raise where a trajectory, which keeps no oscillator, has another number of belts than a
-    machine, or sticks at another belt's velocity."""
+    """Raises if a trajectory does not fit the belts of a machine.
+
+    It keeps no oscillator: compared are the number of belts, and the velocity at which it sticks.
+    """
     if not isinstance(machine, Machine):
         return
     osc, own = machine.oscillator, len(machine.belts)
@@ -332,7 +347,7 @@ def _cycle(cycle: Cycle, machine: Machine | Units) -> "xarray.Dataset":
     units = units_of(machine)
     require(cycle.unknowns.ndim == 2, "result", "one cycle, not a batch", repr(cycle))
     check_machine(cycle, machine)
-    told = {
+    variables = {
         "period": ((), cycle.period, "period"),
         "stick_duration": ("belt", cycle.stick_durations, "time stuck to the belt in one loop"),
         "x1_min": ((), cycle.x1_min, "smallest displacement"),
@@ -344,7 +359,7 @@ def _cycle(cycle: Cycle, machine: Machine | Units) -> "xarray.Dataset":
     }
     found = {
         name: _variable(dims, values, name, units, long_name)
-        for name, (dims, values, long_name) in told.items()
+        for name, (dims, values, long_name) in variables.items()
     }
     attrs = {"status": Status(int(cycle.status)).name}
     return xarray.Dataset(found, {"belt": np.arange(len(cycle.oscillator.belts))}, attrs)
@@ -354,21 +369,21 @@ def _of_portrait(portrait: Portrait, machine: Machine | Units) -> "xarray.Datase
     check_machine(portrait, machine)
     units, table = units_of(machine), portrait.table()
     rate = table["rate"].to_numpy(float) / float(units.time)
-    told = {"long_name": "rate at which small motions about it grow", "units": "s-1"}
-    found = _rows_in_units(table.drop(columns="rate"), units).assign(rate=("row", rate, told))
+    attributes = {"long_name": "rate at which small motions about it grow", "units": "s-1"}
+    found = _rows_in_units(table.drop(columns="rate"), units).assign(rate=("row", rate, attributes))
     return found.assign_attrs(status=Status(int(portrait.status)).name)
 
 
 def _of_shock(shock: FatalShock, machine: Machine | Units) -> "xarray.Dataset":
     check_machine(shock, machine)
     table, units = shock.table(), units_of(machine)
-    distance, told = float(shock.distance), {"long_name": "size of the shock"}
+    distance, attributes = float(shock.distance), {"long_name": "size of the shock"}
     if shock.direction == "x2":
-        distance, told["units"] = distance * float(units.velocity), SYMBOLS["velocity"]
+        distance, attributes["units"] = distance * float(units.velocity), SYMBOLS["velocity"]
     words = ("attractor", "direction", "boundary", "beyond", "status")
     found = _rows_in_units(table.drop(columns=["distance", *words]), units).squeeze("row")
     attrs = {name: table[name][0] for name in words}
-    return found.assign(distance=((), distance, told)).assign_attrs(attrs)
+    return found.assign(distance=((), distance, attributes)).assign_attrs(attrs)
 
 
 def _fitted(fit: Fit, machine: Machine | Units) -> "xarray.Dataset":
@@ -376,8 +391,11 @@ def _fitted(fit: Fit, machine: Machine | Units) -> "xarray.Dataset":
 
     check_machine(fit, machine)
     units, table = units_of(machine), fit.table()
-    told = [*(_unit_of(name, fit.oscillator, units) for name in fit.names), *_units_of_start(units)]
-    symbols, sizes = zip(*told, strict=True)
+    known = [
+        *(_unit_of(name, fit.oscillator, units) for name in fit.names),
+        *_units_of_start(units),
+    ]
+    symbols, sizes = zip(*known, strict=True)
     columns = ("estimate", "standard_error", "lower", "upper")
     found: dict[str, Any] = {
         name: ("parameter", table[name].to_numpy() * np.array(sizes)) for name in columns
@@ -399,21 +417,25 @@ def _fitted(fit: Fit, machine: Machine | Units) -> "xarray.Dataset":
 
 
 def _unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
-    """The unit of a parameter of a fit, and what 1 is in it; tied ones have to have the same."""
-    told = set()
+    """Unit of a parameter of a fit, and the value of 1 in it; tied parameters must have the
+    same."""
+    found = set()
     for path in name.split(" = "):
         if ".friction." in path:
-            told.add(_unit_in_law(path, osc, units))
+            found.add(_unit_in_law(path, osc, units))
         else:
             symbol, size = UNITS_OF_FIELDS[path.rpartition(".")[2]]
-            told.add((symbol, float(size(units))))
-    require(len(told) == 1, "result", "of tied parameters with one unit", name)
-    return told.pop()
+            found.add((symbol, float(size(units))))
+    require(len(found) == 1, "result", "of tied parameters with one unit", name)
+    return found.pop()
 
 
 def _unit_in_law(path: str, osc: Oscillator, units: Units) -> tuple[str, float]:
-    """The same for a number of a friction law, by what becomes of it as speeds are given in another
-    unit; "" and 1 where the law takes speeds in the unit of whoever wrote it."""
+    """Unit of a number of a friction law, and the value of 1 in it.
+
+    It follows from how the number changes when speeds are given in another unit; "" and 1 where the
+    law takes speeds in a unit that only its author knows.
+    """
     number = names_of(osc).index(path)
     leaves, structure = jax.tree.flatten(osc)
     if not np.any(leaves[number]):
@@ -446,13 +468,13 @@ def _along(result: AlongParameter, machine: Any) -> "xarray.Dataset":
     values = table["value"].to_numpy(float)
     units, (symbol, size) = units_along(result, values, machine)
     check_machine(result, machine)
-    told = {"long_name": result.name, **({"units": symbol} if symbol else {})}
+    attributes = {"long_name": result.name, **({"units": symbol} if symbol else {})}
     rest = _rows_in_units(table.drop(columns="value"), units)
-    return rest.assign(value=("row", values * size, told))
+    return rest.assign(value=("row", values * size, attributes))
 
 
 def _rows_in_units(table: "pandas.DataFrame", units: Units) -> "xarray.Dataset":
-    """The columns of a table over `row`, what has a unit in that."""
+    """Columns of a table over `row`, converted where they have a unit."""
     import xarray
 
     found: dict[str, Any] = {}
@@ -472,8 +494,12 @@ def _rows_in_units(table: "pandas.DataFrame", units: Units) -> "xarray.Dataset":
 def units_along(
     result: AlongParameter, values: np.ndarray, machine: Any
 ) -> tuple[Units, tuple[str, float]]:
-    """The units at values of the parameter of a result, numbers or as many; and the unit of the
-    parameter itself, and what 1 is in it: "" and 1 where whoever wrote the function knows it."""
+    """Units at values of the parameter of a result; and the unit of the parameter, with the value
+    of 1.
+
+    The latter is "" and 1 where only the author of the function knows it. values: a number or
+    several; the units have the same shape.
+    """
     if result.is_argument:
         given = {result.name: values}
         expected = f"a function of {result.name} that returns the Machine at a value of it"
@@ -500,33 +526,33 @@ def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
         of, _, by = name.removeprefix("d_").partition("_d_") if name[:2] == "d_" else (name, "", "")
         if of not in DIMENSIONS:
             continue
-        # A unit that varies with a parameter has a derivative, too; and the starts are one axis.
+        # Units that vary with a parameter have a derivative, too; and the starts are one axis.
         fits = not vary or (of == name and name not in axes)
         require(fits, "result", f"without {name} where the units of {', '.join(vary)} vary", name)
         unit = getattr(units, DIMENSIONS[of])
-        told = {"units": SYMBOLS[DIMENSIONS[of]]}
+        attributes = {"units": SYMBOLS[DIMENSIONS[of]]}
         if by in DIMENSIONS:
             unit = unit / getattr(units, DIMENSIONS[by])
-            told["units"] += f" / ({SYMBOLS[DIMENSIONS[by]]})"
+            attributes["units"] += f" / ({SYMBOLS[DIMENSIONS[by]]})"
         elif by:
-            told["units"] += f" / (unit of {by})"
+            attributes["units"] += f" / (unit of {by})"
         if name in axes:
             unit = float(np.ravel(unit)[0])
         old = dataset[name]
         values = (old * unit).transpose(*old.dims).values
-        changed[name] = (old.dims, values, old.attrs | told)
+        changed[name] = (old.dims, values, old.attrs | attributes)
     if words := dataset["label"].attrs.get("flag_meanings") if "label" in dataset else None:
         in_m = " ".join(rest_in_m(word, units).replace(" ", "_") for word in words.split())
         changed["label"] = dataset["label"].assign_attrs(flag_meanings=in_m).variable
     coordinates = {name: changed.pop(name) for name in axes if name in changed}
-    told = {"units": "SI where a variable says so; else dimensionless"}
+    notes = {"units": "SI where a variable says so; else dimensionless"}
     if str(start := dataset.attrs.get("start", "")).startswith("x"):  # not along the axes
-        told["start"] = f"dimensionless: {start}"
-    return dataset.assign(changed).assign_coords(coordinates).assign_attrs(told)
+        notes["start"] = f"dimensionless: {start}"
+    return dataset.assign(changed).assign_coords(coordinates).assign_attrs(notes)
 
 
 def _units_of_runs(dataset: "xarray.Dataset", machine: Any, own: list[str]) -> Units:
-    """The units of every run, arrays over the axes that are not starts."""
+    """Units of every run, arrays over the axes that are not starts."""
     import xarray
 
     if isinstance(machine, Machine | Units):
@@ -542,7 +568,8 @@ def _units_of_runs(dataset: "xarray.Dataset", machine: Any, own: list[str]) -> U
 
 
 def _units_at(machine: Any, values: Mapping[str, np.ndarray]) -> Units:
-    """The units of what a function gives at the values of its arguments, [n] each; of none: one."""
+    """Units of the machines that a function returns for arguments [n] each; without arguments,
+    of one."""
     require(callable(machine), "machine", "a Machine, or a function that returns one", machine)
     try:
         inspect.signature(machine).bind(**values)

@@ -1,6 +1,6 @@
-"""Results as tables: the one kind that the method `table` of every result gives.
+"""Results as tables: the form of what the method `table` of every result returns.
 
-A table is a `pandas.DataFrame`, always: pandas comes with xarray. It has a row for each thing of
+A table is always a `pandas.DataFrame` (pandas comes with xarray). It has a row for each thing of
 one sort (samples, events, cycles, blocks), and columns of plain numbers and words: NaN where there
 is no number, "" where there is no word, a column for each belt named with its number at the end.
 """
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 
 def table_of(rows: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> "pandas.DataFrame":
-    """A table of columns by their names, or of rows that have the same names."""
-    import pandas  # a quarter of a second that only tables need
+    """A table from columns by name, or from rows that have the same names."""
+    import pandas  # import takes a quarter of a second, which only tables need
 
     if isinstance(rows, Mapping):
         return pandas.DataFrame({name: np.asarray(column) for name, column in rows.items()})
@@ -27,14 +27,16 @@ def table_of(rows: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> "pandas.D
 
 
 def per_belt(name: str, values: Any) -> dict[str, Any]:
-    """The columns of a quantity that each belt has its own of, [.., belts]."""
+    """Columns of a quantity that each belt has, [.., belts]."""
     columns = np.moveaxis(np.asarray(values), -1, 0)
     return {f"{name}_{i}": column for i, column in enumerate(columns)}
 
 
 def require_single(result: Any, leaf: Any, *dimensions: int) -> None:
-    """`ValueError` unless a result is a single known one, as tables and pictures show: one of its
-    arrays, known, with so many dimensions."""
+    """Raises a `ValueError` unless a result is a single known one, as tables and pictures show.
+
+    leaf: one of its arrays; it has to be known and to have one of these numbers of dimensions.
+    """
     name = type(result).__name__
     require(
         is_concrete(leaf) and np.ndim(leaf) in dimensions,

@@ -13,7 +13,7 @@ from rich.console import Console
 
 import jaxbelt as jb
 from jaxbelt import activity
-from jaxbelt.activity import Activity, announced, tell
+from jaxbelt.activity import Activity, announced, note_progress
 from jaxbelt.sweeps.progress import SweepProgress
 
 
@@ -44,7 +44,7 @@ def outer(shown):
 
 @announced("inner")
 def inner():
-    tell("half of it")
+    note_progress("half of it")
 
 
 def test_the_outermost_activity_has_the_line(screen, monkeypatch):
@@ -83,7 +83,7 @@ def test_nothing_is_shown_where_it_is_not_wanted(screen):
 
 def test_the_logger_is_told(caplog):
     with caplog.at_level(logging.DEBUG, logger="jaxbelt"), Activity("search"):
-        tell("3 of 7")
+        note_progress("3 of 7")
     first, last = (record.getMessage() for record in caplog.records)
     assert first == "3 of 7" and last.startswith("search: ")
 

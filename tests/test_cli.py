@@ -20,7 +20,7 @@ from jaxbelt.cli import app
 from jaxbelt.commands.map import write_table
 from jaxbelt.commands.options import (
     belts_of_class,
-    family,
+    function_of_axes,
     oscillator,
     parameters,
     parse_belt,
@@ -131,14 +131,16 @@ def test_parameters_are_those_of_the_oscillator(system):
 def test_axes_by_name():
     """Of a class its arguments, then anything by its path; dataset.attrs["call"] can be run."""
     axes = {"nu0": 0.2, "belts[1].load": 0.7}
-    make = family("b", {}, OWN, 0.4, 1.1, axes)
+    make = function_of_axes("b", {}, OWN, 0.4, 1.1, axes)
     assert repr(make(**axes)) == repr(own(0.2, 0.7))
     assert repr(make(damping=0.3, nu0=0.2)) == repr(make(zeta=0.3, nu0=0.2))
     assert float(make(zeta=0.3).damping) == 0.3
-    assert family("b", {}, None, 0.5, 1.0, ["nu0", "nu1"]) is jb.presets.class_b
-    edge = family("c", {"nu1": -0.2}, None, 0.5, 1.0, ["sigma"])
+    assert function_of_axes("b", {}, None, 0.5, 1.0, ["nu0", "nu1"]) is jb.presets.class_b
+    edge = function_of_axes("c", {"nu1": -0.2}, None, 0.5, 1.0, ["sigma"])
     assert repr(edge(sigma=0.3)) == repr(jb.presets.class_c(0.2, -0.2, 0.3))
-    steep = family("c", {"nu1": -0.2}, None, 0.3, 1.0, ["sigma", "belts[0].friction.steepness"])
+    steep = function_of_axes(
+        "c", {"nu1": -0.2}, None, 0.3, 1.0, ["sigma", "belts[0].friction.steepness"]
+    )
     osc = steep(**{"sigma": 0.3, "belts[0].friction.steepness": 8.0})
     first, second = jb.presets.class_c(0.2, -0.2, 0.3).belts
     first = jb.Belt(first.velocity, jb.Conti(1.0, 0.6, 8.0), upper=0.3)

@@ -778,7 +778,7 @@ def test_where_runs_come_to_rest_is_told_though_others_are_near():
     belts = jb.Belt(0.1, LAW, upper=0.15), jb.Belt(-0.7, LAW, lower=-0.5)
     osc = jb.Oscillator(2.0, (*belts, jb.Belt(0.3, LAW, 4.0, lower=1.0)))
     told = jb.basins(osc, x1=np.linspace(0.1, 0.9, 5), x2=np.linspace(-0.2, 0.2, 5))
-    assert told.label.attrs["flag_meanings"] == "undecided rest_at_0.150"
+    assert told.label.attrs["flag_meanings"] == "undecided rest_at_0.15"
     assert bool((told.label == 0).all())
 
 

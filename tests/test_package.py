@@ -235,7 +235,9 @@ def test_every_public_name_has_its_place_in_the_reference():
     shown = Counter(
         name
         for page in pages
-        for name in re.findall(r"^:::\{public\} (\S+)$", page.read_text("utf-8"), re.MULTILINE)
+        for name in re.findall(
+            r"^\.\. auto(?:class|function):: jaxbelt\.(\S+)$", page.read_text("utf-8"), re.MULTILINE
+        )
     )
     classes = {name for name in vars(jaxbelt.presets) if name.startswith("class_")}
     presets = {f"presets.{name}" for name in classes}

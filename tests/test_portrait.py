@@ -264,9 +264,6 @@ def test_an_edge_cuts_off_what_only_the_static_limit_holds(sign):
     np.testing.assert_array_equal(pieces.entries[0], [corner[0], -corner[1]])
 
 
-@pytest.mark.xfail(
-    reason="off by 3e-4 since own units and steep laws came: to be mended", strict=False
-)
 @pytest.mark.slow(first=True)
 def test_cycle_whose_multiplier_is_1e20_is_solved_for_backwards():
     """It passes along the boundary of a slow belt. Starts on its two sides go to two cycles."""

@@ -332,8 +332,8 @@ class BifurcationPoint(eqx.Module):
 
     condition: the condition that holds there; value: of the parameter; residual: largest error in
     the defining equations; iterations: Newton steps; steps: how far each went, NaN padded; error: a
-    bound on |value - exact value|, from the same equations with every integration step halved, and
-    rounding; oscillator: at the point;
+    bound on `|value - exact value|`, from the same equations with every integration step halved,
+    and rounding; oscillator: at the point;
     cycle: at the point, with a status that says why where there is none (at a Hopf point it has
     shrunk to the equilibrium, at `SuddenSliding` its period is infinite); multiplier: of the cycle
     on the side where it does not stick to the belt, for `NonsmoothFold` and `GrazingSliding`, else
@@ -464,7 +464,7 @@ def given_point(point: BifurcationPoint, variation: Variation) -> BifurcationPoi
     """A point that was found in own units, in those of whoever gave what is varied."""
     if variation.units is None:
         return point
-    given, length, (unit,) = variation.units
+    given, length, (unit,), _ = variation.units
     value = point.value * unit
     osc = given.oscillator(np.asarray(value)[None] if is_concrete(value) else value[None])
     found = rescaled(point, length, lambda _: osc)

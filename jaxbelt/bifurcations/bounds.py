@@ -13,9 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..activity import tell
+from ..activity import note_progress
 from ..model.variations import Variation
 from ..numerics.continuation import Stop
+from ..numerics.widths import as_here
 from ..results import Status
 from .base import BifurcationPoint
 from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
@@ -76,7 +77,8 @@ class Bounds:
         # The next lines are searched while curves are followed from those before.
         with ThreadPoolExecutor(1) as ahead:
             searches = [
-                (line, ahead.submit(self._points, *line, self.limits[line[0]])) for line in across
+                (line, ahead.submit(as_here(self._points), *line, self.limits[line[0]]))
+                for line in across
             ]
             for count, ((along, fixed), found) in enumerate(searches, 1):
                 told = f"{count} of {len(across)} lines"
@@ -96,7 +98,9 @@ class Bounds:
             # Far from curves that are known, and so from points of codimension two on them.
             at = int(np.argmax(away))
             row, column, along = rows[at].tolist()
-            tell(f"{len(self.curves)} curves, {int(untried.sum())} pairs of cells without one")
+            note_progress(
+                f"{len(self.curves)} curves, {int(untried.sum())} pairs of cells without one"
+            )
             fixed = float(self.values[1 - along][(row, column)[1 - along]])
             first = (row, column)[along]
             ends = self.values[along][first : first + 2]
@@ -133,7 +137,7 @@ class Bounds:
     ) -> None:
         """Follow the curves of points that are on none that is known."""
         for point in points:
-            tell(f"{len(self.curves)} curves from {told}")
+            note_progress(f"{len(self.curves)} curves from {told}")
             pair = np.empty(2)
             pair[along], pair[1 - along] = float(point.value), fixed
             if point.status == Status.OK and not any(

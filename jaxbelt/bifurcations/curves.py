@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from ..activity import announced, tell
+from ..activity import announced, note_progress
 from ..checks import (
     as_array,
     as_interval,
@@ -28,7 +28,7 @@ from ..checks import (
 )
 from ..cycles.attractors import PLACE_DIMENSIONS
 from ..model.oscillator import Oscillator
-from ..model.own_units import in_own_units, own_length, quantity, rescaled
+from ..model.own_units import own_length, quantity, rescaled
 from ..model.parameters import leaf_index
 from ..model.variations import Variation
 from ..numerics.continuation import CurvePoint, Stop, continue_curve
@@ -148,7 +148,7 @@ def given_curve(curve: BifurcationCurve, variation: Variation) -> BifurcationCur
     """A curve that was found in own units, in those of whoever gave what is varied."""
     if variation.units is None:
         return curve
-    _, length, units = variation.units
+    length, units = variation.units.length, variation.units.parameters
     special = tuple(one.measured_in(units) for one in curve.special)
     found = rescaled(curve, length)
     return replace(found, values=curve.values * units, special=special)
@@ -195,9 +195,9 @@ def bifurcation_curve(
     near = None if at is None else np.asarray(as_array(at, "at", (2,)))
     given = _varied_by_two(point.oscillator, where, near, limits)
     length = own_length(point.oscillator)
-    own = in_own_units(point.oscillator, length)
-    point = rescaled(point, 1 / length, lambda _: own)
     variation = given.in_units(length, np.mean(limits, axis=1) if near is None else near)
+    own = variation.own.of(point.oscillator)
+    point = rescaled(point, 1 / length, lambda _: own)
     units = variation.own.parameters
     start = variation.values_of(
         own, limits / units[:, None], None if near is None else near / units
@@ -305,7 +305,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
     rows: list[_Row] = []
     special: list[SpecialPoint] = []
     while True:
-        tell(f"{len(rows)} points on one side")
+        note_progress(f"{len(rows)} points on one side")
         points, found, beyond, end = _leg(problem, track, u, direction, origin)
         rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
         special += found

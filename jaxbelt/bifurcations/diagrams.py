@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..activity import announced, tell
+from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces, require
 from ..cycles.attractors import MOMENT
 from ..cycles.chains import Loop, cut
@@ -213,7 +213,7 @@ def bifurcation_diagram(
     path.look(np.concatenate(nodes))
     middles = [float(values[len(values) // 2]) for values in nodes]
     labels = [path.label(value) for value in middles]
-    tell(f"branches between {len(points)} points")
+    note_progress(f"branches between {len(points)} points")
     for stretch, around in _separated(labels):
         found = edges_touched(path, nodes[stretch], around)
         points = by_value([*points, *found])
@@ -226,7 +226,7 @@ def bifurcation_diagram(
         warn_of_fast_loops(fast, depth=5)
     pieces = [*_equilibrium_pieces(path, nodes), *_cycle_pieces(path, nodes, labels)]
     names = [region_name(path.at(v), label) for v, label in zip(middles, labels, strict=True)]
-    given, length, (unit,) = path.variation.own
+    given, length, (unit,), _ = path.variation.own
     branches = rescaled(tuple(_joined(pieces, list(special.values()))), length)
     at_ends = [given.oscillator(np.array([unit * v])) for v in (path.first, *middles, path.last)]
     return BifurcationDiagram(

@@ -9,7 +9,7 @@ There is no cycle at these points, and no unknown but the parameter.
   vanish (annihilation). Where the static limit of a belt at rest exceeds mu(0), orbits end only in
   that part of the segment where mu(0) is enough; the end of that part may come to the edge, too.
 - `PseudoHopf`: at a pseudo-focus the leading term by which loops grow or shrink is zero. With the
-  next one, of third order, |x2| at the edge obeys r' = rate r + a r^3, see `edge_focus`, and
+  next one, of third order, `|x2|` at the edge obeys r' = rate r + a r^3, see `edge_focus`, and
   the cycle that is born has r^2 = -rate/a.
 
 Boundary equilibria and the pseudo-Hopf point are those of M. di Bernardo, C. Budd, A. Champneys, P.

@@ -17,7 +17,6 @@ from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, require, require_value
 from ..cycles.cycle import EXACT, warn_of_extrapolation
 from ..model.oscillator import Oscillator, check_oscillator
-from ..model.own_units import in_own_units
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
 from ..numerics.compiling import is_outermost
@@ -177,7 +176,7 @@ def _begun(
         condition.check(osc)
         value = jnp.asarray(jax.tree.leaves(osc)[number], dtype=jnp.float64).reshape(1)
         variation = Variation.of_leaves(osc, [number]).in_own_units(lax.stop_gradient(value))
-        own = in_own_units(osc, variation.own.length)
+        own = variation.own.of(osc)
         return variation, own, value / variation.own.parameters
     require(at is not None, "at", "the value of the parameter to begin from", "None")
     at = as_array(at, "at")

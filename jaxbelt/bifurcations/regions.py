@@ -15,7 +15,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ..activity import announced, tell
+from ..activity import announced, note_progress
 from ..checks import (
     as_array,
     as_positive,
@@ -30,8 +30,8 @@ from ..checks import (
 from ..cycles.cycle import Cycle
 from ..cycles.portrait import portrait
 from ..model.oscillator import Oscillator
-from ..model.own_units import in_own_units
 from ..model.variations import Variation
+from ..numerics.widths import as_here
 from ..results import draw
 from ..tables import table_of
 from .bounds import Bounds, Pair
@@ -211,16 +211,16 @@ def region_map(
     given = varied_by_names(make, span, values)
     corners = [np.array(pair) for pair in product(*([one[0], one[-1]] for one in values))]
     variation = given.in_own_units(*corners)
-    _, length, units = variation.own
+    length, units = variation.own.length, variation.own.parameters
     bounds = Bounds(variation, [one / unit for one, unit in zip(values, units)], step)
     own_starts = tuple((x1 / length, x2 / length) for x1, x2 in further)
 
     def own(**numbers):
-        return in_own_units(make(**numbers), length)
+        return variation.own.of(make(**numbers))
 
     # Two things that know nothing of each other, most of the first time compiling.
     with ThreadPoolExecutor(1) as beside:
-        seen = beside.submit(_look_at_all, own, span, values, own_starts)
+        seen = beside.submit(as_here(_look_at_all), own, span, values, own_starts)
         if lines:
             bounds.search_lines(lines)
         label, motions, on_line = seen.result()
@@ -260,7 +260,7 @@ def _cycles_of_examples(make, names, values, label) -> dict[str, tuple[Cycle, ..
     """The cycles in the example of each region."""
     cycles = {}
     for name in sorted(set(np.unique(label).tolist()) - {""}):
-        tell(f"the portrait of region {name}")
+        note_progress(f"the portrait of region {name}")
         found = portrait(_at(make, names, _example(values, label == name)))
         cycles[name] = (*found.cycles, *found.unstable)
     return cycles

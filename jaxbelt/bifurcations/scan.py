@@ -19,7 +19,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..activity import announced, tell
+from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces
 from ..cycles.attractors import SOLVED, apart, is_same, itinerary, place_of
 from ..cycles.cycle import as_loop, warn_of_extrapolation
@@ -123,7 +123,7 @@ def search(
     path.look(np.concatenate(stretches))
     settled = [path.beside(at) for at in path.breaks]
     while intervals := path.changes(settled):
-        tell(f"{len(path.labels)} values seen, {len(points)} points found")
+        note_progress(f"{len(path.labels)} values seen, {len(points)} points found")
         values: list[float] = []
         again: list[float] = []
         for a, b in intervals:

@@ -1,1 +1,1 @@
-"""The commands of the command line, a file each: words in, files out."""
+"""Commands of the command line, one file each: options in, files out."""

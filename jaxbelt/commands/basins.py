@@ -118,7 +118,7 @@ def basins(
         out.parent.mkdir(parents=True, exist_ok=True)
         with journal_style():
             save(draw_basins(found), written[0])
-        # Version 3 of the format, which needs no library but SciPy.
+        # Version 3 of the format needs no library but SciPy.
         found.dataset.to_netcdf(written[2], engine="scipy")
         with written[1].open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
@@ -129,7 +129,7 @@ def basins(
 
 
 def _shares_as_data(found: "jb.Basins") -> dict[str, Any]:
-    """The fractions of the grid by the words for their attractors."""
+    """Fractions of the grid, by the words for their attractors."""
     labels = found.label.values
     shares = {name: float((labels == i).mean()) for i, name in enumerate(found.attractors)}
     return {"attractors": shares, "undecided": float((labels < 0).mean())}

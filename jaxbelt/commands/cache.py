@@ -1,4 +1,4 @@
-"""`jaxbelt cache`: the compiled programs that are kept on disk."""
+"""`jaxbelt cache`: compiled programs on disk."""
 
 from typing import Annotated
 
@@ -11,15 +11,15 @@ def cache(
     clear: Annotated[bool, typer.Option("--clear", help="Remove all of them.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Tell where the compiled programs are kept, how many there are and how large they are.
+    """Show where compiled programs are kept, how many there are and how large they are.
 
     The folder is **programs** in JAXBELT_CACHE_DIR, or else in the user's cache folder; with
-    JAXBELT_CACHE=0 nothing is kept. To remove it is safe at any time: what is missing is compiled
-    anew.
+    JAXBELT_CACHE=0 nothing is kept. The folder may be removed at any time: missing programs are
+    compiled again.
 
     Example: **jaxbelt cache --clear**
     """
-    # Imported late, with JAX behind it, to keep `--help` quick.
+    # Imported late, because JAX comes with it, to keep `--help` quick.
     from ..numerics import programs
 
     with plain_errors():

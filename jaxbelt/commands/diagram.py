@@ -35,9 +35,9 @@ from .options import (
     turn_on_float64,
 )
 
-#: Arguments of classes that may be varied, other than velocities: an edge of two belts, or of one.
+#: Arguments of classes that may be varied besides velocities: an edge of two belts, or of one.
 EDGES = ("sigma", "sigma0", "sigma1")
-#: What a diagram shows.
+#: Quantities that a diagram can show.
 DRAWABLE = ("amplitude", "x1", "x2", "period")
 POINT_COLUMNS = ("value", "kind", "belts", "type", "error", "status")
 
@@ -80,7 +80,7 @@ def diagram(
     ] = Path("diagram"),
     as_json: Json = False,
 ) -> None:
-    """Equilibria and cycles along a parameter, and every bifurcation point, found by itself.
+    """Equilibria and cycles along a parameter, and every bifurcation point, found without a guess.
 
     - **OUT.png**: the diagram: stable black, unstable grey, unstable cycles dashed; the regions
       between the points have the paper's names. With --quantity x2 as in the paper's Figs. 3 and 7.
@@ -88,11 +88,11 @@ def diagram(
     - **OUT.csv**: the branches: branch, kind, value, stable, x1_min, x1_max, x2_min, x2_max,
       period, multiplier, stick_duration of each belt.
 
-    - **OUT_points.csv**: value, kind, belts, type (such as subcritical, "" where the kind has but
+    - **OUT_points.csv**: value, kind, belts, type (such as subcritical; "" where the kind has only
       one), error (a bound), status of every bifurcation point.
 
-    An oscillator is described as for **simulate**; what is varied needs no value.
-    Takes some ten seconds, mostly to compile; longer with contact edges.
+    An oscillator is described as for **simulate**; the parameter that varies needs no value. Takes
+    some ten seconds, mostly to compile; longer with contact edges.
 
     Examples:
 
@@ -147,7 +147,7 @@ def diagram(
 
 
 def _where(osc: "jb.Oscillator", path: str) -> Any:
-    """What selects the parameter of that path."""
+    """Function that selects the parameter with this path."""
     import jax
 
     from ..model.parameters import names_of
@@ -157,7 +157,7 @@ def _where(osc: "jb.Oscillator", path: str) -> Any:
 
 
 def write_points(points, path: Path) -> None:
-    """value, kind, belts, type, error and status, a row a bifurcation point."""
+    """Writes value, kind, belts, type, error and status, one row for each bifurcation point."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(POINT_COLUMNS)
@@ -171,13 +171,13 @@ def _in_columns(point: "jb.BifurcationPoint") -> list[Any]:
 
 
 def _points_as_data(points) -> list[dict[str, Any]]:
-    """The rows of `write_points`, for JSON."""
+    """Rows of `write_points`, for JSON."""
     rows = [dict(zip(POINT_COLUMNS, _in_columns(point), strict=True)) for point in points]
     return [row | {name: as_json_value(row[name]) for name in ("value", "error")} for row in rows]
 
 
 def write_branches(found: "jb.BifurcationDiagram", path: Path) -> None:
-    """A row an equilibrium or cycle, see `jaxbelt diagram --help`."""
+    """Writes one row for each equilibrium or cycle, see `jaxbelt diagram --help`."""
     fields = ("values", "stable", "x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

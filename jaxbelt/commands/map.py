@@ -22,7 +22,7 @@ from .options import (
     check_axis_names,
     check_description,
     check_range,
-    family,
+    function_of_axes,
     make_console,
     outputs,
     plain_errors,
@@ -69,16 +69,16 @@ def region_map(
 
     - **OUT.png**: the map, and a sketch of the phase portrait of each region.
 
-    - **OUT.csv**: both parameters, the region's name, and what that means in the words of the
-      picture's key, a row a cell; on_line: 1 of a cell where a belt is at rest, or two run at one
-      velocity, which the picture leaves out.
+    - **OUT.csv**: a row for each cell: both parameters, the name of the region, its meaning in the
+      words of the picture's key, and on_line: 1 where a belt is at rest, or two belts have one
+      velocity; the picture leaves such cells out.
 
-    - **OUT_curves.csv**: curve, condition, belts, both parameters, multiplier of the cycle without
-      the stick phase that vanishes, residual, special, a row a point of a curve. Points of
+    - **OUT_curves.csv**: a row for each point of a curve: curve, condition, belts, both parameters,
+      multiplier of the cycle without the stick phase that vanishes, residual, special. Points of
       codimension two stand at their places, named in the last column.
 
-    An oscillator is described as for **simulate**; what is varied needs no value.
-    Takes a minute or more, mostly to compile and for its curves: the cells cost little.
+    An oscillator is described as for **simulate**; parameters that vary need no value. Takes a
+    minute or more, mostly to compile and for the curves: the cells cost little.
 
     Examples:
 
@@ -99,7 +99,7 @@ def region_map(
         turn_on_float64()
         from ..numerics.spacing import evenly_spaced
 
-        make = family(system, arguments, belt, damping, omega, axes)
+        make = function_of_axes(system, arguments, belt, damping, omega, axes)
         pairs = zip(axes, (p, q), cells_along(cells), strict=True)
         values = {name: evenly_spaced(*span, n) for name, span, n in pairs}
         found = jb.region_map(make, values)
@@ -121,15 +121,18 @@ def region_map(
 
 
 def cells_along(cells: int) -> tuple[int, int]:
-    """How many cells there are along each axis: even numbers, lest cells of a symmetric range lie
-    on 0, where a belt is at rest; and not the same, lest they lie where both parameters are equal.
+    """Number of cells along each axis.
+
+    Even numbers, so that no cells of a symmetric range lie on 0, where a belt is at rest; and
+    different ones, so that none lie where both parameters are equal.
     """
     even = cells + cells % 2
     return even, even + 2
 
 
 def write_cells(found: "jb.RegionMap", path: Path) -> None:
-    """Both parameters, the name of the region, what it says, and `on_line`, a row a cell."""
+    """Writes both parameters, name and meaning of the region, and `on_line`, a row for each
+    cell."""
     first, second = (values.tolist() for values in found.values)
     words = {"": "undecided", **found.words}
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -141,5 +144,5 @@ def write_cells(found: "jb.RegionMap", path: Path) -> None:
 
 
 def write_table(table: Any, path: Path) -> None:
-    """A table of a result, every number to the last digit."""
+    """Writes a table of a result, every number to the last digit."""
     table.to_csv(path, index=False, na_rep="nan")

@@ -1,7 +1,7 @@
 """What the commands share: options that describe an oscillator, errors in one sentence.
 
 Neither this module nor those of the commands import what computes before it is used. So help, and
-mistakes in the options, are told at once.
+mistakes in the options, appear at once.
 """
 
 import functools
@@ -26,14 +26,14 @@ import jaxbelt as jb
 
 from ..spelling import did_you_mean
 
-#: The arguments of the four classes of the paper, and what they are unless given.
+#: Arguments of the four classes of the paper, and their defaults.
 CLASSES = {
     "a": {"nu0": 0.2},
     "b": {"nu0": 0.45, "nu1": 0.35},
     "c": {"nu0": 0.2, "nu1": 0.4, "sigma": 0.8},
     "d": {"nu0": 0.2, "nu1": 0.4, "sigma0": 0.5, "sigma1": 1.0},
 }
-#: The friction laws by name: their classes, and what their arguments are unless given.
+#: Friction laws by name: their classes, and the defaults of their arguments.
 LAWS: dict[str, tuple[str, dict[str, float | None]]] = {
     "conti": ("Conti", {"static": 1.0, "residual": 0.6, "steepness": 10.0, "quadratic": 0.0}),
     "coulomb": ("Coulomb", {"static": None, "kinetic": None}),
@@ -43,8 +43,10 @@ LAWS: dict[str, tuple[str, dict[str, float | None]]] = {
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """What a user did wrong is told in its one sentence, with exit code 2; an interrupt, with the
-    shells' 130."""
+    """Prints an error of the user as its one sentence and exits with code 2.
+
+    An interrupt exits with code 130, as in shells.
+    """
     try:
         with _interrupts_that_count():
             yield
@@ -58,23 +60,25 @@ def plain_errors() -> Iterator[None]:
         raise typer.Exit(2) from None
 
 
-#: Seconds that what computes has to end, and to tell what became of it, after an interrupt.
+#: Seconds that a computation has after an interrupt to end and to report on its runs.
 GRACE = 2.0
 
 
 @contextmanager
 def _interrupts_that_count() -> Iterator[None]:
-    """Ends the process after an interrupt that Python does not hear of, as it does not while the
-    main thread compiles."""
+    """Ends the process after an interrupt that Python does not notice.
+
+    Python does not notice it while the main thread compiles.
+    """
     if threading.current_thread() is not threading.main_thread():
-        yield  # which hears of no signals
+        yield  # no signals arrive in other threads
         return
-    hears, told = socket.socketpair()
-    told.setblocking(False)
-    before = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
 
     def watch() -> None:
-        while number := hears.recv(1):
+        while number := reader.recv(1):
             if number[0] == signal.SIGINT:
                 time.sleep(GRACE)
                 print("interrupted", file=sys.stderr, flush=True)
@@ -86,21 +90,24 @@ def _interrupts_that_count() -> Iterator[None]:
         yield
     finally:
         signal.set_wakeup_fd(before)
-        told.close()  # which ends what watches
+        writer.close()  # ends the watching thread
         watcher.join(GRACE / 10)
-        hears.close()
+        reader.close()
 
 
 def turn_on_float64() -> None:
-    """What every command does before it computes: the package itself never touches JAX's settings,
-    a program of its own may."""
+    """Turns 64-bit floats on, before a command computes.
+
+    The package itself never touches JAX's settings; a program may.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
 
 
 def outputs(out: Path, *ends: str) -> list[Path]:
-    """The files that `out` stands for, if they can be written; asked before the computing."""
+    """Paths of the files that `out` stands for; raises, before anything is computed, if one
+    cannot be written."""
     paths = [out.with_name(out.name + end) for end in ends]
     for path in paths:
         check_out(path)
@@ -108,7 +115,7 @@ def outputs(out: Path, *ends: str) -> list[Path]:
 
 
 def check_out(out: Path) -> None:
-    """Raise unless a file can be written there; folders on the way are made later."""
+    """Raises unless a file can be written there; missing folders are made later."""
     if out.is_dir():
         raise IsADirectoryError(f"out must be a file, got the folder {out}")
     there = next(folder for folder in out.absolute().parents if folder.exists())
@@ -122,30 +129,31 @@ def check_out(out: Path) -> None:
 
 
 def check_number(name: str, value: float) -> None:
-    """Raise unless a number is finite and > 0, as what computes does, but before it is imported."""
+    """Raises unless a number is finite and > 0, like the package itself, but before it is
+    imported."""
     if not 0 < value < math.inf:
         raise ValueError(f"{name} must be finite and > 0, got {value}")
 
 
-#: The largest tolerance of a step. Beyond, what comes out is no motion of the oscillator.
+#: Largest tolerance of a step; with larger ones the result is no motion of the oscillator.
 LOOSEST = 1e-2
 
 
 def check_tolerance(value: float) -> None:
-    """Raise unless it is one that an integrator can be asked for."""
+    """Raises unless the value is a possible tolerance of an integrator."""
     if not 0 < value <= LOOSEST:
         raise ValueError(f"tolerance must be > 0 and at most {LOOSEST}, got {value}")
 
 
 def check_range(name: str, ends: tuple[float, float]) -> None:
-    """Raise unless an option FROM TO is an interval."""
+    """Raises unless an option FROM TO is an interval."""
     first, last = ends
     if not -math.inf < first < last < math.inf:
         raise ValueError(f"{name} must be FROM TO with FROM < TO, got {first} {last}")
 
 
 def make_console() -> Console:
-    """A console; in a file, which has no width, lines are not folded."""
+    """A console; in a file, which has no width, it does not fold lines."""
     console = Console()
     return console if console.is_terminal else Console(width=200)
 
@@ -158,17 +166,17 @@ def say(
     as_json: bool = False,
     data: dict[str, Any] | None = None,
 ) -> None:
-    """Print lines as they are, and which files were written; or `data`, with these, as JSON."""
+    """Prints lines and the files that were written; or `data`, with these, as JSON."""
     if as_json:
         print(json.dumps({**(data or {}), "written": [str(path) for path in written]}))
         return
-    told = ", ".join(map(str, written))
-    for line in (*lines, *([f"Written: {told}"] if told else [])):
+    files = ", ".join(map(str, written))
+    for line in (*lines, *([f"Written: {files}"] if files else [])):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def as_json_value(value: Any) -> Any:
-    """A number, or an array of them, as JSON has it: what is not finite is null."""
+    """A number or an array as JSON; numbers that are not finite are null."""
     import numpy as np
 
     def one(x: Any) -> Any:
@@ -178,7 +186,7 @@ def as_json_value(value: Any) -> Any:
 
 
 def _of_classes(name: str) -> str:
-    """The defaults of an argument of the classes, for the help."""
+    """Defaults of an argument of the classes, for the help."""
     values: dict[float, list[str]] = {}
     for system, arguments in CLASSES.items():
         if name in arguments:
@@ -250,8 +258,11 @@ def _with(osc: "jb.Oscillator", values: dict[str, Any]) -> "jb.Oscillator":
 
 
 def parameters(system: str, belt: Sequence[str] | None = None) -> dict[str, str]:
-    """The parameters of what is described: their short names, where they have one, and their paths
-    in the oscillator, such as belts[1].friction.steepness; each with its path."""
+    """Paths of all parameters, by name.
+
+    A path is the place in the oscillator, such as belts[1].friction.steepness. Parameters that have
+    a short name are listed under that, too.
+    """
     laws = [_parts_of_belt(text)[1] for text in belt or ()]
     if not laws:
         laws = [LAWS["conti"][1]] * (1 if system == "a" else 2)
@@ -266,7 +277,7 @@ def parameters(system: str, belt: Sequence[str] | None = None) -> dict[str, str]
 def check_description(
     system: str, arguments: dict[str, float | None], belt: Sequence[str] | None = None
 ) -> None:
-    """Raise unless these options describe belts; numbers are left to the classes themselves."""
+    """Raises unless these options describe belts; the classes themselves check numbers."""
     given = _given(arguments)
     if belt:
         if given:
@@ -286,7 +297,7 @@ def _given(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_class(system: str) -> None:
-    """Raise unless it is one of the paper's classes."""
+    """Raises unless it is one of the paper's classes."""
     if system not in CLASSES:
         raise ValueError(f"class must be a, b, c or d, got {system}")
 
@@ -297,8 +308,10 @@ def check_axis_names(
     others: tuple[str, ...] = (),
     belt: Sequence[str] | None = None,
 ) -> None:
-    """Raise unless all axes are arguments of the class or parameters of what is described, or
-    among other names, and come once."""
+    """Raises unless all axes are known and different.
+
+    Known are arguments of the class, parameters of what is described, and `others`.
+    """
     check_description(system, {}, belt)
     paths = parameters(system, belt)
     names, seen = (*({} if belt else CLASSES[system]), *paths, *others), set()
@@ -313,13 +326,13 @@ def check_axis_names(
 
 
 def names_in_words(names: Iterable[str], paths: dict[str, str]) -> str:
-    """What a parameter may be called: a short name, or one of many paths."""
+    """Possible names of a parameter: the short ones, or one of many paths."""
     short = dict.fromkeys([*names, *(name for name, path in paths.items() if name != path)])
     one = next(path for path in paths if ".friction." in path)
     return f"one of {', '.join(short)}, or a path such as {one} or belts[0].load"
 
 
-def family(
+def function_of_axes(
     system: str,
     arguments: dict[str, float | None],
     belt: Sequence[str] | None,
@@ -327,7 +340,8 @@ def family(
     omega: float,
     axes: Iterable[str],
 ) -> "Callable[..., jb.Oscillator]":
-    """What is described as a function of its axes; its text, which datasets keep, can be run."""
+    """The described oscillator as a function of its axes; the function's text, which datasets
+    keep, can be run."""
     given, axes = _given(arguments), tuple(axes)
     if belt:
         return functools.partial(oscillator, belt=tuple(belt), damping=damping, omega=omega)
@@ -347,7 +361,7 @@ def belts_of_class(system: str, arguments: dict[str, Any]) -> "tuple[jb.Belt, ..
 
 
 def parse_belt(text: str) -> "jb.Belt":
-    """The belt that a text such as `0.3,load=0.5,law=coulomb,static=0.8,kinetic=0.5` describes."""
+    """Parses a belt such as `0.3,load=0.5,law=coulomb,static=0.8,kinetic=0.5`."""
     law, friction, numbers = _parts_of_belt(text)
     from ..model import friction as laws
     from ..model.oscillator import Belt
@@ -356,7 +370,7 @@ def parse_belt(text: str) -> "jb.Belt":
 
 
 def _check_numbers(text: str, friction: dict[str, float], numbers: dict[str, float]) -> None:
-    """Raise where a belt or its law would refuse them, which ask only when they are imported."""
+    """Raises where a belt or its law would refuse these numbers; these check only once imported."""
 
     def fits(name: str, holds: bool, expected: str, came: float) -> None:
         if not holds:
@@ -377,7 +391,7 @@ def _check_numbers(text: str, friction: dict[str, float], numbers: dict[str, flo
 
 
 def _parts_of_belt(text: str) -> tuple[str, dict[str, float], dict[str, float]]:
-    """The class of its law, and the arguments of that and of the belt."""
+    """Class of the law, its arguments, and those of the belt."""
     velocity, *parts = text.split(",")
     words = dict.fromkeys(["velocity"], velocity)
     for part in parts:

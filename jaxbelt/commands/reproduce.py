@@ -31,7 +31,7 @@ def reproduce(
             raise ValueError(f"out must be a folder, got the file {out}")
         check_out(out / "critical_values.json")
     turn_on_float64()
-    # Imported late, with matplotlib behind it, to keep `--help` quick.
+    # Imported late, because matplotlib comes with it, to keep `--help` quick.
     from .. import paper
 
     columns = (

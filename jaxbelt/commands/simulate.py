@@ -160,7 +160,8 @@ def simulate(
 
 
 def write_samples(trajectory: "jb.Trajectory", path: Path) -> None:
-    """t, x1, x2 and the contact code of every belt, a row a sample; numbers to the last digit."""
+    """Writes t, x1, x2 and the contact code of every belt, a row for each sample, to the last
+    digit."""
     modes = trajectory.modes
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -171,7 +172,7 @@ def write_samples(trajectory: "jb.Trajectory", path: Path) -> None:
 
 
 def write_events(trajectory: "jb.Trajectory", path: Path) -> None:
-    """t, x1, x2, kind and belt, a row an event."""
+    """Writes t, x1, x2, kind and belt, a row for each event."""
     events = trajectory.events
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

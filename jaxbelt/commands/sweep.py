@@ -20,15 +20,14 @@ from .options import (
     check_number,
     check_out,
     check_tolerance,
-    family,
+    function_of_axes,
     make_console,
     plain_errors,
     say,
     turn_on_float64,
 )
 
-#: What may be observed: the variables of the dataset, and what the picture shows of them unless
-#: told otherwise.
+#: Values of `--observe`: the variables of the dataset, and the default variable of the picture.
 VARIABLES = {
     "attractor": (
         *("kind", "signature", "sticks", "period", "stick_duration", "x1_min", "x1_max"),
@@ -90,24 +89,24 @@ def sweep(
             metavar="FROM:TO",
             show_default="all",
             help="Do only these blocks of a store, 0:64 for the first 64; other processes may do "
-            "others at the same time. --dry-run tells how many there are.",
+            "others at the same time. --dry-run shows how many there are.",
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only tell how much it is and how long it will take.")
+        bool, typer.Option("--dry-run", help="Only show how much it is and how long it will take.")
     ] = False,
     as_json: Json = False,
 ) -> None:
     """Run an oscillator from every point of a grid; write the data and a picture.
 
-    - **OUT**: the dataset, labelled, with what it came from in its attributes.
+    - **OUT**: the dataset, labelled, with its origin in its attributes.
 
     - the same name with **.png**: a picture, for one or two axes.
 
-    Takes some seconds to compile; **--dry-run** tells how long the runs will take.
+    Takes some seconds to compile; **--dry-run** estimates how long the runs will take.
 
-    An oscillator is described as for **simulate**, and has the values given there, or those that
-    **simulate** takes, but for what is an axis.
+    An oscillator is described as for **simulate**. What is not an axis has the value given there,
+    or the default of **simulate**.
 
     Examples:
 
@@ -115,8 +114,8 @@ def sweep(
 
     - jaxbelt sweep x1=-2:2:200 x2=-2:2:200 --observe final --t1 50 --out starts.zarr
 
-    - jaxbelt sweep nu0=0:1:64 "belts[0].friction.kinetic=0.2:0.8:64"
-      --belt 0.5,law=coulomb,static=0.8,kinetic=0.5 --damping 0.1
+    - jaxbelt sweep nu0=0:1:64 "belts[0].friction.kinetic=0.2:0.8:64" --belt
+      0.5,law=coulomb,static=0.8,kinetic=0.5 --damping 0.1
 
     - jaxbelt sweep nu0=-0.7:0.7:8192 nu1=-0.7:0.7:8192 --out plane.zarr --blocks 0:64
     """
@@ -144,7 +143,7 @@ def sweep(
         check_out(out.with_suffix(".png"))
         turn_on_float64()
         own = [name for name in values if name not in ("x1", "x2")]
-        make = family(system, {}, belt, damping, omega, own)
+        make = function_of_axes(system, {}, belt, damping, omega, own)
         if t1 is None and observe != "attractor":
             t1 = 100.0
         asked: dict[str, Any] = dict(
@@ -155,15 +154,15 @@ def sweep(
             observe=observe,
         )
         if dry_run:
-            told = jb.explain(make, values, **asked)
-            say(console, [repr(told)], [], as_json=as_json, data=asdict(told))
+            estimate = jb.explain(make, values, **asked)
+            say(console, [repr(estimate)], [], as_json=as_json, data=asdict(estimate))
             return
         if out.suffix == ".zarr":
             dataset = jb.sweep(make, values, **asked, store=out, blocks=part)
         else:
             dataset = jb.sweep(make, values, **asked)
             out.parent.mkdir(parents=True, exist_ok=True)
-            # Version 3 of the format, which needs no library but SciPy.
+            # Version 3 of the format needs no library but SciPy.
             dataset.to_netcdf(out, engine="scipy")
         written = [out]
         if drawn:
@@ -173,7 +172,7 @@ def sweep(
 
 
 def _check_variable(name: str, observe: str) -> None:
-    """Raise unless the picture can show that variable."""
+    """Raises unless the picture can show that variable."""
     known = [one for one in VARIABLES[observe] if one not in OF_BELTS]
     if name not in known:
         meant = did_you_mean(name, known)
@@ -181,7 +180,7 @@ def _check_variable(name: str, observe: str) -> None:
 
 
 def _counts_as_data(dataset: Any) -> dict[str, Any]:
-    """How much there is, and how the runs ended."""
+    """Number of runs, and how they ended."""
     statuses = jb.decoded(dataset[["status"]]).status.values.ravel().tolist()
     counts = {name or "not run": statuses.count(name) for name in sorted(set(statuses))}
     sizes = {str(name): size for name, size in dataset.sizes.items()}
@@ -199,7 +198,7 @@ def _draw_variable(dataset: Any, variable: str, out: Path) -> None:
 
 
 def parse_blocks(text: str) -> tuple[int, int]:
-    """The first block and the one behind the last that a text such as `0:64` names."""
+    """Parses `0:64`: the first block, and the one behind the last."""
     first, colon, last = text.partition(":")
     if not (colon and first.isdecimal() and last.isdecimal() and int(first) < int(last)):
         raise ValueError(f"blocks must be FROM:TO, two integers with FROM < TO, got {text!r}")
@@ -207,7 +206,7 @@ def parse_blocks(text: str) -> tuple[int, int]:
 
 
 def parse_axis(text: str) -> tuple[str, list[float]]:
-    """The name and the values that a text such as `nu0=-0.7:0.7:512` or `nu1=0.35` describes."""
+    """Parses an axis such as `nu0=-0.7:0.7:512` or `nu1=0.35`: its name and its values."""
     name, equals, words = text.partition("=")
     parts = words.split(":")
     try:

@@ -1,4 +1,4 @@
-"""`jaxbelt verify`: whether a store is right."""
+"""`jaxbelt verify`: checks a store."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -18,9 +18,9 @@ def verify(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Compute the checksums of a store again and tell which of its blocks are right.
+    """Compute the checksums of a store again and show which of its blocks are right.
 
-    Exit code 1 if there are bad ones and they are not repaired. After a repair the command or the
+    Exit code 1 if there are bad blocks and they are not repaired. After a repair the command or the
     call that made the store does the marked blocks again.
 
     Example: **jaxbelt verify plane.zarr --repair**

@@ -1,4 +1,4 @@
-"""`jaxbelt warm`: compiles what functions and commands need, once a machine."""
+"""`jaxbelt warm`: compiles the programs of functions and commands, once for each machine."""
 
 import os
 import tempfile
@@ -14,9 +14,9 @@ import jaxbelt as jb
 
 from .options import Json, make_console, plain_errors, say, turn_on_float64
 
-#: Where the runs of the commands and of the paper begin.
+#: Start of the runs of the commands and of the paper.
 START = (3.0, 0.0)
-#: The paper's path, and few points of the axes of others: how many is no part of a program.
+#: The paper's path, and few points for other axes: their number is no part of a program.
 SPAN = (-0.7, 0.7)
 FEW, GRID = 3, [-3.0, 0.0, 3.0]
 
@@ -76,7 +76,7 @@ def warm(
 
 
 def jobs() -> list[tuple[str, Callable[[], Any]]]:
-    """What is done for its programs, by name; what is most often asked for first."""
+    """The calls whose programs are compiled, by name; the most frequent ones first."""
     import equinox as eqx
     import numpy as np
 
@@ -98,7 +98,7 @@ def jobs() -> list[tuple[str, Callable[[], Any]]]:
         "basins": lambda osc: jb.basins(osc, x1=GRID, x2=GRID, progress=False),
         "portrait": jb.portrait,
     }
-    # Paths are many programs; those of the paper's law are enough.
+    # Paths need many programs; those of the paper's law are enough.
     paths: dict[str, Callable[[Any], Any]] = {
         "scan": lambda osc: jb.scan(osc, where, SPAN),
         "bifurcation_diagram": lambda osc: jb.bifurcation_diagram(osc, where, SPAN),

@@ -13,23 +13,30 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..checks import as_whole
 from ..model.oscillator import Oscillator
+from ..model.own_units import quantity
 from ..results import Status
 from .chains import Chain, Loop, cut
-from .cycle import Cycle, exactly
+from .cycle import Cycle, exactly, sample_cycle
 
 
 class BackwardCycle(Cycle):
-    """An unstable cycle that was solved for backwards; a `Cycle`, and as what it was solved for.
+    """An unstable cycle that was solved for backwards; its derivatives are not known.
 
-    Its derivatives are not known.
+    backwards_chain, backwards_unknowns: the attracting cycle of the oscillator reversed in time.
     """
 
-    backwards: Cycle
+    backwards_chain: Chain
+    backwards_unknowns: Array = eqx.field(metadata=quantity("length", "velocity", "time"))
 
     def sample(self, n: int) -> Array:
         """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
-        return jnp.flip(self.backwards.sample(n), axis=0) * jnp.array([[1.0, -1.0]])
+        behind = reversed_in_time(self.oscillator)
+        states = sample_cycle(
+            behind, self.backwards_chain, self.backwards_unknowns, as_whole(n, "n")
+        )
+        return jnp.flip(states, axis=0) * jnp.array([[1.0, -1.0]])
 
     def __repr__(self) -> str:
         return Cycle.__repr__(self)
@@ -74,5 +81,6 @@ def forwards(osc: Oscillator, cycle: Cycle) -> BackwardCycle:
         residual=cycle.residual,
         iterations=cycle.iterations,
         status=cycle.status,
-        backwards=cycle,
+        backwards_chain=chain,
+        backwards_unknowns=cycle.unknowns,
     )

@@ -149,7 +149,7 @@ class Cycle(eqx.Module):
 
     def sample(self, n: int) -> Array:
         """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
-        return _sample_cycle(self, as_whole(n, "n"))
+        return sample_cycle(self.oscillator, self.chain, self.unknowns, as_whole(n, "n"))
 
     def row(self) -> dict[str, Any]:
         """What `table` tells of it."""
@@ -220,15 +220,15 @@ def as_loop(cycle: Cycle, size: int) -> Loop:
 
 
 @jit
-def _sample_cycle(cycle: Cycle, n: int) -> Array:
-    durations = cycle.unknowns[:, 2]
+def sample_cycle(osc: Oscillator, chain: Chain, z: Array, n: int) -> Array:
+    """States at n times evenly spread over one period of a closed chain with the unknowns z."""
+    durations = z[:, 2]
     ends = jnp.cumsum(durations)
 
     def at(t):
-        i = jnp.minimum(jnp.searchsorted(ends, t).astype(int), jnp.sum(cycle.chain.used) - 1)
+        i = jnp.minimum(jnp.searchsorted(ends, t).astype(int), jnp.sum(chain.used) - 1)
         since = t - ends[i] + durations[i]
-        chain = cycle.chain
-        return flow(cycle.oscillator, chain.codes[i], chain.mesh[i], cycle.unknowns[i, :2], since)
+        return flow(osc, chain.codes[i], chain.mesh[i], z[i, :2], since)
 
     return jax.vmap(at)(jnp.linspace(0.0, 1.0, n) * ends[-1])
 

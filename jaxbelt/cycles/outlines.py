@@ -273,10 +273,9 @@ def _one_after_another(osc: Oscillator, chain: Chain, durations: Array, y: Array
 
 def outline_of_cycle(cycle: Cycle) -> ClosedOutline:
     """The outline of a cycle with status OK."""
-    way, solved = 1.0, cycle
     if isinstance(cycle, BackwardCycle):
-        way, solved = -1.0, cycle.backwards
-    return ClosedOutline(solved.chain, solved.unknowns, way)
+        return ClosedOutline(cycle.backwards_chain, cycle.backwards_unknowns, -1.0)
+    return ClosedOutline(cycle.chain, cycle.unknowns, 1.0)
 
 
 def outline_of_separatrix(osc: Oscillator, separatrix: Separatrix) -> OpenOutline:

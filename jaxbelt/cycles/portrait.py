@@ -52,8 +52,8 @@ class Portrait(eqx.Module):
     - separatrices: a tuple of `Separatrix`, by their points; the stable ones bound basins, as
       unstable cycles do.
     - escapes: whether starts far out go to infinity.
-    - reach: the bounds of what was looked at, |x1| and |x2| < reach. No cycle is farther out, as
-      far as a bound is known, which it is not where damping is 0. For damping < 0 with friction
+    - reach: the bounds of what was looked at, `|x1|` and `|x2|` < reach. No cycle is farther out,
+      as far as a bound is known, which it is not where damping is 0. For damping < 0 with friction
       that grows with the speed loops beyond were seen to grow, or shrink, as they do at infinity.
     - gaps: intervals (from, to) of x1 at rest in which it is not told whether cycles pass, [gaps,
       2]; those of a continuum of closed orbits, which are neither attracting nor unstable, too; and

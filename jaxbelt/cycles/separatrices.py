@@ -81,7 +81,7 @@ class Separatrix(eqx.Module):
     - ts: times, 0 at the point, [samples]; ys: states (x1, x2), [samples, 2]; both in the order of
       time, and good to 1e-9. Ends of arcs are among the samples.
     - end: what its other end is, where an unstable one leads to and a stable one comes from:
-      "equilibrium" (or an end of a segment), "cycle", "outside" (of |x1|, |x2| < reach, see
+      "equilibrium" (or an end of a segment), "cycle", "outside" (of `|x1|`, `|x2|` < reach, see
       `Portrait`), "boundary" (of a belt whose static limit exceeds mu(0): it leaves this boundary
       beside a piece where the mass sticks), or "unsettled" (it approaches what it comes from, or
       leads to, too slowly).

@@ -1,1 +1,1 @@
-"""From data or aims to parameters: `fit` and `design`."""
+"""Inverse problems: from a record to parameters (`fit`), from targets to parameters (`design`)."""

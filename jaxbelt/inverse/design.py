@@ -1,6 +1,6 @@
-"""`design`: parameters for a wanted cycle.
+"""`design`: parameters for which a cycle meets given targets.
 
-Newton's method on functionals of the cycle, damped, within bounds.
+Damped Newton steps on functionals of the cycle, within bounds.
 """
 
 import functools
@@ -34,23 +34,29 @@ from ..numerics.compiling import jit
 from ..results import Status, describe, draw
 from ..tables import table_of
 from .margins import BasinMargin
-from .selection import ITERATIONS, LONGEST_CHANGE, Selection, selection_of, told_to
+from .selection import ITERATIONS, LONGEST_CHANGE, Selection, progress_reporter, selection_of
 
 if TYPE_CHECKING:
     import pandas
 
-#: Targets are met to this fraction of their size (or of one, where they are smaller).
+#: A target counts as met within this fraction of its size (of 1, where the size is smaller).
 MET = 1e-9
 
 
 class Design(eqx.Module):
-    """What `design` returns.
+    """Parameters for which functionals of the cycle meet their targets; what `design` returns.
 
-    oscillator: the one designed; cycle: its cycle; names, values, [p]: of the parameters in the
-    order of `where`; achieved, targets, [targets]: the functionals, and what they were to be (the
-    nearer end of an interval, or the value itself inside of it); iterations: the steps taken;
-    status: OK, UNREACHABLE, where the nearest that was found is given, or why there is no cycle to
-    begin with.
+    Attributes:
+        oscillator: The designed oscillator.
+        cycle: Its cycle.
+        names: Names of the parameters, in the order of `where`.
+        values: Their values, [p].
+        achieved: Values of the functionals, [targets].
+        targets: What they should be, [targets]: the nearer end of an interval, or the value itself
+            inside of it.
+        iterations: Number of Newton steps.
+        status: OK; UNREACHABLE, where the nearest design that was found is returned; or the reason
+            why there is no cycle to begin with.
     """
 
     oscillator: Oscillator
@@ -63,8 +69,11 @@ class Design(eqx.Module):
     status: Array
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each parameter, then for each target in order: what ("parameter" or "target"),
-        name, value (of a target what was achieved), wanted (of a parameter NaN)."""
+        """Returns a row for each parameter, then one for each target, in order.
+
+        Columns: what ("parameter" or "target"), name, value (of a target: what was achieved),
+        wanted (NaN for a parameter).
+        """
         count = len(self.targets)
         return table_of(
             {
@@ -76,8 +85,14 @@ class Design(eqx.Module):
         )
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the designed cycle, see `Cycle.plot`, into the axes `ax` (None: new ones), which are
-        returned."""
+        """Draws the designed cycle, see `Cycle.plot`.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -95,10 +110,20 @@ class Design(eqx.Module):
 def distance_to(
     *conditions: AbstractCondition, where: Callable[[Oscillator], Any]
 ) -> Callable[[Cycle], Array]:
-    """A functional for `design`: how far a parameter is from the nearest of some bifurcations.
+    """A functional for `design`: distance of a parameter to the nearest of some bifurcations.
 
-    conditions: such as `jb.NonsmoothFold(belt=1)`; where: selects the parameter. Each point is
-    found by `refine` from the oscillator of the cycle; one that is not there is infinitely far.
+    Each point is found by `refine` from the oscillator of the cycle; a point that is not found
+    counts as infinitely far.
+
+    Args:
+        conditions: Conditions such as `jb.NonsmoothFold(belt=1)`.
+        where: Selects the parameter.
+
+    Returns:
+        A function of a `Cycle`.
+
+    Raises:
+        ValueError: If there is no condition, or `where` is no function.
     """
 
     require(len(conditions) > 0, "conditions", "one or more, such as jb.Hopf()", "none")
@@ -131,19 +156,28 @@ def design(
     y0: ArrayLike | tuple = (3.0, 0.0),
     report: Callable[[str], None] | None = None,
 ) -> Design:
-    """Parameters for which functionals of the cycle have wanted values.
+    """Parameters for which functionals of the cycle have given values.
 
-    oscillator: where to begin; it has to have a cycle. targets: pairs of a functional of the
-    `Cycle`, such as `jb.amplitude` or `lambda c: jb.stick_duration(c, 1)`, and its value, or an
-    interval (lower, upper) that it is to lie in; `distance_to` is the functional that keeps a
-    bifurcation away, `distance_to_basin_boundary` the one that lets the cycle withstand shocks.
-    where, bounds: the parameters that may be changed, as for `fit`. y0: the start (x1, x2) that
-    leads to the cycle. report: is told of the progress, too, a line at a time, such as `print`.
+    The method is Newton's, damped, with exact derivatives; with fewer targets than parameters it
+    takes the shortest steps. The status is UNREACHABLE where no choice within the bounds meets the
+    targets, and where they lie behind a bifurcation at which the cycle vanishes.
 
-    Damped Newton steps with exact derivatives; with fewer targets than parameters, the shortest
-    ones. What no choice within the bounds reaches ends with the status UNREACHABLE, and so does
-    what lies behind a bifurcation at which the cycle vanishes. `ValueError` names an argument that
-    is impossible.
+    Args:
+        oscillator: The oscillator to begin with; it needs a cycle.
+        targets: Pairs of a functional of the `Cycle`, such as `jb.amplitude` or `lambda c:
+            jb.stick_duration(c, 1)`, and its value, or an interval (lower, upper). The functional
+            `distance_to` keeps a bifurcation away; `distance_to_basin_boundary` lets the cycle
+            withstand shocks.
+        where: Selects the parameters that may change, as for `fit`.
+        bounds: Their bounds, as for `fit`.
+        y0: Start (x1, x2) that leads to the cycle, shape [2].
+        report: Function that is called with lines on the progress, such as `print`.
+
+    Returns:
+        The `Design`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
     y0 = as_array(y0, "y0", (2,))
@@ -151,7 +185,7 @@ def design(
     functionals, intervals = _checked_targets(targets)
     for functional in functionals:
         _check_functional(functional, oscillator)
-    tell = told_to(report)
+    note = progress_reporter(report)
     selection, u = selection_of(oscillator, where, bounds)
 
     def evaluate(u):
@@ -173,7 +207,7 @@ def design(
         return u + step * min(1.0, LONGEST_CHANGE / max(np.max(np.abs(step)), 1e-300))
 
     achieved, slopes, cycle = evaluate(u)
-    # What is off is measured by the largest of the numbers that are known of each target.
+    # The unit of a miss is the largest known number of its target.
     known = np.column_stack([np.asarray(achieved), intervals])
     sizes = np.max(np.abs(np.where(np.isfinite(known), known, 0.0)), axis=1)
     sizes = np.where(sizes > 0, sizes, 1.0)
@@ -190,7 +224,7 @@ def design(
         if gain > 0:
             u, (achieved, slopes, cycle), miss, wanted = new, trial, new_miss, new_wanted
             damping, idle = max(damping / 4, 1e-12), idle + 1 if gain < 1e-5 else 0
-            tell(f"step {iterations}: off by {np.max(np.abs(miss)):.1e}")
+            note(f"step {iterations}: off by {np.max(np.abs(miss)):.1e}")
         else:
             damping *= 10
     values = selection.values(jnp.asarray(u))
@@ -210,7 +244,7 @@ def design(
 
 @jit
 def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
-    """The functionals of the cycle, NaN where there is none, their derivatives, and the cycle."""
+    """Functionals of the cycle (NaN where there is none), their derivatives, and the cycle."""
 
     def achieved(u):
         cycle = cycle_from(selection.put(osc, selection.values(u)), y0)
@@ -223,7 +257,7 @@ def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
 
 
 def _check_functional(functional: Callable[[Cycle], Any], osc: Oscillator) -> None:
-    """Raise a `ValueError` unless a functional gives one number for a cycle."""
+    """Raises a `ValueError` unless a functional returns one number for a cycle."""
     if isinstance(functional, BasinMargin):
         return
     field, expected = "functional of targets", "a function of a cycle that returns one number"

@@ -1,23 +1,24 @@
 """`fit`: parameters from a measured record, by gradients.
 
-A record of stick-slip motion is hard to fit from afar: a guess with a wrong period
-slips by whole loops against the record, and the sum of squares has a minimum for each of them. So
+A record of stick-slip motion is hard to fit from afar: with a wrong period the motion slips by
+whole loops against the record, and the sum of squares has a minimum for each of these. Hence three
+stages:
 
-1. *search*: where to begin, see `search`: the record is cut into windows shorter than half a loop,
-   over which no phase is lost.
-2. *windows*: the same windows in the exact, event-driven motion, and each with an unknown start
+1. *Search* for guesses, see `search`: the record is cut into windows shorter than half a loop, over
+   which no phase is lost.
+2. *Windows*: the same windows in the exact, event-driven motion, each with an unknown start
    (multiple shooting). A damped Gauss-Newton (Levenberg-Marquardt) iteration for
 
        p + 2W unknowns   p parameters, and the start (x1, x2) of every window
-       N equations       one a datum, weighted with its noise
+       N equations       one for each datum, weighted with its noise
 
    whose matrix is an arrow: the starts are eliminated window by window.
-3. *joining*: three neighbouring windows become one, again and again, until one is left (of
-   candidates that are far off in windows, where no other one leads to the record): the whole
-   record as one motion from one unknown start, followed down its valley until the sum of squares
-   has nothing left to gain. Its Gauss-Newton matrix gives the standard errors.
+3. *Joining*: three neighbouring windows become one, again and again, until the whole record is one
+   motion from one unknown start. (Candidates that are far off in windows are joined only where no
+   other candidate leads to the record.) The last iteration goes on until the sum of squares has
+   nothing left to gain. Its Gauss-Newton matrix gives the standard errors.
 
-All derivatives of 2 and 3 are those of `simulate`, through every stick, slip and crossing.
+All derivatives of stages 2 and 3 are those of `simulate`, through every stick, slip and crossing.
 """
 
 import itertools
@@ -47,28 +48,27 @@ from .selection import (
     Selection,
     own_units_of,
     parameter_sizes,
+    progress_reporter,
     selection_of,
-    told_to,
 )
 
 if TYPE_CHECKING:
     import pandas
 
-#: Each stage joins so many neighbouring windows.
+#: Number of neighbouring windows that are joined at each stage.
 JOIN = 3
-#: A candidate whose windows are further off than this (chi^2 per datum) is far: it is followed
-#: where no other one leads to the record.
+#: Candidates with a larger chi^2 per datum in windows are followed last, if no other one fits.
 FAR_OFF = 6.0
 TOLERANCE = 1e-8
-#: The last stage takes so many times as many steps, until a Gauss-Newton step promises to lower
-#: chi^2 by less than the first number, which is the square of an error in standard errors. It has
-#: not converged where that promises more than the second.
+#: The last stage may take LONGER times as many steps. It ends when a Gauss-Newton step promises to
+#: lower chi^2 by less than GAIN_ENOUGH, the square of an error in standard errors; it has not
+#: converged where the step promises more than GAIN_LEFT.
 LONGER, GAIN_ENOUGH, GAIN_LEFT = 10, 1e-5, 1e-1
 #: Factors by which the damping shrinks and grows: along a bent valley a large one is refused at
 #: every other step.
 LESS_DAMPED, MORE_DAMPED = 3.0, 4.0
-#: Parameters whose error in a direction that is not told is this many of their sizes have a share
-#: in it.
+#: A parameter belongs to an undetermined direction if it changes along it by more than this many of
+#: its sizes, per standard error.
 LEAST_PART = 0.3
 
 
@@ -77,11 +77,13 @@ LEAST_PART = 0.3
 
 @jit
 def _linearized(selection: Selection, osc: Oscillator, record: Record, u, starts, fresh):
-    """The motion at the times of the record, [pieces, samples, 2], and Gauss-Newton blocks.
+    """Motion at the times of the record, [pieces, samples, 2], and blocks of the Gauss-Newton
+    matrix.
 
-    A piece begins at its start where it is `fresh`, else where the one before it ends. Blocks, for
-    each piece: sums over its data of products of the columns of the Jacobian (p parameters, the two
-    components of the start of its window) and of the weighted residual, [pieces, p + 3, p + 3].
+    A piece begins at its start where it is `fresh`, else where the previous piece ends. The blocks,
+    [pieces, p + 3, p + 3], are sums over the data of a piece: products of the columns of the
+    Jacobian (p parameters, the two components of the start of its window) and of the weighted
+    residual.
     """
 
     def motion(u, starts):
@@ -118,7 +120,7 @@ def _linearized(selection: Selection, osc: Oscillator, record: Record, u, starts
 
 
 def _damped_step(blocks: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """The Levenberg-Marquardt step of the parameters, [p], and of the starts, [windows, 2]."""
+    """Levenberg-Marquardt step of the parameters, [p], and of the starts, [windows, 2]."""
     p = blocks.shape[-1] - 3
     a, g = np.sum(blocks[:, :p, :p], axis=0), np.sum(blocks[:, :p, -1], axis=0)
     c, d, h = blocks[:, :p, p:-1], blocks[:, p:-1, p:-1], blocks[:, p:-1, -1:]
@@ -132,7 +134,7 @@ def _damped_step(blocks: np.ndarray, damping: float) -> tuple[np.ndarray, np.nda
 
 
 class _Point(eqx.Module):
-    """Where the iteration stands: unknowns, motion, blocks of the windows, chi^2."""
+    """State of the iteration: unknowns, motion, blocks of the windows, chi^2."""
 
     u: np.ndarray
     starts: np.ndarray
@@ -142,8 +144,11 @@ class _Point(eqx.Module):
 
 
 def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float, far: float) -> _Point:
-    """Levenberg-Marquardt for one division into windows, until chi^2 falls by less than that part;
-    for the whole record, until nothing is left to gain, or chi^2 stays beyond `far`."""
+    """Levenberg-Marquardt iteration for one division of the record into windows.
+
+    It ends when chi^2 falls by less than the fraction `relative`; for the whole record, when
+    nothing is left to gain, or when chi^2 stays above `far`.
+    """
     window = np.cumsum(fresh) - 1
 
     def at(u, starts):
@@ -178,9 +183,8 @@ def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float, far:
 
 
 def _gain_left(block: np.ndarray) -> float:
-    """By how much a Gauss-Newton step would lower chi^2, of a whole record, as far as that is
-    linear."""
-    scale, values, vectors = _told_directions(block[:-1, :-1])
+    """Decrease of chi^2 that a Gauss-Newton step on a whole record promises (linear estimate)."""
+    scale, values, vectors = _known_directions(block[:-1, :-1])
     slopes = vectors.T @ (block[:-1, -1] / scale)
     return float(np.sum(slopes**2 / values))
 
@@ -189,27 +193,36 @@ def _gain_left(block: np.ndarray) -> float:
 
 
 class Fit(eqx.Module):
-    """What `fit` returns.
+    """Estimated parameters with their standard errors; what `fit` returns.
 
-    oscillator: with the estimates in it; names, estimates, standard_errors, [p]: of the parameters,
-    in the order of `where`; covariance, [p, p]; y0, y0_standard_errors, [2]: the start, the state
-    at the first time; ts: the times of the record, [samples]; ys: the fitted motion there,
-    [samples, 2]; residuals: datum minus motion, [samples, 2], NaN where there is no datum; noise:
-    standard deviation of the data in x1 and in x2, as given or estimated, [2].
+    The standard errors are those of the linearised problem: right where the model is right and the
+    errors are small. With the status MISFIT they mean nothing, and `table` and the text leave them
+    out.
 
-    Diagnostics of the residuals: reduced_chi_squared, about 1 +- sqrt(2/data) where model and noise
-    are right; plausibility, the chance that noise alone makes it this large; autocorrelation, at
-    lag one, about 0 +- 1/sqrt(data): what is left has a shape where it is larger.
-
-    candidates: how many starts were followed; evaluations: of the motion and its Jacobian; status:
-    OK, MISFIT (plausibility below 1e-6, or, where the noise was estimated, residuals of its size
-    with an autocorrelation that noise has not), NOT_IDENTIFIED (no misfit, and a standard error
-    that is infinite, or larger than its parameter and than 0.1 of its unit), NO_CONVERGENCE (a
-    further step would move the estimates by a third of a standard error) or NOT_FINITE. Standard
-    errors are
-    those of the linearised problem: right where the model is and the errors are small. With a
-    MISFIT they mean nothing, and `table` and the text leave them out. noise_was_estimated: whether
-    it was, of a column at least.
+    Attributes:
+        oscillator: The oscillator with the estimates in it.
+        names: Names of the parameters, in the order of `where`.
+        estimates: Their estimates, [p].
+        standard_errors: Standard errors of the estimates, [p].
+        covariance: Covariance of the estimates, [p, p].
+        y0: Estimated state (x1, x2) at the first time, [2].
+        y0_standard_errors: Its standard errors, [2].
+        ts: Times of the record, [samples].
+        ys: Fitted motion at these times, [samples, 2].
+        residuals: Datum minus motion, [samples, 2], NaN where there is no datum.
+        noise: Standard deviations of the data in x1 and in x2, as given or estimated, [2].
+        reduced_chi_squared: About 1 +- sqrt(2/data) where model and noise are right.
+        plausibility: Probability that noise alone makes chi^2 this large.
+        autocorrelation: Of the residuals at lag one, about 0 +- 1/sqrt(data); where it is larger,
+            the residuals have a shape that noise has not.
+        candidates: Number of starts that were followed.
+        evaluations: Number of evaluations of the motion and its Jacobian.
+        status: OK; MISFIT (plausibility below 1e-6, or, where the noise was estimated, residuals of
+            its size with an autocorrelation that noise has not); NOT_IDENTIFIED (no misfit, and a
+            standard error that is infinite, or larger than its parameter and than 0.1 of its unit);
+            NO_CONVERGENCE (a further step would move the estimates by a third of a standard error);
+            or NOT_FINITE.
+        noise_was_estimated: Whether the noise of a column at least was estimated.
     """
 
     oscillator: Oscillator
@@ -233,22 +246,34 @@ class Fit(eqx.Module):
 
     @property
     def undetermined(self) -> tuple[tuple[str, ...], ...]:
-        """What the record does not tell, by name: of each group one combination at least, and of a
-        name by itself the parameter. Empty unless the status is NOT_IDENTIFIED."""
+        """Parameters that the record does not determine, by name, in groups.
+
+        A group of one name is a parameter that is not determined; of a larger group at least one
+        combination is not. Empty unless the status is NOT_IDENTIFIED.
+        """
         if int(self.status) != Status.NOT_IDENTIFIED:
             return ()
         sizes = parameter_sizes(self.estimates, own_units_of(self.oscillator, self.names))
         return _undetermined(self.names, self.covariance, sizes)
 
     def intervals(self, level: float = 0.95) -> Array:
-        """Confidence intervals of the parameters, (lower, upper) each, [p, 2]."""
+        """Confidence intervals of the parameters.
+
+        Args:
+            level: Confidence level, between 0 and 1.
+
+        Returns:
+            (lower, upper) for each parameter, [p, 2].
+        """
         reach = _standard_errors_in(level) * self.standard_errors
         return jnp.stack([self.estimates - reach, self.estimates + reach], axis=1)
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each parameter, and for x1 and x2 at the first time: name, estimate,
-        standard_error, lower, upper (the confidence interval of 95 per cent); these three are NaN
-        where the status is MISFIT."""
+        """Returns a row for each parameter, and for x1 and x2 at the first time.
+
+        Columns: name, estimate, standard_error, lower, upper (the confidence interval of 95 per
+        cent); the last three are NaN where the status is MISFIT.
+        """
         names = (*self.names, "x1 at the start", "x2 at the start")
         estimates = np.concatenate([self.estimates, self.y0])
         errors = np.concatenate([self.standard_errors, self.y0_standard_errors])
@@ -265,8 +290,14 @@ class Fit(eqx.Module):
         )
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the record and the fitted motion over time into the axes `ax` (None: new ones),
-        which are returned."""
+        """Draws the record and the fitted motion over time.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -288,22 +319,24 @@ class Fit(eqx.Module):
                 "any, or the record is coarse against its motion. Give noise=."
             ]
         advice += [
-            f"  Not told: {group[0]}."
+            f"  Not determined: {group[0]}."
             if len(group) == 1
-            else f"  Of these only a combination is told, none by itself: {', '.join(group)}."
+            else f"  Of these only a combination is determined, none alone: {', '.join(group)}."
             for group in self.undetermined
         ]
         return "\n".join([head, *rows, *advice])
 
 
 def _undetermined(names: Sequence[str], covariance: ArrayLike, sizes: np.ndarray):
-    """The parameters whose standard errors are larger than their sizes, in groups of those that
-    errors in one direction change together."""
+    """Parameters whose standard errors exceed their sizes, in groups.
+
+    Parameters that an error in one direction changes together are in one group.
+    """
     scaled = np.asarray(covariance) / sizes[:, None] / sizes
     infinite = np.isinf(np.diag(scaled))
     alone = [tuple(np.array(names)[infinite].tolist())] if np.any(infinite) else []
     values, vectors = np.linalg.eigh(scaled[np.ix_(~infinite, ~infinite)])
-    # Parameters that have a share in a direction along which the error is too large.
+    # Parameters that change along a direction in which the error is too large.
     wide = (np.abs(vectors) * np.sqrt(np.maximum(values, 0.0)))[:, values > 1] > LEAST_PART
     kept = np.array(names)[~infinite]
     groups: list[set[str]] = []
@@ -317,7 +350,7 @@ def _undetermined(names: Sequence[str], covariance: ArrayLike, sizes: np.ndarray
 
 
 def _standard_errors_in(level: float) -> float:
-    """How many standard errors a confidence interval of that level reaches to either side."""
+    """Number of standard errors from the estimate to an end of a confidence interval."""
     return float(jax.scipy.stats.norm.ppf(0.5 + 0.5 * level))
 
 
@@ -337,34 +370,42 @@ def fit(
 ) -> Fit:
     """Parameters of an oscillator from a measured record of its motion, with standard errors.
 
-    oscillator: the guess; 30 per cent off is mostly near enough for a stick-slip record of many
-    loops. The status MISFIT may mean that it was not: give a nearer one, or more starts. ts: the
-    times, increasing, [samples]; x1, x2: displacement, velocity, or both, [samples], NaN where a
-    datum is missing. All dimensionless, as in `simulate`. The start of the motion, its state at
-    ts[0], is estimated too.
+    A record determines the velocity of a belt that the mass sticks to, its static friction and the
+    damping well; the kinetic law where slip speeds vary; and the velocity of a belt that is never
+    stuck to or crossed hardly (it trades with the friction law). Belts with tied friction may
+    exchange their velocities.
 
-    where: selects the parameters, as in `equinox.tree_at`: a tuple with one entry each. An entry is
-    a number of the oscillator, or a tuple of numbers that are to be equal:
+    All numbers are dimensionless, as in `simulate`. The state at the first time is estimated, too.
 
-        lambda o: (o.damping, (o.belts[0].friction.static, o.belts[1].friction.static))
+    Args:
+        oscillator: The guess. One that is 30 per cent off is mostly near enough for a stick-slip
+            record of many loops. The status MISFIT may mean that it was not: give a nearer one, or
+            more starts.
+        ts: Times tau, increasing, [samples].
+        x1: Displacements, [samples], NaN where a datum is missing; or None.
+        x2: Velocities, likewise. One of x1 and x2 has to be given.
+        where: Selects the parameters, as in `equinox.tree_at`: one number of the oscillator, or a
+            tuple with one entry for each parameter. An entry may be a tuple of numbers that are
+            kept equal, as in `lambda o: (o.damping, (o.belts[0].load, o.belts[1].load))`.
+        noise: Standard deviation of the data, a pair where both x1 and x2 are given. None estimates
+            it from the scatter of neighbouring data about a smooth curve, for which a loop needs
+            some tens of data.
+        bounds: For each parameter (lower, upper) or None; None keeps positive what cannot be
+            negative. Parameters stay inside by a change of variables, so an estimate at a bound is
+            one that would be outside without it.
+        starts: Number of starts of the search, spread about the guess.
+        report: Function that is called with lines on the progress, such as `print`.
 
-    noise: standard deviation of the data, of x1 and x2 as a pair where both are given; None
-    estimates it from how far neighbouring data scatter about a smooth curve, for which a loop needs
-    some tens of them. bounds: for each parameter (lower, upper) or None, which keeps positive what
-    cannot be negative; a parameter stays inside by reparametrisation, so an estimate at a bound is
-    one that wants to leave. starts: of the search, spread about the guess. report: is told of the
-    progress, too, a line at a time, such as `print`.
+    Returns:
+        The `Fit`; its `status` says whether to trust it.
 
-    What can be told from a record: the velocity of a belt that the mass sticks to, its static
-    friction and the damping, well; the kinetic law where slip speeds vary; the velocity of a belt
-    that is never stuck to or crossed, hardly (it trades with the friction law). Belts with tied
-    friction may exchange their velocities. See `Fit.status`. `ValueError` names an argument that is
-    impossible.
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
     times, values, sigmas = _checked_record(ts, x1, x2, noise)
     starts = as_whole(starts, "starts")
-    tell = told_to(report)
+    note = progress_reporter(report)
     selection, u = selection_of(oscillator, where, bounds)
 
     # The record and its motions are in the own units of the guess.
@@ -381,7 +422,7 @@ def fit(
     data = int(np.sum(np.isfinite(values)))
     freedom = data - u.size - 2
     require(freedom > 0, "ts", f"more data than the {u.size + 2} unknowns", data)
-    tell(f"search: {starts} starts, {len(record.starts)} windows of {WINDOW} time units")
+    note(f"search: {starts} starts, {len(record.starts)} windows of {WINDOW} time units")
     estimated = any(
         sigma is None and np.any(np.isfinite(column))
         for sigma, column in zip(sigmas, values.T, strict=True)
@@ -393,7 +434,7 @@ def fit(
 
     guesses = first_guesses(selection, u, oscillator, record, starts)
     followed: list[_Point] = []
-    for point in _led_to(linearized, guesses, data, tell):
+    for point in _motions_from(linearized, guesses, data, note):
         followed.append(point)
         if judged(point).is_noise:
             break
@@ -403,7 +444,7 @@ def fit(
         oscillator, selection, record, times, values, best, *verdict, len(followed), evaluations
     )
     result = rescaled(found, length)
-    tell(repr(result).splitlines()[0])
+    note(repr(result).splitlines()[0])
     return result
 
 
@@ -439,56 +480,59 @@ def _checked_record(ts, x1, x2, noise):
     return times, np.stack(columns, axis=1), sigmas
 
 
-def _led_to(linearized, guesses, data: int, tell) -> Iterator[_Point]:
-    """Where the guesses lead: those whose windows come near the record, then the others, and at
-    last the first guess without windows."""
+def _motions_from(linearized, guesses, data: int, note) -> Iterator[_Point]:
+    """Motions that the guesses lead to.
+
+    First come those whose windows come near the record, then the others, last the motion from the
+    first guess without windows.
+    """
     guess, far = next(guesses), []
     for number, (u, starts, misfit) in enumerate(itertools.chain([guess], guesses), 1):
         came = "the guess" if np.isnan(misfit) else f"misfit {misfit:.3g} of the smooth formulation"
-        tell(f"candidate {number}: {came}")
-        point = _in_windows(linearized, u, starts, data, tell)
+        note(f"candidate {number}: {came}")
+        point = _in_windows(linearized, u, starts, data, note)
         if point.chi2 < FAR_OFF * data:
-            yield _as_one_motion(linearized, point, data, tell)
+            yield _as_one_motion(linearized, point, data, note)
         else:
             far.append((number, point))
     for number, point in sorted(far, key=lambda one: _misfit_of(one[1])):
-        tell(f"candidate {number}, from afar")
-        yield _as_one_motion(linearized, point, data, tell)
-    tell("the guess, in one piece")
+        note(f"candidate {number}, from afar")
+        yield _as_one_motion(linearized, point, data, note)
+    note("the guess, in one piece")
     u, starts, _ = guess
     yield _fit_windows(linearized, u, starts, np.arange(len(starts)) == 0, 0.0, np.inf)
 
 
 def _misfit_of(point: _Point) -> float:
-    """chi^2, infinite where it is no number."""
+    """chi^2, infinite where it is not finite."""
     return float(np.nan_to_num(point.chi2, nan=np.inf))
 
 
-def _in_windows(linearized, u, starts, data: int, tell) -> _Point:
-    """All windows by themselves."""
+def _in_windows(linearized, u, starts, data: int, note) -> _Point:
+    """Fits all windows as separate motions."""
     fresh = np.full(len(starts), True)
     point = _fit_windows(linearized, u, starts, fresh, 3e-3, FAR_OFF * data)
     if not point.chi2 < FAR_OFF * data:
-        # It may but creep along a valley.
+        # The iteration may have stopped while it crept along a valley.
         point = _fit_windows(linearized, point.u, point.starts, fresh, 0.0, FAR_OFF * data)
-    tell(f"  {len(starts)} windows: chi^2 per datum {point.chi2 / data:.3f}")
+    note(f"  {len(starts)} windows: chi^2 per datum {point.chi2 / data:.3f}")
     return point
 
 
-def _as_one_motion(linearized, point: _Point, data: int, tell) -> _Point:
-    """Windows joined until one is left."""
+def _as_one_motion(linearized, point: _Point, data: int, note) -> _Point:
+    """Joins windows until one is left."""
     pieces, every = len(point.starts), 1
     while True:
         every = min(JOIN * every, pieces)
         fresh, relative = np.arange(pieces) % every == 0, 0.0 if every == pieces else 3e-3
         point = _fit_windows(linearized, point.u, point.starts, fresh, relative, FAR_OFF * data)
-        tell(f"  {np.sum(fresh)} windows: chi^2 per datum {point.chi2 / data:.3f}")
+        note(f"  {np.sum(fresh)} windows: chi^2 per datum {point.chi2 / data:.3f}")
         if every == pieces:
             return point
 
 
 def _motion_of(point: _Point, values: np.ndarray) -> np.ndarray:
-    """The fitted motion at the times of the data, like these."""
+    """Fitted motion at the times of the data, [samples, 2]."""
     return point.ys.reshape(-1, 2)[: len(values)]
 
 
@@ -516,7 +560,7 @@ def _result(
     errors = np.sqrt(np.diag(covariance))
     ys, weights = _motion_of(point, values), _weights_of(record, values)
     status = Status.OK if verdict.is_noise else Status.MISFIT
-    if status == Status.OK:  # of a misfit errors mean nothing
+    if status == Status.OK:  # Errors of a misfit mean nothing.
         if not np.all(errors[:p] <= parameter_sizes(estimates, selection.unit)):
             status = Status.NOT_IDENTIFIED
         elif not _gain_left(point.blocks[0]) < GAIN_LEFT:
@@ -547,20 +591,23 @@ def _result(
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """The inverse of a Gauss-Newton matrix; infinite for what the record does not tell."""
-    scale, values, vectors = _told_directions(matrix)
+    """Inverse of a Gauss-Newton matrix; infinite variances of what is not determined."""
+    scale, values, vectors = _known_directions(matrix)
     inverse = (vectors / values) @ vectors.T / scale[:, None] / scale
-    told = np.sum(vectors**2, axis=1)
-    lost = (1 - told > 1e-8) | (np.diag(matrix) == 0)
+    known = np.sum(vectors**2, axis=1)
+    lost = (1 - known > 1e-8) | (np.diag(matrix) == 0)
     inverse[lost, lost] = np.inf
     return inverse
 
 
-def _told_directions(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The sizes of the unknowns of a Gauss-Newton matrix, [n], and of the matrix in these units the
-    eigenvalues, and eigenvectors as columns, along which the record tells something."""
+def _known_directions(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scales of the unknowns, [n], and the directions that the record determines.
+
+    The directions are eigenvectors, as columns, of the matrix in units of these scales; they come
+    with their eigenvalues.
+    """
     size = np.sqrt(np.diag(matrix))
     scale = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(np.nan_to_num(matrix / scale[:, None] / scale))
-    told = values > 1e-12 * np.max(values, initial=0.0)
-    return scale, values[told], vectors[:, told]
+    known = values > 1e-12 * np.max(values, initial=0.0)
+    return scale, values[known], vectors[:, known]

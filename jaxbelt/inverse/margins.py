@@ -18,11 +18,13 @@ from ..results import Status
 
 
 class BasinMargin(eqx.Module):
-    """How far a cycle is from the boundary of its basin.
+    """Distance of a cycle from the boundary of its basin; a functional of cycles.
 
-    direction: of the shock, see `minimal_fatal_shock`. Where the oscillator is known beforehand,
-    way: the shortest way there, and the unit of length that it is told in; or, where there is none,
-    otherwise: inf, or NaN for one that is not known.
+    Attributes:
+        direction: Direction of the shock, see `minimal_fatal_shock`.
+        way: Shortest way to the boundary, where the oscillator is known beforehand.
+        otherwise: Value where there is no such way: inf, or NaN for one that is not known.
+        length: Unit of length of `way`.
     """
 
     direction: str = eqx.field(static=True)
@@ -31,15 +33,15 @@ class BasinMargin(eqx.Module):
     length: Array | None = None
 
     def at(self, osc: Oscillator, y0: Array) -> "BasinMargin":
-        """The margin of the cycle that a start of a known oscillator leads to.
+        """Returns the margin of the cycle that a start of a known oscillator leads to.
 
-        For oscillators beside that one it is a function that JAX can trace.
+        For oscillators near that one it is a function that JAX can trace.
         """
         own = in_units_of_run(osc)
         length = own.units.length
-        told = portrait(own)
-        (end,) = leads_to(told, np.asarray(y0 / length)[None])
-        way, _, status = shortest_way_out(told, end, along_x2=self.direction == "x2")
+        known = portrait(own)
+        (end,) = leads_to(known, np.asarray(y0 / length)[None])
+        way, _, status = shortest_way_out(known, end, along_x2=self.direction == "x2")
         if status != Status.OK:
             way, value = None, np.nan
         else:
@@ -59,11 +61,18 @@ class BasinMargin(eqx.Module):
 
 
 def distance_to_basin_boundary(direction: str = "both") -> BasinMargin:
-    """A functional for `design`: the size of the smallest shock that makes the mass leave the cycle
-    for good, see `minimal_fatal_shock`.
+    """A functional for `design`: size of the smallest shock that makes the mass leave the cycle.
 
-    direction: "both", a change of x1 and x2, or "x2", of the velocity alone. Of a cycle with one
-    basin without a boundary it is inf. `ValueError` names a direction that is neither.
+    See `minimal_fatal_shock`. For a cycle whose basin has no boundary it is inf.
+
+    Args:
+        direction: "both", a change of x1 and x2, or "x2", a change of the velocity alone.
+
+    Returns:
+        A function of a `Cycle`.
+
+    Raises:
+        ValueError: If the direction is neither.
     """
     require_one_of(direction, DIRECTIONS, "direction")
     return BasinMargin(direction)

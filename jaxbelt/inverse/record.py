@@ -1,5 +1,7 @@
-"""A measured record of a motion, cut into the windows that a fit begins with, and whether what a
-fit leaves of it is noise."""
+"""A measured record of a motion, cut into windows, and the judgement of residuals.
+
+The windows are those that a fit begins with; `verdict_on` decides whether residuals may be noise.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,22 +13,27 @@ from jaxtyping import Array
 
 #: Length of the first windows, less than half a loop: no phase is lost over it.
 WINDOW = 2.5
-#: A fit as bad as this happens once in a million records, by noise.
+#: Noise alone makes a fit as bad as this once in a million records.
 IMPLAUSIBLE = 1e-6
-#: Residuals with a larger autocorrelation, over 1/sqrt(data), are no noise.
+#: Residuals with a larger autocorrelation, in units of 1/sqrt(data), are not noise.
 MOST_CORRELATED = 6.0
-#: Of a smaller reduced chi^2 the noise was estimated too large.
+#: With a smaller reduced chi^2 the noise was overestimated.
 OVERESTIMATED = 0.2
 
 
 class Record(eqx.Module):
-    """Data in pieces of equal number, the first windows.
+    """Data in pieces of equal length, the first windows.
 
-    times: since the start of the piece, the last one the start of the next, [pieces, samples + 1];
-    values: x1 and x2, [pieces, samples, 2]; weights: 1/noise, 0 where there is no datum, the same;
-    starts: states at the starts of the pieces as the record has them, [pieces, 2]; scale: of each
-    component, [2]; lacks: 1.0 where only velocities are known, so that the x1 of the starts lack a
-    common constant, else 0.0; length: the unit of length of all of these.
+    Attributes:
+        times: Times since the start of the piece, the last one being the start of the next piece,
+            [pieces, samples + 1].
+        values: x1 and x2, [pieces, samples, 2].
+        weights: 1/noise, 0 where there is no datum, [pieces, samples, 2].
+        starts: Measured states at the starts of the pieces, [pieces, 2].
+        scale: Scale of each component, [2].
+        lacks: 1.0 where only velocities are known, so that the x1 of all starts lack a common
+            constant, else 0.0.
+        length: Unit of length of all of these.
     """
 
     times: Array
@@ -41,8 +48,14 @@ class Record(eqx.Module):
 def record_of(
     ts: np.ndarray, values: np.ndarray, noise: Sequence[float | None], length: float
 ) -> Record:
-    """values: [samples, 2], NaN where there is no datum; noise: None to be estimated; length: the
-    unit of length in which both are."""
+    """Cuts a record into pieces.
+
+    Args:
+        ts: Times, [samples].
+        values: x1 and x2, [samples, 2], NaN where there is no datum.
+        noise: Standard deviations for x1 and x2; None is estimated.
+        length: Unit of length of values and noise.
+    """
     n = len(ts)
     step = (ts[-1] - ts[0]) / (n - 1)
     size = int(np.clip(round(WINDOW / step), 1, n))
@@ -80,9 +93,9 @@ def record_of(
 
 
 def local_cubics(ts: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Value and slope at every time of a cubic through the data near it; their noise.
+    """Local cubic through the data near every time: its value and slope there, and the noise.
 
-    Near: a third of a time unit on either side, at least seven data.
+    Near means a third of a time unit on either side, and at least seven data.
     """
     known = np.isfinite(column)
     if np.sum(known) < 7:
@@ -98,7 +111,8 @@ def local_cubics(ts: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.nda
     off = x[rows] - np.einsum("tip,tp->ti", powers, cubics)
     from scipy.special import gammaincinv  # late, as only fits need it
 
-    # The median: corners of the motion are no noise. That of chi^2 is below its mean, the freedom.
+    # The median, because corners of the motion are not noise. That of chi^2 is less than its mean,
+    # the number of degrees of freedom.
     freedom = 2 * half - 3
     median = 2 * gammaincinv(0.5 * freedom, 0.5)
     noise = np.sqrt(np.median(np.sum(off**2, axis=1)) / median)
@@ -106,7 +120,7 @@ def local_cubics(ts: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 class Verdict(NamedTuple):
-    """What residuals tell: see `Fit`. is_noise: whether they may be noise."""
+    """Diagnostics of residuals, see `Fit`; is_noise: whether they may be noise."""
 
     reduced_chi_squared: float
     plausibility: float
@@ -115,9 +129,13 @@ class Verdict(NamedTuple):
 
 
 def verdict_on(off: np.ndarray, chi2: float, freedom: int, estimated: bool) -> Verdict:
-    """What weighted residuals tell, [samples, 2], NaN where there is no datum.
+    """Diagnostics of weighted residuals.
 
-    chi2: the sum of their squares; estimated: whether the noise was, of a column at least.
+    Args:
+        off: Weighted residuals, [samples, 2], NaN where there is no datum.
+        chi2: Sum of their squares.
+        freedom: Degrees of freedom.
+        estimated: Whether the noise of a column at least was estimated.
     """
     if not np.isfinite(chi2):
         return Verdict(np.nan, np.nan, np.nan, False)
@@ -125,7 +143,7 @@ def verdict_on(off: np.ndarray, chi2: float, freedom: int, estimated: bool) -> V
 
     plausibility = float(gammaincc(0.5 * freedom, 0.5 * chi2))
     correlation = _autocorrelation(off)
-    # Noise that was taken from the record is no witness: it may be the motion's own.
+    # Noise that was estimated from the record proves nothing: it may be part of the motion.
     has_shape = abs(correlation) > MOST_CORRELATED / np.sqrt(np.sum(np.isfinite(off)))
     suspect = estimated and has_shape and chi2 > OVERESTIMATED * freedom
     return Verdict(
@@ -134,7 +152,7 @@ def verdict_on(off: np.ndarray, chi2: float, freedom: int, estimated: bool) -> V
 
 
 def _autocorrelation(off: np.ndarray) -> float:
-    """Of neighbouring weighted residuals, both components together."""
+    """Autocorrelation of neighbouring weighted residuals, both components together."""
     pairs = np.isfinite(off[1:]) & np.isfinite(off[:-1])
     products = np.where(pairs, off[1:] * off[:-1], 0.0)
     squares = np.where(pairs, 0.5 * (off[1:] ** 2 + off[:-1] ** 2), 0.0)

@@ -1,9 +1,9 @@
-"""Where `fit` begins: guesses from which the exact motion is followed.
+"""First guesses of `fit`, from which the exact motion is followed.
 
-The record is cut into windows shorter than half a loop, over which no phase is lost. Each starts
-from the record itself, from a local polynomial. The guess itself is tried first. Where that does
+The record is cut into windows shorter than half a loop, over which no phase is lost. Each window
+starts from the record itself, by a local polynomial. The user's guess comes first. Where it does
 not lead to the record, the misfit of the smooth formulation (tanh for sgn, a fixed step) is
-minimised by Adam (optax) from several starts under `vmap`. Its answer is biased, by the smoothing
+minimised by Adam (optax) from several starts under `vmap`. The result is biased, by the smoothing
 and by the starts, but near; less so where a friction law changes faster than the smoothing.
 """
 
@@ -28,7 +28,7 @@ SEARCH_STEPS, LEARNING_RATE = 60, 0.1
 
 
 def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
-    """Misfit of the smooth formulation over all windows, of size one where it is off by `scale`."""
+    """Misfit of the smooth formulation over all windows; of size 1 where it is off by `scale`."""
     u, shift = unknown
     osc = in_own_units(selection.put(osc, selection.values(u)), record.length)
     h = record.times[:, -1] / steps
@@ -51,7 +51,7 @@ def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Recor
     start = (record.starts[:, 0] + shift * record.lacks, record.starts[:, 1])
     _, path = lax.scan(advance, start, None, length=steps)
     path = jnp.concatenate([jnp.stack(start, axis=-1)[None], path])
-    # To the times of the data: linear between steps is good enough here.
+    # Linear interpolation between steps at the times of the data is accurate enough here.
     at = jnp.clip(record.times[:, :-1] / h[:, None], 0.0, steps)
     before = jnp.minimum(at.astype(int), steps - 1)
     piece = jnp.arange(h.size)[:, None]
@@ -59,14 +59,14 @@ def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Recor
     predicted = (1 - rest) * path[before, piece] + rest * path[before + 1, piece]
     scale = jnp.broadcast_to(0.02 * record.scale, predicted.shape)
     off = jnp.where(record.weights > 0, (predicted - record.values) / scale, 0.0)
-    # Grows like |off|: windows that are hopeless from here do not outvote the others.
+    # Grows like |off|, so windows that are hopeless from here do not outvote the others.
     return jnp.mean(jnp.sqrt(1 + off**2) - 1)
 
 
 @jit
 def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
-    """Adam from many starts, (u [starts, p], shift [starts]): where each ends, and its misfit."""
-    import optax  # a quarter of a second that only this search needs
+    """Adam from many starts, (u [starts, p], shift [starts]); returns ends and misfits."""
+    import optax  # import takes a quarter of a second, which only this search needs
 
     optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, SEARCH_STEPS))
 
@@ -75,7 +75,7 @@ def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, st
 
     @jax.vmap
     def slopes(unknown):
-        # Forwards: a handful of unknowns, and backwards every step would have to be kept.
+        # Forward mode: there are few unknowns, and reverse mode would have to keep every step.
         numbers, unravel = ravel_pytree(unknown)
         return unravel(jax.jacfwd(lambda numbers: misfit(unravel(numbers)))(numbers))
 
@@ -95,12 +95,15 @@ def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, st
 def first_guesses(
     selection: Selection, u, osc: Oscillator, record: Record, starts: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
-    """The guess, and then the ends of the search, best first, each with its window starts and its
-    misfit, NaN of the guess; near ones count once."""
+    """Yields the guess, then the ends of the search, best first; near ends count once.
+
+    Each comes with the starts of its windows and its misfit (NaN for the guess).
+    """
     yield np.asarray(u), np.asarray(record.starts), np.nan
-    # The velocity over which tanh changes its sign. Steps of the scheme are stable up to 2.8 over
-    # the slope of the friction there; two belts of one velocity double it.
-    # A record of one velocity, of a mass that sticks throughout, gives none: its length has to do.
+    # eps is the velocity over which tanh changes its sign. A record of one velocity, of a mass that
+    # sticks throughout, has no scale of velocity; its length has to do. Steps of the scheme are
+    # stable up to 2.8 over the slope of the friction; two belts with one velocity double that
+    # slope.
     eps = 0.1 * max(float(record.scale[1]), 0.1 * float(record.scale[0]))
     belts = in_own_units(osc, record.length).belts
     slope = max(float(belt.load * belt.friction.static) for belt in belts) / eps

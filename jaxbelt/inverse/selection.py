@@ -1,4 +1,4 @@
-"""Which parameters an inverse problem may change, and within which bounds."""
+"""Parameters that an inverse problem may change, and their bounds."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,24 +9,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..activity import tell
+from ..activity import note_progress
 from ..checks import as_numbers, require, require_value
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_groups, names_of
 from ..model.variations import Variation
 
-#: Most steps of a damped Newton iteration, and the longest, in units of `Selection.values`' u.
+#: Largest number of damped Newton steps, and the longest step, in units of `Selection.values`' u.
 ITERATIONS, LONGEST_CHANGE = 40, 0.4
-#: The size of a parameter that is nearer to zero than this, in its own unit.
+#: Smallest size of a parameter, in its own unit; used where its value is nearer to zero.
 SMALLEST = 0.1
 
 
 class Selection(eqx.Module):
-    """Parameters of an oscillator: for each the numbers of the leaves that it sets, and bounds.
+    """Parameters of an oscillator: the leaves that each one sets, and bounds.
 
-    Each is a function of an unbounded variable u: lower + unit exp(u), upper - unit exp(-u),
-    between two bounds a logistic function of u, without bounds size u. unit: the parameter's own,
-    see `Variation.in_own_units`.
+    Each parameter is a function of an unbounded variable u: lower + unit exp(u) or upper - unit
+    exp(-u) with one bound, a logistic function of u between two bounds, and size u without bounds.
+    unit is the parameter's own, see `Variation.in_own_units`.
     """
 
     leaves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
@@ -46,7 +46,7 @@ class Selection(eqx.Module):
         return jnp.where(has_lower | has_upper, bounded, self.size * u)
 
     def unbounded(self, values: ArrayLike) -> Array:
-        """The u that belong to values within the bounds."""
+        """The u that belong to given values within the bounds."""
         has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         above = jnp.log(jnp.where(has_lower, (values - self.lower) / self.unit, 1.0))
         below = -jnp.log(jnp.where(has_upper, (self.upper - values) / self.unit, 1.0))
@@ -61,15 +61,17 @@ class Selection(eqx.Module):
         return jax.tree.unflatten(structure, leaves)
 
 
-def told_to(report: Callable[[str], None] | None) -> Callable[[str], None]:
-    """What says how far a search is, in the line of its activity and to `report`, or a
-    `ValueError`."""
+def progress_reporter(report: Callable[[str], None] | None) -> Callable[[str], None]:
+    """Returns a function that passes lines on to the progress display and to `report`.
+
+    Raises a `ValueError` if `report` cannot be called.
+    """
 
     fits = report is None or callable(report)
     require_value(fits, "report", "a function of a text, such as print, or None", report)
 
     def both(text: str) -> None:
-        tell(text.strip())
+        note_progress(text.strip())
         if report is not None:
             report(text)
 
@@ -77,7 +79,10 @@ def told_to(report: Callable[[str], None] | None) -> Callable[[str], None]:
 
 
 def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, np.ndarray]:
-    """What `where` selects, a leaf or a tuple of leaves kept equal for each parameter; and u."""
+    """The parameters that `where` selects, and their u.
+
+    A parameter is a leaf, or a tuple of leaves that are kept equal.
+    """
     groups, leaves = leaf_groups(osc, where), jax.tree.leaves(osc)
     named = names_of(osc)
     names = tuple(" = ".join(named[leaf] for leaf in group) for group in groups)
@@ -86,7 +91,7 @@ def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, n
     for group, name, value, pair in zip(
         groups, names, values, _pairs_of(bounds, names), strict=True
     ):
-        lower, upper = (_least(osc, group[0]), np.inf) if pair is None else pair
+        lower, upper = (_lower_bound(osc, group[0]), np.inf) if pair is None else pair
         require(np.isfinite(value), name, "finite, as a guess", f"{value:.12g}")
         inside = f"inside of its bounds ({lower:.12g}, {upper:.12g})"
         require(lower < value < upper, name, inside, f"{value:.12g}")
@@ -99,12 +104,12 @@ def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, n
 
 
 def parameter_sizes(values: ArrayLike, units: ArrayLike) -> np.ndarray:
-    """The sizes of parameters: of one that is near zero a part of its own unit."""
+    """Sizes of parameters; near zero, SMALLEST of the parameter's own unit."""
     return np.maximum(np.abs(np.asarray(values)), SMALLEST * np.asarray(units))
 
 
 def own_units_of(osc: Oscillator, names: Sequence[str]) -> np.ndarray:
-    """By how much each parameter changes the oscillator in its own units by one, as powers of two.
+    """Change of each parameter that changes the oscillator in its own units by 1; a power of two.
 
     names: as in `Selection`.
     """
@@ -117,7 +122,7 @@ def own_units_of(osc: Oscillator, names: Sequence[str]) -> np.ndarray:
 
 
 def _pairs_of(bounds: Any, names: Sequence[str]) -> list[tuple[float, float] | None]:
-    """A pair or None for each parameter, or a `ValueError`."""
+    """Checks `bounds`; returns a pair or None for each parameter."""
     if bounds is None:
         return [None] * len(names)
     many = "one (lower, upper) or None" + " for each" * (len(names) > 1)
@@ -137,8 +142,8 @@ def _pairs_of(bounds: Any, names: Sequence[str]) -> list[tuple[float, float] | N
     return pairs
 
 
-def _least(osc: Oscillator, leaf: int) -> float:
-    """0 for a leaf that may not be negative, by the oscillator's own checks, else -inf."""
+def _lower_bound(osc: Oscillator, leaf: int) -> float:
+    """Lower bound of a leaf: 0 if the oscillator's checks refuse negative values, else -inf."""
     leaves, structure = jax.tree.flatten(osc)
     leaves[leaf] = jnp.asarray(-1.0)
     try:

@@ -53,13 +53,12 @@ if TYPE_CHECKING:
 
 
 class EquilibriumKind(enum.IntEnum):
-    """What sort: rest in a smooth field, held by belts at rest, between the sides of an edge; and a
-    point of an edge that both its sides push away from, where nothing rests."""
+    """Kind of an equilibrium."""
 
-    FIXED_POINT = 1  # rest in a smooth field
-    SEGMENT = 2  # held by belts at rest
-    PSEUDO_FOCUS = 3  # between the sides of a contact edge, each of which pushes to the other
-    SADDLE = 4  # a point of an edge that both its sides push away from; nothing rests there
+    FIXED_POINT = 1  #: rest in a smooth field
+    SEGMENT = 2  #: a segment of states of rest, held by belts at rest
+    PSEUDO_FOCUS = 3  #: on a contact edge, each side of which pushes the mass to the other side
+    SADDLE = 4  #: on a contact edge, both sides of which push the mass away; nothing rests there
 
 
 class Equilibria(eqx.Module):
@@ -78,7 +77,7 @@ class Equilibria(eqx.Module):
     - eigenvalues: its eigenvalues, eqs. (25) and (26) of the paper, the one with the larger real
       or imaginary part first, complex [equilibria, 2], else NaN.
     - rate: small disturbances behave like exp(rate t): the largest real part of the eigenvalues at
-      a fixed point; at a pseudo-focus (tr_L/a_L + tr_R/|a_R|) / (3 (1/a_L + 1/|a_R|)), or -inf
+      a fixed point; at a pseudo-focus `(tr_L/a_L + tr_R/|a_R|) / (3 (1/a_L + 1/|a_R|))`, or -inf
       where a belt at rest touches, which ends them in a finite time; inf at a saddle, which is
       left in a finite time; NaN for a segment.
     - stable: rate < 0. A segment is stable if small disturbances of some part of it stay small and

@@ -52,7 +52,7 @@ class AbstractFriction(eqx.Module):
 
     @abc.abstractmethod
     def mu(self, speed: Array) -> Array:
-        """Kinetic friction coefficient at sliding speed |nu_R| (dimensionless, any shape).
+        """Kinetic friction coefficient at sliding speed `|nu_R|` (dimensionless, any shape).
 
         Must be smooth for speed >= 0 and stay finite and smooth slightly below 0; 0 <= mu(0) <=
         static, and the latter two are equal for a law without a jump.
@@ -298,7 +298,7 @@ class Conti(AbstractFriction):
     def mu(self, speed: Array) -> Array:
         """Kinetic friction coefficient mu(r), eq. (7) of the paper.
 
-        speed: |nu_R| = |nu - omega x2| >= 0, dimensionless, any shape. Returns the same shape.
+        speed: `|nu_R| = |nu - omega x2|` >= 0, dimensionless, any shape. Returns the same shape.
         """
         numerator, denominator = self.fraction(speed)
         return numerator / denominator

@@ -25,8 +25,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from ..checks import is_concrete
-from .oscillator import MovingBelt, Oscillator, acceleration
+from .oscillator import (
+    MovingBelt,
+    NoEdge,
+    Oscillator,
+    acceleration,
+    has_edges,
+    interval_ends,
+)
 
 Tree = TypeVar("Tree")
 STUCK, BELOW, ABOVE = 0.0, -2.0, 2.0
@@ -239,15 +245,8 @@ def edges_ahead(mode: Mode, v: Array) -> list[Array]:
 
 def edges(osc: Oscillator) -> list[Array]:
     """Positions of the contact edges in the order of `edge_guards`; infinite: there is none."""
-    n = len(osc.belts)
-    infinite = [-jnp.inf] * n + [jnp.inf] * n
-    pairs = zip(_interval_ends(osc), infinite, strict=True)
-    return [jnp.asarray(none) if bound is None else bound for bound, none in pairs]
-
-
-def _interval_ends(osc: Oscillator) -> Sequence[Array | None]:
-    """As `edges`; None see `without_edges`."""
-    return [belt.lower for belt in osc.belts] + [belt.upper for belt in osc.belts]
+    bounds = interval_ends(osc)
+    return [jnp.asarray(float(x)) if isinstance(x, NoEdge) else x for x in bounds]
 
 
 def zone(osc: Oscillator, mode: Mode) -> tuple[Array, Array]:
@@ -258,24 +257,3 @@ def zone(osc: Oscillator, mode: Mode) -> tuple[Array, Array]:
         lower = jnp.maximum(lower, jnp.where(on_left, edge, -jnp.inf))
         upper = jnp.minimum(upper, jnp.where(on_right, edge, jnp.inf))
     return lower, upper
-
-
-def has_edges(osc: Oscillator) -> bool:
-    """Whether there may be a contact edge: one is finite, or not known to be infinite.
-
-    Known inside a trace, too, where the bounds are constants: what edges need is then left out.
-    """
-    bounds = [bound for bound in _interval_ends(osc) if bound is not None]
-    return not is_concrete(bounds) or bool(np.any(np.isfinite(bounds)))
-
-
-AnyOscillator = TypeVar("AnyOscillator", bound=Oscillator)
-
-
-def without_edges(osc: AnyOscillator) -> AnyOscillator:
-    """The oscillator whose belts touch the mass everywhere, known in every trace: their bounds are
-    None."""
-    belts = tuple(
-        eqx.tree_at(lambda b: (b.lower, b.upper), belt, (None, None)) for belt in osc.belts
-    )
-    return eqx.tree_at(lambda o: o.belts, osc, belts)

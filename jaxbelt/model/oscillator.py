@@ -81,7 +81,15 @@ def as_edge(value: Any, field: str) -> Array:
     return edge if at_infinity is None else as_array(at_infinity, field)
 
 
-def scaled_edge(edge: Array, factor: ArrayLike) -> Array:
+class NoEdge(float):
+    """An edge at infinity that is part of the structure of an oscillator: a number everywhere, but
+    no leaf, so that it is known in every trace, and what edges need is left out there."""
+
+
+jax.tree_util.register_pytree_node(NoEdge, lambda edge: ((), float(edge)), lambda at, _: NoEdge(at))
+
+
+def scaled_edge(edge: Any, factor: ArrayLike) -> Any:
     """An edge in another unit, without a slope where it is at infinity, in reverse mode neither."""
     if is_concrete(edge):
         return edge if np.isinf(edge) else edge * factor
@@ -130,8 +138,7 @@ class Belt(eqx.Module):
             *_rules_of(self.velocity, "velocity", be_finite),
             *_rules_of(self.load, "load", be_nonnegative),
             *(rule._replace(field=f"{rule.field} of friction") for rule in law),
-            # None: see `modes.without_edges`.
-            *(interval if self.lower is not None else []),
+            *(interval if not isinstance(self.lower, NoEdge) else []),
         ]
 
     def __repr__(self) -> str:
@@ -332,6 +339,20 @@ def has_possible_numbers(osc: Oscillator) -> Array:
     rules = Oscillator.rules(osc) + [rule for belt in osc.belts for rule in Belt.rules(belt)]
     rules += [rule for force in osc.forcing for rule in type(force).rules(force)]
     return functools.reduce(operator.and_, (jnp.asarray(rule.holds()) for rule in rules))
+
+
+def interval_ends(osc: Oscillator) -> list[Any]:
+    """The lower ends of all contact intervals, then the upper ones."""
+    return [belt.lower for belt in osc.belts] + [belt.upper for belt in osc.belts]
+
+
+def has_edges(osc: Oscillator) -> bool:
+    """Whether there may be a contact edge: one is finite, or not known to be infinite.
+
+    Known inside a trace, too, where the bounds are constants: what edges need is then left out.
+    """
+    bounds = [bound for bound in interval_ends(osc) if not isinstance(bound, NoEdge)]
+    return not is_concrete(bounds) or bool(np.any(np.isfinite(bounds)))
 
 
 @traced_once

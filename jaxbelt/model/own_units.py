@@ -17,7 +17,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ from jaxtyping import Array
 
 from ..checks import is_concrete
 from .forcing import Oscillating
-from .oscillator import Belt, Oscillator, scaled_edge
+from .oscillator import Belt, NoEdge, Oscillator, has_edges, scaled_edge
 
 #: Contact edges cut the motion off where a belt could pull the mass farther than this many times
 #: as far: then they and the velocities give its size, not the friction.
@@ -87,7 +87,7 @@ def own_length(osc: Oscillator) -> Any:
         (load, number(edge))
         for load, belt in zip(loads, osc.belts)
         for edge in (belt.lower, belt.upper)
-        if edge is not None and not (is_concrete(edge) and np.isinf(edge))
+        if not (is_concrete(edge) and np.isinf(edge))
     ]
     size = force
     if edges or not is_concrete(force) or not force > 0:
@@ -126,33 +126,63 @@ def power_of_two_below(size: Any) -> Any:
     return lax.bitcast_convert_type(bits & EXPONENT, jnp.float64)
 
 
-def in_own_units(osc: Oscillator, unit: Any = None) -> OwnOscillator:
+def in_own_units(osc: Oscillator, unit: Any = None, *, edges: bool | None = None) -> OwnOscillator:
     """The oscillator in its own units, or in those with a given unit of length.
 
-    An oscillator that is in its own units already stays as it is.
+    An oscillator that is in its own units already stays as it is. edges: whether there may be
+    contact edges, see `without_edges`; None: as far as is known of this one.
     """
     if isinstance(osc, OwnOscillator):
         return osc
     length: Any = own_length(osc) if unit is None else unit
     known = is_concrete((osc.omega, length))
     omega: Any = np.asarray(osc.omega) if known else osc.omega
+    edges = has_edges(osc) if edges is None else edges
     if known and bool(length == 1) and bool(omega == 1):
-        return _unchecked(OwnOscillator, **vars(osc), units=_units_of_one())
+        own = _unchecked(OwnOscillator, **vars(osc), units=_units_of_one())
+        return own if edges else without_edges(own)
     units = _known_units(length, omega * length) if known else OwnUnits(length, omega * length)
     fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=jnp.ones(()))
     forcing = _scaled_forces(osc.forcing, units)
-    return _unchecked(OwnOscillator, **fields, forcing=forcing, units=units)
+    own = _unchecked(OwnOscillator, **fields, forcing=forcing, units=units)
+    return own if edges else without_edges(own)
 
 
-def in_units_of_run(osc: Oscillator) -> OwnOscillator:
+def in_units_of_run(osc: Oscillator, *, edges: bool | None = None) -> OwnOscillator:
     """The oscillator as a run of the kernel takes it: in own units, which lead back to those given.
 
-    An oscillator that comes in its own units gets its results in these.
+    An oscillator that comes in its own units gets its results in these. edges: as in
+    `in_own_units`.
     """
-    own = in_own_units(osc)
+    own = in_own_units(osc, edges=edges)
     if own is not osc:
         return own
     return _unchecked(OwnOscillator, **vars(own) | dict(units=_units_of_one()))
+
+
+AnyOscillator = TypeVar("AnyOscillator", bound=Oscillator)
+#: The bounds of a belt that touches the mass everywhere, with and without leaves.
+NO_EDGES = dict(lower=NoEdge("-inf"), upper=NoEdge("inf"))
+
+
+def without_edges(osc: AnyOscillator) -> AnyOscillator:
+    """The oscillator whose belts touch the mass everywhere, known in every trace, see `NoEdge`."""
+    if all(isinstance(belt.lower, NoEdge) for belt in osc.belts):
+        return osc
+    belts = tuple(_unchecked(type(belt), **vars(belt) | NO_EDGES) for belt in osc.belts)
+    return _unchecked(type(osc), **vars(osc) | dict(belts=belts))
+
+
+def _with_leaves(belts: tuple[Belt, ...]) -> tuple[Belt, ...]:
+    """Belts of which every bound is an array, as their user has them."""
+    if not any(isinstance(belt.lower, NoEdge) for belt in belts):
+        return belts
+    with jax.ensure_compile_time_eval():
+        bounds = {name: jnp.asarray(np.float64(edge)) for name, edge in NO_EDGES.items()}
+    return tuple(
+        _unchecked(type(belt), **vars(belt) | bounds) if isinstance(belt.lower, NoEdge) else belt
+        for belt in belts
+    )
 
 
 def _known_units(length: Any, velocity: Any) -> OwnUnits:
@@ -172,17 +202,14 @@ def in_units(value: Any, unit: Any, default: float) -> Any:
 
 
 def _scaled(belts: tuple[Belt, ...], units: OwnUnits) -> tuple[Belt, ...]:
-    def edge(value):
-        return None if value is None else scaled_edge(value, 1 / units.length)
-
     return tuple(
         _unchecked(
             Belt,
             velocity=in_unit(belt.velocity, units.velocity),
             friction=belt.friction.in_units_of(units.velocity),
             load=in_unit(belt.load, units.length),
-            lower=edge(belt.lower),
-            upper=edge(belt.upper),
+            lower=scaled_edge(belt.lower, 1 / units.length),
+            upper=scaled_edge(belt.upper, 1 / units.length),
         )
         for belt in belts
     )
@@ -291,9 +318,9 @@ def in_units_of_user(own: Oscillator) -> Oscillator:
     units = own.units
     if units.is_given:
         fields = {name: value for name, value in vars(own).items() if name != "units"}
-        return _unchecked(Oscillator, **fields)
+        return _unchecked(Oscillator, **fields | dict(belts=_with_leaves(own.belts)))
     back = OwnUnits(1 / units.length, 1 / units.velocity)
-    belts, forcing = _scaled(own.belts, back), _scaled_forces(own.forcing, back)
+    belts, forcing = _scaled(_with_leaves(own.belts), back), _scaled_forces(own.forcing, back)
     omega = units.velocity / units.length
     fields = dict(damping=own.damping, belts=belts, omega=omega, forcing=forcing)
     return _unchecked(Oscillator, **fields)

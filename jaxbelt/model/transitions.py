@@ -384,7 +384,8 @@ def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
     """
     signs = [_slip_sign(belt.velocity, osc.omega * x2) for belt in osc.belts]
     if not has_edges(osc):
-        return Mode(tuple(signs))
+        shape = jnp.broadcast_shapes(jnp.shape(x1), jnp.shape(x2))
+        return Mode(tuple(jnp.broadcast_to(sign, shape) for sign in signs))
     codes = []
     for belt, sign in zip(osc.belts, signs, strict=True):
         is_below = x1 < belt.lower if rightward else x1 <= belt.lower

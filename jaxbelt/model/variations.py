@@ -25,8 +25,16 @@ from jax.core import Tracer
 
 from ..checks import as_interval, is_concrete, require, require_callable, require_value
 from ..numerics.compiling import depends, is_affine, is_outermost
-from .oscillator import Oscillator, check_oscillator, check_scalars, its_oscillator
-from .own_units import in_own_units, own_length, power_of_two_below
+from .oscillator import (
+    NoEdge,
+    Oscillator,
+    check_oscillator,
+    check_scalars,
+    has_edges,
+    interval_ends,
+    its_oscillator,
+)
+from .own_units import OwnOscillator, in_own_units, own_length, power_of_two_below
 from .parameters import is_number, is_real, leaf_index, names_of
 
 #: Numbers that differ by less, relative to their size beside 1, are the same but for rounding.
@@ -364,10 +372,10 @@ class Variation:
         if self.units is not None:
             known = self.units
             given = known.given.held(axis, value * known.parameters[axis])
-            units = UnitsOfVariation(given, known.length, known.parameters[[free]])
+            units = known._replace(given=given, parameters=known.parameters[[free]])
         return Variation(make, (self.names[free],), line, units=units)
 
-    def measured_in(self, units: np.ndarray) -> "Variation":
+    def measured_in(self, units: Any) -> "Variation":
         """The same with its parameters in these units, [k]."""
         if is_concrete(units) and np.all(units == 1.0):
             return self
@@ -406,9 +414,10 @@ class Variation:
 
     def in_units(self, length: Any, values: Any) -> "Variation":
         """As `in_own_units`, in a given unit of length; those of the parameters are at `values`."""
+        edges = self._may_have_edges(values)
 
         def make(*p):
-            return in_own_units(self.make(*p), length)
+            return in_own_units(self.make(*p), length, edges=edges)
 
         own = Variation(make, self.names, None, varies_leaves=self.varies_leaves)
         if self.line is not None:
@@ -418,7 +427,21 @@ class Variation:
         units = [power_of_two_below(unit) for unit in own.family(values).units]
         pack: Any = np if is_concrete(units) else jnp
         units = pack.stack(units)
-        return replace(own.measured_in(units), units=UnitsOfVariation(self, length, units))
+        return replace(own.measured_in(units), units=UnitsOfVariation(self, length, units, edges))
+
+    def _may_have_edges(self, values: Any) -> bool:
+        """Whether any of the oscillators may have a contact edge; values: possible ones, [k]."""
+        if self.line is not None:
+            slopes = jax.tree.unflatten(jax.tree.structure(self.line.oscillator), self.line.slopes)
+            vary = [not isinstance(row, NoEdge) and np.any(row) for row in interval_ends(slopes)]
+            return any(vary) or has_edges(self.line.oscillator)
+        if not is_concrete(values):
+            return True
+
+        def bounds(*p):
+            return [jnp.asarray(edge) for edge in interval_ends(self.make(*p))]
+
+        return any(depends(bounds, *values)) or has_edges(self.make(*values))
 
     def rest_of(self, belt: int, start: float) -> float:
         """The value, near `start`, of the one parameter, at which a belt is at rest."""
@@ -502,11 +525,16 @@ class Variation:
 
 class UnitsOfVariation(NamedTuple):
     """What is varied as the user gave it, and what its units are in those of the user: of length,
-    and of each parameter, [k]."""
+    and of each parameter, [k]. edges: whether any oscillator may have a contact edge."""
 
     given: Variation
     length: Any
     parameters: Any
+    edges: bool
+
+    def of(self, osc: Oscillator) -> OwnOscillator:
+        """An oscillator, as the user has it, in these units."""
+        return in_own_units(osc, self.length, edges=self.edges)
 
 
 def _varies_omega(line: Family) -> bool:

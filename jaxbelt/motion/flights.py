@@ -218,9 +218,10 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     number, is_even, ratio = _all_steps(by_run, shared, table, unpack)
     short = jnp.clip(jnp.nan_to_num(number), 0, MOST_STEPS).astype(jnp.int32) + 1
     short = jnp.where(wanted, short, 0)
+    numbers = jnp.arange(flights, dtype=jnp.int32)
     # Sorted with their places as one number: a sort of pairs takes ten times as long.
-    order = jnp.sort(short * flights + jnp.arange(flights, dtype=jnp.int32)) % flights
-    places = jnp.zeros_like(order).at[order].set(jnp.arange(flights, dtype=jnp.int32))
+    order = jnp.sort(short * flights + numbers) % flights
+    places = jnp.zeros_like(order).at[order].set(numbers, unique_indices=True)
     # A few groups at least, for all of a group wait for the longest.
     most = min(FLOWN_AT_ONCE.here, largest_power(max(1, LARGEST.here // count)))
     size = min(most, max(1, flights // LEAST_GROUPS.here))

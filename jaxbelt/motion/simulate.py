@@ -22,7 +22,7 @@ from ..checks import (
     is_concrete,
     require,
 )
-from ..model.modes import has_edges, without_edges
+from ..model.modes import has_edges
 from ..model.oscillator import (
     Oscillator,
     at_time,
@@ -31,7 +31,13 @@ from ..model.oscillator import (
     has_clock,
     has_possible_numbers,
 )
-from ..model.own_units import in_given_units, in_units, in_units_of_run, quantity
+from ..model.own_units import (
+    in_given_units,
+    in_units,
+    in_units_of_run,
+    quantity,
+    without_edges,
+)
 from ..model.rest import start_at_focus
 from ..model.transitions import contact
 from ..numerics.compiling import jit, power_of_two

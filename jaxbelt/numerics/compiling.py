@@ -126,8 +126,7 @@ def jit(function: Callable) -> Any:
 
     @functools.cache
     def quick():
-        options = known(QUICK)
-        return filter_jit(function, compiler_options=options) if options else plain
+        return filter_jit(function, compiler_options=QUICK)
 
     kept = _Kept(function, eqx.is_array, lambda: known(QUICK))
 
@@ -138,7 +137,9 @@ def jit(function: Callable) -> Any:
         if not is_outermost(leaves):
             return plain(*args, **kwargs)
         program, arrays = kept.program(leaves, structure)
-        return quick()(*args, **kwargs) if program is None else program(arrays)
+        if program is not None:
+            return program(arrays)
+        return quick()(*args, **kwargs) if known(QUICK) else plain(*args, **kwargs)
 
     return call
 
@@ -150,15 +151,15 @@ def wide(function: Callable) -> Any:
         return known(WIDE) if _has_wide_vectors() else None
 
     @functools.cache
-    def plain():
-        return jax.jit(function, compiler_options=options())
+    def plain(is_wide: bool):
+        return jax.jit(function, compiler_options=WIDE if is_wide else None)
 
     kept = _Kept(function, lambda leaf: True, options)
 
     @functools.wraps(function)
     def call(*args):
         program, arrays = kept.program(*jax.tree.flatten((args, {})))
-        return plain()(*args) if program is None else program(arrays)
+        return plain(bool(options()))(*args) if program is None else program(arrays)
 
     return call
 
@@ -558,7 +559,14 @@ def any_lane(flag: jax.Array) -> jax.Array:
 
 def where_any(flags: jax.Array, function: Callable[[], Any], otherwise: Any) -> Any:
     """What the function gives where any of the flags is set, in any lane; else `otherwise`, a tree
-    of the same shapes. For what few lanes need, and seldom."""
+    of the same shapes. For what few lanes need, and seldom.
+
+    On accelerators always what the function gives: of so many lanes there are some that need it,
+    and the device would wait for the host to choose the branch. So lanes without the flag may hold
+    either.
+    """
+    if not is_cpu():
+        return function()
     return lax.cond(any_lane(jnp.any(flags)), function, lambda: otherwise)
 
 

@@ -319,8 +319,8 @@ def key_of(function: Callable, template: Any, signatures: Sequence[Any], options
     """What a program is known by; an error where this cannot be told."""
     name = getattr(function, "__module__", ""), getattr(function, "__qualname__", "")
     told = fingerprint((name, function, template, options))
-    # The last one is an object of JAX's own, and empty outside of traces.
-    context = [repr(one) for one in jax_settings()[0][:-1]]
+    # Without what has no name but its address: an object of JAX, empty outside of traces.
+    context = [word for word in map(repr, jax_settings()[0]) if " at 0x" not in word]
     parts = surroundings(), _constants(), told, [str(one) for one in signatures], context
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 

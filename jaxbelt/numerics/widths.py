@@ -1,8 +1,18 @@
-"""How much is done side by side, which depends on the device."""
+"""What depends on the device: how much is done side by side, and which form programs have.
 
-from typing import NamedTuple
+The rule stands here alone: `is_cpu` asks for it, `SideBySide` has a number for each side of it, and
+`as_on_accelerator` turns it, so that what an accelerator would compute is computed on the CPU.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import jax
+
+#: Whether programs have the form for accelerators on any device. JAX has programs of their own, and
+#: so has the store of programs, for each value of such a context.
+_as_accelerator = jax.make_user_context(default_value=False)
 
 
 class SideBySide(NamedTuple):
@@ -23,5 +33,27 @@ class SideBySide(NamedTuple):
 
 
 def is_cpu() -> bool:
-    """Whether JAX's default backend is the CPU."""
-    return jax.default_backend() == "cpu"
+    """Whether programs are those for the CPU: JAX's default backend is, and nothing says
+    otherwise."""
+    return jax.default_backend() == "cpu" and not _as_accelerator.value
+
+
+@contextmanager
+def as_on_accelerator() -> Iterator[None]:
+    """Programs in the form for accelerators, whatever the device: for tests without one.
+
+    It holds for this thread, see `as_here`.
+    """
+    with _as_accelerator(True):
+        yield
+
+
+def as_here(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function for another thread, with programs in the form that they have on this one."""
+    setting = _as_accelerator.value
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        with _as_accelerator(setting):
+            return function(*args, **kwargs)
+
+    return call

@@ -1,4 +1,4 @@
-"""Categories of the runs of a sweep in a plane: what is what is told by colours with a key."""
+"""Categories of the runs of a sweep, in a plane: each category is a colour, named in a key."""
 
 from collections import Counter
 
@@ -13,7 +13,7 @@ from ..sweeps.datasets import decoded
 from .style import figure_of, make_room
 
 BLANK, OTHER = "not done", "other"
-#: What has the same colour in every picture; cycles that stick: see `_colour_of_kind`.
+#: Colours that are the same in every picture; for cycles that stick see `_colour_of_kind`.
 COLOURS = {
     BLANK: "#FFFFFF",
     OTHER: "#4D4D4D",
@@ -24,16 +24,16 @@ COLOURS = {
     "cycle": "#009E73",
     "cycle without sticking": "#F0E442",
 }
-#: Everything else in its order, and cycles by the belts that they stick to, as binary digits: belt
-#: 0, belt 1, both, belt 2, ... (Okabe and Ito, and a violet).
+#: Colours of all other categories, in order, and of cycles by the belts that they stick to, as
+#: binary digits: belt 0, belt 1, both, belt 2, ... (Okabe and Ito, and a violet).
 SHADES = ("#56B4E9", "#E69F00", "#CC79A7", "#009E73", "#0072B2", "#D55E00", "#7F5FA8")
 STICKS = "cycle, sticks to belt "
-#: The most categories in a key, and letters in a line of it.
+#: Largest number of categories in a key, and letters in a line of it.
 KEY_ROOM, LINE = 8, 60
 
 
 def words_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
-    """A category of each run in words; of "kind", to which belts cycles stick."""
+    """Category of each run in words; for "kind" with the belts that cycles stick to."""
     words = decoded(dataset[[variable]])[variable].astype(object)
     if variable == "kind" and "belt" in dataset.sizes:
         sticks = dataset.sticks.transpose(*words.dims, "belt").values.astype(bool)
@@ -47,7 +47,7 @@ def words_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
 
 
 def draw_categories(ax: Axes, x: np.ndarray, y: np.ndarray, words: np.ndarray) -> None:
-    """Words [x, y] as colours, with a key of those that most runs have; the rest is "other"."""
+    """Draws words [x, y] as colours; the most frequent are in the key, the others are "other"."""
     counts = Counter(words.ravel().tolist())
     shown = [word for word, _ in counts.most_common(KEY_ROOM)]
     words = np.where(np.isin(words, shown), words, OTHER)
@@ -66,12 +66,12 @@ def draw_categories(ax: Axes, x: np.ndarray, y: np.ndarray, words: np.ndarray) -
 
 
 def _in_key(word: str) -> tuple[bool, bool, int, str]:
-    """Short names first, and last what is not told."""
+    """Sort key: short names first; "other" and "not done" last."""
     return word == BLANK, word == OTHER, len(word), word
 
 
 def _colours_of_words(words: list[str]) -> list[str]:
-    """A colour for each word, no two alike; that of a kind whatever other kinds there are."""
+    """A colour for each word, no two alike; a kind always has the same one."""
     others = [word for word in words if word not in COLOURS and not word.startswith(STICKS)]
     return [
         _shade(others.index(word)) if word in others else _colour_of_kind(word) for word in words
@@ -86,16 +86,16 @@ def _colour_of_kind(word: str) -> str:
 
 
 def _shade(number: int) -> str:
-    """The colour of that number: behind those of `SHADES` hues that do not repeat."""
+    """Colour number `number`: those of `SHADES`, then hues that do not repeat."""
     if number < len(SHADES):
         return SHADES[number]
-    hue = 0.618034 * number % 1.0  # the golden section spreads them
+    hue = 0.618034 * number % 1.0  # multiples of the golden section spread over the circle
     red, green, blue = matplotlib.colors.hsv_to_rgb((hue, 0.55, 0.75)).tolist()
     return matplotlib.colors.to_hex((red, green, blue))
 
 
 def _in_lines(word: str) -> str:
-    """A sequence of events in lines of a length that a key has room for."""
+    """Breaks a sequence of events into lines that fit into a key."""
     lines = [""]
     for event in word.split("-"):
         if lines[-1] and len(lines[-1]) + len(event) > LINE:

@@ -1,6 +1,6 @@
 """Bifurcation diagrams, curves of bifurcation points, and points of codimension two.
 
-How each kind of point is named and its curve drawn its condition tells, see `conditions`.
+The condition of each kind of point carries its name and the style of its curve, see `conditions`.
 """
 
 import functools
@@ -28,7 +28,7 @@ UNSTABLE_COLOUR = "0.6"
 # --- diagrams -----------------------------------------------------------------------------------
 
 
-#: The quantities that have a name, and what their axis is called.
+#: Quantities that have a name, and the labels of their axes.
 QUANTITIES = {
     "amplitude": "amplitude of $x_1$",
     "x1": "displacement $x_1$",
@@ -41,20 +41,27 @@ Quantity = str | Callable[[Cycle], Any]
 def plot_diagram(
     diagram: BifurcationDiagram, ax: Axes | None = None, *, quantity: Quantity | None = None
 ) -> Axes:
-    """A bifurcation diagram in the manner of the paper's Figs. 3 and 7.
+    """Draws a bifurcation diagram in the manner of the paper's Figs. 3 and 7.
 
-    quantity: what is drawn, see `BifurcationDiagram.plot`. In "x2" the velocities of two belts that
-    one cycle sticks to are joined by double arrows. Stable is black, unstable grey; unstable cycles
-    are dashed. Dotted lines are the special points; in the plane of the paper's Fig. 6 the names of
-    the regions between them stand at the upper edge. Between rows the lines are interpolated, from
-    special point to special point. Returns the axes.
+    Stable branches are black, unstable ones grey; unstable cycles are dashed. Dotted lines are the
+    special points; in the plane of the paper's Fig. 6 the names of the regions between them stand
+    at the upper edge. In "x2" a double arrow joins the velocities of two belts that one cycle
+    sticks to. Between rows the lines are interpolated, from special point to special point.
+
+    Args:
+        diagram: From `bifurcation_diagram`.
+        ax: Axes; None makes new ones.
+        quantity: Quantity to draw, see `BifurcationDiagram.plot`.
+
+    Returns:
+        The axes.
     """
     quantity = _default_quantity(diagram) if quantity is None else quantity
     if isinstance(quantity, str) or not callable(quantity):
         expected = f"one of {', '.join(QUANTITIES)}, or a function of a cycle"
         came = repr(quantity) + did_you_mean(quantity, QUANTITIES)
         require(quantity in list(QUANTITIES), "quantity", expected, came)
-    # What has a name is known of equilibria, too.
+    # Functionals with a name are defined for equilibria, too.
     named = ((amplitude, "amplitude"), (period, "period"))
     quantity = next((name for one, name in named if quantity is one), quantity)
     curves = [_curves_of(branch, quantity) for branch in diagram.branches]
@@ -87,7 +94,7 @@ def _default_quantity(diagram: BifurcationDiagram) -> str:
 
 
 def _curves_of(branch: Branch, quantity: Quantity) -> list[np.ndarray]:
-    """What is drawn of a branch, [rows] each, NaN where it has no such quantity."""
+    """Curves to draw for a branch, [rows] each, NaN where it has no such quantity."""
     if not isinstance(quantity, str):
         return [branch.evaluated(quantity)]
     if quantity == "x1":
@@ -99,7 +106,7 @@ def _curves_of(branch: Branch, quantity: Quantity) -> list[np.ndarray]:
 
 
 def _name_of(functional: Any) -> str:
-    """What a functional is called: its name in words, and the arguments that it was given."""
+    """Name of a functional in words, with the arguments that are fixed."""
     if isinstance(functional, functools.partial):
         given = [*map(repr, functional.args), *(f"{k} {v}" for k, v in functional.keywords.items())]
         return f"{_name_of(functional.func)} ({', '.join(given)})"
@@ -108,12 +115,12 @@ def _name_of(functional: Any) -> str:
 
 
 def _stretches_of(flags: np.ndarray) -> list[slice]:
-    """The rows between changes of a flag; each includes the first of the next, to be joined."""
+    """Rows between changes of a flag; each stretch includes the first row of the next one."""
     ends = [0, *(np.flatnonzero(flags[1:] != flags[:-1]) + 1), len(flags)]
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
-#: Points that are drawn of a curve between two of its rows.
+#: Points drawn between two rows of a curve.
 BETWEEN_ROWS = 8
 
 
@@ -122,9 +129,9 @@ def _between_rows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The values of the parameter and a curve through them, with points between the rows.
 
-    Each piece between special values and turning points by itself: how it departs from its chord is
-    taken for Akima's cubics, which do not swing where it bends suddenly, in an angle in which a
-    branch that ends like a square root is smooth.
+    Each piece between special values and turning points is interpolated separately. Akima's cubics,
+    which do not swing where a curve bends suddenly, interpolate its distance from the chord, over
+    an angle in which a branch that ends like a square root is smooth.
     """
     way = np.sign(np.diff(values))
     passed = np.searchsorted(np.sort(special), values)
@@ -178,7 +185,7 @@ def _draw_rows(
 
 
 def _join_stick_phases(ax: Axes, diagram: BifurcationDiagram) -> None:
-    """Double arrows between the velocities that one cycle sticks at in turn."""
+    """Draws double arrows between the velocities that one cycle sticks at in turn."""
     for first, last, _ in diagram.regions:
         count = max(1, round(8 * (last - first) / (diagram.regions[-1][1] - diagram.regions[0][0])))
         for at in first + (last - first) * (np.arange(count) + 0.5) / count:
@@ -195,8 +202,8 @@ def _join_stick_phases(ax: Axes, diagram: BifurcationDiagram) -> None:
                     ax.annotate("", (at, high), (at, low), arrowprops=style, zorder=2)
 
 
-#: How far above the axes the names of points stand, in points, and farther where they lie close
-#: together: by this fraction of how far the names are moved aside.
+#: Height of the names of points above the axes, in points; where names are moved aside they are
+#: higher by the fraction STEEPNESS of that move.
 NAMES_ABOVE, STEEPNESS = 9.0, 0.5
 
 
@@ -255,11 +262,10 @@ def _name_regions(ax: Axes, diagram: BifurcationDiagram) -> None:
 
 
 def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> Axes:
-    """Curves of bifurcation points in the plane of their parameters, special points as dots, open
-    ones where they are no points of double sliding.
+    """Draws curves of bifurcation points in the plane of their parameters.
 
-    Each kind has its line; where a fold turns into a grazing point the line changes. Returns the
-    axes.
+    Special points are dots, open ones where they are not points of double sliding. Each kind has
+    its own style; where a fold turns into a grazing point the style changes. Returns the axes.
     """
     ax = new_axes() if ax is None else ax
     for curve in curves:
@@ -295,7 +301,7 @@ def _kinds_along(curve: BifurcationCurve, path: np.ndarray) -> np.ndarray:
 
 
 def plot_special_point(point: SpecialPoint, ax: Axes | None = None) -> Axes:
-    """A point of codimension two in the plane of the two parameters. Returns the axes."""
+    """Draws a point of codimension two in the plane of the two parameters; returns the axes."""
     ax = new_axes() if ax is None else ax
     words = "".join(f" {one.lower()}" if one.isupper() else one for one in point.kind).strip()
     belts = f", belt{'s' * (len(point.belts) > 1)} {' and '.join(map(str, point.belts))}"

@@ -1,4 +1,4 @@
-"""Which picture belongs to which result: what `result.plot()` draws."""
+"""The picture of each type of result: what `result.plot()` draws."""
 
 from collections.abc import Callable
 from typing import Any
@@ -64,14 +64,22 @@ PICTURES: dict[type, Callable[..., Axes]] = {
 
 
 def draw_result(result: Any, ax: Axes | None, **options: Any) -> Axes:
-    """Draw a result into the axes (None: new ones), which are returned, with a key below them of
-    what they label; options: of its `plot`."""
+    """Draws a result, with a key below the axes.
+
+    Args:
+        result: Any result with a `plot` method.
+        ax: Axes; None makes new ones.
+        options: Options of its `plot`.
+
+    Returns:
+        The axes.
+    """
     picture = PICTURES.get(type(result))
     if picture is None:
         raise TypeError(f"result must be one that has a picture, got {type(result).__name__}")
     require_axes(ax)
     drawn = picture(result, ax, **options)
-    # A figure of several axes has a key of its own.
+    # A figure of several axes has its own key.
     if ax is not None or not figure_of(drawn).legends:
         add_key(drawn)
     return drawn

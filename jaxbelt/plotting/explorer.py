@@ -24,8 +24,8 @@ from .phase import plot_phase_portrait, plot_time_history
 from .si import plot_in_si
 from .style import belt_colour
 
-#: Where the sliders of these numbers end, at least; other numbers go from 0 to 1 at least. They go
-#: to twice the value with which they begin, too.
+#: Ranges of sliders, at least; 0 to 1 for other numbers. Every range includes twice the first
+#: value.
 RANGES = {
     "friction.velocity": (0.0, 1.0),
     "velocity": (-1.0, 1.0),
@@ -41,9 +41,14 @@ RANGES = {
 class Explorer:
     """Sliders beside a picture of the motion, which follows them; see `explore`.
 
-    sliders: ipywidgets by name, one for each finite number of the oscillator or machine ("damping",
-    "belts[0].velocity") and for the start ("x1", "x2"); figure: what is drawn; message: how the run
-    ended, or why there is none; widget: all of it. A cell that ends in an explorer shows it.
+    A cell of a notebook that ends in an explorer shows it.
+
+    Attributes:
+        sliders: Widgets of ipywidgets by name, one for each finite number of the oscillator or
+            machine ("damping", "belts[0].velocity") and for the start ("x1", "x2").
+        figure: The figure.
+        message: How the run ended, or why there is none.
+        widget: Sliders and picture together.
     """
 
     def __init__(self, osc: Oscillator | Machine, start: tuple[float, float], t1: float):
@@ -56,7 +61,8 @@ class Explorer:
         self._names, self._t1 = names_of(osc), t1
         numbers = dict(zip(self._names, map(float, self._leaves), strict=True))
         for number, belt in enumerate(osc.belts):
-            if isinstance(belt.friction, LawInUnits):  # the unit of speeds is no number of the law
+            # the unit of speeds is not a number of the law
+            if isinstance(belt.friction, LawInUnits):
                 numbers.pop(f"belts[{number}].friction.unit")
         numbers |= {"x1": start[0], "x2": start[1]}
         units = osc.units if isinstance(osc, Machine) else None
@@ -79,13 +85,14 @@ class Explorer:
 
     @property
     def shown(self) -> Oscillator | Machine:
-        """The oscillator or machine that the sliders show; `ValueError` where there can be none."""
+        """The oscillator or machine that the sliders show; raises a `ValueError` if it is
+        impossible."""
         values = [
             jnp.asarray(self.sliders[name].value) if name in self.sliders else leaf
             for name, leaf in zip(self._names, self._leaves, strict=True)
         ]
         shown = jax.tree.unflatten(self._structure, values)
-        if isinstance(shown, Machine):  # made anew, for its checks
+        if isinstance(shown, Machine):  # made anew, so that its checks run
             belts = [PhysicalBelt(**vars(belt)) for belt in shown.belts]
             return Machine(shown.mass, shown.stiffness, shown.damping, belts)
         check_oscillator(shown)
@@ -93,14 +100,14 @@ class Explorer:
 
     @property
     def oscillator(self) -> Oscillator:
-        """The oscillator that the sliders show, that of their machine; `ValueError` likewise."""
+        """The oscillator that the sliders show; raises a `ValueError` if it is impossible."""
         shown = self.shown
         osc = shown.oscillator if isinstance(shown, Machine) else shown
         check_oscillator(osc)
         return osc
 
     def redraw(self) -> None:
-        """Draw the motion of the oscillator that the sliders show."""
+        """Draws the motion of the oscillator that the sliders show."""
         try:
             shown, osc = self.shown, self.oscillator
         except ValueError as error:
@@ -120,9 +127,9 @@ class Explorer:
         if isinstance(shown, Machine):
             plot_in_si([portrait, upper, lower], shown)
         page = io.BytesIO()
-        # Drawn once; savefig draws twice.
+        # print_png draws once; savefig draws twice.
         FigureCanvasAgg(self.figure).print_png(page)
-        # Laid out once: that takes as long as all the rest, and nothing should jump.
+        # The layout is computed once: it takes as long as all the rest, and nothing should jump.
         self.figure.set_layout_engine("none")
         self._picture.value = page.getvalue()
         self.message.value = f"{Status(int(run.status)).name}: {describe(run.status)}"
@@ -145,12 +152,21 @@ def explore(
 ) -> Explorer:
     """A live picture of an oscillator, in a notebook, with a slider for each of its numbers.
 
-    Phase portrait, time history and friction laws, drawn anew as sliders move. osc: an
-    `Oscillator`; or a `Machine`, whose sliders and pictures are in SI units. start: (x1, x2) at the
-    beginning (None: 1.5 units of length, at rest); t1: until when it is followed (None: 60 units of
-    time); dimensionless, and of a `Machine` in m, m/s and s. What is returned has `sliders` by
-    name, the `oscillator` that they show, its `figure`, and a `message` on how the run ended. Needs
-    ipywidgets, and raises an `ImportError` without; `ValueError` names an impossible argument.
+    Phase portrait, time history and friction laws are drawn anew as the sliders move.
+
+    Args:
+        osc: An `Oscillator`, or a `Machine`, for which sliders and pictures are in SI units.
+        start: State (x1, x2) at the beginning, dimensionless (None: 1.5 units of length, at rest);
+            for a `Machine` in m and m/s.
+        t1: End of the motion in dimensionless time (None: 60); for a `Machine` in s.
+
+    Returns:
+        An object with `sliders` by name, the `oscillator` that they show, its `figure`, and a
+        `message` that says how the run ended.
+
+    Raises:
+        ImportError: If ipywidgets is not installed.
+        ValueError: If an argument is impossible; the message names it.
     """
     length, time = 1.0, 1.0
     if isinstance(osc, Machine):
@@ -166,7 +182,7 @@ def explore(
 
 
 def _empty(ax: Axes) -> None:
-    """Remove what was drawn, and leave the axes themselves: to make new ones takes longer."""
+    """Removes what was drawn and keeps the axes: making new ones takes longer."""
     legend = [ax.get_legend()] if ax.get_legend() is not None else []
     for artist in [*ax.lines, *ax.patches, *ax.collections, *ax.texts, *legend]:
         artist.remove()
@@ -177,7 +193,7 @@ def _slider(ipywidgets: Any, name: str, value: float, units: Units | None) -> An
     *_, last = path = name.split(".")
     least, most = RANGES.get(".".join(path[-2:]), RANGES.get(last, (0.0, 1.0)))
     if units is not None:
-        # Of a machine's numbers nothing is known but their size, and that of its motions.
+        # For a machine only the sizes of its numbers and motions are known.
         quantity = {"x1": "length", "lower": "length", "upper": "length", "x2": "velocity"}
         quantity |= {"velocity": "velocity"}
         unit = float(getattr(units, quantity[last])) if last in quantity else 0.0

@@ -1,4 +1,4 @@
-"""What happens when: a trajectory, its events and its arcs over time, each in one pair of axes."""
+"""A trajectory, its events and its arcs over time, each in one pair of axes."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,14 +10,14 @@ from ..tables import require_single
 from .phase import belt_shading, path_of, stick_phases
 from .style import belt_colour, new_axes
 
-#: The marks of events, and what they are called.
+#: Marks of events, and their names.
 EVENT_MARKS = {
     EventKind.STICK: ("v", "sticks to belt {}"),
     EventKind.SLIP: ("^", "slips from belt {}"),
     EventKind.CROSS: ("x", "crosses boundary {}"),
     EventKind.EDGE: ("s", "edge of belt {}"),
 }
-#: How contacts are drawn (Okabe and Ito), by their code, and what they are called.
+#: Styles of contacts by their code (Okabe and Ito), and their names.
 CONTACT_STYLES = {
     0: ("#222222", "", "sticks"),
     1: ("#56B4E9", "", "slips, belt faster"),
@@ -33,7 +33,8 @@ def plot_trajectory(trajectory: Trajectory, ax: Axes | None = None) -> Axes:
     t, ys = path_of(trajectory)
     ax.plot(t, ys[:, 0], color="black", linewidth=1.1, label="displacement $x_1$")
     ax.plot(t, ys[:, 1], color="0.35", linewidth=0.9, linestyle="--", label="velocity $x_2$")
-    for belt, begin, end in sorted(stick_phases(trajectory)):  # the key has the belts in order
+    # sorted, so that the key has the belts in order
+    for belt, begin, end in sorted(stick_phases(trajectory)):
         ax.axvspan(begin, end, label=f"sticks to belt {belt}", zorder=0, **belt_shading(belt))
     ax.margins(x=0)
     ax.set_xlabel(r"time $\tau$")
@@ -62,7 +63,7 @@ def plot_arcs(arcs: Arcs, ax: Axes | None = None) -> Axes:
     ax = new_axes() if ax is None else ax
     table = arcs.table()
     spans = np.array(table[["t", "duration"]])
-    # An arc that lasts for ever is drawn a little beyond the others.
+    # An arc of infinite duration is drawn a little longer than the others.
     known = spans[np.isfinite(spans[:, 1])]
     last = np.max(known.sum(axis=1), initial=np.max(spans[:, 0], initial=0.0))
     spans[:, 1] = np.minimum(spans[:, 1], 1.05 * last + 1.0 - spans[:, 0])

@@ -8,7 +8,7 @@ from .style import new_axes
 
 
 def plot_fit(fit: Fit, ax: Axes | None = None) -> Axes:
-    """Data as dots and the fitted motion as lines, over time, of what was recorded."""
+    """Data as dots, the fitted motion as lines, over time, for each recorded component."""
     ax = new_axes() if ax is None else ax
     t, ys, residuals = (np.asarray(x) for x in (fit.ts, fit.ys, fit.residuals))
     words = ("displacement $x_1$", "velocity $x_2$")

@@ -28,13 +28,23 @@ def plot_friction_law(
     speed: float | None = None,
     unit: str | None = None,
 ) -> Axes:
-    """Friction coefficient mu(|nu_R|) sgn(nu_R) over the relative velocity nu_R, up to `speed`.
+    """Draws the friction coefficient `mu(|nu_R|) sgn(nu_R)` over the relative velocity nu_R.
 
-    friction: the law; or a `PhysicalBelt`, whose law takes speeds in m/s. speed: None: to where the
-    table of a `Tabulated` ends, and 1 for another law; what is drawn beyond such an end is dashed,
-    an extrapolation. unit: of the speeds that the law takes, for the label of the axis; None: that
-    of a `PhysicalBelt`, and else none. A stuck mass takes any value on the vertical bar at
-    nu_R = 0. Returns the axes.
+    A stuck mass takes any value on the vertical bar at nu_R = 0.
+
+    Args:
+        friction: The law, or a `PhysicalBelt`, whose law takes speeds in m/s.
+        ax: Axes; None makes new ones.
+        speed: Largest speed. None: where the table of a `Tabulated` ends, 1 for any other law.
+            Beyond the end of a table the curve is dashed: an extrapolation.
+        unit: Unit of the speeds that the law takes, for the label of the axis. None: that of a
+            `PhysicalBelt`, else none.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     if isinstance(friction, PhysicalBelt):
         friction, unit = friction.friction, "m/s" if unit is None else unit
@@ -71,9 +81,9 @@ def plot_friction_law(
 def plot_convergence(
     widths: np.ndarray, errors: dict[str, np.ndarray], ax: Axes | None = None
 ) -> Axes:
-    """Largest error of approximate formulations over the width of their band, by label.
+    """Draws the largest error of approximate formulations over the width of their band.
 
-    A thin line of slope one goes along. Returns the axes.
+    A thin line has the slope one. errors: by label. Returns the axes.
     """
     ax = new_axes() if ax is None else ax
     for belt, (label, values) in enumerate(errors.items()):
@@ -89,10 +99,11 @@ def plot_convergence(
 
 
 def draw_mechanical_model(ax: Axes | None = None) -> Axes:
-    """The double-belt oscillator, Fig. 1 of the paper: a mass on spring and dashpot, two belts.
+    """Draws the double-belt oscillator, Fig. 1 of the paper: a mass on spring and dashpot, two
+    belts.
 
-    The mass touches belt 0 while x < sigma1 and belt 1 while x > sigma0; drawn is the overlapping
-    class (d). Returns the axes.
+    The mass touches belt 0 while x < sigma1 and belt 1 while x > sigma0, the overlapping class (d).
+    Returns the axes.
     """
     ax = new_axes() if ax is None else ax
     ax.set(xlim=(-0.2, 10.6), ylim=(-4.75, 4.1), aspect="equal")
@@ -100,7 +111,7 @@ def draw_mechanical_model(ax: Axes | None = None) -> Axes:
     line = {"color": "black", "linewidth": 1.0, "solid_capstyle": "butt"}
     x_mass, sigma0, sigma1 = 5.7, 4.3, 7.6
 
-    # The axis of x, and the lines that tell where the belts end.
+    # The axis of x, and the lines at which the belts end.
     _draw_arrow(ax, (3.0, -4.0), (9.4, -4.0))
     ax.text(9.55, -4.0, "$x$", ha="left", va="center")
     for x, top, name in (
@@ -125,7 +136,7 @@ def draw_mechanical_model(ax: Axes | None = None) -> Axes:
     ax.text(2.4, 1.05, "$k$", ha="center", va="bottom")
     ax.text(1.75, -0.95, "$c$", ha="center", va="top")
 
-    # The mass, with a foot on each side at x, where it touches.
+    # The mass, with a foot on each side at x, where it touches the belts.
     ax.add_patch(Rectangle((4.8, -0.9), 1.8, 1.8, facecolor="0.9", edgecolor="black", lw=1.0))
     for side in (1, -1):
         foot = [(-0.3, 0.9), (-0.15, 1.3), (0.15, 1.3), (0.3, 0.9)]
@@ -139,7 +150,7 @@ def draw_mechanical_model(ax: Axes | None = None) -> Axes:
 
 
 def _draw_belt(ax: Axes, belt: int, ends, run: float, side: int, force_at: float) -> None:
-    """A belt on two rollers: its run at the height `run`, the rest above (side 1) or below (-1)."""
+    """A belt on two rollers: its run at the height `run`, its rest above (side 1) or below (-1)."""
     radius, colour = 0.6, belt_colour(belt)
     middle, far = run + side * radius, run + side * 2 * radius
     angle = np.linspace(np.pi / 2, 3 * np.pi / 2, 40)

@@ -1,4 +1,4 @@
-"""Orbit diagrams, and how zooming into one computes it anew."""
+"""Orbit diagrams; zooming into one computes it anew."""
 
 from typing import Any
 
@@ -12,8 +12,8 @@ from ..sweeps.orbit_diagram import OrbitDiagram
 from .diagrams import QUANTITIES
 from .style import add_key, figure_of, new_axes, parameter_label
 
-#: What is drawn of each kind of attractor (Okabe and Ito), and what the key calls it. What is
-#: undecided has no place: ticks at the lower edge show for which parameters it is so.
+#: Marks of each kind of attractor (Okabe and Ito), and its name in the key. Undecided starts have
+#: no place; ticks at the lower edge show their parameters.
 DOTS: dict[str, dict[str, Any]] = {
     "equilibrium": {"color": "#0072B2", "marker": ".", "label": "equilibrium"},
     "cycle": {"color": "black", "marker": ".", "label": "cycle"},
@@ -29,7 +29,7 @@ def plot_orbits(
     quantity: str | None = None,
     zoom: bool = False,
 ) -> Axes:
-    """The points of an orbit diagram over its parameter; see `OrbitDiagram.plot`."""
+    """Draws the points of an orbit diagram over its parameter; see `OrbitDiagram.plot`."""
     if quantity is None:
         quantity = diagram.at.of if isinstance(diagram.at, AtExtrema) else "x1"
     require_one_of(quantity, ("x1", "x2"), "quantity")
@@ -61,7 +61,7 @@ def _put(
     quantity: str,
     sizes: tuple[float, float] = (1.0, 1.0),
 ) -> None:
-    """Give each line the points of its kind, times the sizes; the key names those with points."""
+    """Sets the points of each line, times the sizes; the key names the lines that have points."""
     heights = diagram.x1 if quantity == "x1" else diagram.x2
     values = np.broadcast_to(diagram.values[:, None, None], heights.shape)
     for kind, line in lines.items():
@@ -78,28 +78,29 @@ def _put(
 class _Zoom:
     """Computes an orbit diagram anew over the limits of its axes, whenever these change.
 
-    While a button of the mouse is held, as in panning, nothing is done before it is let go.
+    While a button of the mouse is held, as in panning, it waits.
     """
 
     def __init__(self, diagram: OrbitDiagram, ax: Axes, lines: dict[str, Line2D], quantity: str):
         self.diagram, self.ax, self.lines, self.quantity = diagram, ax, lines, quantity
-        # It stays at 1 and 1 where `plot_in_si` scales what is drawn.
+        # Its position stays (1, 1) unless `plot_in_si` scales what is drawn.
         self.one = ax.text(1.0, 1.0, "")
         self.shown, self.is_held = ax.get_xlim(), False
-        self.told = ax.text(0.5, 0.5, "", transform=ax.transAxes, ha="center", wrap=True)
+        self.note = ax.text(0.5, 0.5, "", transform=ax.transAxes, ha="center", wrap=True)
         canvas = figure_of(ax).canvas
-        # Functions: of methods matplotlib would keep weak references, and nobody else has any.
+        # Functions, because matplotlib keeps only weak references to methods, and nothing else
+        # would refer to these.
         ax.callbacks.connect("xlim_changed", lambda _: self.follow())
         canvas.mpl_connect("button_press_event", lambda _: self.hold(True))
         canvas.mpl_connect("button_release_event", lambda _: self.hold(False))
 
     def hold(self, is_held: bool) -> None:
-        """A button of the mouse is held, or let go."""
+        """Called when a button of the mouse is pressed or released."""
         self.is_held = is_held
         self.follow()
 
     def follow(self) -> None:
-        """Draw what belongs between the limits, unless it is there."""
+        """Draws the points between the present limits, unless they are shown already."""
         sizes = self.one.get_position()
         limits = tuple(np.array(self.ax.get_xlim()) / sizes[0])
         if self.is_held or np.allclose(limits, self.shown, rtol=1e-12, atol=0):
@@ -108,10 +109,10 @@ class _Zoom:
         try:
             diagram = self.diagram.over((min(limits), max(limits)))
         except ValueError as error:
-            # What there was stays, and the reason why there is no more.
-            self.told.set_text(str(error))
+            # The old points stay, with the reason why there are no new ones.
+            self.note.set_text(str(error))
         else:
-            self.told.set_text("")
+            self.note.set_text("")
             _put(self.lines, diagram, self.quantity, sizes)
             self.ax.relim()
             self.ax.autoscale_view(scalex=False)

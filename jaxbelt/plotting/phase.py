@@ -1,15 +1,15 @@
 """One oscillator and its motion: time histories, phase portraits, vector fields.
 
-Every function draws into the matplotlib axes that it is given (`ax=None` makes new ones) and
-returns the axes. What is drawn is shown in the manner of the paper:
+Every function draws into the matplotlib axes `ax` (None makes new ones) and returns the axes. The
+conventions are the paper's:
 
-- a discontinuity boundary Sigma_Fi, x2 = nu_i/omega, as a line over the contact interval of its
+- A discontinuity boundary Sigma_Fi, x2 = nu_i/omega, is a line over the contact interval of its
   belt, in the colour of the belt; the part where the mass sticks (the sliding set) is a wide pale
   band behind it. Finite contact edges sigma are dotted vertical lines.
-- stable cycles as thick solid, unstable ones as dashed lines, other orbits thin and grey;
-- stable fixed points filled, unstable ones open, neutral ones grey, pseudo-foci as diamonds in the
-  same way, a segment of pseudo-equilibria as a thick bar, saddles as crosses.
-- stable separatrices, which bound basins, purple, unstable ones grey and dash-dotted.
+- Stable cycles are thick solid lines, unstable ones dashed, other orbits thin and grey.
+- Stable fixed points are filled, unstable ones open, neutral ones grey; pseudo-foci are diamonds in
+  the same way, a segment of pseudo-equilibria is a thick bar, saddles are crosses.
+- Stable separatrices, which bound basins, are purple, unstable ones grey and dash-dotted.
 """
 
 from collections.abc import Sequence
@@ -48,14 +48,14 @@ from .style import (
     spread,
 )
 
-#: A second mark of the belts, for print without colour.
+#: Hatches that identify the belts in print without colour.
 BELT_HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\")
 ORBIT_COLOUR = "0.55"
-#: Where the mass sticks to a belt, in the colour of the belt.
+#: Style of the pieces of a boundary where the mass sticks, in the colour of the belt.
 SLIDING_SET: dict[str, Any] = {"linewidth": 4.5, "alpha": 0.25, "solid_capstyle": "butt"}
-#: How far from its point a separatrix has its arrow, as a fraction of the axes.
+#: Distance of the arrow of a separatrix from its point, as a fraction of the axes.
 ARROW_DISTANCE = 0.3
-#: Separatrices: reddish purple of Okabe and Ito, and grey.
+#: Styles of separatrices: reddish purple of Okabe and Ito, and grey.
 STABLE_SEPARATRIX = {"color": "#CC79A7", "linewidth": 1.3, "label": "stable separatrix"}
 UNSTABLE_SEPARATRIX = {
     "color": "0.45",
@@ -67,13 +67,13 @@ UNSTABLE_SEPARATRIX = {
 
 @runtime_checkable
 class ClosedOrbit(Protocol):
-    """What `plot_phase_portrait` wants of a cycle: its stability, and states all around it."""
+    """Interface of a cycle for `plot_phase_portrait`: its stability, and states all around it."""
 
     @property
     def stable(self) -> Any: ...
 
     def sample(self, n: int, /) -> Any:
-        """About n states (x1, x2) once around, [samples, 2]."""
+        """About n states (x1, x2) of one loop, [samples, 2]."""
         ...
 
 
@@ -81,9 +81,18 @@ class ClosedOrbit(Protocol):
 
 
 def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) -> Sequence[Axes]:
-    """Displacement x1 and velocity x2 over time, stick phases shaded in the colour of their belt.
+    """Draws displacement x1 and velocity x2 over time, stick phases shaded in the colour of their
+    belt.
 
-    trajectory: from `simulate`. ax: two axes, for x1 and for x2. Returns the two.
+    Args:
+        trajectory: From `simulate`.
+        ax: Two axes, for x1 and for x2; None makes new ones.
+
+    Returns:
+        The two axes.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     _check_trajectory(trajectory, "trajectory")
     is_pair = isinstance(ax, Sequence | np.ndarray) and len(ax) == 2
@@ -131,8 +140,8 @@ def _check_window(xlim: Any, ylim: Any) -> None:
 
 
 def stick_phases(trajectory: Trajectory) -> list[tuple[int, float, float]]:
-    """The stick phases of a trajectory as (belt, begin, end), in order of their beginnings."""
-    # Approximate formulations have no arcs; their samples have to do.
+    """Stick phases of a trajectory as (belt, begin, end), in order of their beginnings."""
+    # Approximate formulations have no arcs; their samples are used.
     if trajectory.arcs.t.size:
         begins = np.asarray(trajectory.arcs.t)
         ends = begins + np.asarray(trajectory.arcs.duration)
@@ -143,7 +152,7 @@ def stick_phases(trajectory: Trajectory) -> list[tuple[int, float, float]]:
     stuck = (modes == 0) & np.isfinite(begins)[:, None]
     phases: list[tuple[int, float, float]] = []
     for belt in range(stuck.shape[1]):
-        # A phase is several arcs where another belt comes or goes meanwhile.
+        # A phase consists of several arcs if another belt begins or ends contact meanwhile.
         switches = np.flatnonzero(np.diff(stuck[:, belt], prepend=False, append=False))
         for first, after in switches.reshape(-1, 2):
             phases.append((belt, float(begins[first]), float(ends[after - 1])))
@@ -151,7 +160,7 @@ def stick_phases(trajectory: Trajectory) -> list[tuple[int, float, float]]:
 
 
 def belt_shading(belt: int) -> dict[str, Any]:
-    """How the stick phases of a belt are shaded: pale, with hatches for print without colour."""
+    """Style of the stick phases of a belt: pale, with hatches for print without colour."""
     colour = matplotlib.colors.to_rgba(belt_colour(belt))
     pale = tuple(1 - 0.28 * (1 - channel) for channel in colour[:3])
     hatch = BELT_HATCHES[belt % len(BELT_HATCHES)]
@@ -168,8 +177,8 @@ def path_of(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
 
 
 def path_around(cycle: ClosedOrbit) -> np.ndarray:
-    """States once around a cycle, its events among them where it tells its arcs, so that corners
-    are sharp: [states, 2]."""
+    """States of one loop, [states, 2]; events are among them where arcs are known, for sharp
+    corners."""
     ys = np.asarray(cycle.sample(400))
     if not isinstance(cycle, Cycle):
         return ys
@@ -191,12 +200,22 @@ def plot_phase_portrait(
     ylim: tuple[float, float] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Orbits in the plane of displacement x1 and velocity x2, with the boundaries of `osc`.
+    """Draws orbits in the plane of displacement x1 and velocity x2, with the boundaries of `osc`.
 
-    trajectories: one or several from `simulate`, thin. cycles: see `ClosedOrbit`; stable ones are
-    thick and solid, unstable ones dashed. equilibria: None takes those of `osc`. xlim, ylim: the
-    window; None fits what is drawn. ax: None makes new axes, with a key below them; `ax.legend()`
-    gives others one. Returns the axes.
+    Args:
+        osc: The oscillator.
+        trajectories: One or several results of `simulate`; drawn as thin lines.
+        cycles: Cycles, see `find_cycle`; stable ones are thick and solid, unstable ones dashed.
+        equilibria: Equilibria to draw; None takes those of `osc`.
+        xlim: Window in x1; None fits what is drawn.
+        ylim: Window in x2, likewise.
+        ax: Axes. None makes new ones, with a key below them; for other axes call `ax.legend()`.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(osc)
     if isinstance(trajectories, Trajectory):
@@ -238,7 +257,7 @@ def plot_phase_portrait(
 
 
 def draw_orbit(ax: Axes, path: np.ndarray, words: str) -> None:
-    """An orbit that begins and ends, [samples, 2], and a window that holds it, too."""
+    """Draws an orbit that begins and ends, [samples, 2], and extends the window to hold it."""
     for limits, extend, x in ((ax.get_xlim(), ax.set_xlim, 0), (ax.get_ylim(), ax.set_ylim, 1)):
         margin = 0.05 * np.ptp(path[:, x])
         extend(min(limits[0], path[:, x].min() - margin), max(limits[1], path[:, x].max() + margin))
@@ -247,10 +266,9 @@ def draw_orbit(ax: Axes, path: np.ndarray, words: str) -> None:
 
 
 def plot_portrait(portrait: Portrait, ax: Axes | None = None) -> Axes:
-    """All that there is at one oscillator, see `Portrait`: its cycles and equilibria as in
-    `plot_phase_portrait`, and its separatrices, with an arrow in the direction of time.
+    """Draws a portrait: cycles and equilibria as in `plot_phase_portrait`, and separatrices.
 
-    Returns the axes.
+    Each separatrix has an arrow in the direction of time. Returns the axes.
     """
     ax = new_axes() if ax is None else ax
     osc, cycles = portrait.oscillator, [*portrait.cycles, *portrait.unstable]
@@ -265,7 +283,8 @@ def plot_portrait(portrait: Portrait, ax: Axes | None = None) -> Axes:
 
 
 def plot_separatrix(separatrix: Separatrix, ax: Axes | None = None) -> Axes:
-    """A separatrix, with an arrow in the direction of time, and its point. Returns the axes."""
+    """Draws a separatrix and its point, with an arrow in the direction of time; returns the
+    axes."""
     ax = new_axes() if ax is None else ax
     x1, x2 = np.asarray(separatrix.ys).T
     ax.set(xlim=_with_margin([x1.min(), x1.max()]), ylim=_with_margin([x2.min(), x2.max()]))
@@ -282,7 +301,7 @@ def _draw_separatrix(ax: Axes, one: Separatrix) -> None:
     path, (left, right), (bottom, top) = np.asarray(one.ys), ax.get_xlim(), ax.get_ylim()
     style = STABLE_SEPARATRIX if one.stable else UNSTABLE_SEPARATRIX
     ax.plot(*path.T, zorder=3, **style)
-    # From the point, whichever way it is passed.
+    # From the point outwards, in whichever direction of time.
     away = path[::-1] if one.stable else path
     outside = (away < [left, bottom]) | (away > [right, top])
     leaves = np.append(np.flatnonzero(np.any(outside, axis=1)), len(away))[0]
@@ -292,11 +311,12 @@ def _draw_separatrix(ax: Axes, one: Separatrix) -> None:
 
 
 def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
-    """The discontinuity boundaries and contact edges of `osc`, in the present window of the axes.
+    """Draws the discontinuity boundaries and contact edges of `osc` in the present window of the
+    axes.
 
-    Sigma_Fi, x2 = nu_i/omega, eqs. (8) and (17) of the paper, over the contact interval of belt i,
-    its sliding set as a pale band. A boundary that reaches the right-hand side of the axes has its
-    name outside of them, another one has it at its left end.
+    Sigma_Fi, x2 = nu_i/omega, eqs. (8) and (17) of the paper, is drawn over the contact interval of
+    belt i, its sliding set as a pale band. A boundary that reaches the right-hand side of the axes
+    is named outside of them, any other at its left end.
     """
     left, right = ax.get_xlim()
     outside: list[tuple[float, int]] = []
@@ -308,7 +328,7 @@ def plot_boundaries(osc: Oscillator, ax: Axes) -> Axes:
         if ends[0] == ends[1] or not bottom < level < top:
             continue
         colour = belt_colour(i)
-        # Where two boundaries are one, both colours show.
+        # Where two boundaries coincide, both colours show.
         dashes = (0, (5, 5)) if level in levels else "-"
         ax.plot(ends, [level, level], color=colour, linewidth=0.9, linestyle=dashes, zorder=1.5)
         levels.append(level)
@@ -332,7 +352,7 @@ def _sliding_set(osc, x1, x2, belt):
 
 
 def _draw_edges(ax: Axes, osc: Oscillator) -> None:
-    """Finite contact edges in the window: sigma for a single one, else sigma0, sigma1, ...
+    """Draws finite contact edges in the window: sigma for a single one, else sigma0, sigma1, ...
 
     A name that would touch the one on its left stands a line of text higher.
     """
@@ -378,7 +398,7 @@ def _name_boundary(ax: Axes, belt: int, xy, offset, ha: str, va: str, xycoords: 
 
 
 def _name_boundaries_outside(ax: Axes, names: list[tuple[float, int]]) -> None:
-    """Names beside the right-hand side of the axes, at least a line of text apart."""
+    """Names boundaries beside the right-hand side of the axes, at least a line of text apart."""
     bottom, top = ax.get_ylim()
     height = ax.get_window_extent().height * 72 / figure_of(ax).dpi
     line = 1.25 * matplotlib.rcParams["font.size"]
@@ -391,12 +411,12 @@ def _name_boundaries_outside(ax: Axes, names: list[tuple[float, int]]) -> None:
 
 
 def _window(osc, paths, equilibria, xlim, ylim):
-    """The given limits, or those that hold all that is drawn with a margin."""
+    """The given limits, or limits that hold all that is drawn with a margin."""
     ends = [] if equilibria is None else [*equilibria.x1_lower, *equilibria.x1_upper]
     x1 = [float(x) for x in ends]
     x1 += [x for path in paths for x in (path[:, 0].min(), path[:, 0].max())]
     if not paths:
-        # Nothing but the oscillator: every fixed point lies within the reach of friction.
+        # Without orbits: every fixed point lies within the reach of friction.
         reach = 1 + sum(float(b.load) * float(b.friction.static) for b in osc.belts)
         middle = float(sum(constant_force(osc)))
         x1 += [middle - reach, middle + reach]
@@ -414,7 +434,7 @@ def _with_margin(values: Sequence[float]) -> tuple[float, float]:
 
 
 def draw_equilibrium(ax: Axes, row: Equilibria) -> None:
-    """One row of equilibria, see the module's text; filled where stable, grey where neutral."""
+    """Draws one row of equilibria; filled where stable, grey where neutral."""
     face = "black" if row.stable else "0.6" if row.neutral else "white"
     ends = [float(row.x1_lower), float(row.x1_upper)]
     if row.kind == EquilibriumKind.SEGMENT:
@@ -442,7 +462,8 @@ def draw_equilibrium(ax: Axes, row: Equilibria) -> None:
 
 
 def _index_at_distance(ax: Axes, path: np.ndarray, distance: float) -> int:
-    """Where a path has gone so far, as a fraction of the axes, or half its length if shorter."""
+    """Index at which a path has gone `distance`, a fraction of the axes, or half its length if
+    shorter."""
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     steps = np.diff(path, axis=0) / [right - left, top - bottom]
     gone = np.concatenate([[0.0], np.cumsum(np.hypot(*steps.T))])
@@ -450,8 +471,11 @@ def _index_at_distance(ax: Axes, path: np.ndarray, distance: float) -> int:
 
 
 def _lowest(path: np.ndarray) -> list[int]:
-    """The lowest point of a path; the middle one where it is level there, as along a belt; none
-    where the path is not known."""
+    """Index of the lowest point of a path, as a list.
+
+    Where the lowest stretch is level, as along a belt, its middle; empty where the path is not
+    known.
+    """
     x2 = path[:, 1]
     (lowest,) = np.nonzero(x2 <= x2.min() + 1e-6 * np.ptp(x2))
     middle = len(lowest) // 2
@@ -491,11 +515,22 @@ def plot_vector_field(
     ylim: tuple[float, float] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """The vector field of `osc`, eqs. (2) and (11) of the paper, with its boundaries.
+    """Draws the vector field of `osc`, eqs. (2) and (11) of the paper, with its boundaries.
 
-    kind: "streamlines", or "arrows" of one length that show the direction. The field jumps at the
-    boundaries. On a sliding set it points along the boundary. xlim, ylim: the window; None takes
-    one that holds all fixed points. Returns the axes.
+    The field jumps at the boundaries. On a sliding set it points along the boundary.
+
+    Args:
+        osc: The oscillator.
+        kind: "streamlines", or "arrows" of one length that show the direction.
+        xlim: Window in x1; None takes one that holds all fixed points.
+        ylim: Window in x2, likewise.
+        ax: Axes; None makes new ones.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(osc)
     require_one_of(kind, ("streamlines", "arrows"), "kind")
@@ -513,7 +548,7 @@ def plot_vector_field(
             color="0.65", linewidth=0.6, arrowsize=0.6, density=0.9, zorder=1,
         )  # fmt: skip
     else:
-        # One length on paper: scaled by the window, then normed.
+        # Arrows of one length on paper: scaled by the window, then normalised.
         v1, v2 = v1 / (right - left), v2 / (top - bottom)
         size = np.hypot(v1, v2)
         ax.quiver(

@@ -14,12 +14,12 @@ from ..tables import require_single
 from .phase import draw_equilibrium, draw_orbit, plot_phase_portrait, plot_portrait
 from .style import BELT_COLOURS, new_axes
 
-#: Of the arrow of a shock: that of a fourth belt, which no class has.
+#: Colour of the arrow of a shock: that of a fourth belt, which no class has.
 SHOCK = BELT_COLOURS[3]
 
 
 def plot_cycle(cycle: Cycle, ax: Axes | None = None) -> Axes:
-    """A cycle with the boundaries and equilibria of its oscillator."""
+    """Draws a cycle with the boundaries and equilibria of its oscillator."""
     require_single(cycle, cycle.period, 0)
     _check_found(cycle, "cycle")
     return plot_phase_portrait(cycle.oscillator, cycles=[cycle], ax=ax)
@@ -31,12 +31,12 @@ def _check_found(result: Cycle | BifurcationPoint, name: str) -> None:
 
 
 def plot_design(design: Design, ax: Axes | None = None) -> Axes:
-    """The designed cycle."""
+    """Draws the designed cycle."""
     return plot_cycle(design.cycle, ax)
 
 
 def plot_point(point: BifurcationPoint, ax: Axes | None = None) -> Axes:
-    """The phase plane at a bifurcation point, with the cycle where there is one."""
+    """Draws the phase plane at a bifurcation point, with the cycle where there is one."""
     require_single(point, point.value, 0)
     _check_found(point, "point")
     cycles = [point.cycle] if int(point.cycle.status) == Status.OK else []
@@ -49,7 +49,7 @@ def plot_point(point: BifurcationPoint, ax: Axes | None = None) -> Axes:
 
 
 def plot_shock(shock: FatalShock, ax: Axes | None = None) -> Axes:
-    """The portrait, and in it the smallest fatal shock as an arrow, where there is one."""
+    """Draws the portrait, and the smallest fatal shock as an arrow, where there is one."""
     ax = plot_portrait(shock.portrait, ax)
     if np.isfinite(float(shock.distance)):
         start = np.asarray(shock.start)
@@ -62,7 +62,7 @@ def plot_shock(shock: FatalShock, ax: Axes | None = None) -> Axes:
 
 
 def plot_equilibria(equilibria: Equilibria, ax: Axes | None = None) -> Axes:
-    """Equilibria on the line x2 = 0, stable ones filled."""
+    """Draws equilibria on the line x2 = 0, stable ones filled."""
     table = equilibria.table()
     rows = [equilibria] if equilibria.kind.ndim == 0 else list(equilibria)
     ax = new_axes() if ax is None else ax

@@ -28,25 +28,25 @@ from .style import (
 
 #: Pixels of the coarse raster around the name of a region: half a letter's height, or its width.
 ROOM_FOR_NAME = 3
-#: Colours of regions that have none by the belts that their cycle sticks to (pale).
+#: Pale colours of regions whose cycles do not determine a colour.
 SPARE_COLOURS = ("#DDDDDD", "#F5E9A9", "#BFE3D0", "#F3D0E2", "#D9CBEA", "#C5D9E8", "#E8D5B9")
-#: Rows of sketches for which there is room on a page.
+#: Number of rows of sketches that fit on a page.
 MOST_ROWS = 4
-#: What the names say of equilibria.
-EQUILIBRIA_TOLD = (
+#: Note below the map on what the names say of equilibria.
+EQUILIBRIA_NOTE = (
     "after the colon:\nf fixed point\np pseudo-focus\nh held at rest\n(in brackets: not stable)"
 )
 
 
 def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
-    """The regions of a plane of two parameters, and the curves that bound them.
+    """Draws the regions of a plane of two parameters, and the curves that bound them.
 
-    Every point has the colour of its own side of each curve. The colour tells what the stable cycle
-    sticks to (that of the belt; both: violet; none: grey; of several cycles mixed), paler where an
-    equilibrium is stable, too; white where there is no cycle. In the plane of the paper's Fig. 6,
-    and where there are contact edges, the regions have their names, elsewhere the key tells what
-    there is. Without `ax` a figure is made that shows the portrait of every region below the map,
-    as the paper's Fig. 6 does. Returns the axes of the map.
+    Every point has the colour of its own side of each curve. The colour shows what the stable cycle
+    sticks to (the colour of the belt; both: violet; none: grey; several cycles: mixed); it is paler
+    where an equilibrium is stable, too, and white where there is no cycle. In the plane of the
+    paper's Fig. 6, and where there are contact edges, the regions have their names; elsewhere the
+    key says what there is. Without `ax` the figure shows the portrait of every region below the
+    map, as the paper's Fig. 6 does. Returns the axes of the map.
     """
     if ax is None:
         figure = new_figure()
@@ -59,22 +59,22 @@ def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
     paint = map(_region_colour, unique) if regions.as_paper else _colours_of(unique)
     colours = dict(zip(unique, paint, strict=True))
     image = np.array([colours[heads[name]] for name in known])[np.searchsorted(known, raster)]
-    # Half a pixel beyond the ends: pixels stand for points.
+    # Half a pixel beyond the ends, because pixels stand for points.
     margins = [0.5 * (v[-1] - v[0]) / (size - 1) for v, size in zip((x, y), raster.shape)]
     extent = (x[0] - margins[0], x[-1] + margins[0], y[0] - margins[1], y[-1] + margins[1])
     style: dict[str, Any] = {"origin": "lower", "aspect": "auto", "interpolation": "nearest"}
     ax.imshow(np.swapaxes(image, 0, 1), extent=extent, zorder=0, **style)
     plot_curves(regions.curves, ax)
-    if regions.as_paper or _tells_equilibria(regions):
+    if regions.as_paper or _names_equilibria(regions):
         _name_areas(ax, regions, raster)
     if not regions.as_paper:
         entries = {heads[name]: regions.words[name] for name in filter(None, known)}
-        for head, told in entries.items():
-            label = told.replace(f"; {OPPOSITE}", f"\n{OPPOSITE}")
+        for head, words in entries.items():
+            label = words.replace(f"; {OPPOSITE}", f"\n{OPPOSITE}")
             patch = {"facecolor": colours[head], "edgecolor": "0.4", "label": label}
             ax.add_patch(Rectangle((x[0], y[0]), 0, 0, **patch))
-    if _tells_equilibria(regions):
-        ax.add_patch(Rectangle((x[0], y[0]), 0, 0, visible=False, label=EQUILIBRIA_TOLD))
+    if _names_equilibria(regions):
+        ax.add_patch(Rectangle((x[0], y[0]), 0, 0, visible=False, label=EQUILIBRIA_NOTE))
     ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     first, second = map(parameter_label, regions.names)
     ax.set(xlabel=first, ylabel=second)
@@ -82,8 +82,8 @@ def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
 
 
 def _name_areas(ax: Axes, regions: RegionMap, raster: np.ndarray) -> None:
-    """The name of each region in each of its parts that has room for it."""
-    # A part is told well enough by every fourth pixel.
+    """Writes the name of each region into each of its parts that has room for it."""
+    # Every fourth pixel is enough to find the parts.
     coarse = raster[::4, ::4]
     x, y = (np.linspace(v[0], v[-1], n) for v, n in zip(regions.values, coarse.shape, strict=True))
     for name in filter(None, np.unique(coarse).tolist()):
@@ -105,7 +105,7 @@ def _name_areas(ax: Axes, regions: RegionMap, raster: np.ndarray) -> None:
 
 
 def _colours_of(names: Sequence[str]) -> list[tuple[float, float, float]]:
-    """A colour for each name of a region, no two alike, for a key to tell them."""
+    """A colour for each name of a region, no two alike."""
     spare = map(matplotlib.colors.to_rgb, SPARE_COLOURS)
     colours: list[tuple[float, float, float]] = []
     for name in names:
@@ -115,16 +115,16 @@ def _colours_of(names: Sequence[str]) -> list[tuple[float, float, float]]:
 
 
 def _head(name: str) -> str:
-    """The name of a region without what it says of equilibria."""
+    """Name of a region without the part on equilibria."""
     return name.partition(":")[0]
 
 
-def _tells_equilibria(regions: RegionMap) -> bool:
+def _names_equilibria(regions: RegionMap) -> bool:
     return any(":" in name for name in regions.regions)
 
 
 def _region_colour(name: str) -> tuple[float, float, float]:
-    """Pale for cycles, paler where an equilibrium is stable beside them; white for no cycle."""
+    """Pale for cycles, paler where an equilibrium is stable, too; white for no cycle."""
     letters = {"a": BELT_COLOURS[0], "b": BELT_COLOURS[1], "c": "#7F5FA8"}
     if not name or name[0] in "16":
         return (1.0, 1.0, 1.0)
@@ -135,14 +135,14 @@ def _region_colour(name: str) -> tuple[float, float, float]:
 
 
 def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
-    """The map above, below it a sketch of the phase portrait of each region, in its example."""
+    """Draws the map, and below it a sketch of the phase portrait of each region, in its example."""
     names = [name for name in regions.regions if _has_area(regions, name)]
-    named = regions.as_paper or _tells_equilibria(regions)
+    named = regions.as_paper or _names_equilibria(regions)
     columns = 5 if named else 4
     rows = -(-len(names) // columns)
     if rows > MOST_ROWS:
         figure.set_size_inches(7.2, 5.6 + 1.15 * rows)
-    # Grids of their own: what the key takes beside the map leaves the sketches alone.
+    # Two grids: so the key beside the map does not take room from the sketches.
     heights = (6, 1.25 * rows) if rows <= MOST_ROWS else (5.6, 1.15 * rows)
     whole = figure.add_gridspec(2, 1, height_ratios=heights)
     upper = whole[0].subgridspec(1, 2, width_ratios=(3.2, 1) if regions.as_paper else (2.2, 1))

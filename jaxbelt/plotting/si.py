@@ -1,4 +1,4 @@
-"""Pictures in SI units: what any picture of this package shows, in s, m and m/s."""
+"""Pictures in SI units: any picture of this package in s, m and m/s."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ from ..si import SYMBOLS, AlongParameter, check_machine, rest_in_m, units_along,
 from .draw import draw_result
 from .style import figure_of, in_fractions, parameter_label, require_axes
 
-#: By its label, what an axis shows, and its label in SI units.
+#: For each label of an axis: its quantity, and its label in SI units.
 LABELS = {
     r"time $\tau$": ("time", "time $t$ (s)"),
     "period $T$": ("time", "period (s)"),
@@ -34,7 +34,7 @@ LABELS = {
     "velocity $x_2$": ("velocity", r"velocity $\dot X$ (m/s)"),
     r"relative velocity $\nu_{\mathrm{R}}$": ("velocity", r"relative velocity $R$ (m/s)"),
 }
-#: Parameters of an oscillator that have another symbol in SI units, by the end of their path.
+#: Labels in SI units of parameters of an oscillator, by the end of their path.
 SI_PARAMETERS = {
     "damping": "damping $c$",
     "velocity": "belt velocity $V_%$",
@@ -43,26 +43,35 @@ SI_PARAMETERS = {
 
 
 def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any) -> Any:
-    """A picture with times in s, displacements in m and velocities in m/s, also in its key.
+    """Draws a picture with times in s, displacements in m and velocities in m/s, also in its key.
 
-    result: of the machine's oscillator, anything that has a `.plot()`, drawn into the axes (None:
-    new ones); or the axes, one or several, that another function of this package has drawn into.
-    machine: the `Machine`, or its units alone, see `in_si`; for a diagram or fractions along the
-    argument of a function, a function of that which returns it. options: of that `.plot()`. Returns
-    the axes.
+    Limits and coordinates of the axes are in SI units, so that a measurement can be drawn over the
+    picture: `ax.plot(t_in_s, X_in_m)`; what was in `ax` before is taken to be in SI units. Where
+    one axis shows displacement and velocity, as in the picture of a trajectory, it becomes that of
+    displacement, and velocity gets its own axis at the right, in other axes of the same figure.
 
-    Limits and coordinates of these axes are in SI units, so that a measurement can be drawn over
-    it: `ax.plot(t_in_s, X_in_m)`; what was in `ax` before is taken to be in them. Where one axis
-    shows displacement and velocity, as in the picture of a trajectory, it is that of displacement,
-    and velocity has one of its own at the right, in other axes of the same figure. The parameter of
-    a diagram or of fractions is in SI units, too: that of a function's argument as the function
-    takes it, whose unit only you know: `ax.set_xlabel("belt velocity $V$ (m/s)")`. Its `quantity`
-    is in SI units where that is a functional of this package, such as `energy_fed`, also in
-    `functools.partial`; what a function of your own gives stays as it is, and the label says
-    "(dimensionless)". Other axes that show something else, or tell their unit, stay as they are.
-    The title of a `BifurcationPoint` tells its kind alone, as its value has no unit that is known
-    here. `ValueError` where no axis can be converted, as in the picture of a sweep (draw what
-    `in_si` returns instead), where the units vary along the parameter, and for a wrong argument.
+    The parameter of a diagram or of fractions is in SI units, too; the argument of a function stays
+    as the function takes it, and you label it: `ax.set_xlabel("belt velocity $V$ (m/s)")`. A
+    `quantity` is in SI units where it is a functional of this package, such as `energy_fed`, also
+    in `functools.partial`; the values of your own function stay as they are, and the label says
+    "(dimensionless)". Other axes that show something else, or name their unit, stay as they are.
+    The title of a `BifurcationPoint` names its kind only, as the unit of its value is not known.
+
+    Args:
+        result: A result of the machine's oscillator with a `.plot()`; or the axes, one or several,
+            that another function of this package has drawn into.
+        machine: The `Machine`, or its units alone, see `in_si`; for a diagram or fractions along
+            the argument of a function, a function of that argument that returns the machine.
+        ax: Axes for the `.plot()` of the result; None makes new ones.
+        options: Options of that `.plot()`.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: If no axis can be converted, as in the picture of a sweep (draw what `in_si`
+            returns instead), if the units vary along the parameter, or if an argument is
+            impossible.
     """
     require_axes(ax)
     units, parameter = _units_of_picture(result, machine)
@@ -84,12 +93,12 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
         if parameter is not None:
             _scale(axes, 0, *parameter, before)
         if isinstance(result, BifurcationPoint):
-            # Its value has no unit here: a point does not tell of which parameter it is.
+            # The unit of its value is not known: a point does not record its parameter.
             axes.title.set_text(result.condition.words)
     finally:
         if before is not None:
             before.join()
-    # Axes do not tell which functional, parameter or result they show.
+    # Axes do not record which functional, parameter or result they show.
     expected = (
         "a picture with an axis of time, displacement, velocity, amplitude or period, or what it "
         "shows itself: jb.plot_in_si(diagram, machine, quantity=jb.stick_fraction), "
@@ -103,8 +112,10 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
 
 
 def _units_of_picture(result: Any, machine: Any) -> tuple[Units, tuple[float, str] | None]:
-    """The units of a picture; and of its parameter what 1 is, and its label, where it has one that
-    is not in SI units anyway."""
+    """Units of a picture; for its parameter the value of 1 in SI units, and its label.
+
+    The latter are None where the parameter is in SI units already.
+    """
     if not isinstance(result, AlongParameter):
         check_machine(result, machine)
         return units_of(machine), None
@@ -135,7 +146,7 @@ def _relabel_key(ax: Axes, units: Units) -> None:
 
 
 class _Before:
-    """What axes hold in SI units before a result is drawn into them."""
+    """What axes held, in SI units, before a result was drawn into them."""
 
     def __init__(self, ax: Axes):
         self.artists = {*_artists(ax)}
@@ -144,14 +155,15 @@ class _Before:
         ax.dataLim.set_points(Bbox.null().get_points())
 
     def join(self) -> None:
-        """Let limits that are not set hold all, what is new being in SI units now, too."""
+        """Extends limits that are not set to hold everything; the new part is in SI units now,
+        too."""
         lower, upper = zip(self.held, self.ax.dataLim.get_points(), strict=True)
         self.ax.dataLim.set_points(np.array([np.min(lower, axis=0), np.max(upper, axis=0)]))
         self.ax.autoscale_view()
 
 
 def _convert(every: Sequence[Axes], units: Units, before: _Before | None) -> bool:
-    """Put axes in SI units that show a quantity that has some; whether there are any."""
+    """Converts axes that show a quantity with a unit to SI units; returns whether there are any."""
     is_any = False
     for one in every:
         for number in (0, 1):
@@ -169,12 +181,12 @@ def _convert(every: Sequence[Axes], units: Units, before: _Before | None) -> boo
 def _convert_functional(
     ax: Axes, functional: Callable, units: Units, before: _Before | None
 ) -> None:
-    """Put the values of a functional of cycles in SI units where their unit is known."""
+    """Converts the values of a functional of cycles to SI units where their unit is known."""
     name, coordinate = ax.get_ylabel(), "x1"
     if isinstance(functional, functools.partial):
         coordinate = functional.keywords.get("coordinate", coordinate)
         functional = functional.func
-    # One of somebody's own may have no hash.
+    # A user's functional may have no hash.
     known = [quantity for one, quantity in MEASURED_IN.items() if one is functional]
     if not known:
         ax.set_ylabel(f"{name} (dimensionless)")
@@ -186,7 +198,7 @@ def _convert_functional(
 
 
 def _put_velocity_aside(ax: Axes, unit: float, label: str, before: _Before | None) -> None:
-    """Move the velocities of axes that show displacements, too, to an axis at the right."""
+    """Moves the velocities of axes that show displacements, too, to an axis at the right."""
     limits = ax.get_ylim()
     lines = [line for line in ax.lines if "$x_2$" in str(line.get_label())]
     aside = _right_of(ax, label)
@@ -204,7 +216,7 @@ def _put_velocity_aside(ax: Axes, unit: float, label: str, before: _Before | Non
 
 
 def _right_of(ax: Axes, label: str) -> Axes:
-    """The axes with this label in the place of others, made unless they are there."""
+    """The axes with this label on top of others; made if they do not exist."""
     for one in ax.get_shared_x_axes().get_siblings(ax):
         here = np.allclose(one.get_position().bounds, ax.get_position().bounds)
         if one is not ax and here and one.get_ylabel() == label:
@@ -220,7 +232,8 @@ def _axis(ax: Axes, number: int) -> Axis:
 
 
 def _scale(ax: Axes, number: int, unit: float, label: str, before: _Before | None) -> None:
-    """Multiply what is drawn along the x (0) or y axis (1), and its limits, but what was before."""
+    """Scales what is drawn along the x (0) or y axis (1), and its limits, but not what was there
+    before."""
     sizes = np.where(np.arange(2) == number, unit, 1.0)
     limits = (ax.get_xlim(), ax.get_ylim())[number]
     shared = (ax.get_shared_x_axes, ax.get_shared_y_axes)[number]().get_siblings(ax)
@@ -235,7 +248,7 @@ def _scale(ax: Axes, number: int, unit: float, label: str, before: _Before | Non
         first, last = limits
         (ax.set_xlim, ax.set_ylim)[number](first * unit, last * unit, auto=None)
     if number == 0:
-        # Numbers such as 0.0015 want more room than Matplotlib leaves them side by side.
+        # Numbers such as 0.0015 need more room than Matplotlib leaves between them.
         count = max(2, int(0.65 * ax.xaxis.get_tick_space()))
         ax.xaxis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10]))
 
@@ -245,7 +258,7 @@ def _artists(ax: Axes) -> list[Artist]:
 
 
 def _scale_artist(artist: Artist, ax: Axes, sizes: np.ndarray) -> None:
-    """Multiply the coordinates of an artist that are data."""
+    """Scales those coordinates of an artist that are data."""
     # Matplotlib before 3.11 misspells it.
     names = ("contains_branch_separately", "contains_branch_seperately")
     in_data = next(name for name in names if hasattr(Transform, name))
@@ -259,7 +272,7 @@ def _scale_artist(artist: Artist, ax: Axes, sizes: np.ndarray) -> None:
         x, y = place * of_data(transform)
         return float(x), float(y)
 
-    # Of a patch get_transform() has its own shape in it, too.
+    # For a patch get_transform() would include its own shape.
     transform = Artist.get_transform(artist)
     for edges, size in zip(artist.sticky_edges, of_data(transform), strict=True):
         edges[:] = [edge * size for edge in edges]

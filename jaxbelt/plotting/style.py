@@ -1,4 +1,4 @@
-"""The manner of the pictures: colours, keys, a journal's page; and axes to draw into.
+"""Style of the pictures: colours, keys, a journal's page; and axes to draw into.
 
 The colours are those of Okabe and Ito, which colour-blind readers can tell apart. Only the modules
 of this folder import matplotlib, and `import jaxbelt` imports none of them.
@@ -18,9 +18,9 @@ from matplotlib.transforms import ScaledTranslation
 
 from ..checks import require_value
 
-#: One colour a belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
+#: One colour for each belt: blue, vermillion, bluish green, reddish purple, orange (Okabe and Ito).
 BELT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
-#: What a phase portrait may hold, in the order of its key.
+#: Entries of the key of a phase portrait, in order.
 KEY_ORDER = (
     "orbit",
     "stable cycle",
@@ -38,8 +38,8 @@ KEY_ORDER = (
     "saddle",
 )
 
-#: Parameters by the end of their path in the oscillator, or by the name of the argument of a
-#: function without its number: what they are called, and their symbol; % is the number of the belt.
+#: Names and symbols of parameters, by the end of their path in the oscillator, or by the name of a
+#: function's argument without its number; % is the number of the belt.
 PARAMETERS = {
     "damping": ("damping", r"\zeta"),
     "omega": ("frequency", r"\omega"),
@@ -81,18 +81,20 @@ JOURNAL: dict[Any, Any] = {
 
 
 def journal_style():
-    """A context in which figures are made, drawn and saved in the manner of a journal."""
+    """A context in which figures are made, drawn and saved in the style of a journal."""
     return matplotlib.rc_context(JOURNAL)
 
 
 def journal_figure(width: float, height: float) -> Figure:
-    """An empty figure, in inches, that leaves the settings and windows of pyplot alone."""
+    """An empty figure, size in inches, that leaves the settings and windows of pyplot alone."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def key_entries(axes: Sequence[Axes]) -> dict[str, Any]:
-    """What axes label, each thing once, with how it is drawn, side by side in each of its colours:
-    what a phase portrait holds comes last, in the order of `KEY_ORDER`."""
+    """Labels in axes, each once, with their artists, one for each colour.
+
+    Those of a phase portrait come last, in the order of `KEY_ORDER`.
+    """
     drawn: dict[str, dict[Any, Any]] = {}
     for one in axes:
         for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
@@ -104,8 +106,10 @@ def key_entries(axes: Sequence[Axes]) -> dict[str, Any]:
 
 
 def draw_key(figure: Figure, note: str = "", *, leave_out: Axes | None = None) -> None:
-    """Below the axes of a figure a note, and one key for all that they label, in as many columns as
-    there is room for; leave_out: axes that have a key of their own."""
+    """Draws a note below the axes of a figure, and one key for all that they label.
+
+    The key has as many columns as fit. leave_out: axes that have their own key.
+    """
     entries = key_entries([axes for axes in figure.axes if axes is not leave_out])
     figure.legend(
         entries.values(),
@@ -122,19 +126,22 @@ def draw_key(figure: Figure, note: str = "", *, leave_out: Axes | None = None) -
 
 
 def make_room(figure: Figure) -> None:
-    """Let what stands outside of the axes, a key or names, have room: a figure without a layout, as
-    `matplotlib.pyplot.subplots` makes it, gets the constrained one. Any other is left alone."""
+    """Makes room for what stands outside of the axes, a key or names.
+
+    A figure without a layout engine, as `matplotlib.pyplot.subplots` makes it, gets the constrained
+    one; any other figure is left alone.
+    """
     if figure.get_layout_engine() is None:
         figure.set_layout_engine("constrained")
 
 
 def add_key(ax: Axes) -> None:
-    """Below the axes a key for all that they label, each thing once."""
+    """Draws a key below the axes for all that they label, each thing once."""
     entries = key_entries([ax])
     if not entries:
         return
     make_room(figure_of(ax))
-    # Below the numbers and the name of the axis, whatever the height of the axes.
+    # Below the numbers and the label of the axis, whatever the height of the axes.
     figure, size = figure_of(ax), matplotlib.rcParams["font.size"]
     below = ScaledTranslation(0, -(3.4 * size + 4) / 72, figure.dpi_scale_trans)
     width, grid = ax.get_window_extent().width * 72 / figure.dpi, ax.get_gridspec()
@@ -155,8 +162,11 @@ def add_key(ax: Axes) -> None:
 
 
 def key_columns(width: float, labels: Sequence[str], room: float = 0.0) -> int:
-    """How many columns of a key there is room for in a width, in points; rows of one length. Rather
-    than one two that need more, within what there is room for beside the axes, too."""
+    """Number of columns of a key that fit into a width, in points.
+
+    Rather than one column it takes two that need more, if they fit into `room` beside the axes,
+    too.
+    """
     size = matplotlib.rcParams["font.size"]
     letters = 0.48 * size * np.array([len(label.replace("$", "")) for label in labels])
     count = len(labels)
@@ -170,8 +180,11 @@ def key_columns(width: float, labels: Sequence[str], room: float = 0.0) -> int:
 
 
 def parameter_label(name: str) -> str:
-    """What an axis of a parameter is called, word and symbol; name: the path to it in the
-    oscillator, such as "belts[0].velocity", or that of the argument of a function, such as nu0."""
+    """Label of the axis of a parameter: word and symbol.
+
+    name: path of the parameter in the oscillator, such as "belts[0].velocity", or the name of the
+    argument of a function, such as nu0.
+    """
     path, belt = name.split("."), name.partition("[")[2].partition("]")[0]
     ends = (".".join(path[-2:]), path[-1], name.rstrip("0123456789"))
     known = next((end for end in ends if end in PARAMETERS), None)
@@ -184,7 +197,7 @@ def parameter_label(name: str) -> str:
 
 
 def in_fractions(unit: str) -> str:
-    """A unit such as "m s-1" as it stands in pictures: "m/s"."""
+    """A unit such as "m s-1" as pictures show it: "m/s"."""
     above = [part for part in unit.split() if "-" not in part]
     below = [part.replace("-1", "").replace("-2", "$^2$") for part in unit.split() if "-" in part]
     above = [part.replace("2", "$^2$") for part in above]
@@ -192,17 +205,17 @@ def in_fractions(unit: str) -> str:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG (or what else the ending of the path says)."""
+    """Writes a figure as PNG (or what else the ending of the path says)."""
     figure.savefig(path, dpi=220)
 
 
 def belt_colour(belt: int) -> str:
-    """The colour of a belt; they repeat after five belts."""
+    """Colour of a belt; the colours repeat after five belts."""
     return BELT_COLOURS[belt % len(BELT_COLOURS)]
 
 
 def spread(wanted: np.ndarray, gap: float) -> np.ndarray:
-    """Positions as near to the wanted ones, in order, as a gap between them allows."""
+    """Positions as close to the desired ones, in order, as a minimum gap between them allows."""
     at = wanted.copy()
     for _ in range(200):
         for i in range(1, len(at)):
@@ -214,13 +227,13 @@ def spread(wanted: np.ndarray, gap: float) -> np.ndarray:
 
 
 def require_axes(ax: Any) -> None:
-    """Raise unless `ax` is axes to draw into, or None: new ones."""
+    """Raises a `ValueError` unless `ax` is axes to draw into, or None."""
     expected = "axes of matplotlib, such as plt.subplots()[1], or None"
     require_value(ax is None or isinstance(ax, Axes), "ax", expected, ax)
 
 
 def figure_of(ax: Axes) -> Figure:
-    """The figure that the axes belong to; `ValueError` where they were removed from it."""
+    """The figure of the axes; raises a `ValueError` if they were removed from it."""
     figure = ax.get_figure(root=True)
     if figure is None:
         raise ValueError("ax must be part of a figure, got axes that were removed from theirs")
@@ -228,12 +241,12 @@ def figure_of(ax: Axes) -> Figure:
 
 
 def new_axes() -> Axes:
-    """Axes in a new window of pyplot."""
+    """New axes in a new window of pyplot."""
     return new_figure().subplots()
 
 
 def new_figure() -> Figure:
-    """A new window of pyplot, in which nothing overlaps."""
+    """A new window of pyplot, with a layout in which nothing overlaps."""
     # Imported here only: a window is for people at a notebook or a prompt.
     from matplotlib import pyplot
 

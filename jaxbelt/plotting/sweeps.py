@@ -31,30 +31,40 @@ from .style import (
     require_axes,
 )
 
-#: Axes of datasets that are no parameters.
+#: Axes of datasets that are not parameters.
 COUNTED = ("belt", "attractor")
 #: Axes of datasets along which starts differ.
 AXES_OF_STARTS = ("x1", "x2")
-#: What is 0 of an attractor that is no cycle, though it has no loop.
+#: Variables that are 0 for an attractor other than a cycle, though it has no loop.
 OF_LOOPS = ("stick_duration", "d_stick_duration")
 
 
 def plot_sweep(
     dataset: xr.Dataset, variable: str, ax: Axes | None = None, *, share: str | None = None
 ) -> Axes:
-    """A variable of a sweep over its two axes longer than one, or along its one.
+    """Draws a variable of a sweep over its two axes longer than one, or along its one.
 
-    dataset: what `sweep` or `attractors` returned, also as `in_si` gives it; variable: a name in
-    it. "kind" shows equilibria, and cycles by the belts that they stick to, each kind in the same
-    colour in every picture. Other categories, such as "signature", have a key of those that most
-    runs have; the rest is "other" (along one axis, the numbers of the categories where their words
-    are long). Along one axis a variable of each belt, or of each attractor, is as many lines. What
-    is not done of a store whose sweep is not finished is left white, and in stick durations what is
-    no cycle. A sweep of attractors that asked one start at each point says so in its title: others
-    may lead elsewhere. share: a word of a category, such as "cycle" of "kind", of a sweep with axes
-    x1 or x2; drawn is then the share of the starts along them that have it. Returns the axes.
-    `ValueError` if there is no such variable, or if its axes are not one or two: choose with
-    `dataset.isel(belt=0)` and the like.
+    "kind" shows equilibria, and cycles by the belts that they stick to, each kind in the same
+    colour in every picture. Other categories, such as "signature", have a key of the most frequent
+    ones; the rest is "other" (along one axis: numbers of the categories where their words are
+    long). Along one axis a variable of each belt, or of each attractor, is as many lines. Runs of
+    an unfinished store that are not done are left white, and so are runs without a cycle in stick
+    durations. The title of a sweep of attractors with one start at each point says so: other starts
+    may lead elsewhere.
+
+    Args:
+        dataset: Result of `sweep` or `attractors`, also as `in_si` returns it.
+        variable: Name of one of its variables.
+        ax: Axes; None makes new ones.
+        share: A word of a category, such as "cycle" of "kind", for a sweep with axes x1 or x2. The
+            picture then shows the share of the starts along these axes that have it.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: If there is no such variable, or if it has not one or two axes (choose with
+            `dataset.isel(belt=0)` and the like).
     """
     known = isinstance(dataset, xr.Dataset)
     require_value(known, "dataset", "an xarray.Dataset, such as sweep(...) returns", dataset)
@@ -62,9 +72,9 @@ def plot_sweep(
     require_axes(ax)
     if share is not None:
         dataset, variable = _shares_of(dataset, variable, share), "share"
-    told = dataset[variable].attrs
-    is_category = variable == "kind" or "flag_meanings" in told
-    # Signatures get their numbers when all are known.
+    attributes = dataset[variable].attrs
+    is_category = variable == "kind" or "flag_meanings" in attributes
+    # Signatures are numbered when all are known.
     fits = is_category or variable != "signature"
     require(fits, "dataset", "of a sweep that is done for its signatures", "one that is not")
     values = (words_of_runs if is_category else _numbers_of_runs)(dataset, variable)
@@ -73,11 +83,11 @@ def plot_sweep(
     last = values.dims[-1]
     are_lines = values.ndim == 1 or (last in COUNTED and variable != "kind")
     if are_lines and is_category and max(map(len, values.values.flat)) > LINE // 2:
-        # There is no room for such words beside an axis; numbers stand for them.
+        # Words do not fit beside an axis; numbers stand for them.
         values = _numbers_of_runs(dataset, variable).squeeze(drop=True)
     ax = new_axes() if ax is None else ax
     names = [_axis_label(dataset[name]) for name in map(str, values.dims)]
-    label = _with_unit(told.get("long_name", variable), told)
+    label = _with_unit(attributes.get("long_name", variable), attributes)
     if dataset.attrs.get("observe") == "attractor" and not {*AXES_OF_STARTS} & {
         *map(str, dataset.dims)
     }:
@@ -91,7 +101,7 @@ def plot_sweep(
             if len(lines) > 1:
                 style |= {"color": belt_colour(i), "label": f"{last} {i}"}
             ax.plot(x, line, linestyle=("-", "--", ":", "-.")[i % 4], **style)
-        # All that was swept is shown, also where there is nothing to draw.
+        # The window shows all that was swept, also where there is nothing to draw.
         ends = [float(x.min()), float(x.max())]
         ax.update_datalim(np.column_stack([ends, ends]), updatey=False)
         ax.autoscale_view(scaley=False)
@@ -109,7 +119,7 @@ def plot_sweep(
 
 
 def _shares_of(dataset: xr.Dataset, variable: str, word: str) -> xr.Dataset:
-    """The share of the starts of which a category has this word, as the variable `share`."""
+    """Share of the starts for which a category has this word, as the variable `share`."""
     starts = [name for name in AXES_OF_STARTS if name in dataset[variable].dims]
     expected = "None, or asked of a sweep with axes x1 or x2 for several starts"
     require(starts, "share", expected, f"{word!r} of one without")
@@ -118,12 +128,12 @@ def _shares_of(dataset: xr.Dataset, variable: str, word: str) -> xr.Dataset:
     is_it = (decoded(dataset[[variable]])[variable] == word).astype(float)
     share = is_it.where(dataset.status >= 0).mean(starts)
     share.attrs["long_name"] = f"share of starts: {word.replace('_', ' ')}"
-    # What it was a sweep of starts of is told by the label.
+    # The label names the variable.
     return xr.Dataset({"share": share})
 
 
 def _numbers_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
-    """A variable as floats, NaN where the run is yet to be done, or has no cycle to tell of."""
+    """A variable as floats, NaN where the run is not done or leads to no cycle."""
     values = dataset[variable].astype(float)
     if variable.startswith(OF_LOOPS) and "kind" in dataset:
         values = values.where(decoded(dataset[["kind"]]).kind == "cycle")
@@ -131,7 +141,7 @@ def _numbers_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
 
 
 def _check_axes(values: xr.DataArray) -> None:
-    """Raise unless there are one or two axes, and say how to choose."""
+    """Raises a `ValueError` unless there are one or two axes, and says how to choose."""
     axes = list(map(str, values.dims))
     one = next((name for name in axes if name in COUNTED), axes[-1] if axes else "")
     expected = "a sweep with one or two axes longer than one"
@@ -140,23 +150,33 @@ def _check_axes(values: xr.DataArray) -> None:
 
 
 def _axis_label(axis: xr.DataArray) -> str:
-    """What an axis is called, with its unit if it has one."""
+    """Label of an axis, with its unit if it has one."""
     name = str(axis.name)
     if name in COUNTED or "units" in axis.attrs:
         return _with_unit(axis.attrs.get("long_name", name), axis.attrs)
     return parameter_label(name)
 
 
-def _with_unit(words: str, told: dict[str, Any]) -> str:
-    return f"{words} ({in_fractions(told['units'])})" if "units" in told else words
+def _with_unit(words: str, attributes: dict[str, Any]) -> str:
+    return f"{words} ({in_fractions(attributes['units'])})" if "units" in attributes else words
 
 
 @announced("plot_basins")
 def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
-    """Which start leads where, with the cycles, and the unstable one between the basins dashed.
+    """Draws which start leads where, with the cycles; the unstable cycle between basins is dashed.
 
-    basins: from `basins`. Basins of cycles are pale blue and green, those of equilibria pale
-    orange, undecided starts white. Below the axes is a key, as in `Basins.plot`. Returns the axes.
+    Basins of cycles are pale blue and green, those of equilibria pale orange, undecided starts
+    white. Below the axes is a key, as in `Basins.plot`.
+
+    Args:
+        basins: From `basins`.
+        ax: Axes; None makes new ones.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     require_value(isinstance(basins, Basins), "basins", "what jb.basins returns", basins)
     require_axes(ax)
@@ -182,7 +202,7 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
 
 
 def _basin_colours(attractors: Sequence[str]) -> list[str]:
-    """Pale, so that lines stay visible; light enough apart for print without colour."""
+    """Pale, so that lines stay visible; different in lightness for print without colour."""
     cycles, others = (
         iter(["#B5D6EC", "#A9DCC8", "#D5E8F5", "#8FB8D8", "#7FC4A8"]),
         iter(["#F6C98F", "#F3DCE8", "#F5E9A9", "#E3A56B", "#DDB5CB"]),
@@ -198,7 +218,7 @@ def draw_basins(basins: Basins) -> Figure:
 
 
 def plot_stability(stability: BasinStability, ax: Axes | None = None) -> Axes:
-    """The fractions of the starts as bars, with their standard errors."""
+    """Draws the fractions of the starts as bars, with their standard errors."""
     ax = new_axes() if ax is None else ax
     kinds, fractions = list(stability.fractions), list(stability.fractions.values())
     errors = [stability.standard_errors[kind] for kind in kinds]
@@ -213,11 +233,11 @@ def plot_stability(stability: BasinStability, ax: Axes | None = None) -> Axes:
 
 
 def plot_fractions(fractions: BasinFractions, ax: Axes | None = None) -> Axes:
-    """The fractions as bands over the parameter; see `BasinFractions.plot`."""
+    """Draws the fractions as bands over the parameter; see `BasinFractions.plot`."""
     ax = new_axes() if ax is None else ax
     values, undecided = fractions.values, fractions.undecided
     shares = np.column_stack([fractions.fractions, undecided])
-    # What rests lies below, what is undecided on top; the rest in the order of the names.
+    # Equilibria lie at the bottom, undecided starts on top; the rest in the order of the names.
     names = [*fractions.attractors, "undecided"]
     order = np.argsort([_layer(name) for name in names], kind="stable")
     x, shares = _with_steps(values, shares[:, order])
@@ -244,24 +264,27 @@ def plot_fractions(fractions: BasinFractions, ax: Axes | None = None) -> Axes:
 
 
 def _layer(name: str) -> int:
-    """Which attractors lie on which."""
+    """Position of an attractor in the stack of bands."""
     return ("equilibrium", "stuck", "cycle", "undecided").index(name.split()[0])
 
 
 def _with_steps(values: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shares [values, bands] over the parameter, constant from a value to half-way towards the next
-    where the bands that there are change, twice there."""
+    """Shares [values, bands] over the parameter, with steps.
+
+    Where the set of bands changes between two values the shares are constant up to the middle,
+    which occurs twice.
+    """
     changes = np.flatnonzero(np.any((shares[1:] > 0) != (shares[:-1] > 0), axis=1))
     middles = 0.5 * (values[changes] + values[changes + 1])
     x = np.concatenate([values, middles, middles])
     rows = np.concatenate([np.arange(len(values)), changes, changes + 1])
-    # Where three are one above the other the left-hand side comes first.
+    # Of three points at one place the left-hand one comes first.
     order = np.lexsort((rows, x))
     return x[order], shares[rows[order]]
 
 
 def plot_explanation(explanation: Explanation, ax: Axes | None = None) -> Axes:
-    """How long the compilation and the runs of a sweep take, as bars."""
+    """Draws how long compilation and runs of a sweep take, as bars."""
     ax = new_axes() if ax is None else ax
     seconds = {"compilation": explanation.compile_seconds, "runs": explanation.seconds}
     bars = ax.barh(list(seconds), list(seconds.values()), color="#A9CCE3", edgecolor="black")
@@ -269,14 +292,14 @@ def plot_explanation(explanation: Explanation, ax: Axes | None = None) -> Axes:
     ax.invert_yaxis()
     ax.margins(x=0.15)
     runs, blocks = explanation.runs, explanation.blocks
-    told = f"{runs:,} run{'s' * (runs != 1)}, {blocks:,} block{'s' * (blocks != 1)}"
-    ax.set_title(f"{told}, {explanation.bytes / 1e6:,.3g} MB", fontsize="medium")
+    size_text = f"{runs:,} run{'s' * (runs != 1)}, {blocks:,} block{'s' * (blocks != 1)}"
+    ax.set_title(f"{size_text}, {explanation.bytes / 1e6:,.3g} MB", fontsize="medium")
     ax.set(xlabel="time in seconds", ylabel="part of the sweep")
     return ax
 
 
 def plot_blocks(verified: Verified, ax: Axes | None = None) -> Axes:
-    """The blocks of a store in rows, each coloured by its state."""
+    """Draws the blocks of a store in rows, each coloured by its state."""
     ax = new_axes() if ax is None else ax
     states = {"right": "#009E73", "to do": "#D9D9D9", "bad": "#D55E00"}
     table = verified.table()

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..activity import Activity, announced, tell
+from ..activity import Activity, announced, note_progress
 from ..checks import (
     as_array,
     as_interval,
@@ -280,7 +280,7 @@ def basins(
             atol=atol,
             observe="attractor",
         )
-        tell("telling the attractors apart")
+        note_progress("telling the attractors apart")
         labels, attractors, cycles = _labels(oscillator, dataset)
         # With one attractor there is hardly one, and to look among all cycles takes its time.
         own = in_own_units(oscillator)

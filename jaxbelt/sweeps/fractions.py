@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..activity import announced, tell
+from ..activity import announced, note_progress
 from ..checks import as_positive, as_whole, outside_of_traces
 from ..cycles.attractors import APART, Runs, error_of_runs, place_of
 from ..cycles.cycle import cycle_from
@@ -187,7 +187,7 @@ def basin_fractions(
     starts = [starts_in(corners, n, jax.random.fold_in(key, row)) for row in range(rows)]
     # From here on in own units.
     variation = given.in_own_units(*np.array([[0.5 * (first + last)], [first], [last]]))
-    _, length, (unit,) = variation.own
+    length, (unit,) = variation.own.length, variation.own.parameters
     if numbers["atol"] is not None:
         numbers["atol"] /= float(length)
     found = _found_along(variation, values / unit, np.stack(starts) / length, numbers)
@@ -233,7 +233,7 @@ def _found_along(
             )
 
         told = results_of(program, grid.shared, rows_of, len(part) * n, **numbers)
-        tell("telling the attractors apart")
+        note_progress("telling the attractors apart")
         for row in range(len(part)):
             here = {name: column[row * n : (row + 1) * n] for name, column in told.items()}
             value = values[first + row : first + row + 1]

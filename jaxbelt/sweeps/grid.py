@@ -18,9 +18,15 @@ from ..checks import (
     require_value,
     traceable,
 )
-from ..identity import fingerprint_or_none_like_it
+from ..identity import fingerprint_or_unique
 from ..kernel.lanes import Observer, Program
-from ..model.oscillator import Oscillator, check_scalars, its_oscillator
+from ..model.oscillator import (
+    Oscillator,
+    check_scalars,
+    has_edges,
+    interval_ends,
+    its_oscillator,
+)
 from ..model.own_units import in_units_of_run
 from ..numerics.compiling import jit, power_of_two
 
@@ -41,7 +47,7 @@ class Grid:
             axes,
         )
         self.make = make
-        self.made_of = fingerprint_or_none_like_it(make)
+        self.made_of = fingerprint_or_unique(make)
         self.axes = {
             name: np.asarray(as_array(v, f"axis {name}", (None,))) for name, v in axes.items()
         }
@@ -65,8 +71,13 @@ class Grid:
         known = "one of known numbers: sweeps are not for jit, vmap or derivatives"
         require(is_concrete(self.example), "make", known, "a traced one")
         check_scalars(self.example)
-        leaves, self.structure = jax.tree.flatten(in_units_of_run(self.example))
+        self.edges = True
         self.mapped = traceable(self._varying, "make", returns)
+        own = in_units_of_run(self.example, edges=True)
+        which = jax.tree.unflatten(jax.tree.structure(own), self.mapped)
+        self.edges = has_edges(own) or any(map(bool, interval_ends(which)))
+        leaves, self.structure = jax.tree.flatten(in_units_of_run(self.example, edges=self.edges))
+        self.mapped = self.mapped if self.edges else self._varying()
         pairs = zip(leaves, self.mapped, strict=True)
         self.shared = [jnp.asarray(leaf) for leaf, mapped in pairs if not mapped]
 
@@ -76,7 +87,7 @@ class Grid:
 
         def probe(values):
             # What does not depend on the mapped values is computed on the spot.
-            run = in_units_of_run(self.make(**values))
+            run = in_units_of_run(self.make(**values), edges=self.edges)
             found.extend(not is_concrete(leaf) for leaf in jax.tree.leaves(run))
             return 0
 
@@ -84,14 +95,8 @@ class Grid:
         return tuple(found)
 
     def program(self, observer: Observer) -> Program:
-        leaves = jax.tree.unflatten(self.structure, self.mapped)
-        edges = any(
-            varies or np.isfinite(value)
-            for belt, which in zip(self.example.belts, leaves.belts, strict=True)
-            for varies, value in ((which.lower, belt.lower), (which.upper, belt.upper))
-        )
-        made_of = fingerprint_or_none_like_it((self.structure, observer))
-        return Program(self.structure, self.mapped, observer, bool(edges), made_of=made_of)
+        made_of = fingerprint_or_unique((self.structure, observer))
+        return Program(self.structure, self.mapped, observer, self.edges, made_of=made_of)
 
     def length(self) -> float:
         """The smallest own unit of length among the oscillators of the grid, as a sample tells."""
@@ -115,15 +120,16 @@ class Grid:
             name: axis[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)
         }
         start = tuple(self.y0.items())
-        known = self.make, self.made_of, tuple(self.names), self.mapped
+        known = self.make, self.made_of, tuple(self.names), self.mapped, self.edges
         table = _rows(*known, start, derivatives, values)
         return np.asarray(table)[:, :, : len(runs)]
 
 
 @jit
-def _rows(make, made_of, names, mapped, start, derivatives, values):
+def _rows(make, made_of, names, mapped, edges, start, derivatives, values):
     def row(values):
-        leaves = jax.tree.leaves(in_units_of_run(make(**{name: values[name] for name in names})))
+        osc = make(**{name: values[name] for name in names})
+        leaves = jax.tree.leaves(in_units_of_run(osc, edges=edges))
         varying = [leaf for leaf, varies in zip(leaves, mapped, strict=True) if varies]
         return jnp.stack([*(jnp.asarray(values.get(x, default)) for x, default in start), *varying])
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from ..activity import SHOWN_AFTER, Activity, is_wanted, progress_line, tell
+from ..activity import SHOWN_AFTER, Activity, is_wanted, note_progress, progress_line
 from ..results import Status
 
 
@@ -55,7 +55,7 @@ class SweepProgress:
         now, more = time.monotonic(), sum(counts.values())
         self.completed += more
         if self.bar is None:
-            tell(f"{self.completed:,} of {self.total:,} runs")
+            note_progress(f"{self.completed:,} of {self.total:,} runs")
             return
         with self.lock:
             # The first results may come long after the first runs began: they give no rate.

@@ -28,17 +28,19 @@ from ..kernel.events import pass_events
 from ..kernel.lanes import Lanes, Observer, Program, are_finite, choose
 from ..kernel.rounds import STEPS_PER_ROUND, lanes_at_start
 from ..kernel.step import take_step, window_of
-from ..model.modes import without_edges
-from ..model.own_units import OwnOscillator, in_units
+from ..model.own_units import OwnOscillator, in_units, without_edges
 from ..model.rest import start_at_focus
 from ..numerics.compiling import jit, one_kernel
 from ..numerics.derivatives import in_directions
+from ..numerics.widths import SideBySide
 from ..results import Status
 
 #: Looks at the events between two refills: a refill costs about as much as a step, and a lane that
 #: waits for one is idle.
 ROUNDS_PER_PASS = 4
-
+#: Passes between two looks at whether there is more to do. An accelerator waits for the host at
+#: each look, and else at none: passes that find nothing to do change nothing.
+PASSES_PER_LOOK = SideBySide(on_cpu=1, elsewhere=4)
 
 #: The default absolute tolerance of a step, in own units.
 DEFAULT_TOLERANCE = 1e-8
@@ -287,7 +289,13 @@ def _fill(program: Program, common: Common, block: _Block, desk: _Desk, slopes):
         own = [eqx.tree_at(lambda d: d.stream, one, stream) for one, stream in pairs]
         return replace(desk, stream=stream), own
 
-    return lax.while_loop(unfinished, go_on, (desk, [one for _, one in slopes]))
+    def some_passes(state):
+        passes = PASSES_PER_LOOK.here
+        if passes == 1:
+            return go_on(state)
+        return lax.fori_loop(0, passes, lambda _, state: go_on(state), state)
+
+    return lax.while_loop(unfinished, some_passes, (desk, [one for _, one in slopes]))
 
 
 class Call(eqx.Module):
@@ -315,7 +323,10 @@ def advance(program: Program, common: Common, queue, call: Call, streams):
     columns, runs + 3 lanes].
 
     Two loops, because on the CPU only loops on small arrays can be one kernel. The inner loop sees
-    small ones only: as many new runs, and as many results, as there are lanes.
+    small ones only: as many new runs, and as many results, as there are lanes. On accelerators
+    these are as many as a device does at once, nothing is written to places that lanes choose, so
+    that no write waits for another, and nothing but the conditions of the two loops is for the host
+    to look at.
     """
     program = replace(program, derivatives=len(queue) > 1)
     width, columns = streams[0].ones.size, _columns_of(program, common.shared)

@@ -22,7 +22,7 @@ from ..checks import require
 from ..kernel.lanes import Program
 from ..kernel.rounds import STEPS_PER_ROUND
 from ..numerics.compiling import wide
-from ..numerics.widths import SideBySide, is_cpu
+from ..numerics.widths import SideBySide, as_here, is_cpu
 from .queue import ROUNDS_PER_PASS, Call, Common, advance, differentiable, idle
 
 #: Steps that a run may take for each 100 units of time before it is given up. On its way to a
@@ -31,8 +31,15 @@ STEP_BUDGET = 400_000
 #: Runs that the kernel is given at once: enough that a call costs nothing beside them, and few
 #: enough that the threads end together.
 CHUNK = SideBySide(on_cpu=2**14, elsewhere=2**20)
-#: Lanes, so many that a refill is cheap for each.
-WIDTH = SideBySide(on_cpu=128, elsewhere=2**20)
+#: Lanes, so many that a refill is cheap for each. A GPU has some 2**18 threads; of more lanes more
+#: would wait for the last runs.
+WIDTH = SideBySide(on_cpu=128, elsewhere=2**18)
+#: Few runs have fewer lanes, by powers of `COARSER`, so that few programs are compiled.
+LEAST_WIDTH = SideBySide(on_cpu=128, elsewhere=2**10)
+COARSER = 16
+#: Threads for each device that is no CPU: one makes queues and keeps results while the lanes of the
+#: other are at work.
+THREADS_PER_DEVICE = 2
 #: Seconds in which an interrupt is to be heard; a call of the kernel takes half of that or less.
 PATIENCE = 0.5
 #: Passes of the first call, before it is known how long one takes: about a seventh of a second on
@@ -48,10 +55,18 @@ def compiled(program: Program) -> Callable:
 
 
 def workers() -> int:
-    """Threads that run the kernel: one a core on the CPU, one a device elsewhere."""
+    """Threads that run the kernel: one a core on the CPU, elsewhere some for each device."""
     if not is_cpu():
-        return jax.local_device_count()
+        return THREADS_PER_DEVICE * jax.local_device_count()
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def lanes_for(runs: int) -> int:
+    """Lanes for a thread that has so many runs to do."""
+    width = WIDTH.here
+    while width // COARSER >= max(runs, LEAST_WIDTH.here):
+        width //= COARSER
+    return width
 
 
 def run(
@@ -84,21 +99,22 @@ def run(
     """
     if not runs:
         return
-    most = np.iinfo(np.int32).max
-    require(runs <= most, "axes", f"{most} runs or fewer in one call", runs)
+    largest = np.iinfo(np.int32).max
+    require(runs <= largest, "axes", f"{largest} runs or fewer in one call", runs)
     limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
-    limit = min(limit, most)
+    limit = min(limit, largest)
     threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
     atol = np.nan if atol is None else atol
+    width = lanes_for(-(-runs // threads))
+    most = CHUNK.here * width // WIDTH.here
     team = _Team(
         functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit))),
-        functools.partial(_first_streams, program, shared, columns, derivatives),
+        functools.partial(_first_streams, program, shared, width, columns, derivatives),
         rows_of,
         put,
-        columns,
-        derivatives,
-        _Chunks(runs, threads, CHUNK.here),
+        (1 + derivatives, columns, most + width),
+        _Chunks(runs, threads, most),
         FIRST_PASSES.here // (1 + derivatives),
     )
     devices = jax.local_devices()
@@ -113,9 +129,9 @@ def run(
         wait(at_work, timeout=10 * PATIENCE)
 
 
-def _first_streams(program: Program, shared, columns: int, derivatives: int) -> Any:
+def _first_streams(program: Program, shared, width: int, columns: int, derivatives: int) -> Any:
     """The stream that a kernel starts from, and its derivatives, all zero."""
-    stream = idle(program, shared, WIDTH.here, columns)
+    stream = idle(program, shared, width, columns)
     return stream, [jax.tree.map(jnp.zeros_like, differentiable(stream))] * derivatives
 
 
@@ -137,14 +153,14 @@ class _Chunks:
 
 @dataclass
 class _Team:
-    """What the threads of one call of `run` share: see there; columns: of the queue."""
+    """What the threads of one call of `run` share: see there; room: the shape of a queue, with a
+    chunk and as many runs more as there are lanes."""
 
     kernel: Callable
     idle: Callable[[], Any]
     rows_of: Callable[[int, int], np.ndarray]
     put: Callable[[np.ndarray, np.ndarray], None]
-    columns: int
-    derivatives: int
+    room: tuple[int, int, int]
     chunks: _Chunks
     first_passes: int
     stop: threading.Event = field(default_factory=threading.Event)
@@ -154,7 +170,8 @@ class _Team:
         zero = np.int32(0)
         with _settings(device):
             call = Call(zero, zero, zero, zero, np.bool_(False))
-            jax.block_until_ready(self.kernel(self._queue(), call, self.idle()))
+            queue = jax.device_put(self._queue())
+            jax.block_until_ready(self.kernel(queue, call, self.idle()))
 
     def work(self, device) -> None:
         """Take chunks until there are no more, or until the team is stopped."""
@@ -169,12 +186,13 @@ class _Team:
 
     def _queue(self) -> np.ndarray:
         """Room for a chunk: of one size, for one compiled kernel."""
-        return np.zeros((1 + self.derivatives, self.columns, CHUNK.here + WIDTH.here))
+        return np.zeros(self.room)
 
     def _chunk(self, queue, first: int, last: int, drain: bool, streams, passes: int):
         """Call the kernel until a chunk is taken (with `drain`: done); calls take half of PATIENCE
         or so. Returns the streams, and how many passes a call may make."""
-        taken, more = np.int32(0), True
+        # Once for all calls.
+        queue, taken, more = jax.device_put(queue), np.int32(0), True
         while more and not self.stop.is_set():
             began = time.monotonic()
             span = np.int32(first), np.int32(last - first)
@@ -205,6 +223,7 @@ _alive: set[threading.Thread] = set()
 def _started(function: Callable, *args: Any) -> Future:
     """A function at work on a thread of its own."""
     future: Future = Future()
+    function = as_here(function)
 
     def call():
         try:

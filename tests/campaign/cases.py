@@ -12,6 +12,7 @@ import numpy as np
 
 from . import engine
 from .engine import Belt, Oscillator
+from .units import ENGINES, Units
 
 #: Structures of laws and edges of a campaign, each of which is compiled.
 STRUCTURES = 9
@@ -22,7 +23,8 @@ PAPER = ("conti", 1.0, 0.6, 10.0, 0.0)
 
 @dataclass(frozen=True)
 class Case:
-    """An oscillator, a start and how long it runs; kind says where it came from."""
+    """An oscillator, a start and how long it runs; kind says where it came from, and units in which
+    ones the package is asked."""
 
     oscillator: Oscillator
     y0: tuple
@@ -30,6 +32,13 @@ class Case:
     kind: str = "random"
     #: How far a grazing orbit stays from what it grazes; negative: it goes so far beyond.
     distance: float | None = None
+    units: Units = ENGINES
+
+    @property
+    def given(self):
+        """The oscillator and the start as the package is given them."""
+        x1, x2 = self.y0
+        return self.units.given(self.oscillator), (x1 * self.units.length, x2 * self.units.length)
 
     @property
     def structure(self):
@@ -59,6 +68,7 @@ class Case:
             T=self.T,
             kind=self.kind,
             distance=self.distance,
+            units=[self.units.length, self.units.frequency],
         )
 
 
@@ -81,6 +91,7 @@ def from_json(text):
         d["T"],
         d["kind"],
         d["distance"],
+        Units(*d.get("units", ())),
     )
 
 

@@ -1,7 +1,8 @@
 """The package on cases: final states and labels by `sweep`, trajectories by vmapped `simulate`.
 
 Cases of one structure (laws, edges or none) are one batch of one compiled program: every number of
-the oscillator and of the start varies from lane to lane.
+the oscillator and of the start varies from lane to lane. The package is given each in the units of
+its case, and what it answers is brought back; those of one call share them.
 """
 
 import functools
@@ -64,7 +65,7 @@ def oscillator(osc):
 
 def as_code(case):
     """The case as an expression for a notebook."""
-    osc = case.oscillator
+    osc, y0 = case.given
     belts = []
     for b in osc.belts:
         own = b.law[0] in ("peak", "table")
@@ -78,13 +79,13 @@ def as_code(case):
         belts.append(f"jb.Belt({b.velocity!r}, {law}, {b.load!r}{edges})")
     return (
         f"jb.Oscillator({osc.damping!r}, ({', '.join(belts)},), {osc.omega!r}), "
-        f"y0={tuple(case.y0)!r}, t1={case.T!r}"
+        f"y0={y0!r}, t1={case.T!r}"
     )
 
 
 def numbers(case):
     """All numbers of a case in the order that `_from_numbers` takes them in."""
-    osc, (laws, edges) = case.oscillator, case.structure
+    (osc, _), (laws, edges) = case.given, case.structure
     row = [osc.damping, osc.omega]
     for b, law in zip(osc.belts, laws):
         p = [float(v) for v in b.law[1:]]
@@ -96,12 +97,13 @@ def numbers(case):
 def tangent(case, direction):
     """A direction of `derivatives.directions` in the order of `numbers`, and that of the start."""
     start, damping, belts = direction
+    length, speed = case.units.length, case.units.speed
     _, edges = case.structure
     row = [damping, 0.0]
     for (velocity, load, lower, upper), b in zip(belts, case.oscillator.belts):
-        row += [velocity, load, *[0.0] * _SIZES[b.law[0]]]
-        row += [lower, upper] if edges else []
-    return row, list(start)
+        row += [velocity * speed, load * length, *[0.0] * _SIZES[b.law[0]]]
+        row += [lower * length, upper * length] if edges else []
+    return row, [x * length for x in start]
 
 
 def _from_numbers(structure, row):
@@ -142,7 +144,7 @@ def swept(cases, observe, directions=None, **options):
     """
     structure = cases[0].structure
     table = np.array([numbers(case) for case in cases])
-    starts = np.array([case.y0 for case in cases], dtype=float)
+    starts = np.array([case.given[1] for case in cases], dtype=float)
     tables = [np.column_stack([starts, _leaves(structure, table)])]
     if directions:
         options["derivatives"] = "case"
@@ -178,8 +180,10 @@ class Final:
 
 def finals(cases, tol):
     """Final states by the sweep."""
-    found = swept(cases, "final", t1=cases[0].T, rtol=tol, atol=tol)
-    x1, x2, status = found.x1_end.values, found.x2_end.values, found.status.values
+    length = cases[0].units.length
+    found = swept(cases, "final", t1=cases[0].T, rtol=tol, atol=tol * length)
+    x1, x2 = found.x1_end.values / length, found.x2_end.values / length
+    status = found.status.values
     modes, events = found.mode_end.values, found.n_events.values
     return [
         Final(float(a), float(b), tuple(m.tolist()), int(n), int(s))
@@ -200,7 +204,8 @@ class Label:
 
 def labels(cases, tol, **options):
     """Attractors by the sweep."""
-    found = swept(cases, "attractor", rtol=tol, atol=tol, **options)
+    length = cases[0].units.length
+    found = swept(cases, "attractor", rtol=tol, atol=tol * length, **options)
     words = jb.decoded(found)
     out = []
     for i in range(len(cases)):
@@ -210,8 +215,8 @@ def labels(cases, tol, **options):
                 str(words.kind.values[i]),
                 float(row.period),
                 _loop(str(words.signature.values[i])),
-                (float(row.x1_min), float(row.x1_max)),
-                (float(row.x2_min), float(row.x2_max)),
+                (float(row.x1_min) / length, float(row.x1_max) / length),
+                (float(row.x2_min) / length, float(row.x2_max) / length),
                 tuple(row.stick_duration.values.tolist()),
                 int(row.status),
             )
@@ -223,7 +228,8 @@ def cycles(cases):
     """Attractors by `find_cycle`, one by one."""
     out = []
     for case in cases:
-        found = jb.find_cycle(oscillator(case.oscillator), case.y0)
+        (osc, y0), length = case.given, case.units.length
+        found = jb.find_cycle(oscillator(osc), y0)
         status = int(found.status)
         kind = {0: "cycle", 1: "stuck", 2: "equilibrium", 6: "equilibrium"}.get(status, "undecided")
         loop = of_one_loop([(int(k), int(b)) for k, b in found.signature])
@@ -232,8 +238,8 @@ def cycles(cases):
                 kind,
                 float(found.period),
                 loop,
-                (float(found.x1_min), float(found.x1_max)),
-                (float(found.x2_min), float(found.x2_max)),
+                (float(found.x1_min) / length, float(found.x1_max) / length),
+                (float(found.x2_min) / length, float(found.x2_max) / length),
                 tuple(np.asarray(found.stick_durations).tolist()),
                 status,
             )
@@ -262,20 +268,20 @@ CHUNK = 64
 
 @functools.cache
 def _trajectories(structure, T, tol, max_segments):
-    def one(row, y0):
+    def one(row, y0, length):
         found = jb.simulate(
             _from_numbers(structure, row),
             y0,
             T,
             ts=jnp.array([T]),
             rtol=tol,
-            atol=tol,
+            atol=tol * length,
             max_segments=max_segments,
             max_events=max_segments,
         )
         return found.ys[-1], found.modes[-1], found.events, found.status
 
-    return jax.jit(jax.vmap(one))
+    return jax.jit(jax.vmap(one, in_axes=(0, 0, None)))
 
 
 #: Arcs that runs are given which used up what `simulate` gives them by itself.
@@ -296,12 +302,13 @@ def _simulated(cases, tol, max_segments):
     if not cases:
         return []
     run = _trajectories(cases[0].structure, cases[0].T, tol, max_segments)
-    out = []
+    length, out = cases[0].units.length, []
     for first in range(0, len(cases), CHUNK):
         some = cases[first : first + CHUNK]
         padded = some + [some[0]] * (CHUNK - len(some))
         table = jnp.array([numbers(case) for case in padded])
-        found = run(table, jnp.array([case.y0 for case in padded], dtype=float))
+        starts = jnp.array([case.given[1] for case in padded], dtype=float)
+        found = run(table, starts, jnp.asarray(length))
         ys, modes, events, status = jax.tree.map(np.asarray, found)
         for i in range(len(some)):
             known = events.kind[i] > 0
@@ -309,11 +316,11 @@ def _simulated(cases, tol, max_segments):
                 events.t[i][known].tolist(),
                 events.kind[i][known].tolist(),
                 events.belt[i][known].tolist(),
-                *events.y[i][known].T.tolist(),
+                *(events.y[i][known].T / length).tolist(),
             )
             out.append(
                 Final(
-                    *map(float, ys[i]),
+                    *map(float, ys[i] / length),
                     tuple(modes[i].tolist()),
                     int(known.sum()),
                     int(status[i]),
@@ -328,33 +335,39 @@ def _simulated(cases, tol, max_segments):
 
 @functools.cache
 def _pushed(structure, T, tol):
-    def end(row, y0):
+    def end(row, y0, length):
         found = jb.simulate(
-            _from_numbers(structure, row), y0, T, ts=jnp.array([T]), rtol=tol, atol=tol
+            _from_numbers(structure, row), y0, T, ts=jnp.array([T]), rtol=tol, atol=tol * length
         )
         return found.ys[-1]
 
-    return jax.jit(jax.vmap(lambda row, y0, d: jax.jvp(end, (row, y0), d)[1]))
+    def pushed(row, y0, d, length):
+        return jax.jvp(lambda row, y0: end(row, y0, length), (row, y0), d)[1]
+
+    return jax.jit(jax.vmap(pushed, in_axes=(0, 0, 0, None)))
 
 
 def derivatives(cases, directions, tol, by):
     """d(x1, x2 at T) along a direction a case, by "simulate" or by the "sweep"."""
+    length = cases[0].units.length
     if by == "sweep":
-        found = swept(cases, "final", directions, t1=cases[0].T, rtol=tol, atol=tol)
-        return np.column_stack([found.d_x1_end_d_case.values, found.d_x2_end_d_case.values])
+        found = swept(cases, "final", directions, t1=cases[0].T, rtol=tol, atol=tol * length)
+        columns = [found.d_x1_end_d_case.values, found.d_x2_end_d_case.values]
+        return np.column_stack(columns) / length
     run, out = _pushed(cases[0].structure, cases[0].T, tol), []
     for first in range(0, len(cases), CHUNK):
         some = cases[first : first + CHUNK]
         padding = CHUNK - len(some)
         rows, moves = zip(*map(tangent, some, directions[first : first + CHUNK]))
         table = [numbers(case) for case in some]
-        starts = [case.y0 for case in some]
+        starts = [case.given[1] for case in some]
         parts = (
             jnp.array(list(part) + [part[0]] * padding, dtype=float)
             for part in (table, starts, rows, moves)
         )
         table, starts, rows, moves = parts
-        out.append(np.asarray(run(table, starts, (rows, moves)))[: len(some)])
+        found = run(table, starts, (rows, moves), jnp.asarray(length))
+        out.append(np.asarray(found)[: len(some)] / length)
     return np.concatenate(out)
 
 
@@ -372,5 +385,5 @@ def period_derivatives(cases, directions):
     for case, direction in zip(cases, directions):
         row = jnp.array(numbers(case))
         along = jnp.array(tangent(case, direction)[0])
-        out.append(float(_pushed_cycle(case.structure)(row, jnp.array(case.y0), along)))
+        out.append(float(_pushed_cycle(case.structure)(row, jnp.array(case.given[1]), along)))
     return np.array(out)

@@ -21,6 +21,7 @@ from math import inf, isfinite
 import numpy as np
 
 import jaxbelt as jb
+from jaxbelt.bifurcations.base import given_point
 from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.bifurcations.scan import search
 from jaxbelt.cycles.attractors import place_of
@@ -28,6 +29,7 @@ from jaxbelt.cycles.attractors import place_of
 from . import engine, package
 from .cases import random_case, rational_case, structures
 from .outcome import Outcome
+from .units import ENGINES, Units, drawn
 
 #: Programs, one for each combination of laws, that a campaign compiles.
 PROGRAMS = 6
@@ -64,16 +66,33 @@ NUMBERS = {
 
 @dataclass(frozen=True)
 class Case:
-    """The engine's oscillator, the parameter as (belt or -1, name), and the interval."""
+    """The engine's oscillator, the parameter as (belt or -1, name), and the interval; and units in
+    which the package is asked."""
 
     oscillator: engine.Oscillator
     parameter: tuple[int, str]
     span: tuple[float, float]
     kind: str
+    units: Units = ENGINES
 
     def at(self, value: float) -> engine.Oscillator:
         """The engine's oscillator there."""
         return _with(self.oscillator, self.parameter, value)
+
+    def given(self, value: float) -> jb.Oscillator:
+        """The oscillator there as the package is given it."""
+        return package.oscillator(self.units.given(self.at(value)))
+
+    @property
+    def measured(self) -> float:
+        """How many of the user's units one of the parameter is."""
+        return self.units.of(self.oscillator, self.parameter)
+
+    @property
+    def given_span(self) -> tuple[float, float]:
+        """The interval as the package is given it."""
+        first, last = (end * self.measured for end in self.span)
+        return first, last
 
     def where(self, osc):
         """The parameter of the package's oscillator."""
@@ -436,13 +455,50 @@ class Brute:
         return all(label_of(osc, [cycle.state]).decided for cycle in missing)
 
 
+class OwnPath:
+    """The path of `scan`, which is in own units, as of the engine's."""
+
+    def __init__(self, case: Case):
+        middle = case.given(0.5 * sum(case.span))
+        self.path = ParameterPath(middle, case.where, case.given_span)
+        own, self.case = self.path.variation.own, case
+        self._parameter = float(own.parameters[0]) / case.measured
+        self._length = float(own.length) / case.units.length
+        found = [given_point(point, self.path.variation) for point in search(self.path)]
+        self.points = tuple(
+            replace(p, value=p.value / case.measured, error=p.error / case.measured) for p in found
+        )
+
+    def look(self, values) -> None:
+        self.path.look([self._own(value) for value in values])
+
+    def label(self, value: float):
+        return self.path.label(self._own(value))
+
+    def cycles(self, value: float) -> list[tuple]:
+        """Of each cycle its modes, its place and the state with the largest x1."""
+        found = []
+        for one in self.path.cycles[self._own(value)]:
+            if one.path:
+                place = place_of(one.loop) * np.array([*[self._length] * 4, 1.0])
+                found.append((one.path, place, _start_on(one.loop, self._length)))
+        return found
+
+    def orbit(self, point) -> np.ndarray:
+        """The states of a connection."""
+        return np.asarray(point.orbit) / self.case.units.length
+
+    def _own(self, value: float) -> float:
+        return float(value) / self._parameter
+
+
 def check(case: Case, seed: int) -> Report:
     """Compare along one path."""
     rng = np.random.default_rng(seed)
     begun = time.perf_counter()
     first, last = case.span
-    path = ParameterPath(package.oscillator(case.at(0.5 * (first + last))), case.where, case.span)
-    points = search(path)
+    path = OwnPath(case)
+    points = path.points
     report = Report(case, points, [])
     at_scan = time.perf_counter() - begun
     length = last - first
@@ -479,31 +535,27 @@ def check(case: Case, seed: int) -> Report:
     return report
 
 
-def _compare(path: ParameterPath, brute: Brute, value: float, report: Report) -> None:
+def _compare(path: OwnPath, brute: Brute, value: float, report: Report) -> None:
     """The label of `scan` and that of the engine at one value."""
     label, ours = brute.labels[value], path.label(value)
     if not label.decided:
         return
     report.labels += 1
-    for one in path.cycles[value]:
-        if one.path:
-            cycle = brute.learn(value, _start_on(one.loop))
-            place = place_of(one.loop)
-            if (
-                cycle is None
-                or cycle.modes != one.path
-                or np.any(np.abs(cycle.place - place) > 1e-4 * np.maximum(1.0, np.abs(place)))
-            ):
-                report.wrong.append(
-                    f"at {value:.12g} scan has {one.path} {place.round(6)}: {cycle}"
-                )
+    for modes, place, start in path.cycles(value):
+        cycle = brute.learn(value, start)
+        if (
+            cycle is None
+            or cycle.modes != modes
+            or np.any(np.abs(cycle.place - place) > 1e-4 * np.maximum(1.0, np.abs(place)))
+        ):
+            report.wrong.append(f"at {value:.12g} scan has {modes} {place.round(6)}: {cycle}")
     if tuple(sorted(cycle.modes for cycle in label.cycles)) != ours.cycles:
         report.wrong.append(f"at {value:.12g} cycles {ours.cycles}, engine {_words(label)}")
     if label.rests != ours.equilibria:
         report.wrong.append(f"at {value:.12g} rests {ours.equilibria}, engine {label.rests}")
 
 
-def _both_sides(path: ParameterPath, point, special, brute: Brute, report: Report) -> None:
+def _both_sides(path: OwnPath, point, special, brute: Brute, report: Report) -> None:
     """Whether something changes at a point of `scan`.
 
     The engine starts on the cycles of `scan`, too: it says whether they are there, but from a few
@@ -517,7 +569,7 @@ def _both_sides(path: ParameterPath, point, special, brute: Brute, report: Repor
     if point.kind == "HopfAtInfinity":
         return  # tests/test_infinity.py has its closed forms
     if point.kind == "SaddleConnection":
-        if not _part(brute.case, point, away):
+        if not _part(brute.case, path.orbit(point), float(point.place[4]), at, away):
             report.wrong.append(f"no orbits part at {point!r}")
         return
     path.look([at - away, at + away])
@@ -530,36 +582,35 @@ def _both_sides(path: ParameterPath, point, special, brute: Brute, report: Repor
         # One that hardly attracts, beside a fold, is reached by no run in time; from a start on it
         # the engine says whether it is there.
         for value in (at - away, at + away):
-            for cycle in jb.portrait(package.oscillator(brute.case.at(value))).cycles:
-                brute.learn(value, (float(cycle.x1_max), 0.0))
+            for cycle in jb.portrait(brute.case.given(value)).cycles:
+                brute.learn(value, (float(cycle.x1_max) / brute.case.units.length, 0.0))
     if all(side.decided for side in sides) and sides[0].name == sides[1].name:
         report.wrong.append(f"nothing changes at {point!r}: {_words(sides[0])}")
 
 
-def _part(case: Case, point, away: float) -> bool:
+def _part(case: Case, orbit: np.ndarray, period: float, at: float, away: float) -> bool:
     """Whether the engine's runs from the saddle, on the two sides of a connection, part where that
     ends: they go two ways from there, in a time that is not small."""
-    orbit, at = point.condition.orbit(point), float(point.value)
     upward = np.sign(orbit[1, 1])
     beyond = []
     for value in (at - away, at + away):
         osc = case.at(value)
         ends = [x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)]
         edge = min(ends, key=lambda x: abs(x - orbit[0, 0]))
-        run = engine.simulate(osc, (edge, 1e-10 * upward), point.place[4] + PARTED)
+        run = engine.simulate(osc, (edge, 1e-10 * upward), period + PARTED)
         beyond.append(run.y_end)
     return float(np.max(np.abs(np.subtract(*beyond)))) > 100 * away
 
 
-def _starts_on_cycles(path: ParameterPath, value: float) -> list[tuple[float, float]]:
+def _starts_on_cycles(path: OwnPath, value: float) -> list[tuple[float, float]]:
     """A state on each of the cycles that `scan` has there."""
-    return [_start_on(one.loop) for one in path.cycles[value] if one.path]
+    return [start for *_, start in path.cycles(value)]
 
 
-def _start_on(loop) -> tuple[float, float]:
-    """The state of a loop with the largest x1."""
+def _start_on(loop, length: float) -> tuple[float, float]:
+    """The state of a loop with the largest x1, lengths times that."""
     rows = np.asarray(loop.entries)[np.asarray(loop.used)]
-    x1, x2 = rows[int(np.argmax(rows[:, 0]))].tolist()
+    x1, x2 = (rows[int(np.argmax(rows[:, 0]))] * length).tolist()
     return x1, x2
 
 
@@ -576,7 +627,7 @@ def case_of(seed: int, number: int) -> Case:
         case = random_path(rng, kinds[number // 2 % len(kinds)], rational=number % 2 == 1)
         if _changes(case):
             break
-    return case
+    return replace(case, units=drawn(rng, exact=case.kind == "rational"))
 
 
 def _changes(case: Case) -> bool:
@@ -610,7 +661,7 @@ def outcome(options, number: int) -> Outcome:
     if unexplained:
         one.notes.append(f"unexplained at {unexplained}")
     if report.wrong or unexplained:
-        one.notes.append(f"{case.oscillator!r}")
+        one.notes.append(f"{case.oscillator!r}\n{case.units}")
     one.counts.update(
         points=len(report.points),
         unexplained=len(unexplained),

@@ -20,7 +20,7 @@ import numpy as np
 
 import jaxbelt as jb
 
-from . import engine, package
+from . import engine, package, units
 from .cases import PAPER, random_case, rational_case, special_positions, structures
 from .outcome import Outcome
 
@@ -299,11 +299,13 @@ def numbers(options) -> range:
 
 def outcome(options, number: int) -> Outcome:
     """Compare one random portrait."""
-    kind, osc = random_oscillator(np.random.default_rng((options.seed, number)))
+    rng = np.random.default_rng((options.seed, number))
+    kind, osc = random_oscillator(rng)
+    own = units.drawn(rng, exact=kind not in ("paper", "random"))
     before = time.monotonic()
-    told = jb.portrait(package.oscillator(osc))
+    told = jb.portrait(package.oscillator(own.given(osc)))
     seconds = time.monotonic() - before
-    wrong, aside = differences(osc, told)
+    wrong, aside = differences(osc, own.back(told, package.oscillator(osc)))
     one = Outcome(kind, wrong)
     one.counts.update({f"set aside: {name}": n for name, n in aside.items()})
     one.counts.update(
@@ -316,7 +318,7 @@ def outcome(options, number: int) -> Outcome:
         }
     )
     if wrong:
-        wrong.insert(0, f"{package.oscillator(osc)!r}\n{told}")
+        wrong.insert(0, f"{package.oscillator(own.given(osc))!r}\n{told}\n{own}")
     return one
 
 

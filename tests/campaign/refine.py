@@ -16,7 +16,7 @@ from dataclasses import fields, replace
 import jaxbelt as jb
 from jaxbelt.results import Status
 
-from . import package, paths
+from . import paths
 from .outcome import Outcome
 
 #: How far the guesses are from the points.
@@ -39,15 +39,16 @@ def numbers(options) -> range:
 def outcome(options, number: int) -> Outcome:
     """Ask beside all points of one path."""
     case = paths.case_of(options.seed, number)
-    middle = package.oscillator(case.at(0.5 * sum(case.span)))
-    known = [p for p in jb.scan(middle, case.where, case.span) if p.status == Status.OK]
+    middle = case.given(0.5 * sum(case.span))
+    known = [p for p in jb.scan(middle, case.where, case.given_span) if p.status == Status.OK]
+    known = [_in_engines(case, point) for point in known]
     one = Outcome(f"{case.parameter}, {len(known)} points")
     image = mirror_image(case)
     for point in known:
         for guess in _guesses(case, float(point.value)):
-            osc = package.oscillator(case.at(guess))
+            osc = case.given(guess)
             begun = time.perf_counter()
-            found = jb.refine(point.condition, osc, where=case.where)
+            found = _in_engines(case, jb.refine(point.condition, osc, where=case.where))
             seconds = time.perf_counter() - begun
             one.wrong += _unlike(case, image, point.condition, guess, found)
             verdict = _verdict(case, point, guess, found)
@@ -58,7 +59,7 @@ def outcome(options, number: int) -> Outcome:
             if verdict not in GOOD:
                 told = one.wrong if verdict == "wrong" else one.notes
                 told.append(f"{verdict}: {point.condition} from {guess!r}: {found!r}")
-                told.append(f"    {point!r}\n    {case.oscillator!r}")
+                told.append(f"    {point!r}\n    {case.oscillator!r}\n    {case.units}")
     return one
 
 
@@ -67,6 +68,11 @@ def said(counts, largest) -> list[str]:
     share = 100 * counts["right"] / max(counts["calls"], 1)
     lines.append(f"{counts['right']} of {counts['calls']} calls right ({share:.2f}%)")
     return [*lines, f"the longest, compilation included, {largest.get('seconds', 0.0):.1f} s"]
+
+
+def _in_engines(case: paths.Case, point):
+    """A point with its value as in the engine's units."""
+    return replace(point, value=point.value / case.measured, error=point.error / case.measured)
 
 
 def _guesses(case: paths.Case, value: float) -> list[float]:
@@ -85,15 +91,19 @@ def _verdict(case: paths.Case, point, guess: float, found) -> str:
     if abs(value - guess) > abs(at - guess):
         return "wrong"
     # Another call has to know it, too; by another name, where two things happen at once.
-    path = package.oscillator(case.at(guess)), case.where, (value - 2e-3, value + 1.9e-3)
+    ends = (value - 2e-3) * case.measured, (value + 1.9e-3) * case.measured
+    path = case.given(guess), case.where, ends
     calls = jb.scan, lambda *path, **options: jb.bifurcation_diagram(*path, **options).points
-    if not any(_is_among(value, call(*path, resolution=16)) for call in calls):
+    if not any(_is_among(case, value, call(*path, resolution=16)) for call in calls):
         return "wrong"
     return "between" if (value - guess) * (at - guess) > 0 else "nearer"
 
 
-def _is_among(value: float, points) -> bool:
-    return any(p.status == Status.OK and abs(p.value - value) < SAME for p in points)
+def _is_among(case: paths.Case, value: float, points) -> bool:
+    near = SAME * case.measured
+    return any(
+        p.status == Status.OK and abs(p.value - value * case.measured) < near for p in points
+    )
 
 
 # --- mirror images --------------------------------------------------------------------------------
@@ -136,9 +146,9 @@ def mirrored_condition(condition, count: int):
 def _unlike(case: paths.Case, image: paths.Case, condition, guess: float, found) -> list[str]:
     """What the mirror image answers, if that is something else."""
     value = _mirrored_value(case, guess)
-    osc = package.oscillator(image.at(value))
+    osc = image.given(value)
     condition = mirrored_condition(condition, len(osc.belts))
-    other = jb.refine(condition, osc, where=image.where)
+    other = _in_engines(image, jb.refine(condition, osc, where=image.where))
     if found.status == other.status:
         away = abs(_mirrored_value(case, float(other.value)) - float(found.value))
         if found.status != Status.OK or away <= SAME + float(found.error) + float(other.error):

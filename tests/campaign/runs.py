@@ -6,14 +6,15 @@ A case of this campaign is a batch of runs of one structure, which is one call o
 import functools
 import json
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
-from . import cases, compare, derivatives, engine, package
+from . import cases, compare, derivatives, engine, package, units
 from .outcome import Outcome
 
-#: Runs in one call.
-BATCH = 4096
+#: Runs in one batch, of which those on round numbers share their units, and the others.
+BATCH = 512
 
 
 def settings(options):
@@ -31,14 +32,29 @@ def outcome(options, number):
     structure, count = _batches(options)[number]
     rng = np.random.default_rng((options.seed, number))
     batch = [_case(rng, structure, options) for _ in range(count)]
+    one = Outcome(f"{count} runs")
+    # Only powers of two keep round numbers round, and distances of 1e-11.
+    for is_exact in (True, False):
+        own = units.drawn(np.random.default_rng((options.seed, number, is_exact)), exact=is_exact)
+        some = [replace(c, units=own) for c in batch if _wants_exact(c) == is_exact]
+        if some:
+            _compare(some, one, rng, options)
+    return one
+
+
+def _wants_exact(case):
+    return case.distance is not None or case.kind.endswith("rational")
+
+
+def _compare(batch, one, rng, options):
+    """Compare runs of one call."""
     labels = options.what == "attractors" or options.by == "find_cycle"
     judge = compare.judge_label if labels else compare.judge
     if labels and options.by != "find_cycle":
         judge = functools.partial(judge, again=lambda case, tol: package.labels([case], tol)[0])
     elif options.heavy and options.what == "final":
         judge = functools.partial(judge, again=lambda case, tol: package.finals([case], tol)[0])
-    one, right = Outcome(f"{count} runs"), []
-    told = _ask(batch, options)
+    right, told = [], _ask(batch, options)
     for case, answer, (verdict, mine) in zip(batch, told, _judged(judge, batch, told, options)):
         _count(one, options, case.kind, verdict, case, answer, mine)
         if verdict == "same" and _has_derivatives(mine, answer, options):
@@ -47,7 +63,6 @@ def outcome(options, number):
         _differentiate_cycles(one, right, rng, options)
     elif right:
         _differentiate(one, right, rng, options)
-    return one
 
 
 def said(counts, largest):

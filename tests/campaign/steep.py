@@ -6,10 +6,11 @@ of this campaign is a batch of oscillators of one structure, half of it a call o
 
 import functools
 import json
+from dataclasses import replace
 
 import numpy as np
 
-from . import cases, compare, package
+from . import cases, compare, package, units
 from .engine import Belt, Oscillator
 from .outcome import Outcome
 
@@ -32,8 +33,15 @@ def outcome(options, number):
     laws = STRUCTURES[number % len(STRUCTURES)]
     rng = np.random.default_rng((options.seed, number))
     count = min(BATCH, options.runs - number * BATCH)
-    batch = [case(rng, laws, is_round=i % 2 == 0) for i in range(count)]
     one = Outcome(f"{count} oscillators with {' and '.join(laws)}")
+    drawn = [case(rng, laws, is_round=i % 2 == 0) for i in range(count)]
+    for is_round, some in ((True, drawn[::2]), (False, drawn[1::2])):
+        own = units.drawn(np.random.default_rng((options.seed, number, is_round)), exact=is_round)
+        _compare([replace(one_, units=own) for one_ in some], one)
+    return one
+
+
+def _compare(batch, one):
     swept, found = package.labels(batch, TOL), package.cycles(batch)
     for case_, *told in zip(batch, swept, found):
         verdicts = {}
@@ -47,7 +55,6 @@ def outcome(options, number):
             labels = {by: vars(label) for by, label in zip(verdicts, told)}
             told = dict(verdicts=verdicts, **labels, engine=vars(mine), case=case_.to_json())
             one.wrong.append(f"{package.as_code(case_)}\n  {json.dumps(told)}")
-    return one
 
 
 def _again(by, case, tol):
