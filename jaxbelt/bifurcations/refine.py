@@ -16,7 +16,7 @@ from jax import lax
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, require, require_value
 from ..cycles.cycle import EXACT, warn_of_extrapolation
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
 from ..numerics.compiling import is_outermost
@@ -172,6 +172,7 @@ def _begun(
     if isinstance(osc, Oscillator) or not callable(osc):
         require_value(at is None, "at", "left out where osc is an Oscillator", at)
         check_oscillator(osc)
+        refuse_clock(osc, "refine", "jb.simulate")
         number = leaf_index(osc, where)
         condition.check(osc)
         value = jnp.asarray(jax.tree.leaves(osc)[number], dtype=jnp.float64).reshape(1)

@@ -42,7 +42,7 @@ from .modes import (
     mode_acceleration,
     settle,
 )
-from .oscillator import Oscillator, check_oscillator, has_possible_numbers
+from .oscillator import Oscillator, check_oscillator, has_possible_numbers, refuse_clock
 from .own_units import in_given_units, in_own_units, quantity
 from .pseudofocus import edge_focus
 from .rest import is_centre
@@ -176,6 +176,7 @@ def equilibria(osc: Oscillator) -> Equilibria:
     stable where these are and the other side does not push away from it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "equilibria", "jb.simulate")
     own = in_own_units(osc)
     found = _all_candidates(own)
     return in_given_units(_existing(found, found), osc, own)
@@ -423,6 +424,7 @@ def lyapunov_coefficient(osc: Oscillator) -> Array:
     vanishing ones only, and d^3 x2'/dx2^3: a = (d^3 x2'/dx2^3) / 16.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "lyapunov_coefficient")
     own = in_own_units(osc)
     found, coefficients = _lyapunov_coefficients(own)
     return _existing(coefficients, found) / (1 if own is osc else own.units.length**2)
