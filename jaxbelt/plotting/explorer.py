@@ -94,7 +94,7 @@ class Explorer:
         shown = jax.tree.unflatten(self._structure, values)
         if isinstance(shown, Machine):  # made anew, so that its checks run
             belts = [PhysicalBelt(**vars(belt)) for belt in shown.belts]
-            return Machine(shown.mass, shown.stiffness, shown.damping, belts)
+            return Machine(shown.mass, shown.stiffness, shown.damping, belts, shown.forcing)
         check_oscillator(shown)
         return shown
 

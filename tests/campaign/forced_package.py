@@ -85,9 +85,7 @@ def _of_numbers(structure, sizes, values, rest):
         friction = _LAWS[law](static, *(next(rest) for _ in range(size)))
         edges = next(values), next(values)
         belts.append(jb.Belt(velocity, friction, load, *(edges if structure.edges else ())))
-    forces = tuple(
-        jb.Harmonic(*(next(values) for _ in range(3))) for _ in range(structure.forces)
-    )
+    forces = tuple(jb.Harmonic(*(next(values) for _ in range(3))) for _ in range(structure.forces))
     return y0, jb.Oscillator(damping, tuple(belts), omega, forcing=forces)
 
 
