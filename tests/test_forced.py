@@ -41,7 +41,7 @@ def end_of(osc, y0=(1.0, 0.2), t1=25.0, t0=0.0):
 def assert_same(one, other, within=CLOSE, later=0.0):
     (y, t, kinds), (y_other, t_other, kinds_other) = one, other
     assert kinds == kinds_other
-    assert len(t) > 3
+    assert len(t) > 1
     np.testing.assert_allclose(t + later, t_other, atol=within)
     np.testing.assert_allclose(y, y_other, atol=within)
 
@@ -197,7 +197,8 @@ def engine_cases(number, count, structure):
         (0, 40),  # Coulomb, one force
         (1, 20),  # cubic, one force
         pytest.param(2, 20, marks=pytest.mark.slow),  # two belts with edges
-        (3, 20),  # two belts with edges, a velocity that oscillates, two forces
+        # Two belts with edges, a velocity that oscillates, two forces.
+        pytest.param(3, 20, marks=pytest.mark.slow),
         pytest.param(6, 20, marks=pytest.mark.slow),  # three belts
         pytest.param(8, 20, marks=pytest.mark.slow),  # no force: velocity and load oscillate
     ],
@@ -232,7 +233,9 @@ def test_a_belt_at_rest_holds_for_ever_only_within_its_capacity():
     assert held.status == jb.Status.STUCK_FOREVER
     np.testing.assert_array_equal(held.ys[-1], [0.15, 0.0])
     torn = jb.simulate(osc, (0.25, 0.0), 50.0, ts=[50.0])
-    assert torn.status != jb.Status.STUCK_FOREVER
+    # It slips once, and then holds where it comes to rest.
+    assert torn.status == jb.Status.STUCK_FOREVER
+    assert abs(float(torn.ys[-1, 0])) < 0.2
     assert torn.events.kind[0] == jb.EventKind.SLIP
     # needed = -0.25 + 0.5 cos(1.3 t) first is -0.7.
     assert float(torn.events.t[0]) == pytest.approx(np.arccos(-0.9) / 1.3, abs=1e-11)
@@ -355,10 +358,13 @@ def test_a_force_of_ones_own_is_the_sum_of_its_waves():
     assert_same(end_of(own), end_of(forced_one(forcing=forces, load=8 * 0.7)))
 
 
-@pytest.mark.parametrize("formulation", ["switch", "smooth"])
+@pytest.mark.parametrize(
+    "formulation", ["switch", pytest.param("smooth", marks=pytest.mark.slow)]
+)
 def test_approximations_approach_the_exact_motion(formulation):
-    osc = forced_one(law=jb.Coulomb(1.0, 1.0), velocity=jb.Oscillating(0.3, 0.1, 0.7))
-    exact, name = jb.simulate(osc, (1.0, 0.2), 6.0, ts=[6.0]), "v_star"
+    osc = forced_one(law=jb.Coulomb(1.0, 1.0), velocity=jb.Oscillating(0.3, 0.1, 0.7), load=2.0)
+    exact = jb.simulate(osc, (1.0, 0.2), 6.0, ts=[6.0])
+    assert jb.EventKind.SLIP in np.asarray(exact.events.kind)
     name = "v_star" if formulation == "switch" else "eps"
     errors = []
     for width in (1e-2, 2.5e-3):
