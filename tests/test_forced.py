@@ -358,9 +358,7 @@ def test_a_force_of_ones_own_is_the_sum_of_its_waves():
     assert_same(end_of(own), end_of(forced_one(forcing=forces, load=8 * 0.7)))
 
 
-@pytest.mark.parametrize(
-    "formulation", ["switch", pytest.param("smooth", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("formulation", ["switch", pytest.param("smooth", marks=pytest.mark.slow)])
 def test_approximations_approach_the_exact_motion(formulation):
     osc = forced_one(law=jb.Coulomb(1.0, 1.0), velocity=jb.Oscillating(0.3, 0.1, 0.7), load=2.0)
     exact = jb.simulate(osc, (1.0, 0.2), 6.0, ts=[6.0])
