@@ -21,7 +21,7 @@ from ..checks import outside_of_traces, pick
 from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.events import signature_name
 from ..model.modes import edges
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import OwnOscillator, in_given_units, in_own_units, quantity
 from ..numerics.compiling import compiled_beside
 from ..results import Status, describe, draw
@@ -178,6 +178,7 @@ def portrait(osc: Oscillator) -> Portrait:
         ValueError: If an argument is impossible or traced; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "portrait", "jb.simulate from several starts")
     own = in_own_units(osc)
     found = in_given_units(_portrait(own), osc, own)
     warn_of_extrapolation((*found.cycles, *found.unstable), depth=5)
