@@ -29,16 +29,18 @@ from ..checks import (
 from ..model.events import Signature, signature_name
 from ..model.friction import jump_and_kink
 from ..model.modes import select
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.own_units import in_given_units, in_own_units, quantity
 from ..model.rest import is_neutral
 from ..motion.simulate import Arcs
 from ..numerics.compiling import any_lane, in_groups, jit
 from ..numerics.newton import HOLDS
+from ..numerics.padding import longer
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Chain, Loop, loop_events, modes_of, room_of
 from .orbits import MOST_ARCS, follow, last_loop, loop_of
+from .periodic import PeriodicMotion, motion_reached
 from .shooting import (
     ARC_STEPS,
     Ends,
@@ -412,8 +414,8 @@ def _exactly_in_lanes(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
 def _solved_in_lanes(osc: Oscillator, loop: Loop, status: Array) -> tuple[Array, ...]:
     """Its mesh, unknowns, number of Newton steps, and status."""
     coarse, error = _polished(osc, loop, status, ARC_STEPS)
-    padding = [(0, 0)] * (coarse.chain.mesh.ndim - 1) + [(0, FINE_STEPS - ARC_STEPS)]
-    found = jnp.pad(coarse.chain.mesh, padding), *_solution_of(coarse)
+    mesh = longer(coarse.chain.mesh, FINE_STEPS, axis=-1, fill=0.0)
+    found = mesh, *_solution_of(coarse)
     inexact = _is_inexact(coarse, error) & (status == Status.OK)
 
     def fine():
@@ -455,7 +457,9 @@ MORE_BUDGETS = 15
 
 
 @announced("find_cycle")
-def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Cycle:
+def find_cycle(
+    osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None
+) -> Cycle | PeriodicMotion:
     """The steady cycle that the start y0 leads to.
 
     osc: `Oscillator`; y0: start (x1, x2), shape [2]. max_arcs: room for the arcs of one loop, where
@@ -469,10 +473,16 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     its two sides differ, and what is given may be neither, see `simulate`. Where the start leads to
     an equilibrium, to one of a continuum of closed orbits, or nothing repeats, the status says so.
     `ValueError` names an argument that is impossible.
+
+    Of a forced oscillator y0 is the start at t = 0, and what is returned is the `PeriodicMotion`
+    that the start leads to, of up to 16 periods of the forcing; not under `jax.jit` and `jax.vmap`,
+    see `periodic`. Where the orbit is chaotic or quasi-periodic its status is NOT_SETTLED.
     """
     check_oscillator(osc)
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
+    if has_clock(osc):
+        return motion_reached(osc, y0)
     room = None if max_arcs is None else as_whole(max_arcs, "max_arcs")
     cycle = cycle_from(osc, y0, room)
     warn_of_extrapolation([cycle])
