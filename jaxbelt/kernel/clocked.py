@@ -56,7 +56,6 @@ from ..numerics.control_points import (
 from ..results import Status
 from .lanes import Lanes, Passage, choose, materialise
 from .step import (
-    INITIAL_STEP,
     LANDING,
     LANDS_WITHIN,
     LONGEST_STEP,
@@ -70,11 +69,11 @@ from .step import (
     next_size,
     nystroem,
 )
-from .waves import StepClock
+from .waves import StepClock, StepWave
 
 #: Longest step of a mass that sticks, times the highest frequency: the polynomial of what is needed
-#: is then good to 1e-12.
-LONGEST_STUCK = 0.5
+#: is then good to 1e-9, and steps that end at its root are made again.
+LONGEST_STUCK = 1.2
 #: Rounding of guards, over their size: of boundaries and edges, and of what is needed.
 ROUNDING, NEEDED_ROUNDING = 1e-15, 1e-13
 #: Steps shorter than this have their polynomials from values and slopes alone: what the integral
@@ -84,6 +83,8 @@ SHORT = 1e-3
 SHORTEST = 1e-4
 #: Of the highest coefficient of what is needed, how far the polynomial may be off.
 LAST_TERM = 1e-4
+#: Error of the time of slip onset that needs no shorter step, over `LANDS_WITHIN` of the tolerance.
+STRAIGHT = 1.0
 #: The stages, by their number, whose times make the polynomial of what is needed, beside the
 #: start, 0: of all of them the rounding would be a thousand times as large.
 STAGES = (2, 6, 4, 7, 8, 9, 10, 13)
@@ -302,7 +303,7 @@ def _meetings(osc, clock: StepClock, window: Window, lanes: Lanes, new: _Attempt
     own = _quartic((lanes.x2, rate0), (new.x2, new.rate), new.x1 - lanes.x1, h)
     own = [materialise(k, ones) for k in own]
     found, fuzz = [], ROUNDING * blur(lanes.t)
-    for i, (belt, code) in enumerate(zip(osc.belts, mode.codes, strict=True)):
+    for i, code in enumerate(mode.codes):
         slips = jnp.abs(code) == 1
         v = clock.velocities[i]
         ends = (v.at(0.0), v.rate(0.0)), (v.at(1.0), v.rate(1.0))
@@ -339,33 +340,28 @@ def _meetings(osc, clock: StepClock, window: Window, lanes: Lanes, new: _Attempt
             ]
             points = from_monomials(guard)
             found.append(_meeting(points, doubt, fuzz * size, by_time, h, room, reach, number))
-    limits = where_any(
+    none = jnp.zeros_like(h)
+    no = none > 0
+    limit = where_any(
         stuck,
-        lambda: _limits(osc, clock, window, lanes, new, room, reach),
-        [_no_meeting(h, 3 * n + i) for i in range(2)],
+        lambda: _limit(osc, clock, window, lanes, new, room, reach),
+        _Meeting(no, no, none + 1, none + NEVER, jnp.full_like(lanes.hit, 3 * n)),
     )
     asked = stuck & (lanes.status != Status.STUCK_FOREVER.value)
-    for limit in limits:
-        once, cut, delta = (
-            limit.once & asked,
-            limit.cut & asked,
-            jnp.where(asked, limit.delta, NEVER),
-        )
-        found.append(replace(limit, once=once, cut=cut, delta=delta))
+    once, cut, delta = limit.once & asked, limit.cut & asked, jnp.where(asked, limit.delta, NEVER)
+    found.append(replace(limit, once=once, cut=cut, delta=delta))
     return found
 
 
-def _no_meeting(h: Array, number: int) -> _Meeting:
-    no = jnp.zeros_like(h, dtype=bool)
-    return _Meeting(no, no, jnp.ones_like(h), jnp.full_like(h, NEVER), jnp.asarray(number))
+def _limit(osc, clock: StepClock, window, lanes, new: _Attempt, room, reach) -> _Meeting:
+    """The meeting with a limit of what stuck belts can hold, capacity -+ needed: the nearer one.
 
-
-def _limits(osc, clock: StepClock, window, lanes, new: _Attempt, room, reach) -> list[_Meeting]:
-    """The meetings with the limits of what stuck belts can hold, capacity -+ needed."""
+    Where it may meet both the step is cut.
+    """
     own, n, h = nystroem(), len(osc.belts), clock.h
     nodes = tuple(round(float(own.c[i]), 12) for i in (0, *STAGES))
     matrix = through(nodes)
-    needed = [combine(row, new.needed) for row in matrix]
+    needed = [materialise(combine(row, new.needed), clock.ones) for row in matrix]
 
     def capacity(c):
         now = clock.at(c)
@@ -374,25 +370,32 @@ def _limits(osc, clock: StepClock, window, lanes, new: _Attempt, room, reach) ->
             total = total + jnp.where(stuck, belt.load * belt.friction.static, 0.0)
         return total
 
-    if any(hasattr(load, "along") for load in clock.loads):
+    if any(isinstance(load, StepWave) for load in clock.loads):
         capacities = [capacity(c) for c in nodes]
         held = [combine(row, capacities) for row in matrix]
     else:
         held = [capacity(1.0)] * len(nodes)
-    fuzz = NEEDED_ROUNDING * blur(lanes.t)
-    found = []
-    for i, way in enumerate((-1.0, 1.0)):
-        points = [c + way * x for c, x in zip(held, needed, strict=True)]
-        size = 1 + jnp.abs(held[-1]) + jnp.abs(lanes.x1)
-        doubt = LAST_TERM * jnp.abs(highest_difference(points)) + fuzz * size
-        safe = jnp.where(h > 0, h, 1.0)
-        ends = []
-        for theta in (0.0, 1.0):
-            value, slope = value_at(points, jnp.full_like(h, theta))
-            ends.append((value, slope / safe))
-        one = _meeting(points, doubt, fuzz * size, ends, h, room, reach, 3 * n + i)
-        found.append(one)
-    return found
+    pairs = list(zip(held, needed, strict=True))
+    least = [functools.reduce(jnp.minimum, [c + way * x for c, x in pairs]) for way in (-1.0, 1.0)]
+    way = jnp.where(least[0] < least[1], -1.0, 1.0)
+    points = [c + way * x for c, x in pairs]
+    size = 1 + jnp.abs(held[-1]) + jnp.abs(lanes.x1)
+    fuzz = NEEDED_ROUNDING * blur(lanes.t) * size
+    doubt = LAST_TERM * jnp.abs(highest_difference(points)) + fuzz
+    safe = jnp.where(h > 0, h, 1.0)
+    ends = [(p, (len(points) - 1) * (q - p) / safe) for p, q in (points[:2], points[-2:])]
+    ends[1] = (points[-1], ends[1][1])
+    number = jnp.where(way < 0, 3 * n, 3 * n + 1).astype(lanes.hit.dtype)
+    one = _meeting(points, doubt, fuzz, ends, h, room, reach, number)
+    both = (jnp.maximum(*least) <= doubt) & (h > SHORTEST * reach)
+    one = replace(one, cut=one.cut | both, there=jnp.where(both, 0.5 * one.there, one.there))
+    if any(isinstance(v, StepWave) for v in clock.velocities):
+        return one
+    # The way is straight: the state at the root is as good as that at the end.
+    _, slope, _ = value_at(points, one.there)
+    sharp = doubt * safe <= STRAIGHT * room * jnp.abs(slope)
+    back = jnp.where(one.once & ~one.cut & sharp, (one.there - 1) * h, one.delta)
+    return replace(one, delta=back)
 
 
 def take_step(
@@ -516,7 +519,8 @@ def pass_events(
         x1=x1,
         x2=x2,
         a=a,
-        h=jnp.where(fired, first_step(rtol), jnp.abs(lanes.h)),
+        # A stick phase is known beforehand.
+        h=jnp.where(fired, jnp.where(mode.any_stuck, LONGEST_STEP, first_step(rtol)), abs(lanes.h)),
         pace=jnp.where(fired, STEP_SAFETY / first_step(rtol), lanes.pace),
         mode=mode,
         events=lanes.events + jnp.where(happened, 1, 0),

@@ -92,6 +92,7 @@ class _Tableau(NamedTuple):
 
 @functools.cache
 def nystroem() -> _Tableau:
+    """The weights of the steps."""
     # Order eight takes twice the stages of order five and a third of the steps at 1e-8, and most of
     # a step's cost is not in its stages but in its interpolant, bounds and choices.
     tableau = the_solvers().Dopri8.tableau
@@ -171,6 +172,7 @@ def _quotient(osc: Oscillator, window: _Window, ones: Array, x1: Array, x2: Arra
 
 @jax.custom_jvp
 def as_quotient(osc: Oscillator, signs, pulls, ones: Array, x1: Array, x2: Array) -> Array:
+    """`oscillator.acceleration` as a single quotient; pulls: the signs times the loads."""
     numerator, denominator = -x1 - osc.damping * x2, ones
     for push in constant_force(osc):
         numerator = numerator + push

@@ -9,6 +9,7 @@ after, that it has passed zero once. What else there may be the caller asks of a
 
 import functools
 from collections.abc import Sequence
+from itertools import pairwise
 from math import comb
 from typing import NamedTuple
 
@@ -63,19 +64,15 @@ def highest_difference(points: Sequence[Array]) -> Array:
     return functools.reduce(jnp.add, terms)
 
 
-def value_at(points: Sequence[Array], theta: Array) -> tuple[Array, Array]:
-    """The polynomial and its derivative at theta."""
-    *_, (p, q) = _levels(points, theta)
-    return p + theta * (q - p), (len(points) - 1) * (q - p)
-
-
-def _levels(points: Sequence[Array], theta: Array):
-    """What de Casteljau's algorithm has, until two points are left."""
-    row = list(points)
-    while len(row) > 2:
-        yield row
-        row = [p + theta * (q - p) for p, q in zip(row, row[1:])]
-    yield row
+def value_at(points: Sequence[Array], theta: Array) -> tuple[Array, Array, Array]:
+    """The polynomial and its first two derivatives at theta, by de Casteljau's algorithm."""
+    n, row = len(points) - 1, list(points)
+    while len(row) > 3:
+        row = [p + theta * (q - p) for p, q in pairwise(row)]
+    first, second = row[1] - row[0], row[2] - row[1]
+    slope = first + theta * (second - first)
+    value = row[0] + theta * first + theta * slope
+    return value, n * slope, n * (n - 1) * (second - first)
 
 
 def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array) -> Passage:
@@ -85,7 +82,7 @@ def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array
     where its shape is trusted whatever the doubt, because the way is as short as can be.
     """
     points, doubt, rounding = lax.stop_gradient((list(points), doubt, rounding))
-    steps = [q - p for p, q in zip(points, points[1:])]
+    steps = [q - p for p, q in pairwise(points)]
     rises, falls = ([way * d > rounding for d in steps] for way in (1.0, -1.0))
     seen_rise, seen_fall, peak, dip = rises[0], falls[0], None, None
     for up, down in zip(rises[1:], falls[1:]):
@@ -102,22 +99,16 @@ def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array
     stays = above & (points[0] > -rounding) | known & ~below & ~dip
     root = _first_passage(points, -rounding)
     dips = known & ~below & dip & ~peak & ~stays
-    bottom = _newton(_derivative(steps), _first_passage([-d for d in steps], rounding))
-    lowest = value_at(points, bottom)[0]
+    guess = jnp.where(dips, _first_passage([-d for d in steps], rounding), root)
+    theta, lowest = _newton(points, guess, dips)
     passes = dips & (lowest < -jnp.maximum(doubt, rounding))
-    inside = jnp.minimum(bottom, 1 - bottom) > 1e-3
+    inside = jnp.minimum(theta, 1 - theta) > 1e-3
     splits = dips & ~passes & (lowest <= doubt + rounding) & inside & ~trust
     unclear = ~(once | stays | dips)
-    root = jnp.where(passes, jnp.minimum(root, bottom), root)
     # Newton's method may come to the root at 0 that began the way.
-    root = jnp.maximum(_newton(points, root), 0.1 * root)
-    there = jnp.where(splits, bottom, jnp.where(unclear, 0.5, root))
-    return Passage(once, passes | splits | unclear, there)
-
-
-def _derivative(steps: Sequence[Array]) -> list[Array]:
-    n = len(steps)
-    return [n * d for d in steps]
+    there = jnp.where(dips, theta, jnp.maximum(theta, 0.1 * root))
+    there = jnp.where(passes, jnp.minimum(root, theta), there)
+    return Passage(once, passes | splits | unclear, jnp.where(unclear, 0.5, there))
 
 
 def _first_passage(points: Sequence[Array], level: Array) -> Array:
@@ -131,10 +122,11 @@ def _first_passage(points: Sequence[Array], level: Array) -> Array:
     return jnp.where(points[0] < level, 0.0, found)
 
 
-def _newton(points: Sequence[Array], theta: Array) -> Array:
-    """The root near theta, in [0, 1]."""
+def _newton(points: Sequence[Array], theta: Array, extreme: Array) -> tuple[Array, Array]:
+    """The root near theta, in [0, 1], or the extremum, and the value there."""
     for _ in range(NEWTON_STEPS):
-        value, slope = value_at(points, theta)
-        moved = theta - value / jnp.where(slope == 0, 1.0, slope)
+        value, slope, bend = value_at(points, theta)
+        over, under = jnp.where(extreme, slope, value), jnp.where(extreme, bend, slope)
+        moved = theta - over / jnp.where(under == 0, 1.0, under)
         theta = jnp.clip(jnp.where(jnp.isfinite(moved), moved, theta), 0.0, 1.0)
-    return theta
+    return theta, value_at(points, theta)[0]
