@@ -194,15 +194,14 @@ def slopes():
 
 
 def cycles():
-    def of(nu):
+    def period(nu):
         cycle = jb.find_cycle(jb.presets.class_b(nu, NU1), (3.0, 0.0))
-        slope = jax.grad(
-            lambda nu: jb.period(jb.find_cycle(jb.presets.class_b(nu, NU1), (3.0, 0.0)))
-        )(nu)
-        return cycle.period, cycle.status, slope
+        return jb.period(cycle), cycle.status
 
-    period, status, slope = jax.jit(jax.vmap(of))(jnp.linspace(0.1, 0.6, 70))
-    return {"period": period, "status": status, "d_period": slope}
+    # More than a group on the CPU has.
+    nus = jnp.linspace(0.1, 0.6, 70)
+    (found, status), slope = jax.jit(jax.vmap(jax.value_and_grad(period, has_aux=True)))(nus)
+    return {"period": found, "status": status, "d_period": slope}
 
 
 def unstable_cycles():
@@ -244,7 +243,7 @@ first = pytest.mark.slow(first=True)
         pytest.param(lambda: sweep("attractor", class_d), id="attractors", marks=first),
         pytest.param(ends, id="ends", marks=first),
         pytest.param(slopes, id="slopes", marks=first),
-        pytest.param(cycles, id="cycles", marks=first),
+        pytest.param(cycles, id="cycles", marks=pytest.mark.slow),
         pytest.param(unstable_cycles, id="unstable", marks=pytest.mark.slow),
         pytest.param(scanned, id="scan", marks=pytest.mark.slow),
         pytest.param(mapped, id="regions", marks=pytest.mark.slow),
@@ -374,7 +373,7 @@ def test_the_script_measures_at_small_sizes(script):
     # Some steps for each of 100 units of time.
     assert 100 < told["kernel: steps of a lane a run"] < 1000
     assert told["kernel: bound by"] in ("float64 operations", "memory")
-    assert 0 < told["kernel: share of the bound"] < 2  # on a busy machine, measured one by one
+    assert 0 < told["kernel: share of float64 operations"] <= told["kernel: share of the bound"]
 
 
 @needs_cpu
