@@ -357,7 +357,7 @@ def cost_of_pass(program, shared) -> tuple[float, float]:
     """
     width = 256
     stream = threads._first_streams(program, shared, width, 2 + sum(program.mapped), 0)[0]
-    common = Common(shared, 100.0, 1e-8, np.nan, np.int32(1))
+    common = Common(shared, *map(jnp.asarray, (100.0, 1e-8, np.nan, np.int32(1))))
     traced = jax.make_jaxpr(lambda stream: _work(program, common, stream, [])[0])(stream)
     state = sum(leaf.nbytes for leaf in jax.tree.leaves(stream.lanes)) / width
     return operations(traced.jaxpr) / width, 2 * state * ROUNDS_PER_PASS * STEPS_PER_ROUND
