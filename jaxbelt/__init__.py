@@ -13,15 +13,16 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     numerics/       spacing widths programs compiling
     checks          arguments, checked at the public edge
     tables          results as tables
-    numerics/       derivatives extrapolation newton continuation roots
+    numerics/       padding derivatives extrapolation newton continuation roots
+    numerics/       control_points
     model/          friction forcing oscillator own_units machine parameters variations modes
     model/          pseudofocus transitions instants rest events equilibria far_out
     presets         the published systems
-    kernel/         lanes marks step events rounds
+    kernel/         lanes marks step events rounds waves clocked
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
     motion/         smoothing simulate
     cycles/         chains settling shooting orbits cycle attractors functionals
-    cycles/         backwards returns creeping separatrices portrait unstable
+    cycles/         backwards returns separatrices portrait unstable
     cycles/         outlines nearest sides shocks
     sweeps/         observers moments along reducers attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins

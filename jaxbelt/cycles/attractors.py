@@ -1,4 +1,4 @@
-"""When two motions are one attractor: `itinerary`, `place_of` and `is_same`.
+"""When two motions are one attractor: `itinerary`, `place_of`, `distance` and `is_same`.
 
 An attractor is where it is. What a cycle does in one loop does not tell: there may be two cycles
 with one sequence of events. Two things tell.
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..model.events import of_one_loop
 from ..model.modes import ABOVE
@@ -37,13 +38,16 @@ MOMENT = 1e-13
 #: An arc that vanishes as the square of a distance may take more than MOMENT at one value of a
 #: parameter and less at the next one; it counts at both if it takes longer than this.
 LEAST_MOMENT = 1e-16
-#: Places of one cycle that shooting solved for differ by less, relative to its size: its equations
-#: hold to 1e-9, and beside a fold a cycle moves by ten thousand times that.
-SOLVED = 1e-5
+#: Distance below which two cycles that shooting solved for are the same: its equations hold to
+#: 1e-9, and beside a fold a cycle moves by ten thousand times that.
+SAME = 1e-5
 #: The same of runs of a sweep, times its tolerance: its errors are ten to a thousand times that.
-#: Where they are further apart, but not as far as APART, or their events differ, shooting tells.
 RUN = 1e3
-APART = 1e-2
+#: Distance below which two motions may be the same: ends of two pieces of one branch; runs whose
+#: distance or events leave it open, which shooting then tells.
+BESIDE = 1e-2
+#: Distance below which an unstable cycle goes on to one at the next value of a parameter.
+GOES_ON = 0.3
 
 
 def itinerary(osc: Oscillator, loop: Cycle | Loop, moment: float = MOMENT) -> Itinerary:
@@ -100,18 +104,24 @@ def extent(rows: np.ndarray) -> np.ndarray:
     return np.array([x1.min(), x1.max(), x2.min(), x2.max(), durations.sum()])
 
 
-def apart(place: np.ndarray, other: np.ndarray) -> float:
-    """How far apart two places are, relative to the larger of the two."""
-    size = max(np.ptp(place[:4]), np.ptp(other[:4]))
-    return float(np.max(np.abs(place - other)) / size)
+def distance(place: ArrayLike, other: ArrayLike, least: float = 0.0) -> Any:
+    """Distance between motions by their places, [.., 5], or the first numbers of them.
+
+    It is relative to the size of the larger motion, its largest extent; to `least` where that is
+    larger.
+    """
+    one, two = np.asarray(place), np.asarray(other)
+    size = np.maximum(np.ptp(one[..., :4], axis=-1), np.ptp(two[..., :4], axis=-1))
+    size = np.maximum(size, least)
+    return np.max(np.abs(one - two), axis=-1) / np.where(size > 0, size, 1.0)
 
 
-def is_same(cycle: Cycle, other: Cycle, tolerance: float = SOLVED) -> bool:
+def is_same(cycle: Cycle, other: Cycle) -> bool:
     """Whether two cycles of one oscillator are one; both with status OK."""
     if int(cycle.status) != Status.OK or int(other.status) != Status.OK:
         return False
     modes, others = (itinerary(one.oscillator, one) for one in (cycle, other))
-    return modes == others and apart(place_of(cycle), place_of(other)) < tolerance
+    return modes == others and distance(place_of(cycle), place_of(other)) < SAME
 
 
 def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:
@@ -164,9 +174,7 @@ class Runs:
 
     def same(self, others: "Runs") -> tuple[np.ndarray, np.ndarray]:
         """Which of two runs each lead to one cycle, and for which this does not tell."""
-        both = np.stack(np.broadcast_arrays(self.places, others.places))
-        size = np.max(np.ptp(both[..., :4], axis=-1), axis=0)
-        away = np.max(np.abs(both[0] - both[1]), axis=-1) / np.where(size > 0, size, 1.0)
+        away = distance(self.places, others.places)
         fits = self.signatures == others.signatures
         same = fits & (away < self.error)
-        return same, ~same & (away < max(APART, 10 * self.error))
+        return same, ~same & (away < max(BESIDE, 10 * self.error))

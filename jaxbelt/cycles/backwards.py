@@ -42,13 +42,18 @@ class BackwardCycle(Cycle):
         return Cycle.__repr__(self)
 
 
-def reversed_in_time(osc: Oscillator) -> Oscillator:
-    """The oscillator whose motion (x1, -x2) is the motion of `osc` backwards."""
+def moved_in_time(osc: Oscillator, way: Array | float) -> Oscillator:
+    """The oscillator itself, way = 1, or the one reversed in time, way = -1."""
     return eqx.tree_at(
         lambda o: [o.damping, *(b.velocity for b in o.belts), *(b.load for b in o.belts)],
         osc,
-        replace_fn=lambda leaf: -leaf,
+        replace_fn=lambda leaf: leaf * way,
     )
+
+
+def reversed_in_time(osc: Oscillator) -> Oscillator:
+    """The oscillator whose motion (x1, -x2) is the motion of `osc` backwards."""
+    return moved_in_time(osc, -1.0)
 
 
 def solved(osc: Oscillator, loop: Loop) -> Cycle:

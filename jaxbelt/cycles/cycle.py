@@ -35,6 +35,7 @@ from ..model.rest import is_neutral
 from ..motion.simulate import Arcs
 from ..numerics.compiling import any_lane, in_groups, jit
 from ..numerics.newton import HOLDS
+from ..numerics.padding import longer
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Chain, Loop, loop_events, modes_of, room_of
@@ -412,8 +413,8 @@ def _exactly_in_lanes(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
 def _solved_in_lanes(osc: Oscillator, loop: Loop, status: Array) -> tuple[Array, ...]:
     """Its mesh, unknowns, number of Newton steps, and status."""
     coarse, error = _polished(osc, loop, status, ARC_STEPS)
-    padding = [(0, 0)] * (coarse.chain.mesh.ndim - 1) + [(0, FINE_STEPS - ARC_STEPS)]
-    found = jnp.pad(coarse.chain.mesh, padding), *_solution_of(coarse)
+    mesh = longer(coarse.chain.mesh, FINE_STEPS, axis=-1, fill=0.0)
+    found = mesh, *_solution_of(coarse)
     inexact = _is_inexact(coarse, error) & (status == Status.OK)
 
     def fine():

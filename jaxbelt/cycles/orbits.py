@@ -16,13 +16,13 @@ from ..model.modes import (
     STUCK,
     Mode,
     capacity,
-    edges,
     first_of,
     force_rounding,
     mode_acceleration,
     mode_of,
     select,
     zone,
+    zone_ends,
 )
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.rest import settles
@@ -343,8 +343,7 @@ def before_stick_ends(osc: Oscillator, belt: int | Array) -> Array:
     the belt does not touch. [zones, 2].
     """
     v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
-    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
-    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    lower, upper = zone_ends(osc)
     mode = contact(osc, lower, v, rightward=True)
     onset, held = onset_position(osc, mode), capacity(osc, mode)
     before, ahead = select(v > 0, (lower, upper), (upper, lower))

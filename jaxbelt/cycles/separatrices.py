@@ -24,6 +24,7 @@ upwards or downwards all along a piece of the boundary beyond slip; then the sep
 and that piece of the boundary itself parts the motions.
 """
 
+from collections.abc import Callable
 from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -31,10 +32,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from ..checks import number
-from ..model.equilibria import Equilibria, EquilibriumKind, at_rest_beside
+from ..model.equilibria import Equilibria, EquilibriumKind, at_rest_beside, equilibria
 from ..model.modes import (
     STUCK,
     Mode,
@@ -45,19 +47,20 @@ from ..model.modes import (
     mode_acceleration,
     mode_of,
     select,
+    zone_ends,
 )
 from ..model.oscillator import Oscillator
 from ..model.own_units import quantity
 from ..model.transitions import contact, contact_beside, mode_of_state
 from ..motion.arcs import Ends
+from ..motion.integrators import STRIDE, density
 from ..numerics.compiling import each, jit
 from ..results import Status, draw
 from ..tables import table_of
 from .backwards import reversed_in_time
 from .chains import Loop
-from .creeping import arc_samples
 from .orbits import Orbit, follow_finely, place_of_rest
-from .shooting import trace_of
+from .shooting import flow, trace_of
 
 if TYPE_CHECKING:
     import pandas
@@ -67,8 +70,8 @@ if TYPE_CHECKING:
 SEPARATRIX_ARCS, MORE_ARCS = 256, 2048
 #: Tops that move on by less, relative to the distance from the origin, are settling.
 SETTLING = 1e-6
-#: Samples of each arc.
-ARC_SAMPLES = 32
+#: Samples of each arc; steps of integration, of order 12, between them at most.
+ARC_SAMPLES, STEPS_ALONG = 32, 100_000
 
 
 class Separatrix(eqx.Module):
@@ -223,8 +226,7 @@ def tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     x2'' = -x2 there, so they are orbits that slip with the sign of the belt's velocity.
     """
     v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
-    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
-    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    lower, upper = zone_ends(osc)
     stuck = contact(osc, lower, v, rightward=True)
     slips = Mode(tuple(jnp.where(code == STUCK, jnp.sign(v), code) for code in stuck.codes))
     zero = jnp.zeros_like(lower)
@@ -246,8 +248,7 @@ def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     On one side of such an orbit the mass comes to be held, on the other it slips away.
     """
     v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
-    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
-    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    lower, upper = zone_ends(osc)
     x1 = jnp.where(v > 0, lower, upper)
     inside, before = (_beside(osc, x1, v, rightward=side) for side in (v > 0, v < 0))
     slips = _slipping(inside, jnp.sign(v))
@@ -281,6 +282,25 @@ def _slipping(mode: Mode, sign: Array) -> Mode:
     return Mode(tuple(jnp.where(code == STUCK, sign, code) for code in mode.codes))
 
 
+def end_points(osc: Oscillator) -> Array:
+    """All points in which separatrices may begin or end, [points, 2], NaN where there is none.
+
+    Those of contact edges, those of boundaries, and the ends of what can rest, which come last:
+    their number is not known under a trace.
+    """
+    points = [
+        ends_of(osc, *_as_arrays(belt))[0]
+        for belt in range(len(osc.belts))
+        for ends_of in (tangencies, corners)
+    ]
+    rests = equilibria(osc)
+    ends = jnp.stack([rests.x1_lower, rests.x1_upper], axis=1).reshape(-1)
+    on_edges, at_rest = (
+        jnp.stack([x1, jnp.zeros_like(x1)], axis=1) for x1 in (jnp.stack(edges(osc)), ends)
+    )
+    return jnp.concatenate([on_edges, *points, at_rest])
+
+
 def _at_rest(
     osc: Oscillator, x1: float, side: str, stable: bool, reach: float
 ) -> TracedSeparatrix | None:
@@ -290,6 +310,55 @@ def _at_rest(
     # Backwards the signs of all relative velocities are the other ones.
     mode = np.where(np.abs(mode) == 1, -mode, mode) if stable else mode
     return _branch(osc, (x1, 0.0), mode, side, stable, reach) if leaves else None
+
+
+def places_along(
+    osc: Oscillator, codes: Array, y: Array, duration: Array, rate: Callable, marks: Array
+) -> tuple[Array, Array]:
+    """Times since the entry of an arc, and states, [n] and [n, 2], where the integral of a rate, a
+    function of the state, comes to each of the marks in order, or else where the arc ends."""
+    mode = mode_of(codes)
+
+    def to(carry, mark):
+        def before(carry):
+            _, left, total = carry
+            # Where there is no rate, NaN, it is the end of the arc.
+            return (left > 0) & ~(total >= mark)
+
+        def step(carry):
+            y, left, total = carry
+            wanted = jnp.maximum(STRIDE / density(osc, mode, *y), duration / STEPS_ALONG)
+            length, pace = jnp.minimum(wanted, left), rate(y)
+            passes = total + pace * length > mark
+            length = jnp.where(passes, (mark - total) / pace, length)
+            total = jnp.where(passes, mark, total + pace * length)
+            return flow(osc, codes, jnp.ones(1), y, length), left - length, total
+
+        carry = lax.while_loop(before, step, carry)
+        y, left, _ = carry
+        return carry, (duration - left, y)
+
+    return lax.scan(to, (y, duration, jnp.zeros(())), marks)[1]
+
+
+def arc_samples(
+    osc: Oscillator, codes: Array, y: Array, exit_: Array, duration: Array, n: int
+) -> tuple[Array, Array]:
+    """Times and states of n samples of an arc, the last at its end: three quarters of them evenly
+    along its way in the plane, the others evenly in time.
+
+    x1 and x2 are monotone, as extrema end arcs: |dx1| + |dx2| of the arc is the integral of that of
+    its steps.
+    """
+    mode = mode_of(codes)
+    way = jnp.sum(jnp.abs(exit_ - y))
+
+    def rate(y):
+        pull = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, *y))
+        return 0.75 * (jnp.abs(y[1]) + jnp.abs(pull)) / way + 0.25 / duration
+
+    marks = jnp.append(jnp.arange(1, n) / n, jnp.inf)
+    return places_along(osc, codes, y, duration, rate, marks)
 
 
 @jit

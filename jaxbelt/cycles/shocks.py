@@ -24,10 +24,10 @@ from ..model.oscillator import Oscillator, check_oscillator
 from ..model.own_units import OwnOscillator, in_given_units, in_units_of_run, quantity, rescaled
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .nearest import ShortestWay, end_of_way, sampled_curve, sampled_point, shortest_between
-from .outlines import Outline, outline_of_cycle
+from .nearest import ShortestWay, sampled, shortest_between
+from .outlines import ClosedOutline, Line, Outline, straight
 from .portrait import TRACED, Portrait, portrait
-from .sides import Bound, Destination, bounds_of, destination_of_name, leads_to, resting_places
+from .sides import Bound, Destination, bounds_of, leads_to, segments_of
 
 if TYPE_CHECKING:
     import pandas
@@ -73,21 +73,22 @@ class FatalShock(eqx.Module):
         shock_x1, shock_x2; inf and NaN where there is no boundary in that direction."""
         known, along_x2 = in_units_of_run(self.portrait.oscillator), self.direction == "x2"
         told, unit = _in_units_of(self.portrait, known), float(known.units.length)
-        end = destination_of_name(self.attractor)
+        end = Destination.of_name(self.attractor)
         ts, states = _phases(told, end, as_whole(n, "n"))
-        beside = [bound for bound in bounds_of(told) if end in bound.sides]
-        curves = [sampled_curve(known, bound.outline) for bound in beside]
+        outlines = [bound.outline for bound in bounds_of(told) if end in bound.sides]
+        curves = [sampled(known, outline.pieces(known)) for outline in outlines]
         rows = []
-        for t, y in zip(ts, states, strict=True):
-            point, best, shock = sampled_point(known, y), np.inf, np.full(2, np.nan)
-            for curve in curves:
-                length, meeting = shortest_between(known, point, curve, along_x2=along_x2)
-                if meeting is not None and not length >= best:
-                    best, shock = length, end_of_way(known, curve, meeting) - y
-            rows.append((t, *(unit * np.array([*y, best, *shock])).tolist()))
-        columns = zip(*rows, strict=True)
+        for t, y in zip(ts.tolist(), states, strict=True):
+            x1, x2 = map(jnp.asarray, y)
+            point = sampled(known, straight(known, x1, x1, x2))
+            ways = [shortest_between(known, point, curve, along_x2=along_x2) for curve in curves]
+            best, to = np.inf, np.full(2, np.nan)
+            for length, its_end, meeting in ways:
+                if meeting is not None and length < best:
+                    best, to = length, its_end
+            rows.append([t, *(unit * np.array([*y, best, *(to - y)])).tolist()])
         names = ("t", "x1", "x2", "distance", "shock_x1", "shock_x2")
-        return table_of({name: list(column) for name, column in zip(names, columns, strict=True)})
+        return table_of([dict(zip(names, row, strict=True)) for row in rows])
 
     def table(self) -> "pandas.DataFrame":
         """One row: attractor, direction, distance, x1 and x2 of the start, shock_x1, shock_x2,
@@ -197,17 +198,17 @@ def shortest_way_out(
     if end.what not in ("cycle", "equilibrium"):
         return None, None, Status.NOT_SETTLED
     osc, outline = told.oscillator, _outline_of(told, end)
-    first, found = sampled_curve(osc, outline), bounds_of(told)
+    first, found = sampled(osc, outline.pieces(osc)), bounds_of(told)
     shortest, way, beside = np.inf, None, None
     for bound in (bound for bound in found if end in bound.sides):
-        second = sampled_curve(osc, bound.outline)
-        length, meeting = shortest_between(osc, first, second, along_x2=along_x2)
+        second = sampled(osc, bound.outline.pieces(osc))
+        length, _, meeting = shortest_between(osc, first, second, along_x2=along_x2)
         if np.isnan(length):
             return None, None, Status.NO_CONVERGENCE
         if meeting is not None and length < shortest:
             shortest, beside = length, bound
             way = ShortestWay(outline, bound.outline, meeting, along_x2)
-    farthest = max(np.max(np.abs(ends)) for ends in (first.parts.low, first.parts.high))
+    farthest = max(np.max(np.abs(ends)) for ends in (first.low, first.high))
     # Beyond that separatrices are not followed.
     goes_on = any(one.stable and one.end == "outside" for one in told.separatrices)
     complete = not goes_on or shortest + farthest < TRACED * told.reach
@@ -232,8 +233,8 @@ def _tells_all(told: Portrait, found: list[Bound]) -> bool:
 
 def _outline_of(told: Portrait, end: Destination) -> Outline:
     if end.what == "cycle":
-        return outline_of_cycle(told.cycles[end.number])
-    return next(rest for rest in resting_places(told) if rest.first == end.number)
+        return ClosedOutline.of(told.cycles[end.number])
+    return next(Line(-1, *rows) for rows in segments_of(told) if rows[0] == end.number)
 
 
 def _phases(told: Portrait, end: Destination, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -41,6 +41,7 @@ from .modes import (
     kinetic_capacity,
     mode_acceleration,
     settle,
+    zone_ends,
 )
 from .oscillator import Oscillator, check_oscillator, has_possible_numbers
 from .own_units import in_given_units, in_own_units, quantity
@@ -211,7 +212,7 @@ def _all_candidates(osc: Oscillator) -> Equilibria:
 
 def _rows_of(osc: Oscillator, *, with_saddles: bool) -> Equilibria:
     positions = jnp.sort(jnp.stack(edges(osc)))
-    zones, points = _in_zones(osc, positions), _at_edges(osc, positions, with_saddles=with_saddles)
+    zones, points = _in_zones(osc), _at_edges(osc, positions, with_saddles=with_saddles)
     rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), zones, points)
     return rows[jnp.argsort(rows.x1)]
 
@@ -219,9 +220,8 @@ def _rows_of(osc: Oscillator, *, with_saddles: bool) -> Equilibria:
 # --- within the zones: fixed points and segments ------------------------------------------------
 
 
-def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
-    end = jnp.full(1, jnp.inf)
-    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+def _in_zones(osc: Oscillator) -> Equilibria:
+    lower, upper = zone_ends(osc)
     rest = jnp.zeros_like(lower)
     mode = contact(osc, lower, rest, rightward=True)
     held = capacity(osc, mode)

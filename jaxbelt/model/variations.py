@@ -6,7 +6,7 @@ who uses it does not know from which. Compiled programs are handed a `Family`: o
 linear in the parameters, their leaves and slopes as data, so that one program serves every
 parameter and every function. Where a function is not linear, what was solved for in the family that
 is tangent to it at a guess is solved for again in the one that is tangent at the solution, until
-both are one oscillator there (`Variation.settle`). That is Newton's method once more.
+both are one oscillator there (`Variation.relinearised`). That is Newton's method once more.
 """
 
 import functools
@@ -455,7 +455,7 @@ class Variation:
                 break
         return value
 
-    def settle(
+    def relinearised(
         self, attempt: Callable[[Family, Any], tuple[Any, Any]], unknowns: Any
     ) -> tuple[Any, Any]:
         """What an attempt finds in the family that is tangent where it ends, and whether it is.

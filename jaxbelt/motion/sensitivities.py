@@ -33,6 +33,7 @@ from ..model.oscillator import Oscillator, has_clock
 from ..model.rest import is_slow
 from ..model.transitions import on_guard
 from ..numerics.compiling import LARGEST, any_lane, axes_of, one_kernel
+from ..numerics.padding import in_groups_of, longer
 from .arcs import stick_arc
 from .flights import (
     MOST_FLIGHTS,
@@ -201,16 +202,10 @@ def _sensitivities(by_run, varied, rest, arcs: Arc, remaining: Array) -> Sensiti
     width = min(largest_power(2 * runs - 1), fitting, RUNS.here)
     depth = min(ROWS, max(1, MOST_FLIGHTS.here // width))
     blocks, chunks = -(-runs // width), -(-rows // depth)
-    padding = (0, blocks * width - runs), (0, chunks * depth - rows)
-
-    def padded(leaf):
-        return jnp.pad(leaf, (*padding, *[(0, 0)] * (leaf.ndim - 2)))
-
-    arcs, remaining = jax.tree.map(padded, (arcs, remaining))
+    more_rows = longer((arcs, remaining), chunks * depth, axis=1, fill=0)
+    arcs, remaining = longer(more_rows, blocks * width, fill=0)
     own, shared = eqx.partition((varied, rest), by_run)
-    own = jax.tree.map(
-        lambda leaf: jnp.pad(leaf, (padding[0], *[(0, 0)] * (leaf.ndim - 1)), "edge"), own
-    )
+    own = longer(own, blocks * width)
     first = Sensitivity(*jnp.broadcast_to(jnp.eye(inputs)[:3, None], (3, width, inputs)))
 
     def block(_, number):
@@ -392,9 +387,7 @@ def _slopes_of_samples(by_run, varied, rest, starts: Array, since: Array, codes:
     size = min(MOST_FLIGHTS.here, largest_power(2 * total - 1))
 
     def chunks(leaf):
-        leaf = leaf.reshape(total, *leaf.shape[2:])
-        padding = (0, -total % size), *[(0, 0)] * (leaf.ndim - 1)
-        return jnp.pad(leaf, padding, "edge").reshape(-1, size, *leaf.shape[1:])
+        return in_groups_of(size, leaf.reshape(total, *leaf.shape[2:]))
 
     run = jnp.broadcast_to(jnp.arange(runs)[:, None], since.shape)
 

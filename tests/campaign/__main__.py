@@ -28,6 +28,7 @@ CAMPAIGNS = {
         name: name
         for name in ("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep")
     },
+    "forced-sweep": "forced_sweeps",
 }
 #: What can be asked of each campaign beside `--results`.
 PLAIN = frozenset({"seed", "runs"})
@@ -37,6 +38,7 @@ KNOWN = {
     "maps": frozenset(),
     "steep": PLAIN,
     "fractions": PLAIN | {"threads"},
+    "forced-sweep": PLAIN | {"threads", "structure", "tol"},
     **dict.fromkeys(("final", "simulate", "attractors"), RUNS),
     "derivatives": RUNS | {"by"},
     "grazing": RUNS - {"extreme_share", "heavy"} | {"by"},
