@@ -15,7 +15,7 @@ def filled_up(tree: Any, rows: Any, size: int) -> Any:
     return pick(tree, np.asarray(rows)[np.minimum(np.arange(size), len(rows) - 1)])
 
 
-def longer(tree: Any, size: int, *, axis: int = 0, fill: float | None = None) -> Any:
+def longer(tree: Any, size: int, *, axis: int = 0, fill: int | float | None = None) -> Any:
     """The arrays of a tree made longer along an axis, up to `size`, with a number.
 
     fill: that number; None: the last row of each array.
@@ -31,7 +31,7 @@ def longer(tree: Any, size: int, *, axis: int = 0, fill: float | None = None) ->
     return jax.tree.map(one, tree)
 
 
-def in_groups_of(size: int, tree: Any, *, fill: float | None = None) -> Any:
+def in_groups_of(size: int, tree: Any, *, fill: int | float | None = None) -> Any:
     """The rows of a tree of arrays in groups, [groups, size, ..], the last one made `longer`."""
     return jax.tree.map(
         lambda leaf: longer(leaf, -(-len(leaf) // size) * size, fill=fill).reshape(
