@@ -47,5 +47,6 @@ def plot_exponents(found: Exponents, ax: Axes | None = None) -> Axes:
     ax.errorbar(known, values[known], 3 * errors[known], fmt="o", color="black", capsize=3)
     ax.axhline(0.0, color="grey", linewidth=0.8)
     ax.set_xticks([0, 1], ["first", "second"])
+    ax.set_xlabel("number")
     ax.set_ylabel("Lyapunov exponent")
     return ax
