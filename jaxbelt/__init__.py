@@ -34,7 +34,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     bifurcations/   curves cells faces bounds regions diagrams switch_folds
     inverse/        selection record search fit margins design
     si              results in SI units
-    plotting/       style phase histories points diagrams regions categories sweeps orbits
+    plotting/       style phase histories forced points diagrams regions categories sweeps orbits
     plotting/       inverse model draw si explorer
     paper           the paper's table and figures
     api             the public names
