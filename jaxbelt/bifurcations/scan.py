@@ -14,7 +14,7 @@ found in the same way from its signature, see `edges_touched`.
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise, takewhile
+from itertools import chain, islice, pairwise, takewhile
 from typing import Any
 
 import jax.numpy as jnp
@@ -36,6 +36,7 @@ from .base import (
     given_point,
     point_without_cycle,
 )
+from .conditions import AbstractCycleCondition
 from .connections import SaddleConnection
 from .crossings import CrossingSliding, SlidingExchange
 from .edge_rests import BoundaryEquilibrium, PseudoHopf
@@ -127,28 +128,26 @@ def search(
     near: points are solved for from the ends of intervals narrower than this fraction of the path.
     ahead: calls for the programs that are needed afterwards, see `compiled_beside`.
     """
-    calls = [*_calls_ahead(path), *ahead]
+    calls = chain(_calls_ahead(path), ahead)
     with compiled_beside(f"path {len(ahead)}", path.at(path.first), calls):
         return _searched(path, resolution, near)
 
 
-def _calls_ahead(path: ParameterPath) -> list[Callable[[], Any]]:
+def _calls_ahead(path: ParameterPath) -> Iterator[Callable[[], Any]]:
     """Calls that compile what nearly every path needs: of what happens to belts' velocities on this
     one, of Hopf points, and of cycles that begin to stick."""
     belts = len(path.at(path.first).belts)
-    at_breaks = [
-        (condition, value, None)
-        for value in path.breaks
-        for pair in path.coinciding(value)
-        for kind in LOOKED_FOR
-        for condition in kind.at_coincidence(pair)
-    ]
-    value = path.inside(path.first)
-    anywhere = [(Hopf(), value, ANY), (GrazingSliding(0), value, blank_loop(ROOM, belts))]
-    return [
-        functools.partial(condition.solved_from, path.variation, value, beginning)
-        for condition, value, beginning in (*at_breaks, *anywhere)
-    ]
+    loop, value = blank_loop(ROOM, belts), path.inside(path.first)
+    ahead: list[tuple[AbstractCondition, float]] = []
+    for at in path.breaks:
+        for pair in path.coinciding(at):
+            likely = (one for kind in LOOKED_FOR for one in kind.at_coincidence(pair))
+            ahead += [(one, at) for one in islice(likely, 1)]
+    ahead += [(Hopf(), value), (GrazingSliding(0), value)]
+    for condition, at in ahead:
+        is_of_cycle = isinstance(condition, AbstractCycleCondition)
+        beginning = loop if is_of_cycle else ANY if isinstance(condition, Hopf) else None
+        yield functools.partial(condition.point_from, path.variation, at, beginning)
 
 
 def _searched(path: ParameterPath, resolution: int, near: float) -> tuple[BifurcationPoint, ...]:
