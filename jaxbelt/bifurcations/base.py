@@ -165,6 +165,11 @@ class AbstractCondition(eqx.Module):
         plain = all(isinstance(leaf, int | float) and np.isfinite(leaf) for leaf in leaves)
         require(plain, "condition", "made of plain finite numbers", self)
 
+    def with_clock(self) -> Any:
+        """The same condition for forced oscillators; a `ValueError` where there is none."""
+        expected = "one for forced oscillators, such as jb.PeriodDoubling()"
+        raise ValueError(f"condition must be {expected}, got {self!r}")
+
     def as_data(self) -> Any:
         """The same condition with arrays for its numbers, as compiled programs take it."""
         return jax.tree.map(lambda leaf: jnp.asarray(np.array(leaf)), self)

@@ -29,6 +29,7 @@ from ..numerics.compiling import jit
 from ..results import EventKind, Status
 from .base import Line, check_two_belts
 from .conditions import AbstractCycleCondition, AbstractStickCondition
+from .forced import TimedCrossing
 from .guesses import nearest, orbit_after_stick, repeated_loop, without_arcs
 from .special import SpecialPoint
 from .systems import (
@@ -90,6 +91,9 @@ class CrossingSliding(AbstractStickCondition):
 
     caption: ClassVar[str] = "crossing-sliding, belt {belt}"
     line: ClassVar[Line] = Line("crossing-sliding", "#CC79A7", (0, (5, 1.5)))
+
+    def with_clock(self):
+        return TimedCrossing(self.belt)
 
     @property
     def room(self):

@@ -22,9 +22,10 @@ import numpy as np
 
 from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces, require
-from ..cycles.attractors import BESIDE, MOMENT, distance
+from ..cycles.attractors import MAYBE_SAME, MOMENT, distance
 from ..cycles.chains import Loop, cut
 from ..cycles.cycle import Cycle, exactly, polish, warn_of_fast_loops
+from ..cycles.unstable import from_starts
 from ..model.equilibria import candidates
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator
@@ -233,7 +234,8 @@ def bifurcation_diagram(
     """
     rows, resolution = as_whole(rows, "rows"), as_whole(resolution, "resolution")
     path = ParameterPath(osc, where, span)
-    points = search(path, resolution)
+    osc_at_first = path.at(path.first)
+    points = search(path, resolution, ahead=[lambda: from_starts(osc_at_first)])
     # A point on an end of the span has one side only; a condition that holds all along has none.
     bounds = [point for point in points if int(point.status) != Status.DEGENERATE]
     inner = [point for point in bounds if path.first < float(point.value) < path.last]
@@ -484,7 +486,7 @@ def _joined(pieces: Sequence[_Piece], special: Sequence[list[BifurcationPoint]])
         )
         taken: set[int] = set()
         for away, i, j in pairs:
-            if away < BESIDE and not taken & {i, j}:
+            if away < MAYBE_SAME and not taken & {i, j}:
                 taken |= {i, j}
                 for a, b in ((ends[i], ends[j]), (ends[j], ends[i])):
                     partner[a.piece, a.right] = (b.piece, b.right)

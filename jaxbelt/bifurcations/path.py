@@ -30,7 +30,7 @@ from ..checks import is_concrete, require
 from ..cycles.attractors import (
     GOES_ON,
     LEAST_MOMENT,
-    SAME,
+    SAME_CYCLE,
     Itinerary,
     distance,
     itinerary,
@@ -481,7 +481,7 @@ def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> i
             continue
         if other.path == cycle.path and sticks(cycle.path):
             return number
-        if distance(place, place_of(other.loop)) < SAME:
+        if distance(place, place_of(other.loop)) < SAME_CYCLE:
             return number
     return None
 

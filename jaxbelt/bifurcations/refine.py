@@ -16,12 +16,13 @@ from jax import lax
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, require, require_value
 from ..cycles.cycle import EXACT, warn_of_extrapolation
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
 from ..numerics.compiling import is_outermost
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint, given_point
+from .forced import forced_point
 from .path import ParameterPath
 from .scan import search
 
@@ -49,6 +50,7 @@ def refine(
     *,
     where: Callable[[Oscillator], Any] | None = None,
     at: Any = None,
+    start: Any = None,
     max_arcs: int | None = None,
 ) -> BifurcationPoint:
     """The bifurcation point near an oscillator, by Newton's method with exact derivatives.
@@ -92,6 +94,8 @@ def refine(
     require_value(fits, "condition", "such as jb.Hopf()", condition)
     room = None if max_arcs is None else as_whole(max_arcs, "max_arcs")
     variation, near, value = _begun(condition, osc, where, at)
+    if has_clock(near):
+        return given_point(forced_point(condition, variation, value, start), variation)
     point = condition.point(variation, near, value, room or condition.room)
     if not is_outermost(near, value, point):
         return given_point(point, variation)

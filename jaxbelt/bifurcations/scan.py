@@ -11,9 +11,10 @@ Labels describe attractors. Points where the unstable cycle in a diagram touches
 found in the same way from its signature, see `edges_touched`.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise, takewhile
+from itertools import chain, islice, pairwise, takewhile
 from typing import Any
 
 import jax.numpy as jnp
@@ -21,9 +22,11 @@ import numpy as np
 
 from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces
-from ..cycles.attractors import SAME, distance, is_same, itinerary, place_of
+from ..cycles.attractors import SAME_CYCLE, distance, is_same, itinerary, place_of
+from ..cycles.chains import blank_loop
 from ..cycles.cycle import as_loop, warn_of_extrapolation
 from ..model.oscillator import Oscillator
+from ..numerics.compiling import compiled_beside
 from ..numerics.newton import NEWTON_STEPS
 from ..results import Status
 from .base import (
@@ -33,6 +36,7 @@ from .base import (
     given_point,
     point_without_cycle,
 )
+from .conditions import AbstractCycleCondition
 from .connections import SaddleConnection
 from .crossings import CrossingSliding, SlidingExchange
 from .edge_rests import BoundaryEquilibrium, PseudoHopf
@@ -41,7 +45,7 @@ from .folds import FoldOfCycles
 from .infinity import HopfAtInfinity
 from .meetings import EdgeExchange, MeetingEdges
 from .path import ROOM, ParameterPath
-from .rests import BeltAtRest, Hopf, SuddenSliding
+from .rests import ANY, BeltAtRest, Hopf, SuddenSliding
 from .tangencies import GrazingSliding
 
 #: Kinds that are searched, likelier ones first, and those whose programs compile sooner.
@@ -114,12 +118,39 @@ def scan(
 
 
 def search(
-    path: ParameterPath, resolution: int = 96, near: float = NEAR
+    path: ParameterPath,
+    resolution: int = 96,
+    near: float = NEAR,
+    ahead: Sequence[Callable[[], Any]] = (),
 ) -> tuple[BifurcationPoint, ...]:
     """Every bifurcation point on a path, in order; the path keeps its labels.
 
     near: points are solved for from the ends of intervals narrower than this fraction of the path.
+    ahead: calls for the programs that are needed afterwards, see `compiled_beside`.
     """
+    calls = chain(_calls_ahead(path), ahead)
+    with compiled_beside(f"path {len(ahead)}", path.at(path.first), calls):
+        return _searched(path, resolution, near)
+
+
+def _calls_ahead(path: ParameterPath) -> Iterator[Callable[[], Any]]:
+    """Calls that compile what nearly every path needs: of what happens to belts' velocities on this
+    one, of Hopf points, and of cycles that begin to stick."""
+    belts = len(path.at(path.first).belts)
+    loop, value = blank_loop(ROOM, belts), path.inside(path.first)
+    ahead: list[tuple[AbstractCondition, float]] = []
+    for at in path.breaks:
+        for pair in path.coinciding(at):
+            likely = (one for kind in LOOKED_FOR for one in kind.at_coincidence(pair))
+            ahead += [(one, at) for one in islice(likely, 1)]
+    ahead += [(Hopf(), value), (GrazingSliding(0), value)]
+    for condition, at in ahead:
+        is_of_cycle = isinstance(condition, AbstractCycleCondition)
+        beginning = loop if is_of_cycle else ANY if isinstance(condition, Hopf) else None
+        yield functools.partial(condition.point_from, path.variation, at, beginning)
+
+
+def _searched(path: ParameterPath, resolution: int, near: float) -> tuple[BifurcationPoint, ...]:
     points = [point for at in path.breaks for point in _at_break(path, at)]
     first, last = path.inside(path.first), path.inside(path.last)
     ends = [first, *(v for at in path.breaks for v in path.beside(at)), last]
@@ -308,9 +339,9 @@ def _is_apart(point: BifurcationPoint, other: BifurcationPoint) -> bool:
 def _is_another(point: BifurcationPoint, other: BifurcationPoint) -> bool:
     """Whether two points at one value are of two cycles, or of two equilibria."""
     if all(int(one.cycle.status) == Status.OK for one in (point, other)):
-        return distance(place_of(point.cycle), place_of(other.cycle)) >= SAME
+        return distance(place_of(point.cycle), place_of(other.cycle)) >= SAME_CYCLE
     places = ([float(one.x1), 0.0] for one in (point, other))
-    return distance(*places, least=1.0) > SAME
+    return distance(*places, least=1.0) > SAME_CYCLE
 
 
 def _first_found(

@@ -253,7 +253,7 @@ class CycleSystem(AbstractSystem):
         arcs.
         """
         chain = self.chain
-        values, misses = _on_both_meshes(self, lambda one: residual(osc, one.chain, x))
+        values, misses = on_both_meshes(self, lambda one: residual(osc, one.chain, x))
         error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
         is_tangent = chain.ends >= Ends(chain.codes.shape[-1]).tangent
         error = jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
@@ -409,14 +409,14 @@ def _accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
 
     The bound is the effect of the residual with halved steps, and of rounding.
     """
-    values = _on_both_meshes(system, lambda one: one.residual(osc, z))
+    values = on_both_meshes(system, lambda one: one.residual(osc, z))
     weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
     # Rounding of states; for durations, however long, the velocity cancels it.
     rounding = 1e-15 * (1 + jnp.max(jnp.abs(z[:, :2]))) * jnp.sum(jnp.abs(weights))
     return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
 
 
-def _on_both_meshes(system: CycleSystem, value: Callable[[CycleSystem], Any]) -> Any:
+def on_both_meshes(system: CycleSystem, value: Callable[[CycleSystem], Any]) -> Any:
     """A value of the system with its integration steps as they are, and with all of them halved."""
     mesh = system.chain.mesh
     # Padded by steps of length zero to one shape.

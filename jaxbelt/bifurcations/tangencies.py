@@ -35,6 +35,7 @@ from ..numerics.newton import HOLDS, newton
 from ..results import EventKind, Status
 from .base import Line
 from .conditions import AbstractStickCondition
+from .forced import TimedGrazing
 from .guesses import HINT_BUDGET, least_push, orbit_after_stick
 from .special import SpecialPoint
 from .systems import (
@@ -221,6 +222,9 @@ class GrazingSliding(AbstractTangency):
     @property
     def wanted(self):
         return -1.0
+
+    def with_clock(self):
+        return TimedGrazing(self.belt)
 
     @classmethod
     def between(cls, before, after, edged):

@@ -40,13 +40,13 @@ MOMENT = 1e-13
 LEAST_MOMENT = 1e-16
 #: Distance below which two cycles that shooting solved for are the same: its equations hold to
 #: 1e-9, and beside a fold a cycle moves by ten thousand times that.
-SAME = 1e-5
+SAME_CYCLE = 1e-5
 #: The same for runs of a sweep, times its tolerance: its errors are ten to a thousand times that.
 RUN = 1e3
 #: Distance below which two motions may be the same: ends of two pieces of one branch; runs whose
-#: distance or events are not conclusive, for which shooting decides.
-BESIDE = 1e-2
-#: Distance below which an unstable cycle continues to one at the next value of a parameter.
+#: distance or events leave it open, which shooting then decides.
+MAYBE_SAME = 1e-2
+#: Distance below which an unstable cycle goes on to one at the next value of a parameter.
 GOES_ON = 0.3
 
 
@@ -124,7 +124,7 @@ def is_same(cycle: Cycle, other: Cycle) -> bool:
     if int(cycle.status) != Status.OK or int(other.status) != Status.OK:
         return False
     modes, others = (itinerary(one.oscillator, one) for one in (cycle, other))
-    return modes == others and distance(place_of(cycle), place_of(other)) < SAME
+    return modes == others and distance(place_of(cycle), place_of(other)) < SAME_CYCLE
 
 
 def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:
@@ -181,4 +181,4 @@ class Runs:
         away = distance(self.places, others.places)
         fits = self.signatures == others.signatures
         same = fits & (away < self.error)
-        return same, ~same & (away < max(BESIDE, 10 * self.error))
+        return same, ~same & (away < max(MAYBE_SAME, 10 * self.error))

@@ -63,6 +63,13 @@ class Loop(eqx.Module):
         return jnp.where(last[:, None], self.entries[0], jnp.roll(self.entries, -1, axis=0))
 
 
+def blank_loop(size: int, belts: int) -> Loop:
+    """A loop without arcs, for its shapes."""
+    unused = np.full(size, Ends(belts).unused)
+    arrays = np.ones((size, belts)), unused, np.zeros((size, 2)), np.zeros(size)
+    return Loop(*map(jnp.asarray, arrays))
+
+
 def modes_of(loop: Chain | Loop) -> np.ndarray:
     """Contact codes of the arcs of one loop, [arcs, belts], without those that are unused."""
     codes, ends = np.asarray(loop.codes), np.asarray(loop.ends)

@@ -29,7 +29,7 @@ from ..checks import (
 from ..model.events import Signature, signature_name
 from ..model.friction import jump_and_kink
 from ..model.modes import select
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.own_units import in_given_units, in_own_units, quantity
 from ..model.rest import is_neutral
 from ..motion.simulate import Arcs
@@ -40,6 +40,7 @@ from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Chain, Loop, loop_events, modes_of, room_of
 from .orbits import MOST_ARCS, follow, last_loop, loop_of
+from .periodic import PeriodicMotion, motion_reached
 from .shooting import (
     ARC_STEPS,
     Ends,
@@ -489,7 +490,9 @@ MORE_BUDGETS = 15
 
 
 @announced("find_cycle")
-def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Cycle:
+def find_cycle(
+    osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None
+) -> Cycle | PeriodicMotion:
     """The steady cycle that a start leads to.
 
     The orbit is followed until a loop repeats (up to some thousand loops, under a transformation a
@@ -506,7 +509,10 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
 
     Returns:
         The `Cycle`. Where the start leads to an equilibrium, to one of a continuum of closed
-        orbits, or nothing repeats, its status says so.
+        orbits, or nothing repeats, its status says so. Of a forced oscillator y0 is the start at
+        t = 0, and the `PeriodicMotion` that it leads to is returned, of up to 16 periods of the
+        forcing (not under `jax.jit` and `jax.vmap`, see `periodic`); where the orbit is chaotic or
+        quasi-periodic its status is NOT_SETTLED.
 
     Raises:
         ValueError: If an argument is impossible; the message names it.
@@ -514,6 +520,8 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
     check_oscillator(osc)
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
+    if has_clock(osc):
+        return motion_reached(osc, y0)
     room = None if max_arcs is None else as_whole(max_arcs, "max_arcs")
     cycle = cycle_from(osc, y0, room)
     warn_of_extrapolation([cycle])

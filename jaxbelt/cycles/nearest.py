@@ -2,8 +2,8 @@
 
 x1 and x2 are monotone on every piece, as arcs end at extrema. So a part of a piece lies in the box
 between its ends, and two boxes bound the distance between their contents from below and from above.
-Newton's method solves for the shortest way (see `Meeting`) only between pairs of parts that these
-bounds leave.
+Newton's method solves for the shortest way (see `Meeting`) between those pairs of parts only
+that these bounds leave.
 """
 
 from typing import NamedTuple
@@ -15,17 +15,19 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from ..model.modes import select
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
 from ..numerics.newton import Equations, solution, solve
-from ..numerics.padding import filled, longer
+from ..numerics.padding import filled_up, longer
 from .outlines import Outline, Pieces, place_on
 
 #: Parts of a piece; pairs of parts that are solved for in one batch, and pieces that are sampled.
 PARTS, PAIRS, PIECES = 16, 64, 32
 #: Longest Newton step, as a fraction of a piece: two parts.
-LONGEST = 2 / PARTS
-#: Largest last step, as a fraction of a piece, and largest error in x1 along x2, of a solution.
+LONGEST_PART = 2 / PARTS
+#: How far a solution may still move, as a fraction of a piece, and its largest error in x1 along
+#: x2.
 FOUND = 1e-9
 #: A solution that is so far beyond its part is accepted, too, as a fraction of a piece.
 BEYOND = 0.25 / PARTS
@@ -58,23 +60,35 @@ class Normal(Equations):
     along_x2: bool = eqx.field(static=True)
 
     def residual(self, given: tuple, z: Array) -> Array:
+        return self.linearized(given, z)[0]
+
+    def linearized(self, given: tuple, z: Array) -> tuple[Array, Array]:
         osc, pieces, known, fixed = given
-        (p, q), (dp, dq) = places_on(osc, pieces, z)
-        d, stay = p - q, z - known
+        (p, q), (dp, dq), (ddp, ddq) = places_on(osc, pieces, z)
+        d, stay, unit = p - q, z - known, jnp.eye(2)
         if not self.along_x2:
-            return jnp.where(fixed, stay, jnp.stack([d @ dp, -(d @ dq)]))
-        parallel = dp[0] * dq[1] - dp[1] * dq[0]
-        second = jnp.where(fixed[1], stay[1], jnp.where(fixed[0], stay[0], parallel))
-        return jnp.where(jnp.all(fixed), stay, jnp.stack([d[0], second]))
+            values, mixed = jnp.stack([d @ dp, -(d @ dq)]), -(dp @ dq)
+            rows = jnp.array([[dp @ dp + d @ ddp, mixed], [mixed, dq @ dq - d @ ddq]])
+            return jnp.where(fixed, stay, values), jnp.where(fixed[:, None], unit, rows)
+        parallel, row = _cross(dp, dq), jnp.stack([_cross(ddp, dq), _cross(dp, ddq)])
+        for k in (0, 1):
+            parallel, row = select(fixed[k], (stay[k], unit[k]), (parallel, row))
+        values = jnp.stack([d[0], parallel])
+        rows = jnp.stack([jnp.stack([dp[0], -dq[0]]), row])
+        return select(jnp.all(fixed), (stay, unit), (values, rows))
 
 
-def places_on(osc: Oscillator, pieces: Pieces, fractions: Array) -> tuple[Array, Array]:
-    """`place_on` for two pieces at a fraction each: places and slopes, [2, 2], a row each."""
+def _cross(one: Array, other: Array) -> Array:
+    return one[0] * other[1] - one[1] * other[0]
+
+
+def places_on(osc: Oscillator, pieces: Pieces, fractions: Array) -> tuple[Array, Array, Array]:
+    """`place_on` for two pieces at a fraction each: three arrays [2, 2], a row for each piece."""
     return lax.map(lambda row: place_on(osc, *row), (pieces, fractions))
 
 
 class Sampled(NamedTuple):
-    """A curve of a known oscillator in parts; see `sampled`.
+    """A curve of a known oscillator in parts; see `in_parts`.
 
     pieces: of the curve. piece: its number, of each part; begin: where on it the part begins, a
     fraction; low, high: corners of the part's box, [parts, 2].
@@ -87,24 +101,27 @@ class Sampled(NamedTuple):
     high: np.ndarray
 
 
-def sampled(osc: Oscillator, pieces: Pieces) -> Sampled:
+def in_parts(osc: Oscillator, pieces: Pieces) -> Sampled:
     """A curve of a known oscillator, cut into parts of its pieces."""
     has_extent = (np.asarray(pieces.durations) != 0) | (np.asarray(pieces.lengths) != 0)
-    has_extent[0] |= not np.any(has_extent)  # a point
+    # A point is one piece, of one part.
+    is_point = not np.any(has_extent)
+    has_extent[0] |= is_point
     numbers = np.flatnonzero(has_extent)
     states = np.concatenate(
         [
-            np.asarray(_samples(osc, filled(pieces, numbers[i : i + PIECES], PIECES)))
+            np.asarray(_states_of(osc, filled_up(pieces, numbers[i : i + PIECES], PIECES)))
             for i in range(0, len(numbers), PIECES)
         ]
     )[: len(numbers)]
     ends = np.stack([states[:, :-1], states[:, 1:]]).reshape(2, -1, 2)
     begin = np.tile(np.arange(PARTS) / PARTS, len(numbers))
-    return Sampled(pieces, numbers.repeat(PARTS), begin, ends.min(axis=0), ends.max(axis=0))
+    parts = numbers.repeat(PARTS), begin, ends.min(axis=0), ends.max(axis=0)
+    return Sampled(pieces, *(column[: 1 if is_point else None] for column in parts))
 
 
 @jit
-def _samples(osc: Oscillator, pieces: Pieces) -> Array:
+def _states_of(osc: Oscillator, pieces: Pieces) -> Array:
     """States at the ends of the parts, [pieces, PARTS + 1, 2]."""
 
     def along(piece):
@@ -137,13 +154,13 @@ def shortest_between(
         now, left = left[:PAIRS], left[PAIRS:]
         number = np.stack([curves[k].piece[parts[now, k]] for k in (0, 1)], axis=1)
         begin = np.stack([curves[k].begin[parts[now, k]] for k in (0, 1)], axis=1)
-        pieces = [filled(curves[k].pieces, number[:, k], PAIRS) for k in (0, 1)]
-        found = _solved(osc, *pieces, *filled((fractions, fixed), now, PAIRS), along_x2)
-        z, to, d, last = (np.asarray(one)[: now.size] for one in found)
+        pieces = [filled_up(curves[k].pieces, number[:, k], PAIRS) for k in (0, 1)]
+        found = _solved_for(osc, *pieces, *filled_up((fractions, fixed), now, PAIRS), along_x2)
+        z, to, d, moves = (np.asarray(one)[: now.size] for one in found)
         # Where a piece ends above the other curve, as on an edge, rounding decides on which side.
         inside = np.maximum(begin - BEYOND, -FOUND) <= z
         inside &= z <= np.minimum(begin + 1 / PARTS + BEYOND, 1 + FOUND)
-        good = np.all(inside | fixed[now], axis=1) & (last < FOUND)
+        good = np.all(inside | fixed[now], axis=1) & (moves < FOUND)
         good &= (np.abs(d[:, 0]) < FOUND) | (not along_x2)
         lengths = np.where(good, np.abs(d[:, 1]) if along_x2 else np.hypot(*d.T), np.inf)
         row = int(np.argmin(lengths))
@@ -184,19 +201,21 @@ def _tries_of(one: Sampled, other: Sampled, along_x2: bool) -> tuple[np.ndarray,
 
 
 @jit
-def _solved(osc: Oscillator, first: Pieces, second: Pieces, start: Array, fixed: Array, along_x2):
-    """For each row: fractions, the end of the way there, d, and the length of the last step."""
+def _solved_for(
+    osc: Oscillator, first: Pieces, second: Pieces, start: Array, fixed: Array, along_x2
+):
+    """For each row: fractions, the end of the way there, d, and how far fractions still move."""
 
     def one(first, second, start, fixed):
-        pieces = _side_by_side(first, second)
-        found = solve(Normal(along_x2), (osc, pieces, start, fixed), start, longest=LONGEST)
-        (p, q), _ = places_on(osc, pieces, found.z)
-        return found.z, q, p - q, found.last_two[0]
+        pieces = _both_pieces(first, second)
+        found = solve(Normal(along_x2), (osc, pieces, start, fixed), start, longest=LONGEST_PART)
+        p, q = places_on(osc, pieces, found.z)[0]
+        return found.z, q, p - q, found.unsettled
 
     return each(one)(first, second, start, fixed)
 
 
-def _side_by_side(*two: Pieces) -> Pieces:
+def _both_pieces(*two: Pieces) -> Pieces:
     """Two rows of `Pieces`, stacked. Steps that are added are of length zero."""
     steps = max(one.mesh.shape[-1] for one in two)
     padded = [
@@ -233,7 +252,7 @@ def _ends_of(osc: Oscillator, way: ShortestWay) -> tuple[Array, Array]:
         jax.tree.map(lambda leaf, k=k: leaf[meeting.pieces[k]], outline.pieces(osc))
         for k, outline in enumerate((way.first, way.second))
     )
-    given = osc, _side_by_side(first, second), meeting.fractions, meeting.fixed
+    given = osc, _both_pieces(first, second), meeting.fractions, meeting.fixed
     fractions = solution(Normal(way.along_x2), given, meeting.fractions)
     begin, end = places_on(osc, given[1], fractions)[0]
     return begin, end

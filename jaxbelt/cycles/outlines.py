@@ -33,7 +33,7 @@ from ..model.transitions import contact
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import each, jit, power_of_two
-from ..numerics.padding import filled
+from ..numerics.padding import filled_up
 from .backwards import BackwardCycle, moved_in_time
 from .chains import Chain, Loop
 from .cycle import Cycle
@@ -76,15 +76,24 @@ def straight(osc: Oscillator, x1: Array, to: Array, x2: Array) -> Pieces:
     return Pieces(one, away, one[None], jnp.stack([x1, x2])[None], 0 * one, (to - x1) * one)
 
 
-def place_on(osc: Oscillator, piece: Pieces, fraction: Array) -> tuple[Array, Array]:
-    """A point (x1, x2) of a piece, one row of `Pieces`, and its derivative by the fraction."""
+def place_on(osc: Oscillator, piece: Pieces, fraction: Array) -> tuple[Array, Array, Array]:
+    """A point (x1, x2) of a piece, and its first and second derivatives by the fraction.
+
+    piece: one row of `Pieces`.
+    """
     moving, mode = moved_in_time(osc, piece.way), mode_of(piece.codes)
     y = flow(moving, piece.codes, piece.mesh, piece.entries, fraction * piece.durations)
-    pull = jnp.where(mode.any_stuck, 0.0, mode_acceleration(moving, mode, y[0], y[1]))
+
+    def field(y):
+        pull = mode_acceleration(moving, mode, y[0], y[1])
+        return jnp.stack([y[1], jnp.where(mode.any_stuck, 0.0, pull)])
+
+    slope = field(y)
+    _, bend = jax.jvp(field, (y,), (slope,))
     turned = jnp.stack([jnp.ones(()), piece.way])
     line = jnp.stack([piece.lengths, jnp.zeros(())])
-    slope = piece.durations * turned * jnp.stack([y[1], pull]) + line
-    return turned * y + fraction * line, slope
+    rate = piece.durations * turned
+    return turned * y + fraction * line, rate * slope + line, rate * piece.durations * bend
 
 
 class Outline(eqx.Module):
@@ -95,7 +104,7 @@ class Outline(eqx.Module):
         raise NotImplementedError
 
 
-class Line(Outline):
+class StraightOutline(Outline):
     """A straight line along x1, or a point.
 
     Attributes:
@@ -160,20 +169,20 @@ class ClosedOutline(Outline):
         return cls(cycle.chain, cycle.unknowns, 1.0)
 
     def pieces(self, osc: Oscillator) -> Pieces:
-        z = _closed(moved_in_time(osc, self.way), self.chain, self.unknowns)
+        z = _closed_chain(moved_in_time(osc, self.way), self.chain, self.unknowns)
         none = jnp.zeros(len(z))
         return Pieces(none + self.way, self.chain.codes, self.chain.mesh, z[:, :2], z[:, 2], none)
 
 
-_closed = jit(closed)
+_closed_chain = jit(closed)
 
 
 class OpenOutline(Outline):
     """A stable separatrix, followed backwards from its point.
 
     Attributes:
-        chain: Its arcs, or pieces of them. One that ends by nothing ("unused") goes on in the next,
-            and the last one may be cut off so.
+        chain: Its arcs, or pieces of them. One without an end event ("unused") continues in the
+            next, and the last one may be cut off.
         durations: Their durations.
         origin: Row of its point among `end_points`.
     """
@@ -230,12 +239,12 @@ def _chain_of(osc: Oscillator, loop: Loop) -> Chain:
 def _cut_finely(osc: Oscillator, loop: Loop) -> Loop:
     """Arcs in a row, those that need more than STEPS steps cut into pieces.
 
-    A piece that is not the last of its arc has no end event ("unused"). Padding rows have no
+    A piece that is not the last of its arc has no end event ("unused"). Rows that pad it have no
     duration. An arc may creep: to a node on the boundary of a belt, for example, near which it
     stays for a hundred times as long as it moved.
     """
     count = len(loop.ends)
-    padded = filled(loop, np.arange(count), power_of_two(count, FEWEST))
+    padded = filled_up(loop, np.arange(count), power_of_two(count, FEWEST))
     entries, left = map(np.array, (padded.entries, padded.durations))
     left[count:] = 0.0
     idle = np.flatnonzero(left[:count] == 0)

@@ -21,11 +21,13 @@ from ..checks import outside_of_traces, pick
 from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.events import signature_name
 from ..model.modes import edges
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import OwnOscillator, in_given_units, in_own_units, quantity
+from ..numerics.compiling import compiled_beside
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .cycle import Cycle, warn_of_extrapolation
+from .chains import SIZES, blank_loop
+from .cycle import Cycle, polish, warn_of_extrapolation
 from .returns import Returns, reach_of
 from .separatrices import Separatrix, TracedSeparatrix, branches
 
@@ -176,6 +178,7 @@ def portrait(osc: Oscillator) -> Portrait:
         ValueError: If an argument is impossible or traced; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "portrait", "jb.simulate from several starts")
     own = in_own_units(osc)
     found = in_given_units(_portrait(own), osc, own)
     warn_of_extrapolation((*found.cycles, *found.unstable), depth=5)
@@ -184,7 +187,10 @@ def portrait(osc: Oscillator) -> Portrait:
 
 def _portrait(osc: OwnOscillator) -> Portrait:
     points = equilibria(osc)
-    found, map_ = branches_and_returns(osc, points)
+    # Its cycles are polished when the returns of orbits are known.
+    loop, ok = blank_loop(SIZES[0], len(osc.belts)), jnp.asarray(Status.OK.value)
+    with compiled_beside("portrait", osc, [lambda: polish(osc, loop, ok)]):
+        found, map_ = branches_and_returns(osc, points)
     reach = map_.reach
     cycles = tuple(cycle for cycle in map_.cycles if abs(float(cycle.multiplier)) < 1)
     unstable = tuple(cycle for cycle in map_.cycles if float(cycle.multiplier) > 1)

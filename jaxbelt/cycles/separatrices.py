@@ -332,14 +332,18 @@ def _at_rest(
 def places_along(
     osc: Oscillator, codes: Array, y: Array, duration: Array, rate: Callable, marks: Array
 ) -> tuple[Array, Array]:
-    """Times since the entry of an arc, and states, [n] and [n, 2], where the integral of a rate, a
-    function of the state, comes to each of the marks in order, or else where the arc ends."""
+    """Times since the entry of an arc, and states, [n] and [n, 2], at which an integral reaches
+    marks.
+
+    rate: the integrand, a function of the state; marks: in order. Marks that are not reached are at
+    the end of the arc.
+    """
     mode = mode_of(codes)
 
     def to(carry, mark):
         def before(carry):
             _, left, total = carry
-            # Where there is no rate, NaN, it is the end of the arc.
+            # Where there is no rate, NaN, the arc ends.
             return (left > 0) & ~(total >= mark)
 
         def step(carry):
@@ -361,9 +365,9 @@ def places_along(
 def arc_samples(
     osc: Oscillator, codes: Array, y: Array, exit_: Array, duration: Array, n: int
 ) -> tuple[Array, Array]:
-    """Times and states of n samples of an arc, the last at its end: three quarters of them evenly
-    along its way in the plane, the others evenly in time.
+    """Times and states of n samples of an arc, the last at its end.
 
+    Three quarters of them are spread evenly along its way in the plane, the others evenly in time.
     x1 and x2 are monotone, as extrema end arcs: |dx1| + |dx2| of the arc is the integral of that of
     its steps.
     """

@@ -21,12 +21,12 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, number, require, require_one_of
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import OwnOscillator, in_given_units, in_units_of_run, quantity, rescaled
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .nearest import ShortestWay, sampled, shortest_between
-from .outlines import ClosedOutline, Line, Outline, straight
+from .nearest import ShortestWay, in_parts, shortest_between
+from .outlines import ClosedOutline, Outline, StraightOutline, straight
 from .portrait import TRACED, Portrait, portrait
 from .sides import Bound, Destination, bounds_of, leads_to, segments_of
 
@@ -86,11 +86,11 @@ class FatalShock(eqx.Module):
         end = Destination.of_name(self.attractor)
         ts, states = _phases(shown, end, as_whole(n, "n"))
         outlines = [bound.outline for bound in bounds_of(shown) if end in bound.sides]
-        curves = [sampled(known, outline.pieces(known)) for outline in outlines]
+        curves = [in_parts(known, outline.pieces(known)) for outline in outlines]
         rows = []
         for t, y in zip(ts.tolist(), states, strict=True):
             x1, x2 = map(jnp.asarray, y)
-            point = sampled(known, straight(known, x1, x1, x2))
+            point = in_parts(known, straight(known, x1, x1, x2))
             ways = [shortest_between(known, point, curve, along_x2=along_x2) for curve in curves]
             best, to = np.inf, np.full(2, np.nan)
             for length, its_end, meeting in ways:
@@ -171,6 +171,7 @@ def minimal_fatal_shock(
     shown = osc if isinstance(osc, Portrait) else None
     osc = osc.oscillator if isinstance(osc, Portrait) else osc
     check_oscillator(osc)
+    refuse_clock(osc, "minimal_fatal_shock", "jb.simulate from several starts")
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     require_one_of(direction, DIRECTIONS, "direction")
@@ -225,10 +226,10 @@ def shortest_way_out(
     if end.what not in ("cycle", "equilibrium"):
         return None, None, Status.NOT_SETTLED
     osc, outline = own_portrait.oscillator, _outline_of(own_portrait, end)
-    first, found = sampled(osc, outline.pieces(osc)), bounds_of(own_portrait)
+    first, found = in_parts(osc, outline.pieces(osc)), bounds_of(own_portrait)
     shortest, way, beside = np.inf, None, None
     for bound in (bound for bound in found if end in bound.sides):
-        second = sampled(osc, bound.outline.pieces(osc))
+        second = in_parts(osc, bound.outline.pieces(osc))
         length, _, meeting = shortest_between(osc, first, second, along_x2=along_x2)
         if np.isnan(length):
             return None, None, Status.NO_CONVERGENCE
@@ -261,7 +262,9 @@ def _is_complete(own_portrait: Portrait, found: list[Bound]) -> bool:
 def _outline_of(own_portrait: Portrait, end: Destination) -> Outline:
     if end.what == "cycle":
         return ClosedOutline.of(own_portrait.cycles[end.number])
-    return next(Line(-1, *rows) for rows in segments_of(own_portrait) if rows[0] == end.number)
+    return next(
+        StraightOutline(-1, *rows) for rows in segments_of(own_portrait) if rows[0] == end.number
+    )
 
 
 def _phases(own_portrait: Portrait, end: Destination, n: int) -> tuple[np.ndarray, np.ndarray]:

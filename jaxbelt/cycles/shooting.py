@@ -29,6 +29,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from ..model.instants import carried, field_at
 from ..model.modes import (
     Mode,
     any_of,
@@ -41,7 +42,7 @@ from ..model.modes import (
     select,
     stick_velocity,
 )
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, at_time, has_clock
 from ..model.transitions import held_at_boundary, onset_position
 from ..motion.arcs import Ends
 from ..motion.integrators import density
@@ -59,16 +60,14 @@ MAGNIFIED = 1e4
 
 
 # Of order 12 for the arcs, of order 4 for placing the steps.
-_FINE = scheme((2, 4, 6, 8, 10, 12))
+FINE = scheme((2, 4, 6, 8, 10, 12))
 _COARSE = scheme((2, 4))
 
 
-def _arc_by_arc(function: Callable) -> Callable:
-    """function(*shared, *row) for each arc of a chain, its rows, as one function.
-
-    It takes the shared arguments and the columns, a tuple each. All arcs are one piece of machine
-    code; in a batch each of them is one, of all lanes.
-    """
+def arc_by_arc(function: Callable) -> Callable:
+    """What function(*shared, *row) gives of each arc of a chain, its rows, as a function of the
+    shared and of the columns, a tuple each. All arcs are one piece of machine code; in a batch each
+    of them is one, of all lanes."""
     of_lanes = lanes_in_one_kernel(function)
 
     @functools.wraps(function)
@@ -79,7 +78,7 @@ def _arc_by_arc(function: Callable) -> Callable:
     return call
 
 
-def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -> Array:
+def arc_step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -> Array:
     """One step of size h, for states in one array."""
 
     def apart(state):
@@ -90,7 +89,10 @@ def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -
     return y + jnp.stack(change)
 
 
-def _slip_slopes(osc: Oscillator, codes: Array, y: Array) -> Array:
+def slip_slopes(osc: Oscillator, codes: Array, y: Array) -> Array:
+    """The field of a slip mode at a state, in one array."""
+    if has_clock(osc):
+        return jnp.stack(field_at(osc, mode_of(codes), (y[0], y[1], y[2])))
     return jnp.stack([y[1], mode_acceleration(osc, mode_of(codes), y[0], y[1])])
 
 
@@ -105,11 +107,8 @@ def meshed(osc: Oscillator, loop: Loop, steps: int = ARC_STEPS) -> tuple[Chain, 
 
 @functools.cache
 def _meshes(steps: int) -> Callable:
-    """`_mesh` of all arcs.
-
-    Not by `_arc_by_arc`: in a batch a whole march is too large for one piece of machine code, so
-    each step of it is one.
-    """
+    """`_mesh` of all arcs. Not by `arc_by_arc`: in a batch a whole march is too large for a piece,
+    so each step of it is one."""
 
     @one_kernel_alone
     def call(osc, columns):
@@ -125,7 +124,7 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
 
     def march():
         def advance(y, _):
-            return _coarse_step(osc, codes, y, duration / n)
+            return coarse_step(osc, codes, y, duration / n)
 
         return lax.scan(advance, y, None, length=n)[1]
 
@@ -142,23 +141,24 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
 
 
 @lanes_in_one_kernel
-def _coarse_step(osc: Oscillator, codes: Array, y: Array, h: Array) -> tuple[Array, Array]:
-    """The state after a step, and the density of steps there."""
-    y = _step(functools.partial(_slip_slopes, osc, codes), y, h, _COARSE)
+def coarse_step(osc: Oscillator, codes: Array, y: Array, h: Array) -> tuple[Array, Array]:
+    """The state after a step, and the density of steps that is wanted there."""
+    y = arc_step(functools.partial(slip_slopes, osc, codes), y, h, _COARSE)
     return y, density(osc, mode_of(codes), *y)
 
 
 def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, extra=None):
     """End of one arc, (x1, x2), and the integrals of `extra(osc, mode, x1, x2)`, a vector, over it.
 
-    A stick arc is a straight line; Simpson's rule is exact there for what is at most cubic.
+    A stick arc is a straight line; Simpson's rule is exact there for what is at most cubic. With a
+    clock states are (x1, x2, t), and there is no extra.
     """
     mode = mode_of(codes)
     stuck = mode.any_stuck
     n_extra = 0 if extra is None else extra(osc, mode, y[0], y[1]).size
 
     def field(state):
-        smooth = _slip_slopes(osc, codes, state[:2])
+        smooth = slip_slopes(osc, codes, state[: y.size])
         if extra is None:
             return smooth
         return jnp.concatenate([smooth, extra(osc, mode, state[0], state[1])])
@@ -167,7 +167,7 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     slip_time = jnp.where(stuck, 0.0, duration)
 
     def advance(state, fraction):
-        return _step(field, state, slip_time * fraction, _FINE), None
+        return arc_step(field, state, slip_time * fraction, FINE), None
 
     def advance_some(state, fractions):
         # Padding of a mesh is skipped.
@@ -178,6 +178,9 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
         slipped, _ = lax.scan(advance_some, start, mesh.reshape(-1, ARC_STEPS))
     else:
         slipped, _ = lax.scan(advance, start, mesh)
+    if has_clock(osc):
+        stuck_end = jnp.stack(carried(osc, mode, (y[0], y[1], y[2]), duration))
+        return jnp.where(stuck, stuck_end, slipped)
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
     stuck_end = jnp.stack([y[0] + v * duration, v])
     if extra is not None:
@@ -190,7 +193,9 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
 
 
 def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
-    """The guard that vanishes at y if an arc ends there by `end`; zero for an unused arc."""
+    """What vanishes at y if an arc ends there by `end`; zero for an unused one."""
+    if has_clock(osc):
+        return _timed_end_guard(osc, codes, end, y)
     mode = mode_of(codes)
     values = [
         *[belt.velocity - osc.omega * y[1] for belt in osc.belts],
@@ -200,6 +205,28 @@ def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
         y[0] - onset_position(osc, mode),
     ]
     return sum((jnp.where(end == i, value, 0.0) for i, value in enumerate(values)), jnp.zeros(()))
+
+
+def _timed_end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
+    """`end_guard` with a clock, but for the end of a period."""
+    mode, state = mode_of(codes), (y[0], y[1], y[2])
+
+    def guards(*y):
+        now = at_time(osc, y[2])
+        limit = jnp.abs(mode_acceleration(now, mode, y[0], y[1])) - capacity(now, mode)
+        return jnp.stack([*(belt.velocity - osc.omega * y[1] for belt in now.belts), limit])
+
+    values, slopes = jax.jvp(guards, state, field_at(osc, mode, state))
+    n, names = len(osc.belts), Ends(len(osc.belts))
+    numbers = [
+        *((i, values[i]) for i in range(n)),
+        *((n + i, jnp.where(jnp.isfinite(e), y[0] - e, 1.0)) for i, e in enumerate(edges(osc))),
+        (names.extremum_x1, y[1]),
+        (names.onset, values[n]),
+        *((names.tangent + i, slopes[i]) for i in range(n)),
+        (names.nearest_limit, slopes[n]),
+    ]
+    return sum((jnp.where(end == i, value, 0.0) for i, value in numbers), jnp.zeros(()))
 
 
 def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
@@ -217,7 +244,7 @@ def _magnifies(osc: Oscillator, codes: Array, entry: Array, exit_: Array) -> Arr
     """
     osc, entry, exit_ = lax.stop_gradient((osc, entry, exit_))
     mode = mode_of(codes)
-    slow, fast = (jnp.max(jnp.abs(_slip_slopes(osc, codes, y))) for y in (entry, exit_))
+    slow, fast = (jnp.max(jnp.abs(slip_slopes(osc, codes, y))) for y in (entry, exit_))
     grows = trace_of(osc, mode, entry[0], entry[1])[0] > 0
     return ~mode.any_stuck & grows & (fast > MAGNIFIED * slow)
 
@@ -268,10 +295,10 @@ def _followed(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> A
     return jnp.where(is_tangent, jnp.concatenate([point, after - unknown[:2]]), ordinary)
 
 
-_all_arc_equations = _arc_by_arc(_arc_equations)
+_all_arc_equations = arc_by_arc(_arc_equations)
 
 
-@_arc_by_arc
+@arc_by_arc
 def _equations_and_blocks(
     osc: Oscillator, along: Oscillator | None, codes, end, mesh, backwards, unknown: Array
 ):
@@ -285,22 +312,20 @@ def _equations_and_blocks(
         if along is None:
             of_unknown = functools.partial(equations, osc)
             return jax.jvp(of_unknown, (unknown,), (direction,))
-        moved = jax.tree.map(functools.partial(_weighted, direction[3:]), along)
+        moved = jax.tree.map(functools.partial(weighted, direction[3:]), along)
         return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
 
     return jax.vmap(column, out_axes=(None, -1))(jnp.eye(3 + more))
 
 
-def _weighted(weights: Array, slopes: Array) -> Array:
+def weighted(weights: Array, slopes: Array) -> Array:
     """The sum of the slopes, [k, ..], each times its weight."""
     return jnp.sum(weights.reshape(-1, *[1] * (slopes.ndim - 1)) * slopes, axis=0)
 
 
-def _directions_of(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, Array]:
-    """Directions in the space of oscillators, one for each number with a tangent.
-
-    Returns them as an oscillator of arrays [k, ..], and the tangents, [k].
-    """
+def directions_of(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, Array]:
+    """A direction for each number of the oscillator that has a tangent, as an oscillator of arrays
+    [k, ..], and these tangents, [k]."""
     moving, fixed = moving_and_fixed(osc, tangents)
     numbers, unravel = jax.flatten_util.ravel_pytree(moving)
     steady = jax.tree.map(jnp.zeros_like, fixed)
@@ -326,7 +351,7 @@ def _by_columns(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Ar
 @_by_columns.def_jvp
 def _(primals, tangents):
     osc, chain, backwards, z = primals
-    along, weights = _directions_of(osc, tangents[0])
+    along, weights = directions_of(osc, tangents[0])
     out, blocks = _equations_and_blocks((osc, along), _arc_columns(chain, backwards, z))
     change = blocks[..., 3:] @ weights
     if tangents[3] is not None:
@@ -376,13 +401,10 @@ def residual_and_blocks(
 
 
 def jacobian(blocks: Array, backwards: Array | None = None) -> Array:
-    """The 3N x 3N matrix of the system.
-
-    The slopes of each arc's end and guard, and minus those of the next arc's entry, of which one is
-    its unknown.
-    """
-    n = blocks.shape[0]
-    own, entry = blocks, jnp.asarray(np.diag([1.0, 1.0, 0.0]))[None]
+    """The 3N x 3N matrix of the system: the slopes of each arc's end and guard, and minus those of
+    the next arc's entry, of which one is its unknown."""
+    n, unknowns = blocks.shape[0], blocks.shape[-1]
+    own, entry = blocks, jnp.asarray(np.diag([1.0] * (unknowns - 1) + [0.0]))[None]
     if backwards is not None:
         back, state = backwards[:, None, None], jnp.asarray([True, True, False])[None, :, None]
         own = jnp.where(back & state, entry, blocks)
@@ -390,7 +412,7 @@ def jacobian(blocks: Array, backwards: Array | None = None) -> Array:
     following = jnp.asarray(np.roll(np.eye(n), 1, axis=1))
     same = jnp.eye(n)[:, None, :, None] * own[:, :, None, :]
     then = following[:, None, :, None] * jnp.swapaxes(entry, 0, 1)[None]
-    return (same - then).reshape(3 * n, 3 * n)
+    return (same - then).reshape(unknowns * n, unknowns * n)
 
 
 class ClosedChain(Equations):
@@ -410,7 +432,7 @@ class ClosedChain(Equations):
         return value.reshape(-1), jacobian(blocks[:, :3], self.backwards)
 
     def moved(self, given: Oscillator, z: Array, tangents: Oscillator) -> tuple[Array, Array]:
-        along, weights = _directions_of(given, tangents)
+        along, weights = directions_of(given, tangents)
         _, _, blocks = residual_and_blocks(given, along, self.chain, z, self.backwards)
         out = blocks[..., 3:] @ weights
         change = _mismatch(out, jnp.zeros_like(z), self.backwards)
@@ -483,7 +505,7 @@ def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
 def _(primals, tangents):
     # By columns, as in `_by_columns`; the error has no derivative.
     osc, chain, z = primals
-    along, weights = _directions_of(osc, tangents[0])
+    along, weights = directions_of(osc, tangents[0])
     _, by_z, by_osc = multiplier_and_slopes(osc, along, chain, z)
     change = jnp.sum(by_osc * weights)
     if tangents[2] is not None:
@@ -505,7 +527,7 @@ def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, ent
     return lax.cond(some, followed, nothing, unknown, entry)
 
 
-_errors_and_factors = _arc_by_arc(_error_and_factor)
+_errors_and_factors = arc_by_arc(_error_and_factor)
 
 
 def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, entry):
@@ -554,7 +576,7 @@ def _products_of_others(factors: Array) -> Array:
     return before * after
 
 
-@_arc_by_arc
+@arc_by_arc
 def _factors_and_slopes(
     osc: Oscillator, along: Oscillator, codes, end, mesh, following, unknown: Array, entry: Array
 ):
@@ -566,7 +588,7 @@ def _factors_and_slopes(
         return _error_and_factor(osc, codes, end, mesh, following, unknown, entry)[1]
 
     def column(direction):
-        moved = jax.tree.map(functools.partial(_weighted, direction[5:]), along)
+        moved = jax.tree.map(functools.partial(weighted, direction[5:]), along)
         tangents = moved, direction[:3], direction[3:5]
         return jax.jvp(factor, (osc, unknown, entry), tangents)
 

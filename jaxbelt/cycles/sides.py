@@ -1,4 +1,4 @@
-"""Curves that divide motions, and the attractors on both sides of them.
+"""Curves that divide motions, and the attractors on both of their sides.
 
 On the axis x2 = 0 all cycles, separatrices and equilibria mark places, and all starts between two
 neighbouring places lead to one attractor. So one start between them, far from slow motions, is
@@ -17,10 +17,10 @@ from ..model.equilibria import EquilibriumKind
 from ..model.modes import edges
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
-from ..numerics.padding import filled
+from ..numerics.padding import filled_up
 from ..results import Status
 from .orbits import MOST_ARCS, follow, place_of_rest
-from .outlines import ClosedOutline, Line, OpenOutline, Outline, jumps, place_on
+from .outlines import ClosedOutline, OpenOutline, Outline, StraightOutline, jumps, place_on
 from .portrait import Portrait
 
 #: Starts that are followed in one batch, and number of rounds, MOST_ARCS arcs each.
@@ -54,7 +54,7 @@ class Destination(NamedTuple):
         return cls(what, int(row) if row else -1)
 
 
-UNDECIDED = Destination("undecided")
+NOT_KNOWN = Destination("undecided")
 
 
 class Bound(NamedTuple):
@@ -85,14 +85,14 @@ def bounds_of(portrait: Portrait) -> list[Bound]:
             found.append((f"separatrix {number}", outline, starts))
     for belt in range(len(osc.belts)):
         for row in np.flatnonzero(np.isfinite(jumps(osc, jnp.asarray(np.array(belt)))[0])):
-            outline = Line(belt, int(row), int(row))
+            outline = StraightOutline(belt, int(row), int(row))
             found.append((f"boundary of belt {belt}", outline, _across(osc, outline)))
     ends = leads_to(portrait, np.array([starts for *_, starts in found]).reshape(-1, 2))
     bounds = [
         Bound(name, outline, (ends[2 * i], ends[2 * i + 1]))
         for i, (name, outline, _) in enumerate(found)
     ]
-    return [one for one in bounds if one.sides[0] != one.sides[1] or one.sides[0] == UNDECIDED]
+    return [one for one in bounds if one.sides[0] != one.sides[1] or one.sides[0] == NOT_KNOWN]
 
 
 def _places(portrait: Portrait) -> np.ndarray:
@@ -123,7 +123,7 @@ def _around(places: np.ndarray, x1: float) -> np.ndarray:
 def _across(osc: Oscillator, outline: Outline) -> np.ndarray:
     """Starts on both sides of the middle of the first piece, [2, 2]."""
     piece = jax.tree.map(lambda leaf: leaf[0], outline.pieces(osc))
-    place, slope = map(np.asarray, place_on(osc, piece, jnp.asarray(0.5)))
+    place, slope, _ = map(np.asarray, place_on(osc, piece, jnp.asarray(0.5)))
     normal = np.array([-slope[1], slope[0]]) / np.hypot(*slope)
     return place + ASIDE * (1 + np.abs(place).max()) * np.array([normal, -normal])
 
@@ -139,13 +139,13 @@ def leads_to(portrait: Portrait, starts: np.ndarray) -> list[Destination]:
         left = np.array([i for i in range(len(starts)) if i not in ends], int)
         for first in range(0, left.size, STARTS_AT_ONCE):
             batch = left[first : first + STARTS_AT_ONCE]
-            followed = _followed_on(portrait.oscillator, filled(states, batch, STARTS_AT_ONCE))
+            followed = _followed_on(portrait.oscillator, filled_up(states, batch, STARTS_AT_ONCE))
             for i, status, top, rest, y in zip(batch.tolist(), *map(np.asarray, followed)):
                 states[i] = y
                 end = _destination(portrait, int(status), float(top), float(rest), y)
                 if end is not None:
                     ends[i] = end
-    return [ends.get(i, UNDECIDED) for i in range(len(starts))]
+    return [ends.get(i, NOT_KNOWN) for i in range(len(starts))]
 
 
 @jit
@@ -170,10 +170,10 @@ def _destination(
     if status == Status.OK:
         away = [abs(float(cycle.x1_max) - top) for cycle in portrait.cycles]
         near = len(away) and min(away) < KNOWN * (1 + abs(top))
-        return Destination("cycle", int(np.argmin(away))) if near else UNDECIDED
+        return Destination("cycle", int(np.argmin(away))) if near else NOT_KNOWN
     if not np.all(np.abs(y) < 10 * portrait.reach):
-        return Destination("infinity") if portrait.escapes else UNDECIDED
-    return None if status == Status.NOT_SETTLED else UNDECIDED
+        return Destination("infinity") if portrait.escapes else NOT_KNOWN
+    return None if status == Status.NOT_SETTLED else NOT_KNOWN
 
 
 def _resting_at(portrait: Portrait, x1: float) -> Destination:
@@ -183,7 +183,7 @@ def _resting_at(portrait: Portrait, x1: float) -> Destination:
     away = np.maximum(away, 0.0)
     away[np.asarray(rests.kind) == EquilibriumKind.SADDLE] = np.inf
     if not np.min(away, initial=np.inf) < KNOWN * (1 + abs(x1)):
-        return UNDECIDED
+        return NOT_KNOWN
     row = int(np.argmin(away))
     return Destination("equilibrium", max(i for i, _ in segments_of(portrait) if i <= row))
 

@@ -21,7 +21,7 @@ from ..activity import announced
 from ..checks import as_whole, require_value
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, equilibria, most_equilibria
 from ..model.modes import STUCK
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import in_given_units, in_own_units
 from ..numerics.compiling import each, in_groups, is_outermost, jit
 from ..results import Status
@@ -58,6 +58,7 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "unstable_cycle")
     last = most_equilibria(osc) - 1
     is_number = isinstance(around, int | np.integer) and not isinstance(around, bool)
     among = f"0 to {last}" if last else "0"

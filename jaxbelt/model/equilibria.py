@@ -43,7 +43,7 @@ from .modes import (
     settle,
     zone_ends,
 )
-from .oscillator import Oscillator, check_oscillator, has_possible_numbers
+from .oscillator import Oscillator, check_oscillator, has_possible_numbers, refuse_clock
 from .own_units import in_given_units, in_own_units, quantity
 from .pseudofocus import edge_focus
 from .rest import is_centre
@@ -195,6 +195,7 @@ def equilibria(osc: Oscillator) -> Equilibria:
         ValueError: If a parameter is impossible; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "equilibria", "jb.simulate")
     own = in_own_units(osc)
     found = _all_candidates(own)
     return in_given_units(_existing(found, found), osc, own)
@@ -456,6 +457,7 @@ def lyapunov_coefficient(osc: Oscillator) -> Array:
         ValueError: If a parameter is impossible; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "lyapunov_coefficient")
     own = in_own_units(osc)
     found, coefficients = _lyapunov_coefficients(own)
     return _existing(coefficients, found) / (1 if own is osc else own.units.length**2)

@@ -263,6 +263,16 @@ def refuse_clock(osc: Any, name: str, instead: str = "") -> None:
         require(False, "osc", expected, "one with forcing")
 
 
+def check_clock(osc: Any, name: str, instead: str) -> None:
+    """Raise where an oscillator does not know the time and `name` is for those that do.
+
+    instead: what else to use, such as "jb.find_cycle".
+    """
+    if isinstance(osc, Oscillator) and not has_clock(osc):
+        expected = f"with a clock: {name} is for oscillators that are forced; use {instead}"
+        require(False, "osc", expected, "one without forcing")
+
+
 def frequencies(osc: Oscillator) -> list[Array]:
     """Angular frequencies of all that knows the time: forces, then velocities and loads."""
     forces = [one.frequency for one in osc.forcing if not isinstance(one, ConstantForce)]

@@ -135,16 +135,17 @@ def _passed_in_time(
     """`_passed` with a clock: of a stick phase, too, the guard that ended it tells its duration."""
     mode = arc.mode
     found = _timed_end(osc, arc, end, y)
-    known = [_with_numbers_of(a, b) for a, b in zip(_timed(arc.end), found, strict=True)]
+    x1, x2, t = (_with_numbers_of(a, b) for a, b in zip(_timed(arc.end), found, strict=True))
+    known = x1, x2, t
 
-    def fired_guard(*y):
-        guards = guards_at(osc, mode, _timed(y))
+    def fired_guard(x1, x2, t):
+        guards = guards_at(osc, mode, (x1, x2, t))
         return jnp.sum(jnp.where(jnp.arange(guards.size) == arc.ended_by, guards, 0.0))
 
-    guard, slope = jax.jvp(fired_guard, known, [*field_at(osc, mode, _timed(known))])
+    guard, slope = jax.jvp(fired_guard, known, field_at(osc, mode, known))
     late = (lax.stop_gradient(guard) - guard) / jnp.where(slope == 0, 1.0, slope)
     late = jnp.where(arc.in_time, remaining - arc.duration, late)
-    x1, x2, _ = on_guard_at(osc, mode, arc.ended_by, _later(osc, arc, _timed(known), late))
+    x1, x2, _ = on_guard_at(osc, mode, arc.ended_by, _later(osc, arc, known, late))
     return x1, jnp.where(arc.captured, 0.0, x2), arc.duration + late
 
 

@@ -236,8 +236,10 @@ def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resoluti
 
 @jit
 def _filippov(
-    given, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution, ends_at_t1
+    given, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution, ends_at_t1, last=None
 ) -> Trajectory:
+    """last: the number of the row that is the end of the run, where this is no part of the program
+    (-1: none)."""
     osc = in_units_of_run(given)
     y0 = y0 / osc.units.length
     atol = in_units(atol, osc.units.length, SIMULATION_TOLERANCE)
@@ -266,6 +268,10 @@ def _filippov(
     rows, later = loop.place(numbers, numbers[: count.size])
     t = records.t[rows] + later * period
     arcs = Arcs(t, _without_clock(records.y)[rows], records.mode[rows], records.duration[rows])
+    if last is not None:
+        y1, mode1 = state_at_end(final, records, loop, t1)
+        is_last = (jnp.arange(ys.shape[0]) == last)[:, None]
+        ys, modes = jnp.where(is_last, y1, ys), jnp.where(is_last, mode1, modes)
     rows = wanted_times, ys, modes
     if ends_at_t1:
         # The last row is separate: where it alone is used, no other sample is computed.
@@ -378,6 +384,14 @@ def simulate(
         '"filippov", "switch" or "smooth"',
         repr(formulation),
     )
+    padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
+    ends_at_t1 = ts is None or (
+        is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
+    )
+    samples = None
+    if ts is not None and not padded and np.size(ts) > 1:
+        samples = np.size(ts)
+        ts = np.pad(np.asarray(ts), (0, _rows_for(samples) - samples), mode="edge")
     given = y0, t0, t1, ts, rtol, atol
     span = float(t1 - t0) if is_concrete((t0, t1)) else 100.0
     resolution = 0 if ts is not None else _room_for(10 * span, 512)
@@ -385,23 +399,22 @@ def simulate(
         name = "v_star" if formulation == "switch" else "eps"
         width = as_size(v_star if formulation == "switch" else eps, name)
         fixed = dict(formulation=formulation, resolution=resolution)
-        return _smoothed(osc, *given, width=width, **fixed)
-    padded = not is_concrete((osc, given))
+        found = _smoothed(osc, *given, width=width, **fixed)
+        return found if samples is None else _first_samples(found, samples)
     edges = has_edges(osc)
     busy = span * _busyness(osc)
     rules, max_events = _budgets(max_segments, max_events, busy, len(osc.belts), edges, padded)
-    ends_at_t1 = ts is None or (
-        is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
-    )
+    last = None if samples is None else np.asarray(samples - 1 if ends_at_t1 else -1)
     trajectory = _filippov(
         osc if edges else without_edges(osc),
         *given,
         rules=rules,
         max_events=max_events,
         resolution=resolution,
-        ends_at_t1=ends_at_t1,
+        ends_at_t1=ends_at_t1 and samples is None,
+        last=last,
     )
-    return _without_padding(trajectory, trim_samples=ts is None)
+    return _without_padding(trajectory, trim_samples=ts is None, samples=samples)
 
 
 def _busyness(osc: Oscillator) -> float:
@@ -458,8 +471,30 @@ def _room_for(value: float, least: int) -> int:
     return power_of_two(math.ceil(min(value, 2.0**20)), least)
 
 
-def _without_padding(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
-    """Cuts the padding off where lengths are known, that is, outside of transformations."""
+#: Fewest rows of samples; rows are computed in so many lanes.
+FEWEST_SAMPLES = 32
+
+
+def _rows_for(samples: int) -> int:
+    """Rows that are computed for so many wanted times, so that few programs are compiled."""
+    room = power_of_two(samples, FEWEST_SAMPLES)
+    less = 3 * room // 4
+    return less if samples <= less and less % FEWEST_SAMPLES == 0 else room
+
+
+def _first_samples(trajectory: Trajectory, count: int) -> Trajectory:
+    known = (trajectory.ts, trajectory.ys, trajectory.modes)
+    rows = jax.device_put([np.asarray(leaf)[:count] for leaf in known])
+    return eqx.tree_at(lambda one: (one.ts, one.ys, one.modes), trajectory, tuple(rows))
+
+
+def _without_padding(
+    trajectory: Trajectory, *, trim_samples: bool, samples: int | None = None
+) -> Trajectory:
+    """Cut the padding off where lengths are known, that is, outside of transformations.
+
+    samples: how many rows were wanted; None: all.
+    """
     if not is_concrete(trajectory) or trajectory.ts.ndim != 1:
         return trajectory
     known = jax.tree.map(np.asarray, trajectory)
@@ -467,11 +502,11 @@ def _without_padding(trajectory: Trajectory, *, trim_samples: bool) -> Trajector
     def rows(tree, numbers):
         return jax.tree.map(lambda leaf: leaf[numbers], tree)
 
-    samples = (known.ts, known.ys, known.modes)
+    wanted = rows((known.ts, known.ys, known.modes), slice(samples))
     if trim_samples:
-        samples = rows(samples, np.flatnonzero(np.diff(known.ts, prepend=-np.inf)))
+        wanted = rows(wanted, np.flatnonzero(np.diff(known.ts, prepend=-np.inf)))
     events = rows(known.events, np.flatnonzero(known.events.kind))
     arcs = rows(known.arcs, np.flatnonzero(~np.isnan(known.arcs.t)))
-    # device_put, because jnp.asarray compiles a program for every shape.
-    (ts, ys, modes), events, arcs = jax.device_put((samples, events, arcs))
+    # Put there as they are: jnp.asarray compiles a program for every shape.
+    (ts, ys, modes), events, arcs = jax.device_put((wanted, events, arcs))
     return Trajectory(ts, ys, modes, events, arcs, trajectory.status)

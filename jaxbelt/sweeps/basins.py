@@ -36,8 +36,9 @@ from ..cycles.cycle import Cycle, cycle_from
 from ..cycles.unstable import from_starts, unstable_cycle
 from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import in_given_units, in_own_units, in_units_of_run
+from ..numerics.compiling import compiled_beside
 from ..results import Status, draw
 from ..tables import table_of
 from .attractor import KINDS, Attractor
@@ -319,22 +320,26 @@ def basins(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
+    refuse_clock(oscillator, "basins", "jb.simulate")
     axes = {name: _starts_along(values, name) for name, values in (("x1", x1), ("x2", x2))}
     require_wish(progress, "progress")
     with Activity("basins", progress):
-        dataset = sweep(
-            lambda: oscillator,
-            axes,
-            t1=t1,
-            rtol=rtol,
-            atol=atol,
-            observe="attractor",
-        )
+        own = in_own_units(oscillator)
+        start = jnp.asarray(np.zeros(2))
+        ahead = [lambda: cycle_from(own, start), lambda: from_starts(own)]
+        with compiled_beside("basins", own, ahead):
+            dataset = sweep(
+                lambda: oscillator,
+                axes,
+                t1=t1,
+                rtol=rtol,
+                atol=atol,
+                observe="attractor",
+            )
         note_progress("telling the attractors apart")
         labels, attractors, cycles = _labels(oscillator, dataset)
         # With one attractor there is hardly an unstable cycle, and a search among all cycles takes
         # time.
-        own = in_own_units(oscillator)
         boundary = (unstable_cycle if len(attractors) > 1 else from_starts)(own)
         boundary = in_given_units(boundary, oscillator, own)
     dataset["label"] = (
@@ -492,6 +497,7 @@ def basin_stability(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
+    refuse_clock(oscillator, "basin_stability", "jb.simulate")
     corners, n = as_box(box), as_whole(n, "n")
     check_key(key)
     numbers = settings_of_runs(t1, rtol, atol)

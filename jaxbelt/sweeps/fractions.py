@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, note_progress
 from ..checks import as_positive, as_whole, outside_of_traces
-from ..cycles.attractors import BESIDE, Runs, distance, error_of_runs, place_of
+from ..cycles.attractors import MAYBE_SAME, Runs, distance, error_of_runs, place_of
 from ..cycles.cycle import cycle_from
 from ..model.equilibria import equilibria
 from ..model.oscillator import Oscillator
@@ -423,7 +423,7 @@ def _seeded(osc: Oscillator, one: _Met) -> _Met | None:
 
 def _is_at(one: _Met, other: _Met) -> bool:
     """Whether two attractors of one kind, at one value, are at one place."""
-    is_beside = distance(one.place[:4], other.place[:4], least=1.0) < BESIDE
+    is_beside = distance(one.place[:4], other.place[:4], least=1.0) < MAYBE_SAME
     return one.kind == other.kind and bool(is_beside)
 
 

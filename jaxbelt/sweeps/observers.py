@@ -12,6 +12,7 @@ from jaxtyping import Array
 from ..kernel.events import event_kinds
 from ..kernel.lanes import Observer, Variable, choose
 from ..kernel.marks import Mark
+from ..model.oscillator import has_clock
 from ..model.own_units import OwnOscillator, in_units_of_user
 
 #: Meanings of contact codes.
@@ -46,7 +47,8 @@ class Final(Observer):
         return Mark.none(lanes.t)
 
     def watch(self, osc, lanes, passage, ones, t1, tol):
-        if not self.skip:
+        # With a clock the state does not repeat where x1 and x2 do.
+        if not self.skip or has_clock(osc):
             return lanes
         mark: Mark = lanes.memory
         released = passage.released & ~lanes.mode.any_stuck

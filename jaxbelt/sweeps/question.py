@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from ..checks import (
+    as_array,
     as_positive,
     as_tolerance,
     in_words,
@@ -25,6 +26,7 @@ from ..checks import (
 )
 from ..identity import fingerprint
 from ..kernel.lanes import Observer, Program
+from ..model.oscillator import has_clock
 from ..spelling import did_you_mean
 from .along import Along
 from .attractor import Attractor
@@ -52,7 +54,7 @@ class Question:
     derivatives: tuple[str, ...]
 
     @classmethod
-    def of(cls, make, axes, y0, t1, rtol, atol, observe, derivatives) -> "Question":
+    def of(cls, make, axes, y0, t1, rtol, atol, observe, derivatives, t0=0.0) -> "Question":
         """Checks the arguments of `sweep`."""
         require_usable_jax()
         grid = Grid(make, axes, y0)
@@ -62,6 +64,10 @@ class Question:
             require(observe == "attractor", "t1", given, "None")
             t1 = LONG_ENOUGH
         numbers = settings_of_runs(t1, rtol, atol)
+        if has_clock(grid.example):
+            numbers["t0"] = as_start(t0, numbers["t1"])
+        else:
+            require(t0 == 0.0, "t0", "0 for an oscillator that does not know the time", t0)
         wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
         fits = isinstance(wanted, Sequence)
         require_value(fits, "derivatives", "a tuple of names of axes", wanted)
@@ -78,9 +84,9 @@ class Question:
 
     def arguments(self) -> tuple[Any, ...]:
         """The arguments of `of`, for another process that asks the same question."""
-        grid, numbers = self.grid, self.numbers.values()
-        start = tuple(grid.y0.values())
-        return grid.make, grid.axes, start, *numbers, self.observe, self.derivatives
+        grid, numbers = self.grid, [self.numbers[name] for name in ("t1", "rtol", "atol")]
+        start, t0 = tuple(grid.y0.values()), self.numbers.get("t0", 0.0)
+        return grid.make, grid.axes, start, *numbers, self.observe, self.derivatives, t0
 
     @functools.cached_property
     def program(self) -> Program:
@@ -175,6 +181,13 @@ def settings_of_runs(t1: Any, rtol: Any, atol: Any) -> dict[str, Any]:
     """Checks the arguments of runs; atol may be None, for the default in own units."""
     positive = {name: as_positive(value, name) for name, value in (("t1", t1), ("rtol", rtol))}
     return {**positive, "atol": as_tolerance(atol, "atol")}
+
+
+def as_start(t0: Any, t1: float) -> float:
+    """The time at which runs begin, before t1, as a float."""
+    start = float(as_array(t0, "t0"))
+    require_value(np.isfinite(start) and start < t1, "t0", f"a number below t1 = {t1}", t0)
+    return start
 
 
 def _observer(observe: Any) -> Observer:

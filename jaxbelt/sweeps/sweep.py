@@ -50,6 +50,7 @@ def sweep(
     *,
     y0: ArrayLike | tuple = (3.0, 0.0),
     t1: ArrayLike | None = None,
+    t0: ArrayLike = 0.0,
     rtol: ArrayLike = 1e-8,
     atol: ArrayLike | None = None,
     observe: Any = "final",
@@ -96,8 +97,9 @@ def sweep(
             impossible parameters such as a negative load, give runs with the status NOT_FINITE; but
             the oscillator at the first finite value of each axis has to be possible.
         y0: Start (x1, x2), where it is not on an axis.
-        t1: End of each run, from t = 0 (dimensionless time tau = omega t). The default for
-            attractors is 30,000.
+        t1: End of each run (dimensionless time tau = omega t). The default for attractors is
+            30,000.
+        t0: Time at which each run begins, which matters where the oscillator is forced.
         rtol: Relative tolerance of a step.
         atol: Absolute tolerance of a step, a length; None: 1e-8 of the oscillator's own size.
         observe: What to observe: `"final"`, `"attractor"` or an object, see above.
@@ -126,7 +128,7 @@ def sweep(
         OSError: If the store cannot be written; likewise.
     """
     with _explained_ends() as known:
-        question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives)
+        question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives, t0)
         audit = float(as_array(audit, "audit"))
         require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
         require(

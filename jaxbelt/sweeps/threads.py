@@ -31,12 +31,12 @@ STEP_BUDGET = 400_000
 #: Runs that the kernel gets at once: enough that a call costs nothing beside them, and few enough
 #: that the threads end together.
 CHUNK = SideBySide(on_cpu=2**14, elsewhere=2**20)
-#: Lanes, so many that a refill is cheap for each.
+#: Number of lanes, large enough that a refill is cheap for each.
 WIDTH = SideBySide(on_cpu=128, elsewhere=2**20)
 #: Few runs have fewer lanes, by powers of `COARSER`, so that few programs are compiled.
 LEAST_WIDTH = SideBySide(on_cpu=128, elsewhere=2**10)
 COARSER = 32
-#: Seconds in which an interrupt is to be heard; a call of the kernel takes half of that or less.
+#: Seconds within which an interrupt takes effect; a call of the kernel takes half of that or less.
 PATIENCE = 0.5
 #: Passes of the first call, before it is known how long one takes: about a seventh of a second on
 #: the CPU; with derivatives, or where there are more lanes, a pass takes longer.
@@ -53,7 +53,7 @@ def compiled(program: Program) -> Callable:
 
 
 def workers() -> int:
-    """Threads that run the kernel: one a core on the CPU, one a device elsewhere."""
+    """Number of threads that run the kernel: one for each core, or device other than a CPU."""
     if not is_cpu():
         return jax.local_device_count()
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -77,6 +77,7 @@ def run(
     t1: float,
     rtol: float,
     atol: float | None,
+    t0: float | None = None,
     derivatives: int = 0,
     budget: float = 1.0,
     threads: int | None = None,
@@ -99,6 +100,7 @@ def run(
         put: put(numbers, results) takes results [1 + derivatives, columns, runs] in any order, on
             any thread.
         t1: End of the runs.
+        t0: Time at which they begin, see `queue.Common`.
         rtol: Relative tolerance of a step.
         atol: Absolute tolerance of a step, in the given units; None: the default, in own units.
         derivatives: Number of directions of derivatives.
@@ -110,7 +112,8 @@ def run(
         return
     largest = np.iinfo(np.int32).max
     require(runs <= largest, "axes", f"{largest} runs or fewer in one call", runs)
-    limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
+    span = t1 - (t0 or 0.0)
+    limit = int(budget * STEP_BUDGET * max(1.0, span / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
     limit = min(limit, largest)
     threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
@@ -118,7 +121,7 @@ def run(
     width = lanes_for(-(-runs // threads))
     most = CHUNK.here * width // WIDTH.here
     team = _Team(
-        functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit))),
+        functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit), t0)),
         functools.partial(_first_streams, program, shared, width, columns, derivatives),
         rows_of,
         put,

@@ -28,6 +28,8 @@ CAMPAIGNS = {
         name: name
         for name in ("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep")
     },
+    "forced-sweep": "forced_sweeps",
+    "forced": "forced_runs",
 }
 #: What can be asked of each campaign beside `--results`.
 PLAIN = frozenset({"seed", "runs"})
@@ -37,6 +39,8 @@ KNOWN = {
     "maps": frozenset(),
     "steep": PLAIN,
     "fractions": PLAIN | {"threads"},
+    "forced-sweep": PLAIN | {"threads", "structure", "tol"},
+    "forced": PLAIN | {"threads", "structure", "tol"},
     **dict.fromkeys(("final", "simulate", "attractors"), RUNS),
     "derivatives": RUNS | {"by"},
     "grazing": RUNS - {"extreme_share", "heavy"} | {"by"},
@@ -192,7 +196,7 @@ def _parsed(arguments):
         if name not in told:
             setattr(options, name, value)
     if options.tol is None:
-        options.tol = 1e-10 if what in ("simulate", "derivatives", "grazing") else 1e-8
+        options.tol = 1e-10 if what in ("simulate", "forced", "derivatives", "grazing") else 1e-8
     return options
 
 
