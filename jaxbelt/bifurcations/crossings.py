@@ -131,6 +131,9 @@ class CrossingSliding(AbstractStickCondition):
         return [cls(belt) for belt in (one - other) + (other - one)]
 
 
+TimedCrossing.public = CrossingSliding
+
+
 class Arrival(eqx.Module):
     """An arc that arrives at a boundary: how far from an end of where the mass sticks, its row, and
     the rest of a `StickLimit`."""

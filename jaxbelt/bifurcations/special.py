@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..model.oscillator import has_clock
 from ..model.variations import Variation
 from ..numerics.continuation import Stop
 from ..results import draw
@@ -69,7 +70,7 @@ def where_belts_stop(
     two belts come to rest both parameters are known, else one: what the other comes to is
     extrapolated, and the residual is by how much a parabola and a line differ there.
     """
-    if len(values) < 3:
+    if len(values) < 3 or has_clock(variation.oscillator(values[-1])):
         return None
     family = variation.family(values[-1])
     belts = range(len(family.oscillator.belts))
