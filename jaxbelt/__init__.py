@@ -31,7 +31,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     bifurcations/   special labels systems guesses base conditions forced tangencies crossings
     bifurcations/   rests
     bifurcations/   edge_rests edges folds meetings connections infinity path scan refine tracks
-    bifurcations/   curves cells faces bounds regions diagrams switch_folds
+    bifurcations/   curves cells faces bounds regions branches diagrams switch_folds
     inverse/        selection record search fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits
