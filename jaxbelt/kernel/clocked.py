@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..model.instants import (
-    begun,
+    begun_at,
     blur,
     is_held_for_ever,
     on_guard_at,
@@ -51,7 +51,7 @@ from ..numerics.control_points import (
     highest_difference,
     passage,
     through,
-    value_at,
+    wave_at,
 )
 from ..results import Status
 from .lanes import Lanes, Passage, choose, materialise
@@ -108,7 +108,7 @@ def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0=0.0) -> Lanes:
 
     def start(osc, x1, x2, t):
         y = x1, x2, t
-        mode, focus = begun(osc, y)
+        mode, focus = begun_at(osc, y)
         mode = Mode(tuple(code + jnp.zeros(()) for code in mode.codes))
         return mode, focus & jnp.asarray(True), is_held_for_ever(osc, mode, y)
 
@@ -392,7 +392,7 @@ def _limit(osc, clock: StepClock, window, lanes, new: _Attempt, room, reach) -> 
     if any(isinstance(v, StepWave) for v in clock.velocities):
         return one
     # The way is straight: the state at the root is as good as that at the end.
-    _, slope, _ = value_at(points, one.there)
+    _, slope, _ = wave_at(points, one.there)
     sharp = doubt * safe <= STRAIGHT * room * jnp.abs(slope)
     back = jnp.where(one.once & ~one.cut & sharp, (one.there - 1) * h, one.delta)
     return replace(one, delta=back)
