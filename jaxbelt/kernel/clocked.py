@@ -51,7 +51,7 @@ from ..numerics.control_points import (
     highest_difference,
     passage,
     through,
-    wave_at,
+    value_at,
 )
 from ..results import Status
 from .lanes import Lanes, Passage, choose, materialise
@@ -392,7 +392,7 @@ def _limit(osc, clock: StepClock, window, lanes, new: _Attempt, room, reach) -> 
     if any(isinstance(v, StepWave) for v in clock.velocities):
         return one
     # The way is straight: the state at the root is as good as that at the end.
-    _, slope, _ = wave_at(points, one.there)
+    _, slope, _ = value_at(points, one.there)
     sharp = doubt * safe <= STRAIGHT * room * jnp.abs(slope)
     back = jnp.where(one.once & ~one.cut & sharp, (one.there - 1) * h, one.delta)
     return replace(one, delta=back)
