@@ -49,7 +49,7 @@ from .transitions import codes_past_edge
 TimedState = tuple[Array, Array, Array]
 #: A guard is zero up to rounding below this, times the size of what it is made of; velocities are
 #: equal at an instant up to this fraction.
-GUARD_ROUNDING, SAME_VELOCITY = 1e-14, 2e-15
+GUARD_ROUNDING, EQUAL_VELOCITY = 1e-14, 2e-15
 #: Slopes and curvatures of a limit below these are zero; then the limit is asked a little later.
 LEAST_SLOPE, LEAST_CURVATURE, LATER = 1e-12, 1e-10, 1e-3
 #: Speed at an edge below which loops around a point on it are rounding of x1.
@@ -250,12 +250,9 @@ def at_zero(osc: Oscillator, mode: Mode, y: TimedState, k: Array) -> list[Array]
     found = []
     for i, (belt, touches) in enumerate(zip(now.belts, mode.touching, strict=True)):
         mate = any_of([(k == j) & are_mates(osc, i, j) for j in range(n)])
-        size = (
-            jnp.abs(belt.velocity)
-            + jnp.abs(velocity)
-            + jnp.abs(_wave_numbers(osc.belts[i].velocity)[1])
-        )
-        near = jnp.abs(belt.velocity - velocity) <= SAME_VELOCITY * blur(t) * size
+        amplitude = _wave_numbers(osc.belts[i].velocity)[1]
+        size = jnp.abs(belt.velocity) + jnp.abs(velocity) + jnp.abs(amplitude)
+        near = jnp.abs(belt.velocity - velocity) <= EQUAL_VELOCITY * blur(t) * size
         found.append(touches & (mate | near))
     return found
 

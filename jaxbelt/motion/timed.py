@@ -6,12 +6,13 @@ of its guards vanishes within, by what all guards are at its ends: value, slope 
 the motion, by derivatives of the field. A quintic has these values; in the basis of Bernstein it
 lies within its six control points. Where these, less the error of the quintic, are positive, the
 guard is. Where the guard is negative at the end and the control points fall, it has one root.
-Otherwise the step is halved. The error of the quintic is at most |g''''''| h^6/46080; steps are
-half a radian of the fastest wave or shorter, and there `QUINTIC_SHARE` of its distance from the cubic with
-the same values and slopes, about |g''''| h^4/480 at the control points, is more: for a wave of
-frequency Omega the ratio of the two is (Omega h)^2/96, or 1/400. Slip and stick phases are proved
-in the same way; in stick phases the state is in closed form. A double root, where control points
-are negative by rounding only, is touched, and the arc goes on.
+Otherwise the step is halved. The error of the quintic is at most |g(6)| h^6/46080, g(n) being the
+derivative of order n. Its control points are |g(4)| h^4/240 away from those of the cubic with the
+same values and slopes, and a quarter of that, `QUINTIC_SHARE`, is taken for its error: for a wave
+of frequency Omega it is 48 over (Omega h)^2 times as much, and no step is longer than half a radian
+of the fastest wave. Slip and stick phases are proved in the same way; in stick phases the state is
+in closed form. A double root, where control points are negative by rounding only, is touched, and
+the arc goes on.
 """
 
 import functools
