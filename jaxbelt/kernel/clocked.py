@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..model.instants import (
-    begun,
+    begun_at,
     blur,
     is_held_for_ever,
     on_guard_at,
@@ -108,7 +108,7 @@ def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0=0.0) -> Lanes:
 
     def start(osc, x1, x2, t):
         y = x1, x2, t
-        mode, focus = begun(osc, y)
+        mode, focus = begun_at(osc, y)
         mode = Mode(tuple(code + jnp.zeros(()) for code in mode.codes))
         return mode, focus & jnp.asarray(True), is_held_for_ever(osc, mode, y)
 

@@ -287,7 +287,7 @@ def fastest(osc: Oscillator) -> Array:
     return functools.reduce(jnp.maximum, map(jnp.abs, forces + waves), jnp.ones(()))
 
 
-def value_at(wave: Any, t: Array) -> Any:
+def wave_at(wave: Any, t: Array) -> Any:
     """A velocity or a load at the time t."""
     return wave.value(t) if isinstance(wave, Oscillating) else wave
 
@@ -316,8 +316,8 @@ def _belt_at(belt: Belt, t: Array) -> Belt:
     moves = isinstance(belt.velocity, Oscillating)
     made = object.__new__(MovingBelt if moves else Belt)
     fields = vars(belt) | {
-        "velocity": value_at(belt.velocity, t),
-        "load": value_at(belt.load, t),
+        "velocity": wave_at(belt.velocity, t),
+        "load": wave_at(belt.load, t),
     }
     if moves:
         fields["rate"] = belt.velocity.rate(t)
