@@ -450,8 +450,8 @@ def _try_lanes() -> bool:
 
 # --- one piece of machine code --------------------------------------------------------------------
 
-#: Options that make XLA's CPU compiler put a call into one piece of machine code, and not dissolve it
-#: before. It does so without them for loops on less than a kilobyte.
+#: Options that make XLA's CPU compiler put a call into one piece of machine code, and not dissolve
+#: it before. It does so without them for loops on less than a kilobyte.
 IN_ONE_PIECE = {"xla_cpu_small_call": "true", "inlineable": "false"}
 #: What is inside of the call would inherit the mark.
 NOT_MARKED = {"xla_cpu_small_call": "false", "inlineable": "true"}
