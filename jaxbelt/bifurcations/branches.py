@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..activity import tell
+from ..activity import note_progress
 from ..cycles.clocked import TimedChain, timed_blocks, turns_of
 from ..cycles.periodic import PeriodicMotion, is_same, motion_at, periodic_from
 from ..cycles.shooting import jacobian
@@ -164,7 +164,7 @@ def _side(line: Line, row: Row, sign: float) -> tuple[list[Row], list[Bifurcatio
     """The branch to one side of a motion: leg by leg."""
     rows, points = [row], []
     while len(rows) < MOST_ROWS:
-        tell(f"{len(rows)} motions on one side")
+        note_progress(f"{len(rows)} motions on one side")
         ahead, found, direction = _leg(line, rows[-1], sign)
         rows += ahead
         points += found

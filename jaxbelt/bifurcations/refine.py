@@ -80,6 +80,13 @@ def refine(
     second look; `value` and `cycle` are differentiable with respect to the other parameters. A
     guess that leads to no such point gives a status that says why, and NaN. `ValueError` names an
     impossible argument.
+
+    Of forced oscillators the conditions are those on a periodic motion: `PeriodDoubling()`,
+    `Fold()`, `Torus()`, `GrazingSliding(belt)`, `CrossingSliding(belt)`, `SwitchingSliding(belt)`
+    and `AddingSliding(belt)`. start: the motion to begin from, or a start (x1, x2) at t = 0 that
+    leads to it; None: motions to which some starts lead, and of those with an even number of
+    periods the one that they may have left. The nearest point is taken; not under `jax.vmap` and
+    `jax.jit`.
     """
     fits = isinstance(condition, AbstractCondition)
     require_value(fits, "condition", "such as jb.Hopf()", condition)
