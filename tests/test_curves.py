@@ -67,7 +67,8 @@ def errors(curve, osc, where, condition, rows):
         free = int(np.argmin(np.abs(chord)))
         held = both.held(1 - free, float(values[1 - free]))
         solved = [
-            condition.named_point_from(held, float(values[free]) + offset) for offset in (-1e-3, 1e-3)
+            condition.named_point_from(held, float(values[free]) + offset)
+            for offset in (-1e-3, 1e-3)
         ]
         points = [point for point in solved if point is not None]
         assert curve.kinds[row] in {point.kind for point in points}

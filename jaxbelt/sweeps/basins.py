@@ -36,7 +36,7 @@ from ..cycles.cycle import Cycle, cycle_from
 from ..cycles.unstable import from_starts, unstable_cycle
 from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import in_given_units, in_own_units, in_units_of_run
 from ..results import Status, draw
 from ..tables import table_of
@@ -318,6 +318,7 @@ def basins(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
+    refuse_clock(oscillator, "basins", 'jb.sweep with axes x1 and x2 and observe="attractor"')
     axes = {name: _starts_along(values, name) for name, values in (("x1", x1), ("x2", x2))}
     require_wish(progress, "progress")
     with Activity("basins", progress):
@@ -491,6 +492,9 @@ def basin_stability(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
+    refuse_clock(
+        oscillator, "basin_stability", 'jb.sweep with axes x1 and x2 and observe="attractor"'
+    )
     corners, n = as_box(box), as_whole(n, "n")
     check_key(key)
     numbers = settings_of_runs(t1, rtol, atol)

@@ -17,7 +17,7 @@ from jaxbelt.sweeps import question
 from . import forced, forced_cases
 from .outcome import Outcome
 from .package import Final
-from .runs import said as said  # noqa: PLC0414
+from .runs import said as said
 
 #: Runs in one call, and structures, each a compilation.
 BATCH, PROGRAMS = 1024, 12
@@ -145,6 +145,4 @@ def finals(cases, tol, **options):
     found = swept(cases, "final", t1=cases[0].T, rtol=tol, atol=tol, **options)
     columns = found.x1_end, found.x2_end, found.mode_end, found.n_events, found.status
     rows = zip(*(column.values for column in columns))
-    return [
-        Final(float(a), float(b), tuple(m.tolist()), int(n), int(s)) for a, b, m, n, s in rows
-    ]
+    return [Final(float(a), float(b), tuple(m.tolist()), int(n), int(s)) for a, b, m, n, s in rows]
