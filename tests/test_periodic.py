@@ -12,8 +12,7 @@ import pytest
 from scipy.optimize import brentq
 
 import jaxbelt as jb
-
-from .campaign import forced, forced_cases
+from tests.campaign import forced, forced_cases
 
 OK = jb.Status.OK
 

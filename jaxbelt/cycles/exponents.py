@@ -121,7 +121,8 @@ def lyapunov(
     transient = as_whole(transient, "transient", 0)
     require(is_concrete((osc, y0)), "osc", "known: not under jit or vmap", "a traced one")
     own, turns = in_own_units(osc), turns_of(osc)
-    y, skipped, passed = np.asarray(own.units.into(y0)), 0, 0
+    length = 1.0 if own is osc else own.units.length
+    y, skipped, passed = np.asarray(y0) / np.asarray(length), 0, 0
     logs, sticks, status = [], False, Status.OK.value
     frame = _first_tangents(key)
     while passed < periods:
@@ -138,14 +139,13 @@ def lyapunov(
         logs.append(grown)
         passed += used
         y = after_period(own, followed)
-    units = own.units.length
     return _averaged(
         np.concatenate(logs) if logs else np.zeros((0, 2)),
         sticks,
         status,
         periods,
         float(forcing_period(own, turns)),
-        jnp.asarray(y) * units,
+        jnp.asarray(y) * length,
     )
 
 

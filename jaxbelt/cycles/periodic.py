@@ -170,8 +170,9 @@ class PeriodicMotion(eqx.Module):
         """
         check_oscillator(osc)
         own = in_own_units(osc)
-        z = self.unknowns[..., :2] / own.units.length
-        z = jnp.concatenate([z, self.unknowns[..., 2:]], axis=-1)
+        z = self.unknowns
+        if own is not osc:
+            z = jnp.concatenate([own.units.into(z[..., :2]), z[..., 2:]], axis=-1)
         found, _ = _polished(own, self.chain, lax.stop_gradient(z))
         return in_given_units(found, osc, own)
 
@@ -510,7 +511,7 @@ def _differentiable(osc: Oscillator, y: Array, find: Any) -> PeriodicMotion:
     require(is_concrete((still, y)), "osc", expected, "a traced one")
     turns = turns_of(still)
     own = in_own_units(still)
-    motion = find(own, np.asarray(own.units.into(y)), turns)
+    motion = find(own, np.asarray(y if own is still else own.units.into(y)), turns)
     if is_concrete(osc):
         return in_given_units(motion, osc, own)
     own = in_own_units(osc)
