@@ -26,9 +26,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         observers moments along reducers attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     sweeps/         fractions orbit_diagram
-    bifurcations/   special labels systems guesses base conditions tangencies crossings rests
-    bifurcations/   edge_rests edges folds meetings connections infinity path scan refine tracks
-    bifurcations/   curves cells faces bounds regions diagrams switch_folds
+    bifurcations/   special labels beside systems guesses base conditions tangencies crossings
+    bifurcations/   rests edge_rests edges folds meetings connections infinity path scan refine
+    bifurcations/   tracks curves cells faces bounds regions diagrams switch_folds
     inverse/        selection record search fit margins design
     si              results in SI units
     plotting/       style phase histories points diagrams regions categories sweeps orbits

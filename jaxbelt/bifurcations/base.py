@@ -39,6 +39,7 @@ from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
+from .beside import Side
 from .labels import AttractingCycle, Label
 from .special import SpecialPoint, Trail
 from .systems import (
@@ -338,8 +339,9 @@ class BifurcationPoint(eqx.Module):
     shrunk to the equilibrium, at `SuddenSliding` its period is infinite); multiplier: of the cycle
     on the side where it does not stick to the belt, for `NonsmoothFold` and `GrazingSliding`, else
     NaN; x1: where the mass is at rest at the point where its equations tell it, else NaN; status: a
-    `Status` code. Where it is not OK the value is NaN. member: which of several states of rest it
-    is, as its condition counts them.
+    `Status` code. Where it is not OK the value is NaN, but where the place alone is known. member:
+    which of several states of rest it is, as its condition counts them. sides: where something
+    changes that no condition explains, what there is below and above, two of `Side`; else ().
     """
 
     condition: AbstractCondition = eqx.field(static=True)
@@ -354,6 +356,7 @@ class BifurcationPoint(eqx.Module):
     cycle: Cycle
     status: Array
     member: ArrayLike = 0
+    sides: tuple[Side, ...] = ()
 
     @property
     def _own(self) -> "BifurcationPoint":
@@ -446,7 +449,10 @@ class BifurcationPoint(eqx.Module):
             return f"BifurcationPoint({self.condition!r}, value={self.value.shape})"
         if int(self.status) != Status.OK:
             name, advice = Status(int(self.status)).name, describe(self.status)
-            if "jb.scan" not in advice:
+            if self.sides:
+                below, above = self.sides
+                advice = f"{advice} Below, {below!r}; above, {above!r}."
+            elif "jb.scan" not in advice:
                 advice += " Every bifurcation point in an interval is found by jb.scan."
             # Where the kind alone is not known, the place is, up to `error`.
             value, error = f"value {number(self.value)}", float(self.error)
@@ -467,12 +473,26 @@ def given_point(point: BifurcationPoint, variation: Variation) -> BifurcationPoi
     given, length, (unit,), _ = variation.units
     value = point.value * unit
     osc = given.oscillator(np.asarray(value)[None] if is_concrete(value) else value[None])
-    found = rescaled(point, length, lambda _: osc)
-    return replace(found, value=value, error=point.error * unit)
+    found = rescaled(replace(point, sides=()), length, lambda _: osc)
+    sides = tuple(_given_side(side, variation) for side in point.sides)
+    return replace(found, value=value, error=point.error * unit, sides=sides)
+
+
+def _given_side(side: Side, variation: Variation) -> Side:
+    given, length, (unit,), _ = variation.own
+    value = side.value * unit
+    osc = given.oscillator(np.asarray(value)[None])
+    return replace(rescaled(side, length, lambda _: osc), value=value)
 
 
 class Unexplained(AbstractCondition):
-    """What the oscillator does changes, and no other condition explains it; from `scan` only."""
+    """What the oscillator does changes, and no other condition explains it; from `scan` only.
+
+    The point's `sides` say what there is below its value and above, and how far the branches that
+    end there are from one another, see `Side`. Under a law that falls within a hundredth of the
+    belt's velocity the end of stick-slip is such a point: the fold in which a sticking cycle ends
+    is squeezed together with a canard.
+    """
 
     caption: ClassVar[str] = "unexplained"
 

@@ -23,7 +23,7 @@ from ..numerics.compiling import is_outermost
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint, given_point
 from .path import ParameterPath
-from .scan import search
+from .scan import MOST_ATTEMPTS, search
 
 #: Points found in two ways are one if they are no further apart.
 SAME_POINT = 1e-9
@@ -76,8 +76,9 @@ def refine(
 
     Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`, without that
     second look; `value` and `cycle` are differentiable with respect to the other parameters. A
-    guess that leads to no such point gives a status that says why, and NaN. `ValueError` names an
-    impossible argument.
+    guess that leads to no such point gives a status that says why, and NaN; where something changes
+    nearby that no condition explains, `sides` says what there is below and above. `ValueError`
+    names an impossible argument.
     """
     fits = isinstance(condition, AbstractCondition)
     require_value(fits, "condition", "such as jb.Hopf()", condition)
@@ -101,6 +102,7 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
     is_direct = bool(np.asarray(point.steps)[0] <= SHORT_STEP) and not condition.has_several
     if away <= unit * (QUITE_NEAR if is_direct else BESIDE_OTHERS):
         return point
+    attempts, unexplained = 0, []
     for reach in (unit * each for each in REACHES):
         ends = (guess + side * min(reach, away) for side in (-1, 1))
         first, last = (_possible(variation, guess, end) for end in ends)
@@ -108,8 +110,11 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
             break
         path = ParameterPath(variation, None, (first, last), [condition])
         # From farther off, too, than in `scan`: these paths are short.
-        found = search(path, INTERVALS, near=1.0)
-        found = [one for one in found if int(one.status) == Status.OK]
+        path.attempts = attempts
+        told = search(path, INTERVALS, near=1.0, known=unexplained)
+        attempts = path.attempts
+        unexplained += [one for one in told if int(one.status) == Status.UNEXPLAINED]
+        found = [one for one in told if int(one.status) == Status.OK]
         # What attracts may tell a point as one of another kind, too; or two are so near to each
         # other that the search tells one of them; or it is of one of two belts of one velocity.
         values = [
@@ -129,8 +134,11 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
             nearest = _more_exact(nearest, condition, variation, unit)
             is_nearer = _away(nearest, guess) < away - unit * SAME_POINT
             return replace(nearest, condition=condition) if is_nearer else point
-        if away <= reach:
+        if away <= reach or attempts > MOST_ATTEMPTS:
             break
+    if int(point.status) != Status.OK and unexplained:
+        nearest = min(unexplained, key=lambda one: abs(float(one.value) - guess))
+        return replace(point, sides=nearest.sides)
     return point
 
 
