@@ -18,7 +18,7 @@ import time
 import traceback
 from pathlib import Path
 
-from .cases import STRUCTURES
+from .cases import REGIMES, STRUCTURES
 from .outcome import Outcome, summed
 
 #: Of which module each campaign is.
@@ -31,7 +31,7 @@ CAMPAIGNS = {
 }
 #: What can be asked of each campaign beside `--results`.
 PLAIN = frozenset({"seed", "runs"})
-RUNS = PLAIN | {"threads", "extreme_share", "heavy", "structure", "tol", "table"}
+RUNS = PLAIN | {"threads", "extreme_share", "heavy", "regime", "structure", "tol", "table"}
 KNOWN = {
     **dict.fromkeys(("paths", "refine", "portraits", "shocks"), PLAIN),
     "maps": frozenset(),
@@ -39,11 +39,17 @@ KNOWN = {
     "fractions": PLAIN | {"threads"},
     **dict.fromkeys(("final", "simulate", "attractors"), RUNS),
     "derivatives": RUNS | {"by"},
-    "grazing": RUNS - {"extreme_share", "heavy"} | {"by"},
+    "grazing": RUNS - {"extreme_share", "heavy", "regime"} | {"by"},
 }
 #: What is not told.
 DEFAULTS = dict(
-    seed=0, runs=2000, extreme_share=0.0, heavy=False, by="simulate", threads=os.cpu_count()
+    seed=0,
+    runs=2000,
+    extreme_share=0.0,
+    heavy=False,
+    regime=None,
+    by="simulate",
+    threads=os.cpu_count(),
 )
 #: Seconds between two lines where everything agrees.
 QUIET = 15.0
@@ -243,6 +249,12 @@ def _parser():
         action="store_const",
         const=True,
         help="loads of 1e-6 to 1e6 beside one another, half of the cases on round numbers",
+    )
+    parser.add_argument(
+        "--regime",
+        choices=REGIMES,
+        help="four and six belts; laws with a jump; a Stribeck speed of 1e-4 of the belt; friction "
+        "that grows beyond the static limit",
     )
     parser.add_argument(
         "--by",
