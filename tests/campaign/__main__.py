@@ -26,7 +26,10 @@ CAMPAIGNS = {
     **dict.fromkeys(("final", "simulate", "derivatives", "attractors", "grazing"), "runs"),
     **{
         name: name
-        for name in ("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep")
+        for name in (
+            *("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep"),
+            *("coverage", "slopes"),
+        )
     },
 }
 #: What can be asked of each campaign beside `--results`.
@@ -35,7 +38,7 @@ RUNS = PLAIN | {"threads", "extreme_share", "heavy", "regime", "structure", "tol
 KNOWN = {
     **dict.fromkeys(("paths", "refine", "portraits", "shocks"), PLAIN),
     "maps": frozenset(),
-    "steep": PLAIN,
+    **dict.fromkeys(("steep", "coverage", "slopes"), PLAIN),
     "fractions": PLAIN | {"threads"},
     **dict.fromkeys(("final", "simulate", "attractors"), RUNS),
     "derivatives": RUNS | {"by"},
@@ -190,9 +193,7 @@ def _parsed(arguments):
     told = {name for name, value in vars(options).items() if value is not None}
     for name in sorted(told - {"what", "results"} - KNOWN[what]):
         parser.error(f"--{name.replace('_', '-')}: {what} does not know it")
-    if options.by == "find_cycle" and what == "derivatives":
-        parser.error("--by: derivatives are asked of simulate or sweep")
-    if options.by == "find_cycle" and options.structure is not None:
+    if what == "grazing" and options.by == "find_cycle" and options.structure is not None:
         parser.error("--structure: cycles that graze have none")
     for name, value in DEFAULTS.items():
         if name not in told:

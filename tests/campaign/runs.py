@@ -178,6 +178,8 @@ def _plain(value):
 def _has_derivatives(mine, run, options):
     """Whether derivatives are asked of a run, `mine` the engine's: near grazing always, else where
     it goes on until T, or to a pseudo-focus, and comes near to no other outcome, or to a corner."""
+    if options.what == "derivatives" and options.by == "find_cycle":
+        return mine.kind == "cycle" and mine.margin > 1e-6
     if options.what == "derivatives":
         clear = mine.margin > 1e-6 or mine.margin <= compare.CORNER
         lasts = mine.t_end == cases.Case.T and mine.status == engine.OK
