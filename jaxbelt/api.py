@@ -20,6 +20,7 @@ from .bifurcations.diagrams import BifurcationDiagram, bifurcation_diagram
 from .bifurcations.edge_rests import BoundaryEquilibrium, PseudoHopf
 from .bifurcations.edges import CornerCollision, GrazingEdge
 from .bifurcations.folds import FoldOfCycles
+from .bifurcations.forced import AddingSliding, Fold, PeriodDoubling, SwitchingSliding, Torus
 from .bifurcations.infinity import HopfAtInfinity
 from .bifurcations.meetings import EdgeExchange, MeetingEdges
 from .bifurcations.refine import refine
@@ -29,6 +30,7 @@ from .bifurcations.scan import scan
 from .bifurcations.special import SpecialPoint
 from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, find_cycle
+from .cycles.exponents import Exponents, lyapunov
 from .cycles.functionals import (
     amplitude,
     energy_dissipated,
@@ -40,6 +42,7 @@ from .cycles.functionals import (
     stick_duration,
     stick_fraction,
 )
+from .cycles.periodic import PeriodicMotion, periodic
 from .cycles.portrait import Portrait, portrait
 from .cycles.separatrices import Separatrix
 from .cycles.shocks import FatalShock, minimal_fatal_shock
@@ -74,6 +77,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AbstractForce",
     "AbstractFriction",
+    "AddingSliding",
     "Arcs",
     "AtEvents",
     "AtExtrema",
@@ -102,8 +106,10 @@ __all__ = [
     "EventKind",
     "Events",
     "Explanation",
+    "Exponents",
     "FatalShock",
     "Fit",
+    "Fold",
     "FoldOfCycles",
     "GrazingEdge",
     "GrazingSliding",
@@ -116,6 +122,8 @@ __all__ = [
     "OrbitDiagram",
     "Oscillating",
     "Oscillator",
+    "PeriodDoubling",
+    "PeriodicMotion",
     "PhysicalBelt",
     "Portrait",
     "PseudoHopf",
@@ -127,7 +135,9 @@ __all__ = [
     "Status",
     "Stribeck",
     "SuddenSliding",
+    "SwitchingSliding",
     "Tabulated",
+    "Torus",
     "Trajectory",
     "Units",
     "Verified",
@@ -152,11 +162,13 @@ __all__ = [
     "fit",
     "gap",
     "in_si",
+    "lyapunov",
     "lyapunov_coefficient",
     "minimal_fatal_shock",
     "orbit_diagram",
     "peak",
     "period",
+    "periodic",
     "plot_basins",
     "plot_friction_law",
     "plot_in_si",

@@ -206,7 +206,7 @@ def test_two_cycles_with_one_sequence_of_events():
     points = search(path)
     expected = [jb.SaddleConnection(1, to=1), jb.GrazingEdge(1), jb.Hopf(), jb.Hopf()]
     assert [point.condition for point in points] == expected
-    path.look([-0.06341])
+    path.find_labels([-0.06341])
     loops = [one.loop for one in path.cycles[-0.06341]]
     assert len({loop_events(loop) for loop in loops}) == 1
     assert sorted(np.sum(loop.durations) for loop in loops) == pytest.approx(
@@ -238,7 +238,7 @@ def test_an_orbit_that_still_grows_is_no_cycle():
     )
     osc = jb.Oscillator(0.05, belts, omega=0.5)
     path = ParameterPath(osc, lambda osc: osc.belts[1].velocity, (0.932, 0.935))
-    path.look([0.9333, 0.93331195])
+    path.find_labels([0.9333, 0.93331195])
     assert [len(path.cycles[value]) for value in (0.9333, 0.93331195)] == [1, 1]
 
 
@@ -266,7 +266,7 @@ def test_nested_cycles_in_one_mode():
         oracle_cycles.fold_of_cycles(make, (0.5045, 0.5065), (0.3, 0.45)),
     )
     assert values_of(points) == pytest.approx(expected, abs=1e-9)
-    path.look([0.4975, 0.5, 0.5075])
+    path.find_labels([0.4975, 0.5, 0.5075])
     amplitudes = [
         [float(np.ptp(one.loop.entries[:, 0])) / 2 for one in path.cycles[value]]
         for value in (0.4975, 0.5, 0.5075)

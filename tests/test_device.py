@@ -1,5 +1,6 @@
 """What is computed on accelerators, computed on the CPU: right, and in a form that suits them."""
 
+import json
 import os
 import re
 import subprocess
@@ -16,6 +17,7 @@ from jaxbelt.numerics import compiling, programs, widths
 from jaxbelt.sweeps import threads
 from jaxbelt.sweeps.question import Question
 from jaxbelt.sweeps.queue import Call, Common, advance
+from tests.benchmarks import device
 
 needs_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="compares with the CPU")
 NU1 = 0.35
@@ -88,9 +90,9 @@ def test_few_runs_have_few_lanes():
     assert [threads.lanes_for(n) for n in (1, 10**7)] == [128, 128]
     with widths.as_on_accelerator():
         widest = threads.WIDTH.elsewhere
-        found = [threads.lanes_for(n) for n in (1, 2**10, 2**10 + 1, 2**14 + 1, 10**7)]
-        assert found == [2**10, 2**10, 2**14, widest, widest]
-        assert threads.workers() == 2 * jax.local_device_count()
+        found = [threads.lanes_for(n) for n in (1, 2**10, 2**10 + 1, 2**15 + 1, 10**7)]
+        assert found == [2**10, 2**10, 2**15, widest, widest]
+        assert threads.workers() == jax.local_device_count()
 
 
 # --- the kernel's form ----------------------------------------------------------------------------
@@ -192,15 +194,14 @@ def slopes():
 
 
 def cycles():
-    def of(nu):
+    def period(nu):
         cycle = jb.find_cycle(jb.presets.class_b(nu, NU1), (3.0, 0.0))
-        slope = jax.grad(
-            lambda nu: jb.period(jb.find_cycle(jb.presets.class_b(nu, NU1), (3.0, 0.0)))
-        )(nu)
-        return cycle.period, cycle.status, slope
+        return jb.period(cycle), cycle.status
 
-    period, status, slope = jax.jit(jax.vmap(of))(jnp.linspace(0.1, 0.6, 70))
-    return {"period": period, "status": status, "d_period": slope}
+    # More than a group on the CPU has.
+    nus = jnp.linspace(0.1, 0.6, 70)
+    (found, status), slope = jax.jit(jax.vmap(jax.value_and_grad(period, has_aux=True)))(nus)
+    return {"period": found, "status": status, "d_period": slope}
 
 
 def unstable_cycles():
@@ -242,7 +243,7 @@ first = pytest.mark.slow(first=True)
         pytest.param(lambda: sweep("attractor", class_d), id="attractors", marks=first),
         pytest.param(ends, id="ends", marks=first),
         pytest.param(slopes, id="slopes", marks=first),
-        pytest.param(cycles, id="cycles", marks=first),
+        pytest.param(cycles, id="cycles", marks=pytest.mark.slow),
         pytest.param(unstable_cycles, id="unstable", marks=pytest.mark.slow),
         pytest.param(scanned, id="scan", marks=pytest.mark.slow),
         pytest.param(mapped, id="regions", marks=pytest.mark.slow),
@@ -282,7 +283,7 @@ def watched(function, *arguments):
 threads._started = watched
 axes = {"nu0": np.linspace(-0.6, 0.6, 40), "nu1": [0.35]}
 with as_on_accelerator():
-    assert threads.workers() == 6
+    assert threads.workers() == 3
     found = jb.sweep(jb.presets.class_b, axes, t1=20.0, progress=False)
 assert used == set(jax.local_devices()) and len(used) == 3
 np.savez(sys.argv[1], **{str(name): found[name].values for name in found})
@@ -301,3 +302,92 @@ np.savez(sys.argv[1], **{str(name): found[name].values for name in found})
     expected = jb.sweep(jb.presets.class_b, axes, t1=20.0, progress=False)
     for name, values in np.load(file).items():
         np.testing.assert_allclose(values, expected[name].values, 1e-12, 1e-12, err_msg=name)
+
+
+# --- the script for a device ----------------------------------------------------------------------
+
+
+@pytest.fixture
+def script(tmp_path):
+    """Runs the script, as on an accelerator; gives its exit code and what this device has in the
+    file of its results, in which there was another device before."""
+    file = tmp_path / "device.json"
+    file.write_text(json.dumps({"another": {"proof": {"right": True, "runs": 7}}}))
+
+    def call(*arguments):
+        told = ["--file", str(file), "--as-on-accelerator", "--seconds", "3000", *arguments]
+        code = device.main(told)
+        found = json.loads(file.read_text())
+        assert found.pop("another")["proof"]["runs"] == 7
+        return code, next(iter(found.values()), {})
+
+    return call
+
+
+def test_the_script_keeps_what_is_done_and_tells_what_failed(script, monkeypatch, capsys):
+    def fails(sizes, clock):
+        raise MemoryError("too large")
+
+    monkeypatch.setattr(device, "proof", lambda sizes, clock: {"right": True, "runs": 1234})
+    monkeypatch.setattr(device, "w1", fails)
+    code, found = script("--parts", "proof", "w1")
+    assert code == 1 and found["proof"]["runs"] == 1234
+    assert found["w1"] == {"right": False, "failed": "MemoryError: too large"}
+    assert "1,234" in capsys.readouterr().out
+    monkeypatch.setattr(device.Clock, "left", 0.0)
+    code, _ = script("--parts", "proof")
+    assert code == 0 and "proof: left out, 0 s are left" in capsys.readouterr().out
+
+
+def test_a_map_stops_where_its_time_is_up(monkeypatch):
+    monkeypatch.setattr(device, "TILE", 5)
+    monkeypatch.setattr(device.Clock, "left", 0.0)
+    known = np.array(json.loads(device.ANSWERS.read_text())["basins"])
+
+    def call(x1, x2):
+        return known[: len(x1), : len(x2)]
+
+    found = device.mapped("basins", call, device.BASINS, 10, device.Clock(1.0))
+    assert (found["right"], found["cells"], found["not done"]) == (True, 25, 100)
+    monkeypatch.setattr(device.Clock, "left", 1e9)
+    found = device.mapped("basins", lambda *a: call(*a) + 1, device.BASINS, 10, device.Clock(1.0))
+    assert (found["right"], found["cells"]) == (False, 100)
+
+
+def test_operations_of_a_lane_are_those_that_were_written():
+    def some(x):
+        def step(x, _):
+            return x * 2.0 + 1.0, None
+
+        return jax.lax.scan(step, jnp.sqrt(x), length=3)[0]
+
+    assert device.operations(jax.make_jaxpr(some)(jnp.ones(10)).jaxpr) == 10 * (1 + 3 * 2)
+
+
+@needs_cpu
+@pytest.mark.slow(first=True)
+def test_the_script_measures_at_small_sizes(script):
+    code, found = script("--parts", "w1", "--w1", "900")
+    assert code == 0, found
+    told = found["w1"]
+    assert told["runs"] == 900 and told["right"] and 15 < told["events a run"] < 25
+    # Some steps for each of 100 units of time; of 1,024 lanes some are idle from the start.
+    assert 100 < told["kernel: steps of a lane a run"] < 1000
+    assert told["kernel: bound by"] in ("float64 operations", "memory")
+    assert 0 < told["kernel: share of float64 operations"] <= told["kernel: share of the bound"]
+
+
+@needs_cpu
+@pytest.mark.parametrize(
+    "parts",
+    [
+        pytest.param(("proof",), marks=pytest.mark.slow(first=True)),
+        pytest.param(("grad", "regions", "basins"), marks=pytest.mark.slow),
+    ],
+)
+def test_the_script_proves_at_small_sizes(script, parts):
+    code, found = script("--parts", *parts, "--grad", "150", "--regions", "10", "--basins", "10")
+    assert code == 0, found
+    assert all(found[part]["right"] for part in parts)
+    if "proof" in parts:
+        assert found["proof"]["runs"] == 300

@@ -26,6 +26,7 @@ from jaxbelt.plotting.style import parameter_label
 #: Public classes that are no results: what a user writes down.
 NO_RESULTS = {
     *(jb.AbstractFriction, jb.Conti, jb.Coulomb, jb.Stribeck, jb.Tabulated),
+    *(jb.Cubic, jb.AbstractForce, jb.Harmonic, jb.BaseMotion, jb.Oscillating),
     *(jb.Belt, jb.Oscillator),
     *(jb.Machine, jb.PhysicalBelt, jb.Units),
     *(jb.AtEvents, jb.AtExtrema, jb.AtSection, jb.AtTimes),
@@ -35,6 +36,7 @@ NO_RESULTS = {
     jb.HopfAtInfinity,
     *(jb.MeetingEdges, jb.NonsmoothFold, jb.PseudoHopf, jb.SaddleConnection),
     *(jb.SlidingExchange, jb.SuddenSliding),
+    *(jb.AddingSliding, jb.Fold, jb.PeriodDoubling, jb.SwitchingSliding, jb.Torus),
 }
 PUBLIC = [getattr(jb, name) for name in jb.__all__]
 RESULTS = [one for one in PUBLIC if inspect.isclass(one) and one not in NO_RESULTS]

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..checks import number, pick
-from ..cycles.attractors import apart, place_of
+from ..cycles.attractors import MAYBE_SAME, distance, place_of
 from ..cycles.chains import SIZES, cut
 from ..cycles.cycle import Cycle, cycle_from, exactly
 from ..cycles.unstable import separating_loop
@@ -25,10 +25,6 @@ from ..model.oscillator import Oscillator
 from ..model.own_units import quantity
 from ..results import Status
 from .labels import AttractingCycle
-
-#: Cycles on two sides of an interval of rounding's size are one if they differ by less, relative to
-#: their size.
-GOES_ON = 1e-3
 
 
 class Side(eqx.Module):
@@ -83,7 +79,7 @@ def _side(value, osc, across, cycles, places, others, other_places) -> Side:
         exactly(osc, cut([one.loop])[0], ok)
         for one, place in zip(cycles, places, strict=True)
         if not any(
-            one.path == other.path and apart(place, at) < GOES_ON
+            one.path == other.path and distance(place, at) < MAYBE_SAME
             for other, at in zip(others, other_places, strict=True)
         )
     ]
@@ -121,9 +117,9 @@ def _tops_that_come_to_rest(osc: Oscillator, rests: Equilibria) -> list[float]:
     meant &= np.asarray(rests.kind) != EquilibriumKind.SEGMENT
     tops = []
     for around, row in enumerate(np.flatnonzero(meant).tolist()):
-        _, status, distance = separating_loop(osc, SIZES[-1], around)
+        _, status, away = separating_loop(osc, SIZES[-1], around)
         if int(status) == Status.OK:
-            tops.append(float(pick(rests, row).x1) + float(distance))
+            tops.append(float(pick(rests, row).x1) + float(away))
     return tops
 
 

@@ -1,21 +1,21 @@
 """Shooting with a fixed signature: a closed chain of arcs as a square system of equations.
 
-The mode of every arc, and what ends it, is all that has to be known to compute a cycle: the
+To compute a cycle only the mode of every arc has to be known, and the event that ends it: the
 numbers follow without any event detection (fixed-signature multiple shooting). An arc ends at a
 boundary r_k = 0, at a contact edge, at slip onset, or at an extremum, x2' = 0 or x2 = 0. The
-extrema make x1 and x2 monotone on every arc, so all extrema of a cycle are ends of arcs. Counted
-for N arcs:
+extrema make x1 and x2 monotone on every arc, so all extrema of a cycle are ends of arcs. For N arcs
+there are
 
     3N unknowns    entry state (x1, x2) and duration T of every arc
      N equations   the guard of the arc's end vanishes at its end
     2N equations   the end of an arc is the entry of the next, after the last comes the first
 
 The number N is padded to a few fixed sizes and modes are data, so that one compiled program serves
-all signatures. Slip arcs are integrated by a fixed number of steps of a scheme of order
-twelve, spread over the arc so that they are short where the friction law bends; all arcs at
-once, each step smooth in everything. An arc that magnifies is followed backwards, see
-`solve_closed`. Derivatives of a solution come from the implicit function theorem and work in
-forward and reverse mode and under `jax.vmap`.
+all signatures. Slip arcs are integrated by a fixed number of steps of a scheme of order twelve,
+spread over the arc so that they are short where the friction law bends; all arcs at once, each step
+smooth in everything. An arc that magnifies is followed backwards, see `solve_closed`. Derivatives
+of a solution come from the implicit function theorem and work in forward and reverse mode and under
+`jax.vmap`.
 """
 
 import functools
@@ -29,6 +29,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from ..model.instants import carried, field_at
 from ..model.modes import (
     Mode,
     any_of,
@@ -41,7 +42,7 @@ from ..model.modes import (
     select,
     stick_velocity,
 )
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, at_time, has_clock
 from ..model.transitions import held_at_boundary, onset_position
 from ..motion.arcs import Ends
 from ..motion.integrators import density
@@ -57,16 +58,16 @@ ARC_STEPS = 8
 EVEN_STEPS, MESH_STRIDE, MESH_MARCH = 32, 0.3, 20_000
 #: An arc of a shorter duration may have none: it is the square root of rounding.
 LASTS = 1e-6
-#: An arc magnifies, if its end moves so much faster than its entry.
+#: An arc magnifies if its end moves so much faster than its entry.
 MAGNIFIED = 1e4
 
 
 # Of order 12 for the arcs, of order 4 for placing the steps.
-_FINE = scheme((2, 4, 6, 8, 10, 12))
+FINE = scheme((2, 4, 6, 8, 10, 12))
 _COARSE = scheme((2, 4))
 
 
-def _arc_by_arc(function: Callable) -> Callable:
+def arc_by_arc(function: Callable) -> Callable:
     """What function(*shared, *row) gives of each arc of a chain, its rows, as a function of the
     shared and of the columns, a tuple each. All arcs are one piece of machine code; in a batch each
     of them is one, of all lanes."""
@@ -80,7 +81,7 @@ def _arc_by_arc(function: Callable) -> Callable:
     return call
 
 
-def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -> Array:
+def arc_step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -> Array:
     """One step of size h, for states in one array."""
 
     def apart(state):
@@ -91,7 +92,10 @@ def _step(field: Callable[[Array], Array], y: Array, h: Array, scheme: Scheme) -
     return y + jnp.stack(change)
 
 
-def _slip_slopes(osc: Oscillator, codes: Array, y: Array) -> Array:
+def slip_slopes(osc: Oscillator, codes: Array, y: Array) -> Array:
+    """The field of a slip mode at a state, in one array."""
+    if has_clock(osc):
+        return jnp.stack(field_at(osc, mode_of(codes), (y[0], y[1], y[2])))
     return jnp.stack([y[1], mode_acceleration(osc, mode_of(codes), y[0], y[1])])
 
 
@@ -106,7 +110,7 @@ def meshed(osc: Oscillator, loop: Loop, steps: int = ARC_STEPS) -> tuple[Chain, 
 
 @functools.cache
 def _meshes(steps: int) -> Callable:
-    """`_mesh` of all arcs. Not by `_arc_by_arc`: in a batch a whole march is too large for a piece,
+    """`_mesh` of all arcs. Not by `arc_by_arc`: in a batch a whole march is too large for a piece,
     so each step of it is one."""
 
     @one_kernel_alone
@@ -117,18 +121,19 @@ def _meshes(steps: int) -> Callable:
 
 
 def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
-    """Steps as fractions of the duration, [steps], so that each has about the same share of it."""
+    """Steps as fractions of the duration, [steps], each with about the same share of the
+    density."""
     if steps > EVEN_STEPS:
         return _marched_mesh(osc, steps, codes, y, duration)
     n = 24
 
     def march():
         def advance(y, _):
-            return _coarse_step(osc, codes, y, duration / n)
+            return coarse_step(osc, codes, y, duration / n)
 
         return lax.scan(advance, y, None, length=n)[1]
 
-    # Stick phases, and what pads a chain, take no steps.
+    # Stick phases, and the padding of a chain, take no steps.
     rest = lax.cond(any_lane(duration != 0), march, lambda: jnp.ones(n))
     rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
     # Clipped: where a guess is poor the mesh is only less good.
@@ -156,7 +161,7 @@ def _marched_mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration:
             # The last step that there is room for goes to the end.
             wanted = jnp.where(number < MESH_MARCH - 1, MESH_STRIDE / rho, left)
             h = jnp.minimum(wanted, left)
-            y, after = _coarse_step(osc, codes, y, h)
+            y, after = coarse_step(osc, codes, y, h)
             after = jnp.maximum(jnp.nan_to_num(after, nan=1.0), 1.0)
             more, passed = 0.5 * h * (rho + after), duration - left
             behind = even * total - share
@@ -176,23 +181,24 @@ def _marched_mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration:
 
 
 @lanes_in_one_kernel
-def _coarse_step(osc: Oscillator, codes: Array, y: Array, h: Array) -> tuple[Array, Array]:
+def coarse_step(osc: Oscillator, codes: Array, y: Array, h: Array) -> tuple[Array, Array]:
     """The state after a step, and the density of steps that is wanted there."""
-    y = _step(functools.partial(_slip_slopes, osc, codes), y, h, _COARSE)
+    y = arc_step(functools.partial(slip_slopes, osc, codes), y, h, _COARSE)
     return y, density(osc, mode_of(codes), *y)
 
 
 def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, extra=None):
     """End of one arc, (x1, x2), and the integrals of `extra(osc, mode, x1, x2)`, a vector, over it.
 
-    A stick arc is a straight line; Simpson's rule is exact there for what is at most cubic.
+    A stick arc is a straight line; Simpson's rule is exact there for what is at most cubic. With a
+    clock states are (x1, x2, t), and there is no extra.
     """
     mode = mode_of(codes)
     stuck = mode.any_stuck
     n_extra = 0 if extra is None else extra(osc, mode, y[0], y[1]).size
 
     def field(state):
-        smooth = _slip_slopes(osc, codes, state[:2])
+        smooth = slip_slopes(osc, codes, state[: y.size])
         if extra is None:
             return smooth
         return jnp.concatenate([smooth, extra(osc, mode, state[0], state[1])])
@@ -201,10 +207,10 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     slip_time = jnp.where(stuck, 0.0, duration)
 
     def advance(state, fraction):
-        return _step(field, state, slip_time * fraction, _FINE), None
+        return arc_step(field, state, slip_time * fraction, FINE), None
 
     def advance_some(state, fractions):
-        # What pads a mesh is not worth a step.
+        # Padding of a mesh is skipped.
         some = any_lane(jnp.any(fractions > 0))
         return lax.cond(some, lambda: lax.scan(advance, state, fractions)[0], lambda: state), None
 
@@ -212,6 +218,9 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
         slipped, _ = lax.scan(advance_some, start, mesh.reshape(-1, ARC_STEPS))
     else:
         slipped, _ = lax.scan(advance, start, mesh)
+    if has_clock(osc):
+        stuck_end = jnp.stack(carried(osc, mode, (y[0], y[1], y[2]), duration))
+        return jnp.where(stuck, stuck_end, slipped)
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
     stuck_end = jnp.stack([y[0] + v * duration, v])
     if extra is not None:
@@ -225,6 +234,8 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
 
 def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     """What vanishes at y if an arc ends there by `end`; zero for an unused one."""
+    if has_clock(osc):
+        return _timed_end_guard(osc, codes, end, y)
     mode = mode_of(codes)
     values = [
         *[belt.velocity - osc.omega * y[1] for belt in osc.belts],
@@ -236,6 +247,28 @@ def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     return sum((jnp.where(end == i, value, 0.0) for i, value in enumerate(values)), jnp.zeros(()))
 
 
+def _timed_end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
+    """`end_guard` with a clock, but for the end of a period."""
+    mode, state = mode_of(codes), (y[0], y[1], y[2])
+
+    def guards(*y):
+        now = at_time(osc, y[2])
+        limit = jnp.abs(mode_acceleration(now, mode, y[0], y[1])) - capacity(now, mode)
+        return jnp.stack([*(belt.velocity - osc.omega * y[1] for belt in now.belts), limit])
+
+    values, slopes = jax.jvp(guards, state, field_at(osc, mode, state))
+    n, names = len(osc.belts), Ends(len(osc.belts))
+    numbers = [
+        *((i, values[i]) for i in range(n)),
+        *((n + i, jnp.where(jnp.isfinite(e), y[0] - e, 1.0)) for i, e in enumerate(edges(osc))),
+        (names.extremum_x1, y[1]),
+        (names.onset, values[n]),
+        *((names.tangent + i, slopes[i]) for i in range(n)),
+        (names.nearest_limit, slopes[n]),
+    ]
+    return sum((jnp.where(end == i, value, 0.0) for i, value in numbers), jnp.zeros(()))
+
+
 def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     """Divergence of the field of a slip mode, d(x2')/d(x2), as a vector of one."""
     _, slope = jax.jvp(lambda v: mode_acceleration(osc, mode, x1, v), (x2,), (jnp.ones_like(x2),))
@@ -245,13 +278,13 @@ def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 def _magnifies(osc: Oscillator, codes: Array, entry: Array, exit_: Array) -> Array:
     """Whether an arc leads away from a place where the orbit hardly moves, and lingers.
 
-    A mass that a slow belt leaves is such: where it ends is lost in the rounding of where it began,
+    Such is a mass that a slow belt leaves: its end is lost in the rounding of its beginning,
     magnified by the ratio of the two velocities in the plane. Backwards this is the ratio over the
-    growth of areas, so it is done where these grow.
+    growth of areas, so the arc is followed backwards where areas grow.
     """
     osc, entry, exit_ = lax.stop_gradient((osc, entry, exit_))
     mode = mode_of(codes)
-    slow, fast = (jnp.max(jnp.abs(_slip_slopes(osc, codes, y))) for y in (entry, exit_))
+    slow, fast = (jnp.max(jnp.abs(slip_slopes(osc, codes, y))) for y in (entry, exit_))
     grows = trace_of(osc, mode, entry[0], entry[1])[0] > 0
     return ~mode.any_stuck & grows & (fast > MAGNIFIED * slow)
 
@@ -266,11 +299,11 @@ def _arc_equations(osc: Oscillator, codes, end, mesh, backwards, unknown: Array)
     """(x1, x2, guard, 0) at the end of one arc, from its unknowns (x1, x2, T).
 
     Backwards: (x1, x2) are the state in which it ends; of the four numbers the first two are its
-    entry. An unused arc ends as it begins, and its guard is its duration. One that is to end
+    entry. An unused arc ends as it begins, and its guard is its duration. An arc that has to end
     tangent to the boundary of a belt ends at the point of it with x2' = 0. Trial arcs that run past
-    there meet the pole of the friction law, so this one is followed backwards, from that point, to
-    where it begins: (x1, x2) are the point's, the last two the misses of x1 and of x2. That is one
-    equation more, a condition on the oscillator.
+    there meet the pole of the friction law, so this arc is followed backwards, from that point to
+    its beginning: (x1, x2) are the point's, the last two numbers the misses of x1 and of x2. That
+    is one more equation, a condition on the oscillator.
     """
     is_unused = end == Ends(len(osc.belts)).unused
 
@@ -302,10 +335,10 @@ def _followed(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> A
     return jnp.where(is_tangent, jnp.concatenate([point, after - unknown[:2]]), ordinary)
 
 
-_all_arc_equations = _arc_by_arc(_arc_equations)
+_all_arc_equations = arc_by_arc(_arc_equations)
 
 
-@_arc_by_arc
+@arc_by_arc
 def _equations_and_blocks(
     osc: Oscillator, along: Oscillator | None, codes, end, mesh, backwards, unknown: Array
 ):
@@ -319,18 +352,18 @@ def _equations_and_blocks(
         if along is None:
             of_unknown = functools.partial(equations, osc)
             return jax.jvp(of_unknown, (unknown,), (direction,))
-        moved = jax.tree.map(functools.partial(_weighted, direction[3:]), along)
+        moved = jax.tree.map(functools.partial(weighted, direction[3:]), along)
         return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
 
     return jax.vmap(column, out_axes=(None, -1))(jnp.eye(3 + more))
 
 
-def _weighted(weights: Array, slopes: Array) -> Array:
+def weighted(weights: Array, slopes: Array) -> Array:
     """The sum of the slopes, [k, ..], each times its weight."""
     return jnp.sum(weights.reshape(-1, *[1] * (slopes.ndim - 1)) * slopes, axis=0)
 
 
-def _directions_of(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, Array]:
+def directions_of(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, Array]:
     """A direction for each number of the oscillator that has a tangent, as an oscillator of arrays
     [k, ..], and these tangents, [k]."""
     moving, fixed = moving_and_fixed(osc, tangents)
@@ -348,15 +381,17 @@ def _arc_columns(chain: Chain, *others: Array) -> tuple[Array, ...]:
 
 @eqx.filter_custom_jvp
 def _by_columns(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
-    """`_all_arc_equations`, with derivatives by columns, arc by arc: backwards through all steps
-    takes ten times as long."""
+    """`_all_arc_equations`, with derivatives by columns, arc by arc.
+
+    Reverse mode through all steps takes ten times as long.
+    """
     return _all_arc_equations((osc,), _arc_columns(chain, backwards, z))
 
 
 @_by_columns.def_jvp
 def _(primals, tangents):
     osc, chain, backwards, z = primals
-    along, weights = _directions_of(osc, tangents[0])
+    along, weights = directions_of(osc, tangents[0])
     out, blocks = _equations_and_blocks((osc, along), _arc_columns(chain, backwards, z))
     change = blocks[..., 3:] @ weights
     if tangents[3] is not None:
@@ -367,9 +402,11 @@ def _(primals, tangents):
 def residual(
     osc: Oscillator, chain: Chain, z: Array, backwards: Array | None = None
 ) -> tuple[Array, Array]:
-    """The 3N equations at the unknowns z, [N, 3]: mismatch of x1, of x2, guard, for every arc; and
-    the miss of the tangent arcs, zero where there is none. backwards: arcs that are followed so,
-    none unless told, [N]."""
+    """The 3N equations at the unknowns z, [N, 3], and the miss of the tangent arcs.
+
+    Mismatch of x1, of x2, guard, for every arc; the miss is zero where there is no tangent arc.
+    backwards: arcs that are followed backwards, [N]; default none.
+    """
     backwards = _none(z) if backwards is None else backwards
     out = _by_columns(osc, chain, backwards, z)
     return _mismatch(out, z, backwards), jnp.sum(out[:, 3])
@@ -392,9 +429,12 @@ def residual_and_blocks(
     z: Array,
     backwards: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """`residual`, and its derivatives: those of the equations of each arc with respect to its
-    (x1, x2, T), and along the k directions `along` in the space of oscillators, if they are given
-    (an oscillator of arrays [k]), [N, 4, 3 + k]."""
+    """`residual`, and its derivatives, [N, 4, 3 + k].
+
+    The derivatives of the equations of each arc with respect to its (x1, x2, T), and along the k
+    directions `along` in the space of oscillators, if these are given (an oscillator of arrays
+    [k]).
+    """
     backwards = _none(z) if backwards is None else backwards
     out, blocks = _equations_and_blocks((osc, along), _arc_columns(chain, backwards, z))
     return _mismatch(out, z, backwards), jnp.sum(out[:, 3]), blocks
@@ -403,8 +443,8 @@ def residual_and_blocks(
 def jacobian(blocks: Array, backwards: Array | None = None) -> Array:
     """The 3N x 3N matrix of the system: the slopes of each arc's end and guard, and minus those of
     the next arc's entry, of which one is its unknown."""
-    n = blocks.shape[0]
-    own, entry = blocks, jnp.asarray(np.diag([1.0, 1.0, 0.0]))[None]
+    n, unknowns = blocks.shape[0], blocks.shape[-1]
+    own, entry = blocks, jnp.asarray(np.diag([1.0] * (unknowns - 1) + [0.0]))[None]
     if backwards is not None:
         back, state = backwards[:, None, None], jnp.asarray([True, True, False])[None, :, None]
         own = jnp.where(back & state, entry, blocks)
@@ -412,13 +452,13 @@ def jacobian(blocks: Array, backwards: Array | None = None) -> Array:
     following = jnp.asarray(np.roll(np.eye(n), 1, axis=1))
     same = jnp.eye(n)[:, None, :, None] * own[:, :, None, :]
     then = following[:, None, :, None] * jnp.swapaxes(entry, 0, 1)[None]
-    return (same - then).reshape(3 * n, 3 * n)
+    return (same - then).reshape(unknowns * n, unknowns * n)
 
 
 class ClosedChain(Equations):
     """The 3N equations of a chain in the unknowns z, [N, 3], for an oscillator.
 
-    backwards: the arcs that are followed so, [N].
+    backwards: the arcs that are followed backwards, [N].
     """
 
     chain: Chain
@@ -432,7 +472,7 @@ class ClosedChain(Equations):
         return value.reshape(-1), jacobian(blocks[:, :3], self.backwards)
 
     def moved(self, given: Oscillator, z: Array, tangents: Oscillator) -> tuple[Array, Array]:
-        along, weights = _directions_of(given, tangents)
+        along, weights = directions_of(given, tangents)
         _, _, blocks = residual_and_blocks(given, along, self.chain, z, self.backwards)
         out = blocks[..., 3:] @ weights
         change = _mismatch(out, jnp.zeros_like(z), self.backwards)
@@ -440,13 +480,14 @@ class ClosedChain(Equations):
 
 
 def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Array, Array]:
-    """The unknowns of a closed chain near a guess of them, [N, 3], differentiable with respect to
-    the oscillator; the number of Newton steps; and how far off the states may be, by the last steps
-    and by rounding: not at all in a chain that sticks, which begins at slip onset, known from the
-    parameters (durations that wander do not move it).
+    """The unknowns of a closed chain near a guess, [N, 3], differentiable with respect to the
+    oscillator.
 
-    An arc that magnifies is followed backwards from the state in which it ends, which is then its
-    unknown: forwards its rounding would be larger than what equations may leave.
+    Also returns the number of Newton steps, and the possible error of the states, by the last steps
+    and by rounding: none in a chain that sticks, which begins at slip onset, known from the
+    parameters (durations that wander do not move it). An arc that magnifies is followed backwards
+    from the state in which it ends, which is then its unknown: forwards its rounding would be
+    larger than the tolerance of the equations.
     """
     guess = lax.stop_gradient(guess)
     backwards = _magnifying(osc, chain, guess)
@@ -459,7 +500,7 @@ def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Ar
 
 
 def closed(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """The unknowns z, which `solve_closed` has found, differentiable with respect to the
+    """The unknowns z that `solve_closed` has found, differentiable with respect to the
     oscillator."""
     z = lax.stop_gradient(z)
     backwards = _magnifying(osc, chain, z)
@@ -468,12 +509,12 @@ def closed(osc: Oscillator, chain: Chain, z: Array) -> Array:
 
 
 def _with_ends(backwards: Array, z: Array) -> Array:
-    """The entries, or of arcs that are followed backwards the states in which they end."""
+    """The entries, or for arcs that are followed backwards the states in which they end."""
     return jnp.where(_is_end(backwards), jnp.roll(z, -1, axis=0), z)
 
 
 def _with_entries(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
-    """The other way round, by following these arcs."""
+    """The inverse of `_with_ends`, by following these arcs."""
 
     def entered():
         return jnp.where(_is_end(backwards), _by_columns(osc, chain, backwards, z)[:, :3], z)
@@ -487,12 +528,12 @@ def _is_end(backwards: Array) -> Array:
 
 @eqx.filter_custom_jvp
 def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
-    """The largest error in the shooting equations, and the determinant of the monodromy matrix with
-    stick phases left out: exp of the mean divergence, and at each crossing of a boundary the
-    determinant of its saltation matrix, x2' after over before.
+    """The largest error in the shooting equations, and the determinant of the monodromy matrix.
 
-    One multiplier of a planar cycle is 1, so this is the other one. Contact edges have determinant
-    one: their saltation matrix is [[1, 0], [jump of x2' / x2, 1]].
+    The latter with stick phases left out: exp of the mean divergence, and at each crossing of a
+    boundary the determinant of its saltation matrix, x2' after over before. One multiplier of a
+    planar cycle is 1, so this is the other one. Contact edges have determinant one: their saltation
+    matrix is [[1, 0], [jump of x2' / x2, 1]].
     """
     entries = jnp.roll(z[:, :2], -1, axis=0)
     columns = _arc_columns(chain, following_codes(chain), z, entries)
@@ -504,7 +545,7 @@ def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
 def _(primals, tangents):
     # By columns, as in `_by_columns`; the error has no derivative.
     osc, chain, z = primals
-    along, weights = _directions_of(osc, tangents[0])
+    along, weights = directions_of(osc, tangents[0])
     _, by_z, by_osc = multiplier_and_slopes(osc, along, chain, z)
     change = jnp.sum(by_osc * weights)
     if tangents[2] is not None:
@@ -513,7 +554,7 @@ def _(primals, tangents):
 
 
 def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, entry):
-    """The largest error in the equations of an arc, and what it contributes to the determinant."""
+    """The largest error in the equations of an arc, and its factor of the determinant."""
 
     def followed(unknown, entry):
         return _error_and_factor_of(osc, codes, end, mesh, following, unknown, entry)
@@ -526,7 +567,7 @@ def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, ent
     return lax.cond(some, followed, nothing, unknown, entry)
 
 
-_errors_and_factors = _arc_by_arc(_error_and_factor)
+_errors_and_factors = arc_by_arc(_error_and_factor)
 
 
 def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, entry):
@@ -553,10 +594,10 @@ def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, 
 def multiplier_and_slopes(
     osc: Oscillator, along: Oscillator, chain: Chain, z: Array
 ) -> tuple[Array, Array, Array]:
-    """The determinant that `closure` gives, and its derivatives: with respect to z, [N, 3], and
-    along the k directions `along`, as for `residual_and_blocks`, [k].
+    """The determinant of `closure`, and its derivatives, [N, 3] and [k].
 
-    Arc by arc: backwards through all of them the program takes three times as long to compile.
+    With respect to z, and along the k directions `along`, as for `residual_and_blocks`. Arc by arc:
+    reverse mode through all of them takes three times as long to compile.
     """
     entries = jnp.roll(z[:, :2], -1, axis=0)
     columns = _arc_columns(chain, following_codes(chain), z, entries)
@@ -575,19 +616,19 @@ def _products_of_others(factors: Array) -> Array:
     return before * after
 
 
-@_arc_by_arc
+@arc_by_arc
 def _factors_and_slopes(
     osc: Oscillator, along: Oscillator, codes, end, mesh, following, unknown: Array, entry: Array
 ):
-    """The factor of an arc and its derivatives with respect to its unknowns, the entry of the next
-    one, and along the directions, [5 + k]."""
+    """The factor of an arc and its derivatives, [5 + k]: by its unknowns, the next entry, the
+    directions."""
     more = jax.tree.leaves(along)[0].size
 
     def factor(osc, unknown, entry):
         return _error_and_factor(osc, codes, end, mesh, following, unknown, entry)[1]
 
     def column(direction):
-        moved = jax.tree.map(functools.partial(_weighted, direction[5:]), along)
+        moved = jax.tree.map(functools.partial(weighted, direction[5:]), along)
         tangents = moved, direction[:3], direction[3:5]
         return jax.jvp(factor, (osc, unknown, entry), tangents)
 
@@ -595,12 +636,12 @@ def _factors_and_slopes(
 
 
 def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """Whether the oscillator moves like that, as far as equations hold.
+    """Whether the oscillator moves along a solution.
 
-    Every arc has a duration >= 0 and stays inside its mode: both ends are looked at; between them
+    Every arc has a duration >= 0 and stays inside its mode: both ends are examined; between them
     x1, x2 and the needed force are monotone, and no extremum of x1 is passed unmarked. All belts to
-    which the mass sticks have its velocity. None crosses a boundary, or goes on from one beyond an
-    edge, where the mass would stick.
+    which the mass sticks have its velocity. None crosses a boundary, or leaves one beyond an edge,
+    where the mass would stick.
     """
     belts = range(len(osc.belts))
 
@@ -616,7 +657,7 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
         # An arc along which x2 changes its sign passes an extremum of x1 that is no end of an arc.
         lowest, highest = jnp.minimum(unknown[1], exit_[1]), jnp.maximum(unknown[1], exit_[1])
         fine = fine & ((lowest >= -HOLDS) | (highest <= HOLDS))
-        # At the point of a corner what follows the edge has no duration.
+        # At the point of a corner the arc behind the edge has no duration.
         on_boundary = jnp.abs(velocities - osc.omega * exit_[1]) <= HOLDS
         goes_on = on_boundary & (jnp.abs(after) == 1) & lasts
         hit = [(end == belt) | goes_on[belt] for belt in belts]

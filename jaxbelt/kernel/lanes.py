@@ -31,7 +31,7 @@ class Lanes(eqx.Module):
     that the last error would have allowed; mode; events: how many there were; status; done. lower,
     upper: extrema of x2 since the observer reset them, where it asks for extrema. memory: the
     observer's. integrals: of the rates that it gives to the steps, see `Observer.follow`, from 0
-    to t.
+    to t. hit: with a clock, the guard that a lane has landed on, as numbered in `instants`, or -1.
     """
 
     run: Array
@@ -50,6 +50,7 @@ class Lanes(eqx.Module):
     upper: Array
     memory: Any
     integrals: Any = None
+    hit: Any = None
 
 
 class Passage(eqx.Module):

@@ -46,13 +46,16 @@ class Ends:
 
     i < n: the boundary of belt i; n <= i < 3n: the edge i - n of `modes.edges`; then the extremum
     x2' = 0 of x2, the extremum x2 = 0 of x1, and slip onset. For shooting there follow an arc that
-    is not used, and from there on a tangency to the boundary of belt i.
+    is not used, and from there on a tangency to the boundary of belt i. With a clock a tangency is
+    where r_i' = 0, and last come the end of a period, and where what a stick phase needs comes
+    nearest to the limit.
     """
 
     def __init__(self, n: int):
         self.extremum_x2, self.extremum_x1, self.onset, self.unused, self.tangent = range(
             3 * n, 3 * n + 5
         )
+        self.period, self.nearest_limit = 4 * n + 4, 4 * n + 5
 
 
 class ArcEnd(eqx.Module):

@@ -30,7 +30,7 @@ from ..results import Status
 from .loops import RepeatedLoop
 
 #: Lanes of a group, at most.
-LANES_AT_ONCE = SideBySide(on_cpu=128, elsewhere=2**16)
+LANES_AT_ONCE = SideBySide(on_cpu=128, elsewhere=2**14)
 #: Rounds that one piece of machine code makes.
 PAGE = 8
 #: An arc of a batch ends where a multiple of this time is passed: longer ones would take more steps

@@ -38,6 +38,7 @@ from ..model.oscillator import Oscillator, has_clock, has_possible_numbers
 from ..model.rest import is_at_rest
 from ..model.transitions import at_focus, mode_of_state
 from ..numerics.compiling import any_lane, more_rows, of_lane, one_kernel, with_batches
+from ..numerics.padding import in_groups_of
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
 from .batches import BOOK, LANES_AT_ONCE, PAGE, Batch, Group, blank_book, followed_together
@@ -315,8 +316,7 @@ def _followed_rows(lane, axis_size: int, batched, args, rules: Rules):
 
     def by_group(leaf):
         # Lanes that are left over do nothing: they start nowhere.
-        padding = jnp.full((groups * width - axis_size, *leaf.shape[1:]), jnp.nan, leaf.dtype)
-        return jnp.concatenate([leaf, padding]).reshape(groups, width, *leaf.shape[1:])
+        return in_groups_of(width, leaf, fill=jnp.nan)
 
     def spread(leaf, flag):
         return leaf if flag else jnp.broadcast_to(leaf, (axis_size, *jnp.shape(leaf)))

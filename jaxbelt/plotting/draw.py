@@ -11,6 +11,8 @@ from ..bifurcations.diagrams import BifurcationDiagram
 from ..bifurcations.regions import RegionMap
 from ..bifurcations.special import SpecialPoint
 from ..cycles.cycle import Cycle
+from ..cycles.exponents import Exponents
+from ..cycles.periodic import PeriodicMotion
 from ..cycles.portrait import Portrait
 from ..cycles.separatrices import Separatrix
 from ..cycles.shocks import FatalShock
@@ -24,6 +26,7 @@ from ..sweeps.orbit_diagram import OrbitDiagram
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
 from .diagrams import plot_curves, plot_diagram, plot_special_point
+from .forced import plot_exponents, plot_motion
 from .histories import plot_arcs, plot_events, plot_trajectory
 from .inverse import plot_fit
 from .orbits import plot_orbits
@@ -51,9 +54,11 @@ PICTURES: dict[type, Callable[..., Axes]] = {
     Equilibria: plot_equilibria,
     Events: plot_events,
     Explanation: plot_explanation,
+    Exponents: plot_exponents,
     FatalShock: plot_shock,
     Fit: plot_fit,
     OrbitDiagram: plot_orbits,
+    PeriodicMotion: plot_motion,
     Portrait: plot_portrait,
     RegionMap: plot_region_map,
     Separatrix: plot_separatrix,

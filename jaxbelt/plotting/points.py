@@ -6,11 +6,13 @@ from matplotlib.axes import Axes
 from ..bifurcations.base import BifurcationPoint
 from ..checks import require
 from ..cycles.cycle import Cycle
+from ..cycles.periodic import PeriodicMotion
 from ..cycles.shocks import FatalShock
 from ..inverse.design import Design
 from ..model.equilibria import Equilibria
 from ..results import Status
 from ..tables import require_single
+from .forced import plot_motion
 from .phase import draw_equilibrium, draw_orbit, plot_phase_portrait, plot_portrait
 from .style import BELT_COLOURS, new_axes
 
@@ -39,6 +41,10 @@ def plot_point(point: BifurcationPoint, ax: Axes | None = None) -> Axes:
     """Draws the phase plane at a bifurcation point, with the cycle where there is one."""
     require_single(point, point.value, 0)
     _check_found(point, "point")
+    if isinstance(point.cycle, PeriodicMotion):
+        drawn = plot_motion(point.cycle, ax)
+        drawn.set_title(f"{point.condition.words} at {float(point.value):.6g}", fontsize="medium")
+        return drawn
     cycles = [point.cycle] if int(point.cycle.status) == Status.OK else []
     drawn: Axes = plot_phase_portrait(point.oscillator, cycles=cycles, ax=ax)
     orbit = point.orbit

@@ -1,12 +1,13 @@
-"""Reducers that see the smooth stretches of a motion, too: moments in it and integrals over it.
+"""Reducers that are asked between events, too: at moments of the motion, with integrals over it.
 
-Steps are those of `step.take_step`. One that passes a section is made again, shorter, until an end
-of it is so near to the crossing that a Taylor step leads there; the run itself goes on from the
-step's end. Stick phases are known in closed form. Integrals are summed by the stages of the steps,
-as the motion is, and over stick phases by Gauss's rule.
+Steps are those of `step.take_step`. A step that passes a section is repeated with a shorter length
+until one of its ends is so near to the crossing that a Taylor step leads there; the run itself goes
+on from the end of the step. Stick phases are known in closed form. Integrals are summed by the
+stages of the steps, as the motion is, and over stick phases by Gauss's rule.
 
-Where a moment is carries no derivative as it is found. A Newton step from there, of size 0 but for
-rounding, gives it that of the implicit function, and so results have right derivatives.
+The time of a moment carries no derivative as it is found. A Newton step from there, of size 0 but
+for rounding, gives it the derivative of the implicit function, so results have the right
+derivatives.
 """
 
 import functools
@@ -46,8 +47,15 @@ NODES = [(0.5 * (1 + x), 0.5 * w) for x, w in zip(*np.polynomial.legendre.leggau
 
 
 class Motion(eqx.Module):
-    """A state of a run, as `rates` sees it: scalars t, x1, x2, a (which is x2'), and forces, the
-    friction force of each belt on the mass, [belts]."""
+    """State of a run as `rates` sees it.
+
+    Attributes:
+        t: Time, scalar.
+        x1: Displacement, scalar.
+        x2: Velocity, scalar.
+        a: Acceleration x2', scalar.
+        forces: Friction force of each belt on the mass, [belts].
+    """
 
     t: Array
     x1: Array
@@ -57,8 +65,11 @@ class Motion(eqx.Module):
 
 
 class _Watched(eqx.Module):
-    """What is known of the runs: the reducer's state, the side of each section, and the number of
-    fixed times that are past, each [lanes]."""
+    """Memory of the runs, arrays [lanes].
+
+    state: of the reducer; sides: the side of each section; passed: number of fixed times that are
+    past.
+    """
 
     state: Any
     sides: tuple[Array, ...]
@@ -66,7 +77,7 @@ class _Watched(eqx.Module):
 
 
 class Along(Observer):
-    """What a reducer with moments or integrals makes of a run; see `sweep.sweep`."""
+    """Observer of a reducer with moments or integrals; see `sweep.sweep`."""
 
     reducer: Any = eqx.field(static=True)
 
@@ -115,7 +126,7 @@ class Along(Observer):
         return _Watched(state, tuple(sides), passed)
 
     def integrals(self, osc, lanes):
-        """Zeros: integrals of runs that begin."""
+        """Zeros: the integrals of runs that begin."""
         return jax.tree.map(
             jnp.zeros_like, self.rates(osc, lanes.mode, lanes.t, lanes.x1, lanes.x2)
         )
@@ -137,7 +148,7 @@ class Along(Observer):
         cuts = []
         for (_, _, function), side in zip(self._sections(), seen.sides, strict=True):
             looks = [
-                course.look(function, osc, lanes.mode, jnp.full_like(h, k / PARTS_OF_STEP))
+                course.sample(function, osc, lanes.mode, jnp.full_like(h, k / PARTS_OF_STEP))
                 for k in range(PARTS_OF_STEP + 1)
             ]
             looks = [(materialise(v, ones), materialise(r, ones)) for v, r in looks]
@@ -154,7 +165,7 @@ class Along(Observer):
         for (number, direction, function), side, cut in parts:
             now = value_and_rate(function, osc, new.mode, new.x1, new.x2)
             now = jnp.where(kept, side_of(*now, side), side)
-            # The end that is nearer, and from there by Taylor steps.
+            # The nearer end; from there a Taylor step leads to the crossing.
             near = choose(cut.at_start, lanes, new)
             delta = jnp.zeros_like(near.t)
             for _ in range(2):
@@ -184,7 +195,8 @@ class Along(Observer):
         return self._update(seen, osc, place, number, totals, wanted)
 
     def _update(self, seen: _Watched, osc, place: Any, number, totals, wanted) -> _Watched:
-        """The state after an update where it is wanted; place: t, x1, x2, kind and belt."""
+        """The state after an update in lanes where `wanted` holds; place: t, x1, x2, kind and
+        belt."""
         t, x1, x2, kind, belt = place
         number = jnp.broadcast_to(jnp.asarray(number, int), t.shape)
         length = osc.units.length
@@ -212,7 +224,7 @@ class Along(Observer):
         lanes = replace(lanes, integrals=totals)
         sides = []
         for (number, direction, function), side in zip(self._sections(), seen.sides, strict=True):
-            # Where the field jumps, its extrema do.
+            # Where the field jumps, its extrema jump, too.
             value = value_and_rate(function, osc, lanes.mode, lanes.x1, lanes.x2)
             now = jnp.where(busy & ~lanes.done, side_of(*value, side), side)
             wanted = (now != side) & (now * direction >= 0)
@@ -221,7 +233,7 @@ class Along(Observer):
         return replace(lanes, memory=replace(seen, sides=tuple(sides)))
 
     def _over_hold(self, osc, before: Lanes, after: Lanes, holds) -> Any:
-        """The integrals after a stick phase, or rest."""
+        """Integrals after a stick phase, or rest."""
         duration = jnp.where(holds, after.t - before.t, 0.0)
         totals = after.integrals
         for node, weight in NODES if totals is not None else ():
@@ -233,25 +245,25 @@ class Along(Observer):
         return totals
 
     def _held(self, seen: _Watched, osc, ones, before: Lanes, after: Lanes, holds) -> _Watched:
-        """Moments within a stick phase, or rest, in their order: x1 moves evenly."""
+        """Takes the moments within a stick phase, or rest, in their order: x1 moves evenly."""
         frozen, start, end = lax.stop_gradient((osc, before, after))
         course = Course((start.x1, end.x1 - start.x1), start.x2, end.t - start.t)
         tables, sides = [], []
         for (_, direction, function), side in zip(self._sections(), seen.sides, strict=True):
 
-            def look(theta, function=function):
-                told = course.look(function, frozen, start.mode, theta)
-                return materialise(told[0], ones), materialise(told[1], ones)
+            def sample(theta, function=function):
+                values = course.sample(function, frozen, start.mode, theta)
+                return materialise(values[0], ones), materialise(values[1], ones)
 
-            side, *table = crossings_held(look, side, direction, holds)
+            side, *table = crossings_held(sample, side, direction, holds)
             sides.append(side)
             tables.append(tuple(table))
         seen = replace(seen, sides=tuple(sides))
 
         def pending(state):
             seen, tables = state
-            left = [jnp.any(self._due(seen, after))]
-            return jnp.any(jnp.stack(left + [jnp.any(jnp.isfinite(_first(t))) for t in tables]))
+            due = [jnp.any(self._due(seen, after))]
+            return jnp.any(jnp.stack(due + [jnp.any(jnp.isfinite(_first(t))) for t in tables]))
 
         def ask(state):
             seen, tables = state
@@ -260,7 +272,7 @@ class Along(Observer):
         return lax.while_loop(pending, ask, (seen, tables))[0]
 
     def _due(self, seen: _Watched, after: Lanes) -> Array:
-        """The lanes that have passed a fixed time; at the start of a run, too."""
+        """Lanes that have passed a fixed time, also at the start of a run."""
         late = [
             _next(times, passed) <= after.t
             for (_, times), passed in zip(self._times(), seen.passed, strict=True)
@@ -268,7 +280,7 @@ class Along(Observer):
         return (after.run >= 0) & functools.reduce(jnp.logical_or, late, jnp.zeros_like(after.done))
 
     def _ask_next_held(self, seen: _Watched, tables, osc, before, after, holds):
-        """The state after the next moment of each lane, and the tables without it."""
+        """The state after the next moment of each lane, and the tables without that moment."""
         duration = after.t - before.t
         safe = jnp.where(duration > 0, duration, 1.0)
         theta, number = jnp.full_like(duration, jnp.inf), jnp.zeros(duration.shape, int)
@@ -315,7 +327,7 @@ class Along(Observer):
 
 
 def _first(table: tuple[Array, ...]) -> Array:
-    """The earliest of the crossings in each lane."""
+    """The earliest crossing in each lane."""
     return functools.reduce(jnp.minimum, [jnp.min(part, axis=0) for part in table])
 
 
@@ -340,7 +352,7 @@ def _moved(osc: OwnOscillator, lanes: Lanes, delta: Array) -> tuple[Array, Array
 
 
 def _to_section(function, osc, lanes: Lanes, delta, low, high) -> Array:
-    """The way in time to a section, by a Newton step from `delta`, between two bounds.
+    """Time to a section, by a Newton step from `delta`, between two bounds.
 
     Its derivatives are those of the implicit function, whatever the bounds.
     """
@@ -352,12 +364,12 @@ def _to_section(function, osc, lanes: Lanes, delta, low, high) -> Array:
 
 
 def _next(times: tuple[float, ...], passed: Array) -> Array:
-    """The next of the fixed times; inf when all are past."""
+    """The next fixed time; inf when all are past."""
     return jnp.asarray((*times, np.inf))[jnp.minimum(passed, len(times))]
 
 
 def _forces(osc: OwnOscillator, mode: Mode, x2: Array, residual: Array) -> list[Array]:
-    """The friction force of each belt on the mass; stuck belts share what is needed by capacity."""
+    """Friction force of each belt on the mass; stuck belts share the holding force by capacity."""
     limits = [
         jnp.where(stuck, belt.load * belt.friction.static, 0.0)
         for belt, stuck in zip(osc.belts, mode.stuck, strict=True)

@@ -31,6 +31,8 @@ CAMPAIGNS = {
             *("coverage", "slopes"),
         )
     },
+    "forced-sweep": "forced_sweeps",
+    "forced": "forced_runs",
 }
 #: What can be asked of each campaign beside `--results`.
 PLAIN = frozenset({"seed", "runs"})
@@ -40,6 +42,8 @@ KNOWN = {
     "maps": frozenset(),
     **dict.fromkeys(("steep", "coverage", "slopes"), PLAIN),
     "fractions": PLAIN | {"threads"},
+    "forced-sweep": PLAIN | {"threads", "structure", "tol"},
+    "forced": PLAIN | {"threads", "structure", "tol"},
     **dict.fromkeys(("final", "simulate", "attractors"), RUNS),
     "derivatives": RUNS | {"by"},
     "grazing": RUNS - {"extreme_share", "heavy", "regime"} | {"by"},
@@ -199,7 +203,7 @@ def _parsed(arguments):
         if name not in told:
             setattr(options, name, value)
     if options.tol is None:
-        options.tol = 1e-10 if what in ("simulate", "derivatives", "grazing") else 1e-8
+        options.tol = 1e-10 if what in ("simulate", "forced", "derivatives", "grazing") else 1e-8
     return options
 
 

@@ -1,0 +1,638 @@
+"""Bifurcations of periodic motions of forced oscillators.
+
+Beside the 4N equations of a periodic motion, see `cycles.clocked`, stands one more, in one more
+unknown, the parameter:
+
+- `PeriodDoubling`, `Fold`, `Torus`: a multiplier of -1 or 1, or a pair of modulus 1, in terms of
+  trace and determinant of the monodromy matrix M: 1 + tr + det = 0, 1 - tr + det = 0, det = 1.
+- `GrazingSliding`: a slip arc touches the boundary of a belt, r = r' = 0.
+- `CrossingSliding`, `SwitchingSliding`: it arrives at the boundary where the force that is needed
+  to stick is just what the belt can hold, with the sign with which it arrives; that force rises
+  (crossing) or falls (switching).
+- `AddingSliding`: inside a stick phase the force that is needed touches the limit.
+
+M. di Bernardo, P. Kowalczyk, A. Nordmark, Int. J. Bifurcation Chaos 13 (2003) 2935, have the four
+sliding bifurcations. What touches begins as an arc that is cut there, or from an arc beyond that is
+left out.
+"""
+
+import functools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..checks import as_array, check_finite, is_concrete, require
+from ..cycles.chains import Loop
+from ..cycles.clocked import (
+    TimedChain,
+    guards_along,
+    least_steps,
+    monodromy,
+    monodromy_and_slopes,
+    sticks_in,
+    timed_blocks,
+    timed_chain,
+    timed_residual,
+    turns_of,
+)
+from ..cycles.periodic import (
+    Followed,
+    PeriodicMotion,
+    attracted,
+    motion_at,
+    motions_of,
+    nothing_found,
+    periodic_from,
+)
+from ..cycles.shooting import jacobian
+from ..model.instants import course, guards_at
+from ..model.modes import STUCK, capacity, mode_acceleration, mode_of
+from ..model.oscillator import Oscillator, at_time, check_clock
+from ..model.own_units import OwnOscillator, in_own_units, rescaled
+from ..model.variations import Variation
+from ..motion.arcs import Ends
+from ..numerics.compiling import jit
+from ..results import Status
+from .base import AbstractCondition, BifurcationPoint, Line, point_of
+from .systems import (
+    EXACT_ARC,
+    PARTS_OF_ARC,
+    WEIGHT,
+    AbstractSystem,
+    Seen,
+    on_both_meshes,
+    solve_system,
+)
+
+#: Places of a motion from which a condition is tried, the most promising ones first.
+TRIED = 3
+#: A multiplier that is off by less is the one that the condition asks for.
+ON_CIRCLE = 1e-6
+#: States from which motions are looked for, in own units.
+STARTS = ((0.5, 0.0), (0.0, 0.0), (-0.5, 0.0), (1.5, 0.0), (-1.5, 0.0), (0.0, 0.5), (3.0, 0.0))
+
+
+# --- systems --------------------------------------------------------------------------------------
+
+
+class TimedSystem(AbstractSystem):
+    """A periodic motion of a fixed signature and a condition; the unknowns are those of the motion,
+    [N, 4]."""
+
+    chain: eqx.AbstractVar[TimedChain]
+
+    def condition(self, osc: Oscillator, z: Array) -> Array:
+        """What vanishes there."""
+        raise NotImplementedError
+
+    def condition_and_slopes(self, osc_of: Any, z: Array, p: Array):
+        """The condition at the parameters p, and its derivatives by z and p."""
+        return jax.value_and_grad(lambda z, p: self.condition(osc_of(p), z), (0, 1))(z, p)
+
+    def judge(self, osc: Oscillator, motion: PeriodicMotion) -> Array:
+        """The status of a solution."""
+        return motion.status
+
+    def residual(self, osc, x):
+        value = timed_residual(osc, self.chain, x)
+        return jnp.append(value.reshape(-1), self.condition(osc, x))
+
+    def linearized(self, osc_of, x, p):
+        osc, along = osc_of(p), jax.jacfwd(osc_of)(p)
+        value, blocks = timed_blocks(osc, along, self.chain, x)
+        last, (by_z, by_p) = self.condition_and_slopes(osc_of, x, p)
+        by_parameter = blocks[..., 4:].reshape(-1, p.size)
+        rows = jnp.concatenate([jacobian(blocks[..., :4]), by_parameter], axis=1)
+        row = jnp.append(by_z.reshape(-1), by_p)
+        return jnp.append(value.reshape(-1), last), jnp.concatenate([rows, row[None]])
+
+    def look(self, osc, x):
+        error = jnp.max(jnp.abs(self.residual(osc, x)))
+        motion = motion_at(osc, self.chain, x, error, jnp.asarray(0), jnp.asarray(0))
+        exists = (motion.status == Status.OK) & (self.judge(osc, motion) == Status.OK)
+        return Seen({}, exists, jnp.real(motion.multipliers[0]), error)
+
+    def place(self, x):
+        used = np.asarray(self.chain.used)
+        states = np.asarray(x)[used]
+        ends = np.min(states[:, :2], axis=0), np.max(states[:, :2], axis=0)
+        return np.array([ends[0][0], ends[1][0], ends[0][1], ends[1][1], np.sum(states[:, 3])])
+
+    def shaped(self, x):
+        return x.reshape(-1, 4)
+
+    def weights(self, x):
+        return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
+
+    def remeshed(self, osc, x):
+        loop = Loop(self.chain.codes, self.chain.ends, x[:, :3], x[:, 3])
+        chain, _ = timed_chain(osc, loop, least_steps(osc, loop), self.chain.turns)
+        return eqx.tree_at(lambda system: system.chain, self, chain).refined(osc, x)
+
+    def refined(self, osc: Oscillator, x: Array) -> "TimedSystem":
+        """The same with shorter integration steps on arcs that need them, as `CycleSystem` has."""
+        values = on_both_meshes(self, lambda one: timed_residual(osc, one.chain, x))
+        error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
+        mesh = self.chain.mesh
+        fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
+        coarse = jnp.pad(mesh, [(0, 0), (0, (PARTS_OF_ARC - 1) * mesh.shape[-1])])
+        is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
+        mesh = jnp.where(is_exact[:, None], coarse, fine)
+        return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
+
+
+class OnUnitCircle(TimedSystem):
+    """weights[0] + weights[1] trace + weights[2] determinant of the monodromy matrix vanishes.
+
+    weights: (1, 1, 1) a multiplier -1, (1, -1, 1) a multiplier 1, (-1, 0, 1) a determinant of 1.
+    """
+
+    chain: TimedChain
+    parts: Array
+
+    def _of(self, matrix: Array) -> Array:
+        trace = matrix[0, 0] + matrix[1, 1]
+        det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+        det = jnp.where(sticks_in(self.chain), 0.0, det)
+        return self.parts[0] + self.parts[1] * trace + self.parts[2] * det
+
+    def condition(self, osc, z):
+        return self._of(monodromy(osc, self.chain, z))
+
+    def condition_and_slopes(self, osc_of, z, p):
+        along = jax.jacfwd(osc_of)(p)
+        matrix, by_z, by_p = monodromy_and_slopes(osc_of(p), along, self.chain, z)
+        value, by_matrix = jax.value_and_grad(self._of)(matrix)
+        contracted = functools.partial(jnp.tensordot, by_matrix, axes=2)
+        return value, (contracted(by_z), contracted(by_p))
+
+    def judge(self, osc, motion):
+        # -1 or 1 where the trace counts; else a pair.
+        wanted = jnp.where(self.parts[1] > 0, -1.0, 1.0)
+        found = motion.multipliers
+        is_there = jnp.min(jnp.abs(found - wanted)) < ON_CIRCLE
+        is_pair = jnp.abs(jnp.imag(found[0])) > ON_CIRCLE
+        fits = jnp.where(self.parts[1] == 0, is_pair, is_there)
+        other = (motion.status == Status.OK) & ~fits
+        return jnp.where(other, Status.OTHER_KIND.value, motion.status)
+
+
+class Touching(TimedSystem):
+    """r = 0 at the end of the arc `row`, at which r' = 0."""
+
+    chain: TimedChain
+    row: Array
+    belt: Array
+
+    def condition(self, osc, z):
+        y = z[self.row + 1]
+        velocities = jnp.stack([belt.velocity for belt in at_time(osc, y[2]).belts])
+        return velocities[self.belt] - osc.omega * y[1]
+
+
+class AtLimit(TimedSystem):
+    """The force that stuck belts need is what they can hold at the end of the arc `row`.
+
+    codes: of the mode in which they stick; rises: 1 where that force is to rise there, -1 where it
+    is to fall, 0 where it may do either.
+    """
+
+    chain: TimedChain
+    row: Array
+    codes: Array
+    rises: Array
+
+    def condition(self, osc, z):
+        y, mode = z[self.row + 1], mode_of(self.codes)
+        now = at_time(osc, y[2])
+        return jnp.abs(mode_acceleration(now, mode, y[0], y[1])) - capacity(now, mode)
+
+    def judge(self, osc, motion):
+        mode, y = mode_of(self.codes), motion.unknowns[self.row + 1]
+
+        def guards(y):
+            return guards_at(osc, mode, y)
+
+        limits = course(osc, mode, guards, (y[0], y[1], y[2])).slope[-2:]
+        values = guards((y[0], y[1], y[2]))[-2:]
+        rises = -jnp.where(values[0] < values[1], limits[0], limits[1])
+        other = (motion.status == Status.OK) & ~(self.rises * rises >= 0)
+        return jnp.where(other, Status.OTHER_KIND.value, motion.status)
+
+
+# --- what conditions have in common ---------------------------------------------------------------
+
+
+class Rows(NamedTuple):
+    """The arcs of a known motion, in NumPy: codes, ends, and unknowns [arcs, 4]."""
+
+    codes: np.ndarray
+    ends: np.ndarray
+    z: np.ndarray
+
+    @classmethod
+    def of(cls, motion: PeriodicMotion) -> "Rows":
+        used = np.asarray(motion.chain.used)
+        parts = motion.chain.codes, motion.chain.ends, motion.unknowns
+        return cls(*(np.asarray(part)[used] for part in parts))
+
+    def put(self, first: int, last: int, *rows: tuple[Any, int, Any]) -> "Rows":
+        """With (codes, end, unknowns) in place of the arcs from the first up to the last one."""
+        new = [np.array(list(column)) for column in zip(*rows, strict=True)]
+        parts = [
+            np.concatenate([own[:first], some.astype(own.dtype), own[last + 1 :]])
+            for own, some in zip(self, new, strict=True)
+        ]
+        return Rows(*parts)
+
+    def cut(self, row: int, since: float, state: np.ndarray, end: int) -> "Rows":
+        """With an arc cut where it is at `state`, (x1, x2, t), by that end."""
+        codes, z = self.codes[row], self.z[row]
+        first = (codes, end, np.append(z[:3], since))
+        return self.put(row, row, first, (codes, self.ends[row], np.append(state, z[3] - since)))
+
+    def loop(self) -> Loop:
+        empty = np.zeros((0, 2))
+        return Followed(self.codes, self.ends, self.z[:, :3], self.z[:, 3], empty, 0).loop()
+
+
+class Beginning(NamedTuple):
+    """Arcs near a point, how far from it they seem to be, and what makes its system of a chain."""
+
+    rows: Rows
+    distance: float
+    system: Any
+
+
+class AbstractForcedCondition(AbstractCondition):
+    """A condition on a periodic motion of a forced oscillator.
+
+    public: the class that users know it by, where that serves oscillators without a clock, too.
+    """
+
+    public: ClassVar[type[AbstractCondition] | None] = None
+    ends_at_contact: ClassVar[bool] = True
+
+    def kind_along(self, osc, multiplier):
+        return self.public or type(self)
+
+    def check(self, osc):
+        super().check(osc)
+        check_clock(osc, type(self).__name__, "the conditions for oscillators without")
+
+    def with_clock(self):
+        return self
+
+    def beginnings_of(
+        self, osc: Oscillator, motion: PeriodicMotion, known: bool = False
+    ) -> Iterator[Beginning]:
+        """Where its system may begin from a motion of a known oscillator in own units.
+
+        known: the motion is that of one of its points.
+        """
+        raise NotImplementedError
+
+    def points(
+        self, variation: Variation, value: Any, motion: PeriodicMotion
+    ) -> list[BifurcationPoint]:
+        """The points that are found from a motion at a value, [1], of what is varied."""
+        osc = lax.stop_gradient(variation.oscillator(value))
+        some = sorted(self.beginnings_of(osc, motion), key=lambda one: one.distance)
+        return [self.point_from(variation, osc, value, one) for one in some[:TRIED]]
+
+    def point_from(
+        self, variation: Variation, osc: Oscillator, value: Any, beginning: Beginning
+    ) -> BifurcationPoint:
+        """The point that is found from one beginning."""
+        return self.solve(variation, osc, value, beginning)
+
+    def guess(self, osc, size):
+        raise NotImplementedError
+
+    def prepared(self, osc, guess):
+        loop = guess.rows.loop()
+        chain, z = _chain_of(osc, loop, least_steps(osc, loop), turns_of(osc))
+        system = guess.system(chain)
+        return _refined(osc, system, z), z, jnp.asarray(Status.OK.value)
+
+    def solved(self, family, system, x, p, status):
+        return _solved_point(family, system, x, p, status)
+
+    def followed(self, point):
+        motion = point.cycle
+        some = min(
+            self.beginnings_of(point.oscillator, motion, known=True), key=lambda one: one.distance
+        )
+        return eqx.tree_at(lambda s: s.chain, some.system(motion.chain), motion.chain), (
+            motion.unknowns
+        )
+
+    def place(self, point):
+        return place_of_motion(point.cycle)
+
+
+_chain_of = jit(timed_chain)
+
+
+@jit
+def _refined(osc: Oscillator, system: TimedSystem, x: Array) -> TimedSystem:
+    return system.refined(osc, x)
+
+
+@jit
+def _solved_point(family, system, z0, p0, status):
+    solution = solve_system(family, system, z0, p0, status)
+    osc, z = family.at(solution.p), solution.z
+    numbers = solution.residual, solution.iterations, solution.status
+    motion = motion_at(osc, system.chain, z, *numbers)
+    status = system.judge(lax.stop_gradient(osc), lax.stop_gradient(motion))
+    return point_of(family, solution, motion, jnp.asarray(jnp.nan), status), (z, solution.p)
+
+
+def place_of_motion(motion: PeriodicMotion, samples: int = 257) -> np.ndarray:
+    """Smallest and largest x1, the same of x2, and the period, [5]."""
+    if int(motion.status) != Status.OK:
+        return np.full(5, np.nan)
+    states = np.asarray(motion.sample(samples))
+    x1, x2 = states.T
+    return np.array([x1.min(), x1.max(), x2.min(), x2.max(), float(motion.period)])
+
+
+def forced_point(
+    condition: AbstractCondition, variation: Variation, value: Any, start: Any
+) -> BifurcationPoint:
+    """The nearest point of a condition that is found from the motions at a value, [1].
+
+    start: one of these motions, or a state at the phase 0 that leads to one; None: all that are
+    found from some states.
+    """
+    timed = condition.with_clock()
+    near = lax.stop_gradient(variation.oscillator(value))
+    require(
+        is_concrete((near, value)),
+        "osc",
+        "known, as points of forced oscillators are",
+        "a traced one",
+    )
+    own, turns = in_own_units(near), turns_of(near)
+    found = [
+        point
+        for motion in motions_to_begin_from(own, start, turns)
+        for point in timed.points(variation, value, motion)
+    ]
+    fine = [point for point in found if int(point.status) == Status.OK]
+    guess = float(np.asarray(lax.stop_gradient(value))[0])
+    if fine:
+        nearest = min(fine, key=lambda one: abs(float(lax.stop_gradient(one.value)) - guess))
+        return replace(nearest, condition=condition)
+    if found:
+        return replace(found[0], condition=condition)
+    nothing = nothing_found(own, turns, Status.NOT_TOUCHED)
+    nan = jnp.asarray(jnp.nan)
+    return BifurcationPoint(
+        condition=condition,
+        value=nan,
+        residual=nan,
+        iterations=jnp.asarray(0),
+        steps=jnp.full(1, jnp.nan),
+        error=nan,
+        multiplier=nan,
+        x1=nan,
+        oscillator=own,
+        cycle=nothing,
+        status=jnp.asarray(Status.NOT_TOUCHED.value),
+    )
+
+
+def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequence[PeriodicMotion]:
+    """The motions to begin from; of those with an even number of periods also the one between
+    their halves, from which they may have left."""
+    if isinstance(start, PeriodicMotion):
+        return [rescaled(start, 1 / osc.units.length, lambda _: osc)]
+    if start is not None:
+        start = as_array(start, "start", (2,))
+        check_finite(start, "start")
+        motion = attracted(osc, np.asarray(osc.units.into(start)), turns)
+        found = [motion] if int(motion.status) == Status.OK else []
+    else:
+        found = motions_of(osc, STARTS, turns)
+    for motion in list(found):
+        half, odd = divmod(motion.periods, 2)
+        if not odd:
+            starts = np.asarray(motion.starts)
+            between = periodic_from(osc, 0.5 * (starts[0] + starts[half]), half, turns)
+            found += [between] if int(between.status) == Status.OK else []
+    return found
+
+
+# --- multipliers ----------------------------------------------------------------------------------
+
+
+class _UnitCircle(AbstractForcedCondition):
+    parts: ClassVar[tuple[float, float, float]]
+
+    def beginnings_of(self, osc, motion, known=False):
+        first, second = np.asarray(motion.multipliers)
+        wanted = -1.0 if self.parts[1] > 0 else 1.0
+        near = min(abs(first - wanted), abs(second - wanted))
+        distance = near if self.parts[1] else abs(abs(first) - 1)
+        parts = jnp.asarray(self.parts)
+        yield Beginning(Rows.of(motion), float(distance), lambda chain: OnUnitCircle(chain, parts))
+
+
+class PeriodDoubling(_UnitCircle):
+    """A multiplier of a periodic motion is -1.
+
+    The motion goes on, stable on one side only, and one of twice as many periods leaves it.
+    """
+
+    caption: ClassVar[str] = "period doubling"
+    line: ClassVar[Line] = Line("period doubling", "#0072B2")
+    parts: ClassVar = (1.0, 1.0, 1.0)
+
+
+class Fold(_UnitCircle):
+    """A multiplier of a periodic motion is 1: two motions meet and vanish."""
+
+    caption: ClassVar[str] = "fold"
+    line: ClassVar[Line] = Line("fold", "#E69F00")
+    parts: ClassVar = (1.0, -1.0, 1.0)
+
+
+class Torus(_UnitCircle):
+    """A pair of multipliers has modulus 1: the motion loses its stability to a torus around it.
+
+    The motion on the torus is quasi-periodic, or locked to the forcing. What sticks has no torus.
+    """
+
+    caption: ClassVar[str] = "torus"
+    line: ClassVar[Line] = Line("torus", "#009E73")
+    parts: ClassVar = (-1.0, 0.0, 1.0)
+
+
+# --- sliding --------------------------------------------------------------------------------------
+
+
+class TimedGrazing(AbstractForcedCondition):
+    """`GrazingSliding` with a clock."""
+
+    belt: int
+
+    def beginnings_of(self, osc, motion, known=False):
+        rows, k = Rows.of(motion), int(self.belt)
+        names = Ends(rows.codes.shape[1])
+
+        def system(row):
+            belt = jnp.asarray(k)
+            return lambda chain: Touching(chain, jnp.asarray(row), belt)
+
+        if known:
+            row = int(np.flatnonzero(rows.ends == names.tangent + k)[0])
+            yield Beginning(rows, 0.0, system(row))
+            return
+        for row in range(1, len(rows.ends) - 1):
+            before, here, after = rows.codes[row - 1 : row + 2]
+            alone = here[k] == STUCK and np.all(before == after) and abs(before[k]) == 1
+            if alone and rows.ends[row - 1] == k and rows.ends[row] == names.onset:
+                # A stick phase that is left out, cut in its middle.
+                last, phase, then = rows.z[row - 1 : row + 2]
+                half = 0.5 * phase[3]
+                middle = phase[:3] + half * np.array([phase[1], 0.0, 1.0])
+                first = (before, names.tangent + k, np.append(last[:3], last[3] + half))
+                second = (after, rows.ends[row + 1], np.append(middle, then[3] + half))
+                shorter = rows.put(row - 1, row + 1, first, second)
+                yield Beginning(shorter, float(phase[3]) ** 2, system(row - 1))
+        for row, since, state, value in _turns(osc, motion, lambda guards: guards[k : k + 1]):
+            if abs(rows.codes[row, k]) == 1:
+                cut = rows.cut(row, since, state, names.tangent + k)
+                yield Beginning(cut, value, system(row))
+
+
+class _AtArrival(AbstractForcedCondition):
+    belt: int
+    rises: ClassVar[float]
+
+    def beginnings_of(self, osc, motion, known=False):
+        rows, k, way = Rows.of(motion), int(self.belt), jnp.asarray(self.rises)
+
+        def system(row, held):
+            return lambda chain: AtLimit(chain, jnp.asarray(row), held, way)
+
+        for row in range(len(rows.ends) - 1):
+            before, after = rows.codes[row], rows.codes[row + 1]
+            if rows.ends[row] != k or np.any(before == STUCK) or abs(before[k]) != 1:
+                continue
+            changed = (before != after) & (np.abs(after) < 2)
+            held = jnp.asarray(np.where(changed, STUCK, after))
+            distance, rises = _excess(osc, held, jnp.asarray(rows.z[row + 1, :3]))
+            fits = known or float(rises) * self.rises > 0 or abs(float(distance)) > 0.1
+            there = rows
+            returns = row + 2 < len(rows.ends) and rows.ends[row + 1] == k
+            if returns and after[k] == -before[k] and rows.codes[row + 2, k] == STUCK:
+                # It crosses, comes back soon, and sticks: the excursion is left out.
+                gone, phase = rows.z[row + 1], rows.z[row + 2]
+                longer = np.append(gone[:3], phase[3] + gone[3])
+                there = rows.put(
+                    row + 1, row + 2, (rows.codes[row + 2], rows.ends[row + 2], longer)
+                )
+            if fits:
+                yield Beginning(there, abs(float(distance)), system(row, held))
+
+
+@jit
+def _excess(osc: Oscillator, codes: Array, y: Array) -> tuple[Array, Array]:
+    """By how much the force that is needed exceeds what the stuck belts hold, and its rate."""
+    mode = mode_of(codes)
+    at = course(osc, mode, lambda y: guards_at(osc, mode, y)[-2:], (y[0], y[1], y[2]))
+    nearest = jnp.argmin(at.value)
+    return -at.value[nearest], -at.slope[nearest]
+
+
+class TimedCrossing(_AtArrival):
+    """`CrossingSliding` with a clock."""
+
+    rises: ClassVar[float] = 1.0
+
+
+class SwitchingSliding(_AtArrival):
+    """A motion arrives at the boundary of a belt where it could just begin to stick.
+
+    The force that is needed to stick falls there: to one side of the point the mass sticks at once,
+    to the other it crosses the boundary, comes back soon, and sticks then.
+
+    Args:
+        belt: Number of the belt.
+    """
+
+    caption: ClassVar[str] = "switching-sliding, belt {belt}"
+    line: ClassVar[Line] = Line("switching-sliding", "#D55E00")
+    rises: ClassVar[float] = -1.0
+
+
+class AddingSliding(AbstractForcedCondition):
+    """Inside a stick phase the force that is needed touches what the belt can hold.
+
+    Beyond the point the phase is two: in between the mass slips and sticks again.
+
+    Args:
+        belt: Number of the belt.
+    """
+
+    belt: int
+
+    caption: ClassVar[str] = "adding-sliding, belt {belt}"
+    line: ClassVar[Line] = Line("adding-sliding", "#56B4E9", (0, (5, 1.5)))
+
+    def beginnings_of(self, osc, motion, known=False):
+        rows, k = Rows.of(motion), int(self.belt)
+        names = Ends(rows.codes.shape[1])
+
+        def system(row, codes):
+            held, any_way = jnp.asarray(codes), jnp.zeros(())
+            return lambda chain: AtLimit(chain, jnp.asarray(row), held, any_way)
+
+        if known:
+            row = int(np.flatnonzero(rows.ends == names.nearest_limit)[0])
+            yield Beginning(rows, 0.0, system(row, rows.codes[row]))
+            return
+        for row in range(1, len(rows.ends) - 1):
+            before, here, after = rows.codes[row - 1 : row + 2]
+            alone = before[k] == STUCK and np.all(before == after) and abs(here[k]) == 1
+            if alone and rows.ends[row - 1] == names.onset and rows.ends[row] == k:
+                last, phase, then = rows.z[row - 1 : row + 2]
+                half = 0.5 * phase[3]
+                middle = phase[:3] + half * np.array([phase[1], 0.0, 1.0])
+                first = (before, names.nearest_limit, np.append(last[:3], last[3] + half))
+                second = (after, rows.ends[row + 1], np.append(middle, then[3] + half))
+                shorter = rows.put(row - 1, row + 1, first, second)
+                yield Beginning(shorter, float(phase[3]) ** 2, system(row - 1, before))
+        for row, since, state, value in _turns(osc, motion, lambda guards: guards[-2:]):
+            if rows.codes[row, k] == STUCK:
+                cut = rows.cut(row, since, state, names.nearest_limit)
+                yield Beginning(cut, value, system(row, rows.codes[row]))
+
+
+def _turns(osc: Oscillator, motion: PeriodicMotion, of: Any) -> Iterator[tuple]:
+    """Where guards of the arcs of a motion have a minimum inside: the row, the time since its
+    entry, the state (x1, x2, t), and the value there.
+
+    of: those wanted, of the guards of an arc in their order.
+    """
+    found = guards_along(osc, motion.chain, motion.unknowns)
+    states, value, slope = map(np.asarray, found)
+    for row in np.flatnonzero(np.asarray(motion.chain.used)).tolist():
+        for values, slopes in zip(of(value[row].T), of(slope[row].T), strict=True):
+            times = states[row, :, 2]
+            falls = (slopes[:-1] < 0) & (slopes[1:] > 0) & np.isfinite(values[:-1])
+            for i in np.flatnonzero(falls & (np.diff(times) > 0)).tolist():
+                part = slopes[i] / (slopes[i] - slopes[i + 1])
+                state = states[row, i] + part * (states[row, i + 1] - states[row, i])
+                least = float(min(values[i], values[i + 1]))
+                yield row, float(state[2] - times[0]), state, abs(least)

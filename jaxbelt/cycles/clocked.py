@@ -1,0 +1,431 @@
+"""Shooting with a clock: a chain of arcs that is closed after n periods of the forcing.
+
+As in `shooting`, but a state is (x1, x2, t), and a chain begins at the phase 0 of the forcing and
+is cut wherever a period ends, at which t begins at 0 again. For N arcs:
+
+    4N unknowns    entry state (x1, x2, t) and duration T of every arc
+     N equations   the guard of the arc's end vanishes at its end; at the end of a period t - P
+    3N equations   the end of an arc is the entry of the next, after the last comes the first
+
+The derivative of the end of an arc by its entry, at the time at which its guard vanishes, holds
+what saltation matrices do: a chain's product of these is the monodromy matrix, [2, 2]. Behind a
+stick phase it has rank one, for what a motion remembers of its start is one number, the time.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from fractions import Fraction
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..checks import require
+from ..model.instants import carried, course, guards_at
+from ..model.modes import capacity, mode_acceleration, mode_of, select
+from ..model.oscillator import Oscillator, at_time, frequencies
+from ..motion.arcs import Ends
+from ..motion.integrators import density
+from ..numerics.compiling import any_lane, jit, power_of_two
+from ..numerics.newton import HOLDS, Equations, Newton, solution, solve
+from .chains import Chain, Loop, following_codes
+from .shooting import (
+    ARC_STEPS,
+    FINE,
+    arc_by_arc,
+    arc_step,
+    coarse_step,
+    directions_of,
+    end_guard,
+    flow,
+    jacobian,
+    slip_slopes,
+    weighted,
+)
+
+#: A step times the density of steps that is wanted there: of order twelve, so that what a step
+#: leaves is rounding.
+STRIDE = 0.25
+#: The smallest mesh of an arc; steps by which steps are placed, for each that an arc may have.
+LEAST_STEPS, PLACING = 8 * ARC_STEPS, 2
+#: Periods of forces have a common multiple if their ratios have denominators up to this.
+RATIOS = 64
+#: A boundary or limit that is passed by less is touched.
+TOUCHES = 1e-8
+
+
+class TimedChain(Chain):
+    """A chain that begins at the phase 0 of the forcing; turns: periods of the first wave in one
+    of all that knows the time."""
+
+    turns: int = eqx.field(static=True, kw_only=True)
+
+
+def turns_of(osc: Oscillator) -> int:
+    """How many periods of the first wave, in the order of `frequencies`, are one of all waves.
+
+    `ValueError` where they have none in common.
+    """
+    found = np.array([float(one) for one in lax.stop_gradient(frequencies(osc))])
+    ratios = [Fraction(one / found[0]).limit_denominator(RATIOS) for one in found.tolist()]
+    pairs = zip(ratios, found / found[0], strict=True)
+    common = all(abs(float(ratio) - one) <= 1e-14 * one and ratio > 0 for ratio, one in pairs)
+    require(common, "osc", "such that all its frequencies have a period in common", found)
+    return math.lcm(*(ratio.denominator for ratio in ratios))
+
+
+def forcing_period(osc: Oscillator, turns: int) -> Array:
+    """The period of all that knows the time."""
+    return 2 * jnp.pi * turns / frequencies(osc)[0]
+
+
+# --- the mesh -------------------------------------------------------------------------------------
+
+
+def least_steps(osc: Oscillator, loop: Loop) -> int:
+    """The size of a mesh that the arcs of a known loop need; see `timed_mesh`."""
+    counts = _counts(lax.stop_gradient(osc), loop.codes, loop.entries, loop.durations)
+    return power_of_two(math.ceil(min(float(jnp.max(counts)), 4096.0)) + 1, LEAST_STEPS)
+
+
+@jit
+def _counts(osc: Oscillator, codes: Array, entries: Array, durations: Array) -> Array:
+    """The numbers of steps that arcs need, by the mean density of steps along them."""
+
+    def one(codes, y, duration):
+        def advance(y, _):
+            return coarse_step(osc, codes, y, duration / LEAST_STEPS)
+
+        _, rho = lax.scan(advance, y, None, length=LEAST_STEPS)
+        mean = jnp.mean(jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0))
+        return jnp.where(mode_of(codes).any_stuck, 0.0, duration * mean / STRIDE)
+
+    return lax.map(lambda row: one(*row), (codes, entries, durations))
+
+
+def timed_mesh(osc: Oscillator, size: int, codes: Array, y: Array, duration: Array) -> Array:
+    """Steps as fractions of the duration of a slip arc, [size]: as many as it needs, and zeros."""
+    n = PLACING * size
+
+    def march():
+        def advance(y, _):
+            return coarse_step(osc, codes, y, duration / n)
+
+        return lax.scan(advance, y, None, length=n)[1]
+
+    slips = ~mode_of(codes).any_stuck & (duration > 0)
+    rest = lax.cond(any_lane(slips), march, lambda: jnp.ones(n))
+    rho = jnp.concatenate([density(osc, mode_of(codes), y[0], y[1], y[2])[None], rest])
+    rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
+    share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(0.5 * (rho[1:] + rho[:-1]))])
+    count = jnp.clip(jnp.ceil(duration * share[-1] / n / STRIDE), 1, size)
+    places = jnp.minimum(jnp.arange(size + 1) / count, 1.0)
+    grid = jnp.interp(places, share / share[-1], jnp.linspace(0, 1, n + 1))
+    return jnp.where(slips, jnp.diff(grid), jnp.zeros(size).at[0].set(1.0))
+
+
+def timed_chain(osc: Oscillator, loop: Loop, size: int, turns: int) -> tuple[TimedChain, Array]:
+    """The chain of a loop with its mesh, and the guess of its unknowns, [N, 4]."""
+    osc, loop = lax.stop_gradient((osc, loop))
+    meshes = arc_by_arc(lambda osc, *row: timed_mesh(osc, size, *row))
+    mesh = meshes((osc,), (loop.codes, loop.entries, loop.durations))
+    z = jnp.concatenate([loop.entries, loop.durations[:, None]], axis=1)
+    return lax.stop_gradient((TimedChain(loop.codes, loop.ends, mesh, turns=turns), z))
+
+
+# --- equations ------------------------------------------------------------------------------------
+
+
+def _arc_equations(turns: int, osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
+    """(x1, x2, t, guard) at the end of one arc, from its unknowns (x1, x2, t, T).
+
+    An unused arc ends as it begins, and its guard is its duration.
+    """
+    names = Ends(len(osc.belts))
+
+    def followed(unknown):
+        after = flow(osc, codes, mesh, unknown[:3], unknown[3])
+        left = after[2] - forcing_period(osc, turns)
+        guard = jnp.where(end == names.period, left, end_guard(osc, codes, end, after))
+        after = after.at[2].set(jnp.where(end == names.period, left, after[2]))
+        return jnp.append(after, guard)
+
+    return lax.cond(any_lane(end != names.unused), followed, lambda unknown: unknown, unknown)
+
+
+def _and_columns(turns: int, osc, along, codes, end, mesh, unknown: Array):
+    """`_arc_equations` and their derivatives by the unknowns and along directions, [4, 4 + k]."""
+    return _columns(functools.partial(_arc_equations, turns), osc, along, codes, end, mesh, unknown)
+
+
+def _columns(function: Callable, osc: Oscillator, along: Oscillator | None, *row: Array):
+    """A function of an oscillator and the row of an arc, and its derivatives by the unknowns, the
+    last of the row, and along directions, in a last axis of 4 + k."""
+    *given, unknown = row
+    more = 0 if along is None else jax.tree.leaves(along)[0].size
+
+    def column(direction):
+        if along is None:
+            return jax.jvp(lambda u: function(osc, *given, u), (unknown,), (direction,))
+        moved = jax.tree.map(functools.partial(weighted, direction[4:]), along)
+        tangents = moved, direction[:4]
+        return jax.jvp(lambda o, u: function(o, *given, u), (osc, unknown), tangents)
+
+    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(4 + more))
+
+
+def _by_turns(function: Callable) -> Callable[[int], Callable]:
+    """A function of an arc's row whose first argument is the static number of turns, arc by arc."""
+
+    @functools.cache
+    def of_turns(turns: int) -> Callable:
+        return arc_by_arc(functools.partial(function, turns))
+
+    return of_turns
+
+
+_equations = _by_turns(_arc_equations)
+_equations_and_blocks = _by_turns(_and_columns)
+
+
+def _rows(chain: TimedChain, z: Array) -> tuple[Array, ...]:
+    return chain.codes, chain.ends, chain.mesh, z
+
+
+def _mismatch(out: Array, z: Array) -> Array:
+    exits = out[:, :3] - jnp.roll(z[:, :3], -1, axis=0)
+    return jnp.concatenate([exits, out[:, 3:4]], axis=1)
+
+
+def timed_residual(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
+    """The 4N equations at the unknowns z, [N, 4]: mismatch of x1, x2, t, and the guard."""
+    return _mismatch(_equations(chain.turns)((osc,), _rows(chain, z)), z)
+
+
+def timed_blocks(osc: Oscillator, along: Oscillator | None, chain: TimedChain, z: Array):
+    """`timed_residual`, and its derivatives as `shooting.residual_and_blocks` has them."""
+    out, blocks = _equations_and_blocks(chain.turns)((osc, along), _rows(chain, z))
+    return _mismatch(out, z), blocks
+
+
+class TimedClosed(Equations):
+    """The 4N equations of a chain in the unknowns z, [N, 4], for an oscillator."""
+
+    chain: TimedChain
+
+    def residual(self, given: Oscillator, z: Array) -> Array:
+        return timed_residual(given, self.chain, z).reshape(-1)
+
+    def linearized(self, given: Oscillator, z: Array) -> tuple[Array, Array]:
+        value, blocks = timed_blocks(given, None, self.chain, z)
+        return value.reshape(-1), jacobian(blocks)
+
+    def moved(self, given: Oscillator, z: Array, tangents: Oscillator) -> tuple[Array, Array]:
+        along, weights = directions_of(given, tangents)
+        _, blocks = timed_blocks(given, along, self.chain, z)
+        change = _mismatch(blocks[..., 4:] @ weights, jnp.zeros_like(z))
+        return change.reshape(-1), jacobian(blocks[..., :4])
+
+
+def solve_timed(osc: Oscillator, chain: TimedChain, guess: Array) -> Newton:
+    """The unknowns of a chain near a guess, differentiable with respect to the oscillator."""
+    return solve(TimedClosed(chain), osc, lax.stop_gradient(guess))
+
+
+def timed_solution(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
+    """The unknowns z, which `solve_timed` has found, differentiable by the oscillator."""
+    return solution(TimedClosed(chain), osc, lax.stop_gradient(z))
+
+
+# --- the monodromy matrix -------------------------------------------------------------------------
+
+
+def _arc_map(turns, osc, codes, end, mesh, unknown: Array) -> Array:
+    """How the state in which the next arc begins moves with that in which this one does, [3, 3]."""
+    _, blocks = _and_columns(turns, osc, None, codes, end, mesh, unknown)
+    by_entry, by_time = blocks[:, :3], blocks[:, 3]
+    return by_entry[:3] - jnp.outer(by_time[:3], by_entry[3] / by_time[3])
+
+
+_arc_maps = _by_turns(_arc_map)
+
+
+@_by_turns
+def _maps_and_slopes(turns, osc, along, *row):
+    """`_arc_map` and its derivatives by the unknowns and along directions, [3, 3, 4 + k]."""
+    return _columns(functools.partial(_arc_map, turns), osc, along, *row)
+
+
+def arc_maps(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
+    """`_arc_map` of all arcs, [N, 3, 3]."""
+    return _arc_maps(chain.turns)((osc,), _rows(chain, z))
+
+
+def _product(maps: Array) -> Array:
+    def times(total, one):
+        return one @ total, None
+
+    return lax.scan(times, jnp.eye(3), maps)[0]
+
+
+@eqx.filter_custom_jvp
+def monodromy(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
+    """The derivative of the state at the end of a chain by that at its beginning, [2, 2]."""
+    return _product(arc_maps(osc, chain, z))[:2, :2]
+
+
+@monodromy.def_jvp
+def _(primals, tangents):
+    # By columns, arc by arc, as in `shooting.closure`.
+    osc, chain, z = primals
+    along, weights = directions_of(osc, tangents[0])
+    matrix, by_z, by_osc = monodromy_and_slopes(osc, along, chain, z)
+    change = by_osc @ weights
+    if tangents[2] is not None:
+        change = change + jnp.einsum("ijnk,nk->ij", by_z, tangents[2])
+    return matrix, change
+
+
+def monodromy_and_slopes(
+    osc: Oscillator, along: Oscillator, chain: TimedChain, z: Array
+) -> tuple[Array, Array, Array]:
+    """`monodromy`, and its derivatives by z, [2, 2, N, 4], and along directions, [2, 2, k]."""
+    maps, slopes = _maps_and_slopes(chain.turns)((osc, along), _rows(chain, z))
+
+    def times(total, one):
+        return one @ total, total
+
+    def times_behind(total, one):
+        return total @ one, total
+
+    matrix, before = lax.scan(times, jnp.eye(3), maps)
+    _, behind = lax.scan(times_behind, jnp.eye(3), maps, reverse=True)
+    moved = jnp.einsum("nij,njkd,nkl->ilnd", behind, slopes, before)[:2, :2]
+    return matrix[:2, :2], moved[..., :4], jnp.sum(moved[..., 4:], axis=2)
+
+
+def sticks_in(chain: Chain) -> Array:
+    """Whether a chain has a stick phase."""
+    return jnp.any(chain.used[:, None] & (chain.codes == 0))
+
+
+def multipliers_of(matrix: Array, sticks: Array) -> Array:
+    """The eigenvalues of a monodromy matrix, complex, [2], the larger one first; of a motion that
+    sticks the second is exactly 0, and the first the trace."""
+    trace = matrix[0, 0] + matrix[1, 1]
+    det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+    inner = 0.25 * trace**2 - det
+    root = jnp.sqrt(jnp.where(inner == 0, 1.0, jnp.abs(inner))) * (inner != 0)
+    largest = 0.5 * trace + jnp.where(trace < 0, -1.0, 1.0) * root
+    none = largest == 0
+    smallest = jnp.where(none, 0.0, det / jnp.where(none, 1.0, largest))
+    zero = jnp.zeros(())
+    real = jnp.stack([largest, smallest]), jnp.stack([zero, zero])
+    pair = jnp.stack([0.5 * trace, 0.5 * trace]), jnp.stack([root, -root])
+    stuck = jnp.stack([trace, zero]), jnp.stack([zero, zero])
+    parts = select(sticks, stuck, select(inner >= 0, real, pair))
+    return lax.complex(*parts)
+
+
+# --- along the arcs -------------------------------------------------------------------------------
+
+
+def states_along(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array) -> Array:
+    """The states of an arc at the ends of its steps, its entry first, [steps + 1, 3].
+
+    A stick arc is cut into steps of one length.
+    """
+    stuck = mode_of(codes).any_stuck
+    fractions = jnp.where(stuck, jnp.full_like(mesh, 1 / mesh.size), mesh)
+
+    def advance(state, fraction):
+        h = duration * fraction
+        slipped = arc_step(functools.partial(slip_slopes, osc, codes), state, h, FINE)
+        held = jnp.stack(carried(osc, mode_of(codes), (state[0], state[1], state[2]), h))
+        new = jnp.where(stuck, held, slipped)
+        return new, new
+
+    _, states = lax.scan(advance, y, fractions)
+    return jnp.concatenate([y[None], states])
+
+
+@jit
+def guards_along(osc: Oscillator, chain: TimedChain, z: Array) -> tuple[Array, Array, Array]:
+    """Of all arcs the states at the ends of steps, [N, steps + 1, 3], and the guards of their modes
+    there and how fast these change, [N, steps + 1, guards]."""
+
+    def one(osc, codes, mesh, unknown):
+        mode = mode_of(codes)
+
+        def at(y):
+            found = course(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+            return found.value, found.slope
+
+        states = states_along(osc, codes, mesh, unknown[:3], unknown[3])
+        return states, *jax.vmap(at)(states)
+
+    return arc_by_arc(one)((osc,), (chain.codes, chain.mesh, z))
+
+
+def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array) -> Array:
+    """The least value that a guard of its mode has along an arc, up to rounding.
+
+    Between the ends of steps a guard is the quintic with its values, slopes and curvatures there.
+    """
+    mode = mode_of(codes)
+    states = states_along(osc, codes, mesh, y, duration)
+    at = jax.vmap(
+        lambda y: course(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+    )(states)
+    there = jnp.isfinite(at.value)
+    h = jnp.diff(states[:, 2])[:, None]
+    value, slope, curvature = (jnp.where(there, one, 0.0) for one in at)
+    f, d, c = value, slope[:-1] * h, curvature[:-1] * h**2
+    rise = f[1:] - f[:-1] - d - 0.5 * c
+    steeper, bent = slope[1:] * h - d - c, curvature[1:] * h**2 - c
+    powers = [f[:-1], d, 0.5 * c, 10 * rise - 4 * steeper + 0.5 * bent]
+    powers += [-15 * rise + 7 * steeper - bent, 6 * rise - 3 * steeper + 0.5 * bent]
+
+    def quintic(s):
+        return functools.reduce(lambda total, p: total * s + p, reversed(powers))
+
+    places = jnp.linspace(0.0, 1.0, 9)
+    values = jnp.stack([quintic(s) for s in places])
+    s = places[jnp.argmin(values, axis=0)]
+    for _ in range(4):
+        first, second = _derivatives(powers, s)
+        s = jnp.clip(s - first / jnp.where(second > 0, second, jnp.inf), 0.0, 1.0)
+    least = jnp.minimum(jnp.min(values, axis=0), quintic(s))
+    return jnp.min(jnp.where(there[:-1], least, jnp.inf))
+
+
+def _derivatives(powers: list[Array], s: Array) -> tuple[Array, Array]:
+    first = sum(k * p * s ** (k - 1) for k, p in enumerate(powers) if k)
+    second = sum(k * (k - 1) * p * s ** (k - 2) for k, p in enumerate(powers) if k > 1)
+    return jnp.asarray(first), jnp.asarray(second)
+
+
+def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
+    """Whether the oscillator moves along a solution of the equations: no arc leaves its mode before
+    its end, and none crosses a boundary where the mass would stick."""
+    n = len(osc.belts)
+
+    def one(osc, codes, mesh, end, after, unknown):
+        y, duration = unknown[:3], unknown[3]
+        end_state = flow(osc, codes, mesh, y, duration)
+        now = at_time(osc, end_state[2])
+        flips = codes * after == -1
+        held = mode_of(jnp.where(flips, 0.0, after))
+        needed = jnp.abs(mode_acceleration(now, held, end_state[0], end_state[1]))
+        crosses = (end < n) & ~jnp.any(after == 0) & jnp.any(flips)
+        would_stick = crosses & (needed < capacity(now, held) - TOUCHES)
+        least = least_guard(osc, codes, mesh, y, duration)
+        return (duration >= -HOLDS) & (least >= -TOUCHES) & ~would_stick
+
+    columns = chain.codes, chain.mesh, chain.ends, following_codes(chain), z
+    each = arc_by_arc(one)((osc,), columns)
+    return jnp.all(each | ~chain.used)

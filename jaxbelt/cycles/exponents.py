@@ -1,0 +1,202 @@
+"""Lyapunov exponents of forced oscillators: `lyapunov` and what it returns, `Exponents`.
+
+The orbit is followed period by period, and the derivative of the state at the end of each period by
+that at its beginning is the product of the maps of its arcs, see `clocked`, in which saltation is
+contained. Two tangents are carried along and made orthogonal after each period; the exponents are
+the mean logarithms of what the factorisation leaves on its diagonal. Behind a stick phase the maps
+have rank one: then the second exponent is -inf, which is told by the arcs and not by rounding.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from ..activity import announced
+from ..checks import as_array, as_whole, check_finite, is_concrete, number, require
+from ..model.modes import STUCK
+from ..model.oscillator import Oscillator, check_clock, check_oscillator
+from ..model.own_units import in_own_units
+from ..motion.arcs import Ends
+from ..numerics.compiling import jit
+from ..results import Status, describe, draw
+from ..tables import require_single, table_of
+from .chains import Loop
+from .clocked import arc_maps, forcing_period, least_steps, timed_chain, turns_of
+from .periodic import Followed, after_period, arcs_over
+
+if TYPE_CHECKING:
+    import pandas
+
+#: Blocks of periods whose means tell the standard errors.
+BLOCKS = 25
+
+
+class Exponents(eqx.Module):
+    """Lyapunov exponents of a motion of a forced oscillator, the larger one first.
+
+    Attributes:
+        exponents: Per unit of time, [2]; -inf where tangents vanish, as the second one does of a
+            motion that sticks.
+        per_period: The same per period of the forcing, [2].
+        standard_errors: Of `exponents`, from the means of blocks of periods, [2]; 0 of -inf.
+        periods: Periods that were averaged.
+        sticks: Whether the mass sticks.
+        end: State at the end, at the phase 0, [2].
+        status: A `Status` code; where it is not OK every number is NaN.
+    """
+
+    exponents: Array
+    per_period: Array
+    standard_errors: Array
+    periods: int = eqx.field(static=True)
+    sticks: Array
+    end: Array
+    status: Array
+
+    def table(self) -> "pandas.DataFrame":
+        """A row for each exponent: exponent, per_period, standard_error, status."""
+        require_single(self, self.exponents, 1)
+        rows = zip(self.exponents, self.per_period, self.standard_errors, strict=True)
+        names = ("exponent", "per_period", "standard_error")
+        status = Status(int(self.status)).name
+        return table_of(
+            [dict(zip(names, map(float, row), strict=True), status=status) for row in rows]
+        )
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw both exponents with three standard errors into the axes `ax` (None: new ones), which
+        are returned."""
+        return draw(self, ax)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.exponents):
+            return f"Exponents({self.exponents.shape})"
+        if int(self.status) != Status.OK:
+            return f"Exponents({Status(int(self.status)).name}: {describe(self.status)})"
+        told = " and ".join(
+            f"{number(value)} +- {float(error):.1g}" if np.isfinite(value) else "-inf"
+            for value, error in zip(np.asarray(self.exponents), self.standard_errors, strict=True)
+        )
+        return f"Exponents({told}, {self.periods} periods)"
+
+
+@announced("lyapunov")
+def lyapunov(
+    osc: Oscillator,
+    y0: ArrayLike | tuple,
+    *,
+    periods: int = 1000,
+    transient: int = 200,
+    key: Any = None,
+) -> Exponents:
+    """Lyapunov exponents of the motion that a start leads to, of a forced oscillator.
+
+    Args:
+        osc: An `Oscillator` with forcing.
+        y0: Start (x1, x2) at the phase 0, that is, at t = 0, shape [2].
+        periods: Periods of the forcing that are averaged.
+        transient: Periods before these that are not.
+        key: A key of `jax.random` for the first tangents; None: always the same ones.
+
+    Returns:
+        Both exponents with standard errors. A chaotic motion has a first exponent that is more than
+        three standard errors above zero.
+
+    Raises:
+        ValueError: If an argument is impossible, or if the frequencies have no common period.
+
+    Example:
+        found = jb.lyapunov(osc, (0.5, 0.0))
+        is_chaotic = found.exponents[0] > 3 * found.standard_errors[0]
+    """
+    check_oscillator(osc)
+    check_clock(osc, "lyapunov", "the multiplier of jb.find_cycle")
+    y0 = as_array(y0, "y0", (2,))
+    check_finite(y0, "y0")
+    periods = as_whole(periods, "periods", BLOCKS)
+    transient = as_whole(transient, "transient", 0)
+    require(is_concrete((osc, y0)), "osc", "known: not under jit or vmap", "a traced one")
+    own, turns = in_own_units(osc), turns_of(osc)
+    y, skipped, passed = np.asarray(own.units.into(y0)), 0, 0
+    logs, sticks, status = [], False, Status.OK.value
+    frame = _first_tangents(key)
+    while passed < periods:
+        followed = arcs_over(own, y, turns)
+        reached = len(followed.starts) - 1
+        if followed.status != Status.OK or reached == 0:
+            status = followed.status or Status.NOT_FINITE.value
+            break
+        used = min(reached - min(transient - skipped, reached), periods - passed)
+        skipped = min(transient, skipped + reached)
+        if used > 0:
+            sticks = sticks or bool(np.any(followed.last(used).codes == STUCK))
+        frame, grown = _followed_tangents(own, followed, turns, frame, used)
+        logs.append(grown)
+        passed += used
+        y = after_period(own, followed)
+    units = own.units.length
+    return _averaged(
+        np.concatenate(logs) if logs else np.zeros((0, 2)),
+        sticks,
+        status,
+        periods,
+        float(forcing_period(own, turns)),
+        jnp.asarray(y) * units,
+    )
+
+
+def _first_tangents(key: Any) -> np.ndarray:
+    """Two orthogonal tangents, as columns."""
+    angle = 1.0 if key is None else float(jax.random.uniform(key, maxval=2 * np.pi))
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def _followed_tangents(
+    osc: Oscillator, followed: Followed, turns: int, frame: np.ndarray, used: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The tangents at the end of an orbit, and the logarithms of how much they grew in the last
+    periods of it, [used, 2]."""
+    loop = followed.loop()
+    maps = np.asarray(_maps(osc, loop, least_steps(osc, loop), turns))[: len(followed.ends)]
+    ends = np.flatnonzero(followed.ends == Ends(followed.codes.shape[1]).period)
+    logs, total, place = [], np.eye(3), 0
+    for row, one in enumerate(maps):
+        total = one @ total
+        if row == ends[place]:
+            frame, factors = np.linalg.qr(total[:2, :2] @ frame)
+            with np.errstate(divide="ignore"):
+                logs.append(np.log(np.abs(np.diag(factors))))
+            total, place = np.eye(3), place + 1
+    return frame, np.array(logs[len(logs) - used :]).reshape(-1, 2)
+
+
+@jit
+def _maps(osc: Oscillator, loop: Loop, size: int, turns: int) -> Array:
+    chain, z = timed_chain(osc, loop, size, turns)
+    return arc_maps(osc, chain, z)
+
+
+def _averaged(logs, sticks, status, periods, period, end) -> Exponents:
+    known = 1.0 if status == Status.OK else np.nan
+    means, errors = np.full(2, np.nan), np.full(2, np.nan)
+    if status == Status.OK:
+        blocks = np.array([np.mean(rows, axis=0) for rows in np.array_split(logs, BLOCKS)])
+        means = np.mean(logs, axis=0)
+        with np.errstate(invalid="ignore"):
+            errors = np.std(blocks, axis=0, ddof=1) / np.sqrt(BLOCKS)
+        if sticks:
+            means[1] = -np.inf
+        errors = np.where(np.isfinite(means), errors, 0.0)
+    return Exponents(
+        exponents=jnp.asarray(means / period),
+        per_period=jnp.asarray(means),
+        standard_errors=jnp.asarray(errors / period),
+        periods=periods,
+        sticks=jnp.asarray(bool(sticks)),
+        end=end * known,
+        status=jnp.asarray(status),
+    )

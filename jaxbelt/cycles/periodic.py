@@ -1,0 +1,581 @@
+"""Periodic motions of forced oscillators: `periodic`, what `find_cycle` finds, `PeriodicMotion`.
+
+An orbit is followed for n periods of the forcing; its arcs are the signature and the guess from
+which `clocked` solves for the motion that repeats after them.
+"""
+
+import functools
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike
+
+from ..activity import announced
+from ..checks import (
+    as_array,
+    as_whole,
+    check_finite,
+    is_concrete,
+    number,
+    pick,
+    require,
+)
+from ..model.events import Signature, signature_name
+from ..model.modes import BELOW, STUCK, mode_of, stick_velocity
+from ..model.oscillator import Oscillator, at_time, check_clock, check_oscillator
+from ..model.own_units import in_given_units, in_own_units, quantity
+from ..motion.arcs import Ends
+from ..motion.simulate import Arcs, simulate
+from ..numerics.compiling import jit, power_of_two
+from ..numerics.newton import HOLDS
+from ..results import Status, describe, draw
+from ..tables import per_belt, require_single, table_of
+from .chains import SIZES, Loop, loop_events
+from .clocked import (
+    TimedChain,
+    forcing_period,
+    least_steps,
+    monodromy,
+    multipliers_of,
+    solve_timed,
+    sticks_in,
+    timed_admissible,
+    timed_chain,
+    timed_residual,
+    timed_solution,
+    turns_of,
+)
+from .shooting import flow
+
+if TYPE_CHECKING:
+    import pandas
+
+#: Periods that are followed in one run, which are the most that a motion may have.
+PERIODS_AT_ONCE = 32
+#: Runs after which an orbit that has not come near a periodic motion is given up.
+MOST_RUNS = 32
+#: States after n periods that differ by less, relative to their size, may be one motion's.
+NEARLY_BACK, HARDLY_BACK = 1e-6, 1e-2
+#: Errors that the steps of integration leave in the equations; with more they are halved, so often.
+EXACT, HALVINGS = 1e-11, 3
+#: States that differ by less are one, where the least number of periods is asked for.
+SAME_STATE = 1e-7
+#: Newton steps on the state at phase 0 where the arcs that were followed are not those sought.
+OUTER_STEPS = 12
+
+
+class PeriodicMotion(eqx.Module):
+    """A motion of a forced oscillator that repeats after n periods of the forcing.
+
+    Differentiable with respect to every parameter of its oscillator.
+
+    Attributes:
+        oscillator: Whose motion it is.
+        chain: Its arcs, from the phase 0 on; padded.
+        unknowns: (x1, x2, t, duration) at the entry of every arc, t counted from the last phase 0,
+            [arcs, 4].
+        multipliers: Both Floquet multipliers, complex, the larger one first. Of a motion that
+            sticks the second is exactly 0.
+        residual: Largest error in the equations.
+        iterations: Newton steps.
+        status: A `Status` code; where it is not OK every number is NaN.
+    """
+
+    oscillator: Oscillator
+    chain: TimedChain
+    unknowns: Array = eqx.field(metadata=quantity("length", "velocity", "time", "time"))
+    multipliers: Array
+    residual: Array
+    iterations: Array
+    status: Array
+
+    @property
+    def periods(self) -> int:
+        """After how many periods of the forcing it repeats."""
+        ends = np.asarray(self.chain.ends)
+        return int(np.max(np.sum(ends == Ends(self.chain.codes.shape[-1]).period, axis=-1)))
+
+    @property
+    def period(self) -> Array:
+        """Its own period, `periods` times that of the forcing."""
+        own = self.periods * forcing_period(self.oscillator, self.chain.turns)
+        return own * (0.0 * self.residual + 1.0)
+
+    @property
+    def start(self) -> Array:
+        """The state (x1, x2) at the phase 0: at t = 0."""
+        return self.unknowns[..., 0, :2]
+
+    @property
+    def starts(self) -> Array:
+        """The states (x1, x2) at the phase 0 of each of its periods, [periods, 2]."""
+        ends = np.asarray(self.chain.ends)
+        cuts = np.flatnonzero(ends == Ends(self.chain.codes.shape[-1]).period)
+        return self.unknowns[jnp.asarray(np.append(0, cuts[:-1] + 1)), :2]
+
+    @property
+    def stick_durations(self) -> Array:
+        """Time that it sticks to each belt, [belts], in all its periods."""
+        stuck = jnp.where(self.chain.codes == STUCK, 1.0, 0.0)
+        return jnp.sum(self.unknowns[..., 3:] * stuck, axis=-2)
+
+    @property
+    def stable(self) -> Array:
+        """Whether both multipliers are inside of the unit circle."""
+        return jnp.all(jnp.abs(self.multipliers) < 1, axis=-1)
+
+    @property
+    def arcs(self) -> Arcs:
+        """The arcs, smooth pieces in one mode each; NaN, or cut off, where unused."""
+        used, durations = self.chain.used, self.unknowns[..., 3]
+        nan = functools.partial(jnp.where, used)
+        arcs = Arcs(
+            t=nan(jnp.cumsum(durations, axis=-1) - durations, jnp.nan),
+            y=jnp.where(used[..., None], self.unknowns[..., :2], jnp.nan),
+            mode=self.chain.codes,
+            duration=nan(durations, jnp.nan),
+        )
+        if is_concrete(self.unknowns) and used.ndim == 1:
+            arcs = pick(arcs, slice(int(np.sum(used))))
+        return arcs
+
+    @property
+    def signature(self) -> Signature:
+        """Its events, (kind, belt) each; outside of transformations only."""
+        fits = is_concrete(self.chain) and self.chain.ends.ndim == 1
+        expected = "asked of one motion outside of transformations"
+        require(fits, "signature", expected, "a traced or batched motion")
+        return loop_events(self.chain) if int(self.status) == Status.OK else ()
+
+    def sample(self, n: int) -> Array:
+        """States (x1, x2) at n times evenly spread over its period, ends included, [n, 2]."""
+        return _sampled(self.oscillator, self.chain, self.unknowns, as_whole(n, "n"))
+
+    def at(self, osc: Oscillator) -> "PeriodicMotion":
+        """The motion with the same signature of another oscillator, near to its own.
+
+        Works under `jax.jit`, `jax.vmap` and derivatives.
+
+        Args:
+            osc: An oscillator with the same belts and forces, but for their numbers.
+
+        Returns:
+            The motion; its status tells where there is none.
+        """
+        check_oscillator(osc)
+        own = in_own_units(osc)
+        z = self.unknowns[..., :2] / own.units.length
+        z = jnp.concatenate([z, self.unknowns[..., 2:]], axis=-1)
+        found, _ = _polished(own, self.chain, lax.stop_gradient(z))
+        return in_given_units(found, osc, own)
+
+    def row(self) -> dict[str, Any]:
+        """What `table` tells of it."""
+        require_single(self, self.residual, 0)
+        known = int(self.status) == Status.OK
+        start, (first, second) = np.asarray(self.start), np.asarray(self.multipliers)
+        numbers = {
+            "period": self.period,
+            "x1": start[0],
+            "x2": start[1],
+            "multiplier_0": first.real,
+            "multiplier_0_imaginary": first.imag,
+            "multiplier_1": second.real,
+            "multiplier_1_imaginary": second.imag,
+            **per_belt("stick_duration", self.stick_durations),
+            "residual": self.residual,
+        }
+        return {
+            "stable": bool(self.stable),
+            "periods": self.periods,
+            **{name: float(value) if known else np.nan for name, value in numbers.items()},
+            "iterations": int(self.iterations),
+            "signature": signature_name(self.signature) if known else "",
+            "status": Status(int(self.status)).name,
+        }
+
+    def table(self) -> "pandas.DataFrame":
+        """One row: stable, periods, period, x1 and x2 at the phase 0, real and imaginary parts of
+        both multipliers, stick_duration_0, ... of each belt, residual, iterations, signature,
+        status."""
+        return table_of([self.row()])
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw it in the phase plane, with a dot at the phase 0 of each period, into the axes `ax`
+        (None: new ones), which are returned. `ValueError` where there is no motion."""
+        return draw(self, ax)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.unknowns) or self.unknowns.ndim != 2:
+            return f"PeriodicMotion(unknowns={self.unknowns.shape})"
+        if int(self.status) != Status.OK:
+            return f"PeriodicMotion({Status(int(self.status)).name}: {describe(self.status)})"
+        events = " ".join(f"{kind.name} {belt}" for kind, belt in self.signature) or "smooth"
+        sticks = ", ".join(map(number, self.stick_durations))
+        found = np.asarray(self.multipliers)
+        told = ", ".join(f"{one:.6g}" if one.imag else f"{one.real:.6g}" for one in found.tolist())
+        return (
+            f"PeriodicMotion({self.periods} periods; {events}; sticks ({sticks}), "
+            f"multipliers {told}, {'' if self.stable else 'un'}stable, "
+            f"residual {float(self.residual):.1e})"
+        )
+
+
+@jit
+def _sampled(osc: Oscillator, chain: TimedChain, z: Array, n: int) -> Array:
+    ends = jnp.cumsum(z[:, 3])
+
+    def at(t):
+        i = jnp.minimum(jnp.searchsorted(ends, t).astype(int), jnp.sum(chain.used) - 1)
+        since = t - ends[i] + z[i, 3]
+        return flow(osc, chain.codes[i], chain.mesh[i], z[i, :3], since)[:2]
+
+    return lax.map(at, jnp.linspace(0.0, 1.0, n) * ends[-1])
+
+
+# --- orbits, period by period ---------------------------------------------------------------------
+
+
+class Followed(NamedTuple):
+    """An orbit that was followed over whole periods, in NumPy.
+
+    codes, ends, entries (x1, x2, t), durations: of its arcs, as of a `Loop`; starts: the states at
+    the phase 0, [periods + 1, 2]; status: of the run.
+    """
+
+    codes: np.ndarray
+    ends: np.ndarray
+    entries: np.ndarray
+    durations: np.ndarray
+    starts: np.ndarray
+    status: int
+
+    def last(self, periods: int) -> "Followed":
+        """The last periods of it."""
+        cuts = np.flatnonzero(self.ends == Ends(self.codes.shape[-1]).period)
+        first = 0 if periods >= len(cuts) else cuts[-periods - 1] + 1
+        arcs = (one[first:] for one in self[:4])
+        return Followed(*arcs, self.starts[-periods - 1 :], self.status)
+
+    def first(self, periods: int) -> "Followed":
+        """The first periods of it."""
+        cuts = np.flatnonzero(self.ends == Ends(self.codes.shape[-1]).period)
+        arcs = (one[: cuts[periods - 1] + 1] for one in self[:4])
+        return Followed(*arcs, self.starts[: periods + 1], self.status)
+
+    def loop(self) -> Loop:
+        """As a loop, padded to a size of chains."""
+        n, count = self.codes.shape[-1], len(self.ends)
+        size = next((one for one in SIZES if one >= count), power_of_two(count, SIZES[-1]))
+        more = size - count
+        return Loop(
+            codes=jnp.asarray(np.pad(self.codes, [(0, more), (0, 0)], constant_values=1.0)),
+            ends=jnp.asarray(np.pad(self.ends, (0, more), constant_values=Ends(n).unused)),
+            # After the last used arc comes the first one.
+            entries=jnp.asarray(np.concatenate([self.entries, self.entries[[0] * more]])),
+            durations=jnp.asarray(np.pad(self.durations, (0, more))),
+        )
+
+
+def arcs_over(osc: Oscillator, y0: Any, turns: int) -> Followed:
+    """The orbit from the state y0 at the phase 0, over PERIODS_AT_ONCE periods, if it gets so far.
+
+    osc: known, in its own units.
+    """
+    period = float(forcing_period(osc, turns))
+    cuts = period * np.arange(1, PERIODS_AT_ONCE + 1)
+    run = simulate(osc, y0, cuts[-1], ts=cuts)
+    arcs, states = run.arcs, np.asarray(run.ys)
+    modes, times = np.asarray(arcs.mode, float), np.asarray(arcs.t)
+    entries = np.column_stack([np.asarray(arcs.y), times])
+    reached = int(np.sum(np.all(np.isfinite(states), axis=1)))
+    # Arcs of one mode, one after the other, are one; and at the end of a period one is cut.
+    begins = np.flatnonzero(np.any(np.diff(modes, axis=0, prepend=np.nan) != 0, axis=1))
+    names = Ends(modes.shape[1])
+    rows = [(entries[i, 2], 0, entries[i], modes[i]) for i in begins.tolist()]
+    for k in range(reached):
+        inside = modes[begins[np.searchsorted(times[begins], cuts[k], side="right") - 1]]
+        rows.append((cuts[k], 1, np.append(states[k], cuts[k]), inside))
+    rows.sort(key=lambda row: row[:2])
+    last = next(i for i in reversed(range(len(rows))) if rows[i][1]) if reached else 0
+    rows = rows[: last + 1]
+    begun = np.cumsum([row[1] for row in rows])
+    found = [row[2] - np.array([0.0, 0.0, period * k]) for row, k in zip(rows, begun)]
+    for place, row in enumerate(rows):
+        if row[1]:
+            found[place][2] = 0.0
+    lengths = np.diff([row[0] for row in rows])
+    codes = np.array([row[3] for row in rows])
+    ends = [
+        names.period if then[1] else _end_between(names, now[3], then[3])
+        for now, then in itertools.pairwise(rows)
+    ]
+    starts = np.concatenate([[np.asarray(y0, float)], states[:reached]])
+    columns = codes[:-1], np.array(ends, int), np.array(found)[:-1], lengths
+    return Followed(*columns, starts, int(run.status))
+
+
+def _end_between(names: Ends, before: np.ndarray, after: np.ndarray) -> int:
+    """What ends an arc, a number of `Ends`, by the codes of it and of the next one."""
+    n = len(before)
+    apart = np.abs(before) > 1, np.abs(after) > 1
+    for i in np.flatnonzero(apart[0] != apart[1]).tolist():
+        return n + i if BELOW in (before[i], after[i]) else 2 * n + i
+    for changed in ((before != 0) & (after == 0), before * after == -1):
+        if np.any(changed):
+            return int(np.argmax(changed))
+    return names.onset
+
+
+def after_period(osc: Oscillator, followed: Followed) -> np.ndarray:
+    """The last state, from which to go on, exactly on the belt that the mass sticks to."""
+    x1, x2 = followed.starts[-1].tolist()
+    mode = mode_of(jnp.asarray(followed.codes[-1]))
+    velocity = stick_velocity(at_time(osc, jnp.zeros(())), mode, osc.omega * x2)
+    return np.array([x1, float(velocity / osc.omega)])
+
+
+# --- solutions ------------------------------------------------------------------------------------
+
+
+@jit
+def _polished(osc: Oscillator, chain: TimedChain, guess: Array) -> tuple[PeriodicMotion, Array]:
+    """The motion near a guess of a chain's unknowns, and the error that its steps leave."""
+    solved = solve_timed(osc, chain, guess)
+    z, settled = solved.z, solved.unsettled
+    still, at = lax.stop_gradient((osc, z))
+    mesh = chain.mesh
+    # Padded by steps of length zero to one shape.
+    halved = jnp.repeat(0.5 * mesh, 2, axis=1)
+    meshes = jnp.stack([jnp.concatenate([mesh, jnp.zeros_like(mesh)], axis=1), halved])
+    values = lax.map(lambda m: timed_residual(still, replace(chain, mesh=m), at), meshes)
+    error = jnp.max(jnp.abs(values[0] - values[1]))
+    residual = jnp.max(jnp.abs(values[0]))
+    fine = (residual < HOLDS) & (settled < HOLDS)
+    status = jnp.where(fine, Status.OK.value, Status.NO_CONVERGENCE.value)
+    # Where it sticks all along, no place is better than another.
+    always = jnp.all(jnp.any(chain.codes == STUCK, axis=-1) | ~chain.used)
+    status = jnp.where(always, Status.NEUTRAL.value, status)
+    return motion_at(osc, chain, z, residual, solved.iterations, status), error
+
+
+def motion_at(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
+    """The motion with the unknowns z, NaN with a status where it is none."""
+    inside = timed_admissible(*lax.stop_gradient((osc, chain, z)))
+    fails = (status == Status.OK) & ~inside
+    status = jnp.where(fails, Status.NOT_ADMISSIBLE.value, status)
+    return _motion(osc, chain, z, residual, iterations, status)
+
+
+def _motion(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
+    known = jnp.where(status == Status.OK, 1.0, jnp.nan)
+    found = multipliers_of(monodromy(osc, chain, z), sticks_in(chain))
+    numbers = iterations, status
+    return PeriodicMotion(osc, chain, z * known, found * known, residual * known, *numbers)
+
+
+@jit
+def _with_derivatives(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
+    """A motion that is known, as one of an oscillator by which it can be differentiated."""
+    chain, status = motion.chain, motion.status
+    z = timed_solution(osc, chain, motion.unknowns)
+    return _motion(osc, chain, z, motion.residual, motion.iterations, status)
+
+
+_chain_of = jit(timed_chain)
+
+
+def solved_from(osc: Oscillator, loop: Loop, turns: int) -> PeriodicMotion:
+    """The motion that a loop nearly is, with as many steps of integration as it takes."""
+    chain, guess = _chain_of(osc, loop, least_steps(osc, loop), turns)
+    motion, error = _polished(osc, chain, guess)
+    for _ in range(HALVINGS):
+        converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
+        if not converged or float(error) < EXACT:
+            break
+        chain = replace(chain, mesh=jnp.repeat(0.5 * chain.mesh, 2, axis=1))
+        finer, remaining = _polished(osc, chain, guess)
+        if float(remaining) > 0.1 * float(error):
+            break  # the rest is rounding
+        motion, error = finer, remaining
+    return motion
+
+
+def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
+    """What is returned where there is no motion: NaN, and why."""
+    n, arcs = len(osc.belts), SIZES[0]
+    chain = TimedChain(
+        jnp.ones((arcs, n)),
+        jnp.full(arcs, Ends(n).unused),
+        jnp.zeros((arcs, 1)),
+        turns=turns,
+    )
+    nan, none = jnp.asarray(jnp.nan), jnp.full((arcs, 4), jnp.nan)
+    found = jnp.full(2, jnp.nan, complex)
+    return PeriodicMotion(osc, chain, none, found, nan, jnp.asarray(0), jnp.asarray(status))
+
+
+def periodic_from(osc: Oscillator, guess: Any, periods: int, turns: int) -> PeriodicMotion:
+    """What `periodic` returns, of a known oscillator in its own units."""
+    y = np.asarray(guess, float)
+    motion = None
+    for _ in range(OUTER_STEPS):
+        followed = arcs_over(osc, y, turns)
+        if len(followed.starts) <= periods:
+            status = followed.status or Status.NOT_FINITE.value
+            return motion or nothing_found(osc, turns, int(status))
+        followed = followed.first(periods)
+        motion = solved_from(osc, followed.loop(), turns)
+        if int(motion.status) in (Status.OK, Status.NEUTRAL):
+            return _of_least_periods(osc, motion, turns)
+        change = _newton_step(osc, followed, turns)
+        size = float(np.max(np.abs(change)))
+        if not np.isfinite(size):
+            break
+        y = y + change * min(1.0, 0.5 / size)
+    return motion if motion is not None else nothing_found(osc, turns, Status.NO_CONVERGENCE)
+
+
+def _newton_step(osc: Oscillator, followed: Followed, turns: int) -> np.ndarray:
+    """How far the state at the phase 0 is from that of a periodic motion, by Newton's method along
+    the orbit as it was followed."""
+    loop = followed.loop()
+    chain, z = _chain_of(osc, loop, least_steps(osc, loop), turns)
+    matrix = np.asarray(_monodromy(osc, chain, z))
+    miss = followed.starts[-1] - followed.starts[0]
+    if not np.all(np.isfinite(matrix)):
+        return np.full(2, np.nan)
+    return np.linalg.lstsq(np.eye(2) - matrix, miss, rcond=None)[0]
+
+
+_monodromy = jit(monodromy)
+
+
+def _of_least_periods(osc: Oscillator, motion: PeriodicMotion, turns: int) -> PeriodicMotion:
+    """The motion with the least number of periods after which it repeats."""
+    if int(motion.status) != Status.OK:
+        return motion
+    periods, starts = motion.periods, np.asarray(motion.starts)
+    for least in (one for one in range(1, periods) if periods % one == 0):
+        apart = np.max(np.abs(starts - np.roll(starts, -least, axis=0)))
+        if apart < SAME_STATE * (1 + np.max(np.abs(starts))):
+            shorter = solved_from(osc, arcs_over(osc, starts[0], turns).first(least).loop(), turns)
+            if int(shorter.status) == Status.OK:
+                return shorter
+    return motion
+
+
+@announced("periodic")
+def periodic(osc: Oscillator, guess: ArrayLike | tuple, *, periods: int = 1) -> PeriodicMotion:
+    """The periodic motion of a forced oscillator near a guess, stable or not, sticking or not.
+
+    By Newton's method. Differentiable with respect to the parameters of the oscillator, not under
+    `jax.jit` or `jax.vmap`: there use `motion.at(osc)`.
+
+    Args:
+        osc: An `Oscillator` with forcing.
+        guess: State (x1, x2) at the phase 0, that is, at t = 0, shape [2].
+        periods: After how many periods of the forcing it repeats, 32 at most. A motion that
+            repeats earlier is given as what it is.
+
+    Returns:
+        The motion; where there is none its status says why.
+
+    Raises:
+        ValueError: If an argument is impossible, or if the frequencies have no common period.
+
+    Example:
+        motion = jb.periodic(osc, guess=(0.5, 0.2), periods=2)
+        motion.multipliers, motion.stable, motion.start
+    """
+    check_oscillator(osc)
+    check_clock(osc, "periodic", "jb.find_cycle or jb.unstable_cycle")
+    guess = as_array(guess, "guess", (2,))
+    check_finite(guess, "guess")
+    periods = as_whole(periods, "periods")
+    require(periods <= PERIODS_AT_ONCE, "periods", f"at most {PERIODS_AT_ONCE}", periods)
+    return _differentiable(osc, guess, lambda o, y, turns: periodic_from(o, y, periods, turns))
+
+
+def _differentiable(osc: Oscillator, y: Array, find: Any) -> PeriodicMotion:
+    """What find(osc, y, turns) finds of the known oscillator in own units, as a function of osc."""
+    still, y = lax.stop_gradient((osc, y))
+    expected = "known: under jit and vmap use motion.at(osc) of a motion that was found outside"
+    require(is_concrete((still, y)), "osc", expected, "a traced one")
+    turns = turns_of(still)
+    own = in_own_units(still)
+    motion = find(own, np.asarray(own.units.into(y)), turns)
+    if is_concrete(osc):
+        return in_given_units(motion, osc, own)
+    own = in_own_units(osc)
+    return in_given_units(_with_derivatives(own, motion), osc, own)
+
+
+def attracted(osc: Oscillator, y0: Any, turns: int) -> PeriodicMotion:
+    """The periodic motion that a start leads to, of a known oscillator in its own units."""
+    y, tried = np.asarray(y0, float), 1
+    for run in range(MOST_RUNS):
+        followed = arcs_over(osc, y, turns)
+        if len(followed.starts) <= PERIODS_AT_ONCE:
+            return nothing_found(osc, turns, followed.status or Status.NOT_FINITE.value)
+        # Slow motions are tried now and then.
+        slow = run + 1 == tried or run == MOST_RUNS - 1
+        tried *= 1 + slow
+        found = _repeated(osc, followed, HARDLY_BACK if slow else NEARLY_BACK, turns)
+        if found is not None:
+            return found
+        y = after_period(osc, followed)
+    return nothing_found(osc, turns, Status.NOT_SETTLED)
+
+
+def _repeated(
+    osc: Oscillator, followed: Followed, near: float, turns: int
+) -> PeriodicMotion | None:
+    """The stable motion to which an orbit comes that is nearly back after some periods."""
+    starts = followed.starts
+    size = 1 + np.max(np.abs(starts))
+    for periods in range(1, PERIODS_AT_ONCE // 2 + 1):
+        away = np.max(np.abs(starts[-1] - starts[-1 - periods]))
+        before = np.max(np.abs(starts[-1 - periods] - starts[-1 - 2 * periods]))
+        if not (away < near * size and away <= max(before, NEARLY_BACK * size)):
+            continue
+        motion = solved_from(osc, followed.last(periods).loop(), turns)
+        if int(motion.status) == Status.NEUTRAL:
+            return motion
+        if int(motion.status) != Status.OK or not bool(motion.stable):
+            continue
+        largest = float(np.max(np.abs(motion.multipliers)))
+        off = np.max(np.abs(np.asarray(motion.start) - starts[-1 - periods]))
+        if off < 10 * away / (1 - largest) + NEARLY_BACK * size:
+            return motion
+    return None
+
+
+def motion_reached(osc: Oscillator, y0: Array) -> PeriodicMotion:
+    """What `find_cycle` returns of an oscillator with a clock."""
+    return _differentiable(osc, y0, attracted)
+
+
+def motions_of(osc: Oscillator, starts: Sequence[Any], turns: int) -> list[PeriodicMotion]:
+    """The different periodic motions to which some starts lead."""
+    found: list[PeriodicMotion] = []
+    for start in starts:
+        motion = attracted(osc, start, turns)
+        if int(motion.status) == Status.OK and not any(is_same(motion, one) for one in found):
+            found.append(motion)
+    return found
+
+
+def is_same(one: PeriodicMotion, other: PeriodicMotion) -> bool:
+    """Whether two motions are one, wherever they begin."""
+    if one.periods != other.periods:
+        return False
+    a, b = np.asarray(one.starts), np.asarray(other.starts)
+    gaps = [np.max(np.abs(a - np.roll(b, k, axis=0))) for k in range(len(a))]
+    return bool(min(gaps) < SAME_STATE * (1 + np.max(np.abs(a))))

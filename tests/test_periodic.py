@@ -1,0 +1,269 @@
+"""Periodic motions of forced oscillators, their multipliers, bifurcations and exponents.
+
+Oracles: the engine of tests/campaign/forced.py, which follows runs and differentiates them by
+differences; closed forms of Den Hartog; the numbers of di Bernardo, Kowalczyk and Nordmark that two
+independent engines computed.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import jaxbelt as jb
+
+from .campaign import forced, forced_cases
+
+OK = jb.Status.OK
+
+
+def bkn(frequency):
+    """The oscillator of di Bernardo, Kowalczyk and Nordmark, 2003."""
+    law = jb.Cubic(1.5, 1.5, 0.45)
+    return jb.Oscillator(0.0, (jb.Belt(1.0, law),), forcing=jb.Harmonic(0.1, frequency))
+
+
+def bkn_of_engine(frequency):
+    law = ("cubic", 1.5, 1.5, 0.45)
+    return forced.Oscillator(0.0, (forced.Belt(1.0, law),), (forced.Harmonic(0.1, frequency),))
+
+
+def frequency_of(osc):
+    return osc.forcing[0].frequency
+
+
+@pytest.fixture(scope="module")
+def smooth():
+    """A motion of four periods that does not stick."""
+    return jb.find_cycle(bkn(1.7079), (0.5, 0.0))
+
+
+@pytest.fixture(scope="module")
+def sticking():
+    """A motion of two periods that sticks."""
+    return jb.find_cycle(bkn(1.68), (0.5, 0.0))
+
+
+def test_find_cycle_finds_the_number_of_periods(smooth, sticking):
+    assert (smooth.periods, sticking.periods) == (4, 2)
+    assert smooth.period == pytest.approx(4 * 2 * np.pi / 1.7079, rel=1e-15)
+    assert smooth.signature == ()
+    assert sticking.signature == ((jb.EventKind.STICK, 0), (jb.EventKind.SLIP, 0))
+    assert bool(smooth.stable) and bool(sticking.stable)
+    assert sticking.multipliers[1] == 0.0
+    assert float(smooth.stick_durations[0]) == 0.0
+
+
+def test_motions_and_multipliers_are_those_of_the_engine(smooth, sticking):
+    # Differences of runs at 1e-13; the state is 3e-5 from grazing, so the step is small.
+    for motion, frequency, h in ((smooth, 1.7079, 1e-6), (sticking, 1.68, 1e-4)):
+        osc, start = bkn_of_engine(frequency), np.asarray(motion.start)
+        y, multipliers = forced_cases.periodic(osc, start, motion.periods, h=h)
+        assert start == pytest.approx(y, abs=1e-10)
+        wanted = sorted(np.abs(multipliers))
+        assert sorted(np.abs(np.asarray(motion.multipliers))) == pytest.approx(wanted, abs=3e-7)
+    run = forced_cases.stroboscopic(bkn_of_engine(1.68), np.asarray(sticking.start), 2)
+    stuck = np.diff(run.t)[run.kind[:-1] == forced.STICK]
+    assert float(sticking.stick_durations[0]) == pytest.approx(stuck[0], abs=1e-10)
+
+
+def test_unstable_motions_are_found_from_a_guess(smooth):
+    between = 0.5 * (smooth.starts[0] + smooth.starts[2])
+    motion = jb.periodic(bkn(1.7079), between, periods=2)
+    assert int(motion.status) == OK and motion.periods == 2 and not bool(motion.stable)
+    _, multipliers = forced_cases.periodic(bkn_of_engine(1.7079), np.asarray(motion.start), 2)
+    assert np.sort(motion.multipliers.real) == pytest.approx(np.sort(multipliers.real), abs=1e-7)
+    # Asked for twice the number of periods it is given as what it is.
+    again = jb.periodic(bkn(1.7079), np.asarray(motion.start), periods=4)
+    assert again.periods == 2
+    assert again.start == pytest.approx(np.asarray(motion.start), abs=1e-10)
+
+
+def test_samples_begin_and_end_at_the_start(sticking):
+    states = np.asarray(sticking.sample(101))
+    assert states[0] == pytest.approx(np.asarray(sticking.start), abs=1e-14)
+    assert states[-1] == pytest.approx(states[0], abs=1e-10)
+    assert states[50] == pytest.approx(np.asarray(sticking.starts[1]), abs=1e-10)
+
+
+def test_derivatives_are_those_of_the_engine(sticking):
+    def start(frequency):
+        osc = bkn_of_engine(frequency)
+        return forced_cases.periodic(osc, np.asarray(sticking.start), 2)[0]
+
+    slope = jax.jacfwd(lambda frequency: jb.find_cycle(bkn(frequency), (0.5, 0.0)).start)(1.68)
+    near, far = ((start(1.68 + h) - start(1.68 - h)) / (2 * h) for h in (1e-4, 2e-4))
+    # Of fourth order in h, and 1e-12/h of rounding.
+    assert np.asarray(slope) == pytest.approx((4 * near - far) / 3, abs=1e-6)
+
+
+def test_at_follows_a_motion_to_other_oscillators(sticking):
+    values = jnp.array([1.678, 1.68, 1.682])
+    moved = jax.vmap(lambda frequency: sticking.at(bkn(frequency)).start)(values)
+    assert moved[1] == pytest.approx(np.asarray(sticking.start), abs=1e-11)
+    other = jb.find_cycle(bkn(1.682), (0.5, 0.0))
+    assert moved[2] == pytest.approx(np.asarray(other.start), abs=1e-10)
+
+
+def test_grazing_of_the_motion_of_four_periods(smooth):
+    point = jb.refine(jb.GrazingSliding(0), bkn(1.7079), where=frequency_of, start=smooth)
+    assert int(point.status) == OK
+    assert float(point.value) == pytest.approx(1.707799714885, abs=1e-10)
+    wanted = [0.840725392543, 0.00719233612]
+    assert point.cycle.multipliers.real == pytest.approx(wanted, abs=1e-9)
+    assert point.kind == "GrazingSliding" and len(point.table()) == 1
+
+
+def test_fold_of_the_sticking_motion(sticking):
+    point = jb.refine(jb.Fold(), bkn(1.68), where=frequency_of, start=sticking)
+    assert int(point.status) == OK
+    assert float(point.value) == pytest.approx(1.683440572496, abs=1e-10)
+    assert point.cycle.multipliers == pytest.approx(np.array([1.0, 0.0]), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_period_doubling():
+    guess = (2.00853228736, -0.306478097835)
+    motion = jb.periodic(bkn(1.714), guess, periods=2)
+    point = jb.refine(jb.PeriodDoubling(), bkn(1.714), where=frequency_of, start=motion)
+    assert int(point.status) == OK
+    assert float(point.value) == pytest.approx(1.712981036227, abs=1e-10)
+    assert point.cycle.multipliers[0] == pytest.approx(-1.0, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_the_torus_point_is_where_the_area_is_kept():
+    def osc(velocity):
+        law = jb.Cubic(1.5, 1.5, 0.45)
+        return jb.Oscillator(0.0, (jb.Belt(velocity, law),), forcing=jb.Harmonic(0.05, 1.7))
+
+    point = jb.refine(jb.Torus(), osc, at=1.07, start=(1.4, 0.0))
+    assert int(point.status) == OK
+    belt = forced.Belt(float(point.value), ("cubic", 1.5, 1.5, 0.45))
+    engine = forced.Oscillator(0.0, (belt,), (forced.Harmonic(0.05, 1.7),))
+    _, multipliers = forced_cases.periodic(engine, np.asarray(point.cycle.start), 1)
+    assert np.abs(multipliers) == pytest.approx(1.0, abs=1e-8)
+
+
+# --- Den Hartog, 1931: one belt at rest, Coulomb friction -----------------------------------------
+
+ZETA, FRICTION, FORCE = 0.05, 0.4, 1.0
+
+
+def den_hartog(frequency):
+    return jb.Oscillator(
+        *(ZETA, (jb.Belt(0.0, jb.Coulomb(FRICTION, FRICTION)),)),
+        forcing=jb.Harmonic(FORCE, frequency),
+    )
+
+
+def closed_form(frequency):
+    """The motion without stops from its largest displacement X on, in closed form: X, the phase of
+    the force there, and (x1, x2) at a time less than half a period later."""
+    root = np.sqrt(1 - ZETA**2 / 4)
+    T = np.pi / frequency
+    e, c, s = np.exp(-ZETA * T / 2), np.cos(root * T), np.sin(root * T)
+    # x = f + e^(-zeta t/2) (A cos + B sin) + P cos(Omega t) + Q sin(Omega t), and -X after T.
+    half = ZETA / 2
+    matrix = [
+        [1.0, 0.0, -1.0, 0.0],
+        [-half, root, 0.0, frequency],
+        [e * c, e * s, 1.0, 0.0],
+        [e * (-half * c - root * s), e * (root * c - half * s), 0.0, -frequency],
+    ]
+    A, B, rest, Q = np.linalg.solve(matrix, [-FRICTION, 0.0, -FRICTION, 0.0])
+    response = 1 / complex(1 - frequency**2, ZETA * frequency)
+    P = np.sqrt((FORCE * abs(response)) ** 2 - Q**2)
+    phase = np.angle((P - 1j * Q) / response)
+
+    def state(t):
+        fades, angle = np.exp(-half * t), root * t
+        own = A * np.cos(angle) + B * np.sin(angle)
+        turned = -A * np.sin(angle) + B * np.cos(angle)
+        wave = P * np.cos(frequency * t) + Q * np.sin(frequency * t)
+        slope = frequency * (-P * np.sin(frequency * t) + Q * np.cos(frequency * t))
+        x1, x2 = FRICTION + fades * own + wave, fades * (root * turned - half * own) + slope
+        return np.array([x1, x2])
+
+    return rest + P, phase, state
+
+
+def start_of(frequency):
+    """Its state at the phase 0 of the force."""
+    _, phase, state = closed_form(frequency)
+    half = np.pi / frequency
+    since = (-phase / frequency) % (2 * half)
+    return state(since) if since < half else -state(since - half)
+
+
+def limit_without_stops():
+    """The frequency at which friction could just hold the mass where it turns back."""
+
+    def excess(frequency):
+        X, phase, _ = closed_form(frequency)
+        return abs(FORCE * np.cos(phase) - X) - FRICTION
+
+    return brentq(excess, 0.5, 0.6, xtol=1e-14)
+
+
+def test_den_hartog_without_stops():
+    motion = jb.find_cycle(den_hartog(0.6), (0.0, 0.0))
+    assert motion.periods == 1
+    assert motion.start == pytest.approx(start_of(0.6), abs=1e-10)
+    assert [kind.name for kind, _ in motion.signature] == ["CROSS", "CROSS"]
+
+
+@pytest.mark.slow
+def test_the_limit_without_stops_is_a_bifurcation():
+    limit = limit_without_stops()
+    osc = den_hartog(limit + 0.02)
+    kind = jb.CrossingSliding(0)
+    point = jb.refine(kind, osc, where=frequency_of, start=(0.0, 0.0))
+    assert int(point.status) == OK
+    assert float(point.value) == pytest.approx(limit, abs=1e-10)
+
+
+# --- exponents ------------------------------------------------------------------------------------
+
+
+def test_exponents_of_a_motion_that_sticks(sticking):
+    found = jb.lyapunov(bkn(1.68), (0.5, 0.0), periods=100, transient=200)
+    wanted = np.log(abs(sticking.multipliers[0])) / 2
+    assert float(found.per_period[0]) == pytest.approx(float(wanted), abs=1e-9)
+    assert found.per_period[1] == -np.inf and bool(found.sticks)
+    assert float(found.exponents[0]) == pytest.approx(wanted * 1.68 / (2 * np.pi), abs=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "frequency, start, wanted", [(1.69, (0.5, 0), 0.1277), (1.68, (2, -0.3), 0.1494)]
+)
+def test_exponents_of_chaos(frequency, start, wanted):
+    found = jb.lyapunov(bkn(frequency), start, periods=2000)
+    error = float(found.standard_errors[0]) * 2 * np.pi / frequency
+    # The wanted one is known to 1e-4.
+    assert abs(float(found.per_period[0]) - wanted) < 3 * error + 1e-4
+    assert found.exponents[1] == -np.inf
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+def test_what_is_for_forced_oscillators_says_so():
+    still = jb.presets.class_b(0.45, 0.35)
+    with pytest.raises(ValueError, match="osc must be with a clock: periodic is for"):
+        jb.periodic(still, (0.0, 0.0))
+    with pytest.raises(ValueError, match="osc must be with a clock: lyapunov is for"):
+        jb.lyapunov(still, (0.0, 0.0))
+    with pytest.raises(ValueError, match="osc must be with a clock: PeriodDoubling is for"):
+        jb.refine(jb.PeriodDoubling(), still, where=lambda o: o.belts[0].velocity)
+    with pytest.raises(ValueError, match="condition must be one for forced oscillators"):
+        jb.refine(jb.NonsmoothFold(0), bkn(1.7), where=frequency_of)
+    with pytest.raises(ValueError, match="periods must be at most 32, got 33"):
+        jb.periodic(bkn(1.7), (0.0, 0.0), periods=33)
+    forces = jb.Harmonic(0.1, 1.0), jb.Harmonic(0.1, 2**0.5)
+    law = jb.Cubic(1.5, 1.5, 0.45)
+    osc = jb.Oscillator(0.0, (jb.Belt(1.0, law),), forcing=forces)
+    with pytest.raises(ValueError, match="a period in common"):
+        jb.find_cycle(osc, (0.0, 0.0))
