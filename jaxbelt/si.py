@@ -30,7 +30,7 @@ from .model.equilibria import Equilibria
 from .model.friction import LawInUnits
 from .model.machine import Machine, Units
 from .model.modes import STUCK, mode_acceleration, mode_of, stick_rate
-from .model.oscillator import Oscillator, at_time, constant_force, value_at
+from .model.oscillator import Oscillator, at_time, constant_force, wave_at
 from .model.parameters import names_of
 from .motion.simulate import Trajectory
 from .results import EventKind, Status
@@ -337,7 +337,7 @@ def _check_belts(run: Trajectory, machine: Any) -> None:
         return
     stuck = np.asarray(run.modes) == STUCK
     for belt, held in enumerate(stuck.T):
-        velocity = np.asarray(value_at(osc.belts[belt].velocity, run.ts))
+        velocity = np.asarray(wave_at(osc.belts[belt].velocity, run.ts))
         own, its = np.broadcast_to(velocity, held.shape)[held], np.asarray(run.ys)[held, 1]
         fits = np.allclose(its, own, rtol=SAME_MACHINE, atol=SAME_MACHINE)
         if not fits:

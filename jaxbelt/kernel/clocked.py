@@ -4,7 +4,8 @@ Beside `step`, `events` and `rounds`, which are for oscillators without a clock,
 Where x2' = 0 the next derivative is not -x2, boundaries may move, and stick phases are not over in
 closed form. So a step asks each guard of its mode by its control points, see `control_points`,
 whether it may vanish; and a mass that sticks is stepped as well, its stages on the belt's course,
-where their x2' is the force that the belts have to hold.
+where their x2' is the force that the belts have to hold. A step has the derivatives of the motion
+at a fixed time; those of events are not in it.
 
 The guards are numbered as in `instants.guards_at`. Of boundaries and edges the values and slopes at
 both ends of a step and the integral are known, as in `step`: these make a polynomial. What stuck
@@ -25,7 +26,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..model.instants import (
-    begun,
+    begun_at,
     blur,
     is_held_for_ever,
     on_guard_at,
@@ -108,7 +109,7 @@ def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0=0.0) -> Lanes:
 
     def start(osc, x1, x2, t):
         y = x1, x2, t
-        mode, focus = begun(osc, y)
+        mode, focus = begun_at(osc, y)
         mode = Mode(tuple(code + jnp.zeros(()) for code in mode.codes))
         return mode, focus & jnp.asarray(True), is_held_for_ever(osc, mode, y)
 
@@ -232,6 +233,15 @@ def _attempt(osc, clock: StepClock, window: Window, lanes: Lanes, rtol, atol, ra
     rate = jnp.where(stuck, _stick_rate(end, mode), stages[-1])
     needed = [stages[i] for i in (0, *STAGES)]
     return _Attempt(h, y1, y2, stages[-1], rate, lax.stop_gradient(error), integrals, needed)
+
+
+def flown(osc, window: Window, ones: Array, lanes: Lanes, h: Array, x1: Array, x2: Array):
+    """The states (x1, x2) that a step of size h leads to from those of the arguments."""
+    a = needed_or_rate(osc, lanes.mode, lanes.t, x1, x2)
+    lanes = replace(lanes, x1=x1, x2=x2, a=a)
+    clock = StepClock.of(osc, ones, lanes.t, h)
+    new = _attempt(osc, clock, window, lanes, jnp.ones(()), jnp.ones(()), None)
+    return new.x1, new.x2
 
 
 def _moves(now: Oscillator) -> bool:
@@ -440,7 +450,7 @@ def take_step(
     outcome = materialise(jnp.where(lands, 2.0, outcome), ones)
     shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
     theta = materialise(theta, ones)
-    delta = materialise(jnp.where(lands, delta, 0.0), ones)
+    delta = lax.stop_gradient(materialise(jnp.where(lands, delta, 0.0), ones))
     x1 = new.x1 + delta * (new.x2 + 0.5 * delta * new.rate)
     x2 = new.x2 + delta * new.rate
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)

@@ -35,7 +35,7 @@ from ..checks import (
 )
 
 
-def _scalar(name: str) -> Callable[[Any], Array]:
+def _number_named(name: str) -> Callable[[Any], Array]:
     return lambda value: as_array(value, name)
 
 
@@ -148,7 +148,7 @@ class ForceInUnits(AbstractForce):
 class ConstantForce(AbstractForce):
     """A constant force, as of an incline: a `Harmonic` with the frequency 0. No clock."""
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
+    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
 
     @property
     def frequency(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -180,9 +180,9 @@ class Harmonic(AbstractForce):
         ValueError: If an argument is impossible; the message names it.
     """
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_scalar("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_scalar("phase"), default=0.0)
+    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
+    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
 
     def __check_init__(self):
         self.check("Harmonic")
@@ -220,9 +220,9 @@ class BaseMotion(AbstractForce):
         ValueError: If an argument is impossible; the message names it.
     """
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_scalar("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_scalar("phase"), default=0.0)
+    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
+    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
 
     def __check_init__(self):
         self.check("BaseMotion")
@@ -260,10 +260,10 @@ class Oscillating(_Wave):
         ValueError: If an argument is impossible; the message names it.
     """
 
-    mean: Float[Array, ""] = eqx.field(converter=_scalar("mean"))
-    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_scalar("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_scalar("phase"), default=0.0)
+    mean: Float[Array, ""] = eqx.field(converter=_number_named("mean"))
+    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
+    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
 
     def __check_init__(self):
         self.check("Oscillating")
@@ -370,13 +370,13 @@ def _without_frequency(force: AbstractForce) -> AbstractForce:
 
 
 #: Users' forces whose `force` was traced.
-_traced: set[type] = set()
+_traced_forces: set[type] = set()
 
 
 def _check_force(force: AbstractForce) -> None:
     """Raises a `ValueError` if a user's `force` cannot be traced, once for each class."""
     kind = type(force)
-    if kind.__module__ == __name__ or kind in _traced:
+    if kind.__module__ == __name__ or kind in _traced_forces:
         return
     frequency = getattr(force, "frequency", None)
     fits = eqx.is_array(frequency) or isinstance(frequency, float | int)
@@ -388,4 +388,4 @@ def _check_force(force: AbstractForce) -> None:
 
     found = traceable(at_a_time, f"force of {kind.__name__}", "a function of the time")
     require_one_float(found, f"force of {kind.__name__}", "a function that returns one float64")
-    _traced.add(kind)
+    _traced_forces.add(kind)

@@ -187,7 +187,7 @@ class Machine(eqx.Module):
     @property
     def units(self) -> Units:
         """One unit of each dimensionless quantity, in SI units."""
-        largest = jnp.max(jnp.stack([_largest(belt.normal_force) for belt in self.belts]))
+        largest = jnp.max(jnp.stack([_largest_force(belt.normal_force) for belt in self.belts]))
         # Without any force on a belt there is no natural length.
         length = jnp.where(largest > 0, largest / self.stiffness, 1.0)
         time, force = jnp.sqrt(self.mass / self.stiffness), self.stiffness * length
@@ -283,7 +283,7 @@ def _forcing_text(forcing: tuple[AbstractForce, ...]) -> str:
     return f", forcing=({', '.join(map(repr, forcing))},)" if forcing else ""
 
 
-def _largest(normal_force: Any) -> Array:
+def _largest_force(normal_force: Any) -> Array:
     if isinstance(normal_force, Oscillating):
         return normal_force.mean + jnp.abs(normal_force.amplitude)
     return normal_force

@@ -17,7 +17,7 @@ velocity or load oscillates, stand in `forcing`. The paper's symbols, and ours:
 | sigma0, sigma1 | `Belt.lower`, `Belt.upper` | interval of x1 in which a belt touches |
 | mus, p1, p2, p3 | `Conti.static, residual, quadratic, steepness` | eqs. (7), (16) |
 
-What happens where the field is not smooth is told in `modes`.
+What happens where the field is not smooth is defined in `modes`.
 
 An oscillator that knows the time, see `has_clock`, has no field of (x1, x2) alone. At an instant it
 is one without a clock, with a constant force and belts of constant velocity and load: `at_time`
@@ -287,7 +287,7 @@ def fastest(osc: Oscillator) -> Array:
     return functools.reduce(jnp.maximum, map(jnp.abs, forces + waves), jnp.ones(()))
 
 
-def value_at(wave: Any, t: Array) -> Any:
+def wave_at(wave: Any, t: Array) -> Any:
     """A velocity or a load at the time t."""
     return wave.value(t) if isinstance(wave, Oscillating) else wave
 
@@ -316,8 +316,8 @@ def _belt_at(belt: Belt, t: Array) -> Belt:
     moves = isinstance(belt.velocity, Oscillating)
     made = object.__new__(MovingBelt if moves else Belt)
     fields = vars(belt) | {
-        "velocity": value_at(belt.velocity, t),
-        "load": value_at(belt.load, t),
+        "velocity": wave_at(belt.velocity, t),
+        "load": wave_at(belt.load, t),
     }
     if moves:
         fields["rate"] = belt.velocity.rate(t)

@@ -63,7 +63,7 @@ class Sensitivity(eqx.Module):
         return jax.tree.map(lambda slopes: slopes @ inputs, self)
 
 
-def _carried(osc: Oscillator, arc: Arc, end: State, y: State, since: Array) -> State:
+def _state_since(osc: Oscillator, arc: Arc, end: State, y: State, since: Array) -> State:
     """The state a time after the entry y, in the mode of an arc, near its end.
 
     end: as `_flown_again` gives it.
@@ -112,7 +112,7 @@ def _passed(osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array) -
 
 
 def _timed_end(osc: Oscillator, arc: Arc, end: State, y: State) -> TimedState:
-    """With a clock: the end of an arc, stuck or not, see `_carried`."""
+    """With a clock: the end of an arc, stuck or not, see `_state_since`."""
     x1, x2, t = select(arc.mode.any_stuck, carried(osc, arc.mode, _timed(y), arc.duration), end)
     return x1, x2, t
 
@@ -169,7 +169,7 @@ def split(osc: Oscillator, slopes) -> tuple[Oscillator, Oscillator]:
     return eqx.partition(osc, moves)
 
 
-def columns_of(states: Array) -> State:
+def parts_of_states(states: Array) -> State:
     """The parts of states, [rows, parts]."""
     return tuple(states[:, i] for i in range(states.shape[1]))
 
@@ -397,8 +397,8 @@ def _slopes_of_samples(by_run, varied, rest, starts: Array, since: Array, codes:
         known = ~jnp.isnan(since)
         never = jnp.zeros_like(known)
         arcs = Arc(
-            entry=columns_of(starts),
-            end=columns_of(ends),
+            entry=parts_of_states(starts),
+            end=parts_of_states(ends),
             codes=codes,
             duration=since,
             ended_by=jnp.full(since.shape, -1),
@@ -409,7 +409,7 @@ def _slopes_of_samples(by_run, varied, rest, starts: Array, since: Array, codes:
             again=jnp.zeros(since.shape, int),
         )
 
-        slopes = slopes_of(_carried, by_run, varied, rest, run, arcs, since, known)
+        slopes = slopes_of(_state_since, by_run, varied, rest, run, arcs, since, known)
         return jnp.where(known[:, None, None], jnp.stack(slopes, axis=1), 0.0)
 
     slopes = lax.map(of_chunk, tuple(map(chunks, (run, starts, since, codes, ends))))
