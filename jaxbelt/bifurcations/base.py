@@ -39,6 +39,7 @@ from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
+from .beside import Side
 from .labels import AttractingCycle, Label
 from .special import SpecialPoint, Trail
 from .systems import (
@@ -340,7 +341,8 @@ class BifurcationPoint(eqx.Module):
 
     Attributes:
         condition: The condition that holds there.
-        value: Value of the parameter; NaN where the status is not OK.
+        value: Value of the parameter; NaN where the status is not OK, unless only the kind is
+            unknown.
         residual: Largest error in the defining equations.
         iterations: Number of Newton steps.
         steps: Lengths of the Newton steps, NaN padded.
@@ -354,6 +356,8 @@ class BifurcationPoint(eqx.Module):
             has shrunk to the equilibrium, at `SuddenSliding` its period is infinite).
         status: A `Status` code.
         member: Number of the state of rest, as its condition counts them.
+        sides: Where something changes that no condition explains, what there is below the value and
+            above it, two of `Side`; else ().
     """
 
     condition: AbstractCondition = eqx.field(static=True)
@@ -368,6 +372,7 @@ class BifurcationPoint(eqx.Module):
     cycle: Cycle
     status: Array
     member: ArrayLike = 0
+    sides: tuple[Side, ...] = ()
 
     @property
     def _own(self) -> "BifurcationPoint":
@@ -473,7 +478,10 @@ class BifurcationPoint(eqx.Module):
             return f"BifurcationPoint({self.condition!r}, value={self.value.shape})"
         if int(self.status) != Status.OK:
             name, advice = Status(int(self.status)).name, describe(self.status)
-            if "jb.scan" not in advice:
+            if self.sides:
+                below, above = self.sides
+                advice = f"{advice} Below, {below!r}; above, {above!r}."
+            elif "jb.scan" not in advice:
                 advice += " Every bifurcation point in an interval is found by jb.scan."
             # Where only the kind is unknown, the place is known up to `error`.
             value, error = f"value {number(self.value)}", float(self.error)
@@ -494,12 +502,26 @@ def given_point(point: BifurcationPoint, variation: Variation) -> BifurcationPoi
     given, length, (unit,), _ = variation.units
     value = point.value * unit
     osc = given.oscillator(np.asarray(value)[None] if is_concrete(value) else value[None])
-    found = rescaled(point, length, lambda _: osc)
-    return replace(found, value=value, error=point.error * unit)
+    found = rescaled(replace(point, sides=()), length, lambda _: osc)
+    sides = tuple(_given_side(side, variation) for side in point.sides)
+    return replace(found, value=value, error=point.error * unit, sides=sides)
+
+
+def _given_side(side: Side, variation: Variation) -> Side:
+    given, length, (unit,), _ = variation.own
+    value = side.value * unit
+    osc = given.oscillator(np.asarray(value)[None])
+    return replace(rescaled(side, length, lambda _: osc), value=value)
 
 
 class Unexplained(AbstractCondition):
-    """A change of the motion that no other condition explains; from `scan` only."""
+    """What the oscillator does changes, and no other condition explains it; from `scan` only.
+
+    The point's `sides` say what there is below its value and above, and how far the branches that
+    end there are from one another, see `Side`. Under a law that falls within a hundredth of the
+    belt's velocity the end of stick-slip is such a point: the fold in which a sticking cycle ends
+    is squeezed together with a canard.
+    """
 
     caption: ClassVar[str] = "unexplained"
 

@@ -107,6 +107,8 @@ class ParameterPath:
         self.labels: dict[float, Label] = {}
         self.cycles: dict[float, list[AttractingCycle]] = {}
         self.unstable_cycles: dict[tuple[float, int], Cycle] = {}
+        #: How often Newton's method was begun for a point of it.
+        self.attempts = 0
         self._searched: set[tuple[float, int]] = set()
         # From one value to another: for each cycle that does not stick the one that it continues
         # to, or None.

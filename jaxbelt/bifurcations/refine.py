@@ -24,7 +24,7 @@ from ..results import Status
 from .base import AbstractCondition, BifurcationPoint, given_point
 from .forced import forced_point
 from .path import ParameterPath
-from .scan import search
+from .scan import MOST_ATTEMPTS, search
 
 #: Points found in two ways count as one if they are no farther apart.
 SAME_POINT = 1e-9
@@ -92,7 +92,8 @@ def refine(
 
     Returns:
         The `BifurcationPoint`. Without a point near the guess its status says why, and its value is
-        NaN.
+        NaN; where something changes nearby that no condition explains, `sides` says what there is
+        below and above.
 
     Raises:
         ValueError: If an argument is impossible; the message names it.
@@ -121,6 +122,7 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
     is_direct = bool(np.asarray(point.steps)[0] <= SHORT_STEP) and not condition.has_several
     if away <= unit * (QUITE_NEAR if is_direct else BESIDE_OTHERS):
         return point
+    attempts, unexplained = 0, []
     for reach in (unit * each for each in REACHES):
         ends = (guess + side * min(reach, away) for side in (-1, 1))
         first, last = (_possible(variation, guess, end) for end in ends)
@@ -128,8 +130,11 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
             break
         path = ParameterPath(variation, None, (first, last), [condition])
         # From farther off than in `scan`, as these paths are short.
-        found = search(path, INTERVALS, near=1.0)
-        found = [one for one in found if int(one.status) == Status.OK]
+        path.attempts = attempts
+        searched = search(path, INTERVALS, near=1.0, known=unexplained)
+        attempts = path.attempts
+        unexplained += [one for one in searched if int(one.status) == Status.UNEXPLAINED]
+        found = [one for one in searched if int(one.status) == Status.OK]
         # The search may report a point as one of another kind, too; or two are so near to each
         # other that it reports one of them; or it is of one of two belts with one velocity.
         values = [
@@ -149,8 +154,11 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
             nearest = _more_exact(nearest, condition, variation, unit)
             is_nearer = _away(nearest, guess) < away - unit * SAME_POINT
             return replace(nearest, condition=condition) if is_nearer else point
-        if away <= reach:
+        if away <= reach or attempts > MOST_ATTEMPTS:
             break
+    if int(point.status) != Status.OK and unexplained:
+        nearest = min(unexplained, key=lambda one: abs(float(one.value) - guess))
+        return replace(point, sides=nearest.sides)
     return point
 
 

@@ -12,6 +12,7 @@ found in the same way from its signature, see `edges_touched`.
 """
 
 import functools
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, islice, pairwise, takewhile
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..activity import announced, note_progress
-from ..checks import as_whole, outside_of_traces
+from ..checks import as_whole, number, outside_of_traces
 from ..cycles.attractors import SAME_CYCLE, distance, is_same, itinerary, place_of
 from ..cycles.chains import blank_loop
 from ..cycles.cycle import as_loop, warn_of_extrapolation
@@ -36,6 +37,7 @@ from .base import (
     given_point,
     point_without_cycle,
 )
+from .beside import sides_of
 from .conditions import AbstractCycleCondition
 from .connections import SaddleConnection
 from .crossings import CrossingSliding, SlidingExchange
@@ -65,6 +67,9 @@ LOOKED_FOR: tuple[type[AbstractCondition], ...] = (
     SaddleConnection,
     HopfAtInfinity,
 )
+#: How often Newton's method is begun in one search, at most. The paper's path takes 26 attempts, a
+#: point that stays unexplained 130; one takes some 10 ms.
+MOST_ATTEMPTS = 2000
 #: Intervals narrower than this fraction of the span are good guesses for Newton's method. On the
 #: paper's path 1/100 finds the same points as fast, 1/1600 in a third more time.
 NEAR = 1 / 400
@@ -89,7 +94,11 @@ def scan(
     Bifurcations at contact edges are searched where there are any; points where only an unstable
     cycle touches them are in `bifurcation_diagram`, as the attractors stay the same. Where
     something changes and no condition explains it, there is a point of kind `Unexplained`, with the
-    status UNEXPLAINED and the value where it happens, good to about 1e-9 of the span. A condition
+    status UNEXPLAINED and the value where it happens, good to about 1e-9 of the span; its `sides`
+    say what there is below and above, and how far apart the branches end. A search ends, with a
+    warning, when it has begun Newton's method two thousand times: the intervals that it did not
+    look into are points of kind `Unexplained` with the status INCOMPLETE; their values and errors
+    are the middles and half the lengths of these. A condition
     that holds all along, as where an edge moves with an equilibrium, is reported once, with the
     status DEGENERATE; its value and error are the middle and half the length of the range where it
     holds, and changes there that Newton's method does not find at once are not reported.
@@ -122,15 +131,17 @@ def search(
     resolution: int = 96,
     near: float = NEAR,
     ahead: Sequence[Callable[[], Any]] = (),
+    known: Sequence[BifurcationPoint] = (),
 ) -> tuple[BifurcationPoint, ...]:
     """Every bifurcation point on a path, in order; the path keeps its labels.
 
     near: points are solved for from the ends of intervals narrower than this fraction of the path.
     ahead: calls for the programs that are needed afterwards, see `compiled_beside`.
+    known: unexplained points of another path, which are not searched once more.
     """
     calls = chain(_calls_ahead(path), ahead)
     with compiled_beside(f"path {len(ahead)}", path.at(path.first), calls):
-        return _searched(path, resolution, near)
+        return _searched(path, resolution, near, known)
 
 
 def _calls_ahead(path: ParameterPath) -> Iterator[Callable[[], Any]]:
@@ -150,7 +161,9 @@ def _calls_ahead(path: ParameterPath) -> Iterator[Callable[[], Any]]:
         yield functools.partial(condition.point_from, path.variation, at, beginning)
 
 
-def _searched(path: ParameterPath, resolution: int, near: float) -> tuple[BifurcationPoint, ...]:
+def _searched(
+    path: ParameterPath, resolution: int, near: float, known: Sequence[BifurcationPoint]
+) -> tuple[BifurcationPoint, ...]:
     points = [point for at in path.breaks for point in _at_break(path, at)]
     first, last = path.inside(path.first), path.inside(path.last)
     ends = [first, *(v for at in path.breaks for v in path.beside(at)), last]
@@ -161,7 +174,13 @@ def _searched(path: ParameterPath, resolution: int, near: float) -> tuple[Bifurc
             stretches.append(np.linspace(a, b, 1 + max(1, round((b - a) / width))))
     path.find_labels(np.concatenate(stretches))
     explained = [path.beside(at) for at in path.breaks]
+    explained += [path.beside(float(point.value)) for point in known]
+    for point in known:
+        path.find_labels(path.beside(float(point.value)))
     while intervals := path.changes(explained):
+        if path.attempts > MOST_ATTEMPTS:
+            points += _left(path, intervals)
+            break
         note_progress(f"{len(path.labels)} values seen, {len(points)} points found")
         values: list[float] = []
         again: list[float] = []
@@ -181,7 +200,7 @@ def _searched(path: ParameterPath, resolution: int, near: float) -> tuple[Bifurc
             elif b - a <= 1e-9 * path.length and not path.is_fine(a, b):
                 again.append(0.5 * (a + b))
             elif b - a <= 1e-9 * path.length:
-                points.append(_unsolved_point(path, 0.5 * (a + b), b - a))
+                points.append(_unexplained(path, a, b))
                 explained.append((a, b))
             else:
                 values += np.linspace(a, b, 3 if is_narrow else 9).tolist()
@@ -189,6 +208,20 @@ def _searched(path: ParameterPath, resolution: int, near: float) -> tuple[Bifurc
         for value in again:
             path.find_labels_finely(value, NEAR * path.length)
     return by_value(points)
+
+
+def _left(path: ParameterPath, intervals: Sequence[tuple[float, float]]) -> list[BifurcationPoint]:
+    """Points for intervals that were not looked into, and a warning that says so."""
+    unit = 1.0 if path.variation.units is None else float(path.variation.own.parameters[0])
+    where = ", ".join(f"{number(a * unit)} to {number(b * unit)}" for a, b in intervals)
+    warnings.warn(
+        f"the search was left after {path.attempts} attempts of Newton's method; something changes "
+        f"that was not looked into in {where}: see the points with the status INCOMPLETE, or ask "
+        "of a shorter span",
+        stacklevel=5,
+    )
+    middles = [(0.5 * (a + b), 0.5 * (b - a)) for a, b in intervals]
+    return [_unsolved_point(path, *one, why=Status.INCOMPLETE) for one in middles]
 
 
 def is_at_one_value(point: BifurcationPoint, other: BifurcationPoint) -> bool:
@@ -238,6 +271,9 @@ def edges_touched(
 
     points, intervals = [], changes(values)
     while intervals:
+        if path.attempts > MOST_ATTEMPTS:
+            points += _left(path, intervals)
+            break
         a, b = intervals.pop()
         solved = (
             condition.named_point_from(path.variation, value, loop)
@@ -246,6 +282,7 @@ def edges_touched(
             for kind in LOOKED_FOR
             for condition in kind.of_unstable_cycles(path.edged)
         )
+        path.attempts += 1
         points_inside = (point for point in solved if point is not None and a < point.value < b)
         point = next(points_inside, None)
         middle = 0.5 * (a + b)
@@ -368,6 +405,7 @@ def _all_found(
     low, high = (path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]) if slow else (a, b)
     for value in condition.values(a, b):
         for one in condition.beginnings(path.at(value), path.cycles.get(value, [])):
+            path.attempts += 1
             point = condition.named_point_from(path.variation, value, one)
             if point is not None and _is_inside(low, high, point):
                 yield point
@@ -394,7 +432,8 @@ def _at_break(path: ParameterPath, value: float) -> list[BifurcationPoint]:
     if not points and not labels[0].is_as(labels[1]):
         # Something else may happen exactly there.
         point = _explained(path, *interval)
-        points = [point or _unsolved_point(path, value, 0.0)]
+        told = replace(_unexplained(path, *interval), value=jnp.asarray(value), error=jnp.zeros(()))
+        points = [point or told]
     return points
 
 
@@ -437,6 +476,16 @@ def _holds_along(path: ParameterPath, value: float, condition: AbstractCondition
     beginnings = condition.beginnings(path.at(value), path.cycles[value])
     points = (condition.point_from(path.variation, value, one) for one in beginnings)
     return any(int(point.status) == Status.DEGENERATE for point in points)
+
+
+def _unexplained(path: ParameterPath, a: float, b: float) -> BifurcationPoint:
+    """A point between two values close together, and what there is below and above."""
+    # As far off as labels are told apart: nearer to the point no cycle may be solved for.
+    before, after = path.beside(0.5 * (a + b))
+    ends = max(before, path.inside(path.first)), min(after, path.inside(path.last))
+    path.find_labels(ends)
+    oscs, cycles = (tuple(map(of, ends)) for of in (path.at, path.cycles.__getitem__))
+    return replace(_unsolved_point(path, 0.5 * (a + b), b - a), sides=sides_of(ends, oscs, cycles))
 
 
 def _unsolved_point(

@@ -53,6 +53,9 @@ from .chains import Chain, Loop, following_codes
 
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 ARC_STEPS = 8
+#: Meshes of more steps than this are laid along a march of steps of this stride over the `density`,
+#: so many at most: those of other ones along even steps, of which some may jump a thin layer.
+EVEN_STEPS, MESH_STRIDE, MESH_MARCH = 32, 0.3, 20_000
 #: An arc of a shorter duration may have none: it is the square root of rounding.
 LASTS = 1e-6
 #: An arc magnifies if its end moves so much faster than its entry.
@@ -120,6 +123,8 @@ def _meshes(steps: int) -> Callable:
 def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
     """Steps as fractions of the duration, [steps], each with about the same share of the
     density."""
+    if steps > EVEN_STEPS:
+        return _marched_mesh(osc, steps, codes, y, duration)
     n = 24
 
     def march():
@@ -138,6 +143,41 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
         jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
     )
     return jnp.diff(grid)
+
+
+def _marched_mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
+    """The same, by as many steps along the arc as its density wants."""
+    even = jnp.linspace(0.0, 1.0, steps + 1)
+
+    def march(total):
+        """The share of the whole duration; and the times of even shares of `total`."""
+
+        def unfinished(carry):
+            number, _, _, left, _, _ = carry
+            return (number < MESH_MARCH) & any_lane(left > 0)
+
+        def advance(carry):
+            number, y, rho, left, share, grid = carry
+            # The last step that there is room for goes to the end.
+            wanted = jnp.where(number < MESH_MARCH - 1, MESH_STRIDE / rho, left)
+            h = jnp.minimum(wanted, left)
+            y, after = coarse_step(osc, codes, y, h)
+            after = jnp.maximum(jnp.nan_to_num(after, nan=1.0), 1.0)
+            more, passed = 0.5 * h * (rho + after), duration - left
+            behind = even * total - share
+            inside = (behind >= 0) & (behind <= more)
+            grid = jnp.where(inside, passed + h * behind / jnp.where(more > 0, more, 1.0), grid)
+            return number + 1, y, after, left - h, share + more, grid
+
+        at = jnp.maximum(density(osc, mode_of(codes), *y), 1.0)
+        start = jnp.asarray(0), y, at, duration, jnp.zeros(()), jnp.zeros(steps + 1)
+        *_, share, grid = lax.while_loop(unfinished, advance, start)
+        return share, grid
+
+    # Stick phases, and what pads a chain, take no steps.
+    _, grid = march(march(jnp.ones(()))[0])
+    grid = grid.at[-1].set(duration) / jnp.where(duration == 0, 1.0, duration)
+    return jnp.diff(jnp.where(duration == 0, even, grid))
 
 
 @lanes_in_one_kernel
