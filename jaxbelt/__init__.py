@@ -25,13 +25,13 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     cycles/         attractors functionals
     cycles/         backwards returns separatrices portrait unstable
     cycles/         outlines nearest sides shocks
-    sweeps/         observers moments along reducers attractor queue threads audit
+    sweeps/         observers moments along reducers attractor exponents queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     sweeps/         fractions orbit_diagram
     bifurcations/   special labels systems guesses base conditions forced tangencies crossings
     bifurcations/   rests
     bifurcations/   edge_rests edges folds meetings connections infinity path scan refine tracks
-    bifurcations/   curves cells faces bounds regions diagrams switch_folds
+    bifurcations/   curves cells faces bounds regions branches diagrams switch_folds
     inverse/        selection record search fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits

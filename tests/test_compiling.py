@@ -85,10 +85,12 @@ SAME_PROGRAM = {
 CLASS_B, OTHER = jb.presets.class_b(0.45, 0.35), jb.presets.class_b(0.41, 0.3)
 
 
+ALONG_NU0 = functools.partial(jb.presets.class_b, nu1=0.35)
+
+
 def swept(count, y0):
     axes = {"nu0": np.linspace(0.1, 0.1 * count, count)}
-    make = functools.partial(jb.presets.class_b, nu1=0.35)
-    return jb.sweep(make, axes, y0=y0, t1=20.0 + count, observe="final")
+    return jb.sweep(ALONG_NU0, axes, y0=y0, t1=20.0 + count, observe="final")
 
 
 @pytest.mark.parametrize("name", SAME_PROGRAM)

@@ -106,6 +106,15 @@ def test_at_follows_a_motion_to_other_oscillators(sticking):
     assert moved[2] == pytest.approx(np.asarray(other.start), abs=1e-10)
 
 
+def test_no_number_depends_on_the_unit_of_length(sticking):
+    law = jb.Cubic(1.5, 1.5 / 4, 0.45 / 64)
+    belt, force = jb.Belt(4.0, law, 4.0), jb.Harmonic(0.4, 1.68)
+    motion = jb.find_cycle(jb.Oscillator(0.0, (belt,), forcing=force), (2.0, 0.0))
+    np.testing.assert_array_equal(motion.start, 4 * sticking.start)
+    np.testing.assert_array_equal(motion.multipliers, sticking.multipliers)
+    np.testing.assert_array_equal(motion.stick_durations, sticking.stick_durations)
+
+
 def test_grazing_of_the_motion_of_four_periods(smooth):
     point = jb.refine(jb.GrazingSliding(0), bkn(1.7079), where=frequency_of, start=smooth)
     assert int(point.status) == OK
@@ -222,6 +231,20 @@ def test_the_limit_without_stops_is_a_bifurcation():
     point = jb.refine(kind, osc, where=frequency_of, start=(0.0, 0.0))
     assert int(point.status) == OK
     assert float(point.value) == pytest.approx(limit, abs=1e-10)
+
+
+# --- branches ---------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_branch_with_its_points(sticking):
+    """From the sticking motion to the fold and back on the unstable motion that it meets there."""
+    diagram = jb.bifurcation_diagram(bkn(1.68), frequency_of, (1.675, 1.69), start=sticking)
+    folds = [point for point in diagram.points if point.kind == "Fold"]
+    assert [float(one.value) for one in folds] == pytest.approx([1.683440572496], abs=1e-10)
+    (branch,) = diagram.branches
+    assert branch.values.max() < 1.683440573
+    assert np.any(branch.stable) and np.any(~branch.stable)
 
 
 # --- exponents ------------------------------------------------------------------------------------

@@ -17,6 +17,8 @@ from matplotlib.colors import to_hex
 import jaxbelt as jb
 from jaxbelt.commands.map import cells_along, write_cells
 from jaxbelt.cycles.chains import Loop
+from jaxbelt.cycles.clocked import TimedChain
+from jaxbelt.motion.arcs import Ends
 from jaxbelt.numerics.continuation import Stop
 from jaxbelt.numerics.spacing import evenly_spaced
 from jaxbelt.plotting.categories import COLOURS, _colour_of_kind
@@ -44,6 +46,15 @@ RESULTS = [one for one in PUBLIC if inspect.isclass(one) and one not in NO_RESUL
 
 def nu0(osc):
     return osc.belts[0].velocity
+
+
+def forced_motion() -> jb.PeriodicMotion:
+    """A motion of one arc, made up."""
+    osc = jb.Oscillator(0.1, (jb.Belt(1.0, jb.Coulomb(0.1, 0.1)),), forcing=jb.Harmonic(0.1, 1.0))
+    ends = jnp.array([Ends(1).period])
+    chain = TimedChain(jnp.ones((1, 1)), ends, jnp.full((1, 8), 1 / 8), turns=1)
+    z, zero = jnp.array([[0.5, 0.0, 0.0, 2 * np.pi]]), jnp.zeros((), int)
+    return jb.PeriodicMotion(osc, chain, z, jnp.zeros(2, complex), jnp.zeros(()), zero, zero)
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +112,8 @@ def results() -> dict[type, Any]:
             *("belts[0].velocity", None),
         ),
         jb.Explanation(4096, 4, 300_000, 1.5, 0.1),
+        forced_motion(),
+        jb.Exponents(two, two, two, 100, zero, two, run.status),
         jb.Verified((0, 1, 3), (4,), (2,), False),
     ]
     return {type(one): one for one in found}
@@ -130,9 +143,11 @@ TABLES = {
     jb.Equilibria: (1, "kind stable x1 x1_lower x1_upper rate frequency contact_0"),
     jb.Events: (None, "t x1 x2 kind belt"),
     jb.Explanation: (1, "runs blocks bytes compile_seconds seconds"),
+    jb.Exponents: (2, "exponent per_period standard_error status"),
     jb.FatalShock: (1, "attractor direction distance x1 shock_x2 boundary beyond status"),
     jb.Fit: (3, "name estimate standard_error lower upper"),
     jb.OrbitDiagram: (3, "value start kind period x1 x2"),
+    jb.PeriodicMotion: (1, "stable periods period x1 multiplier_0 stick_duration_0 signature"),
     jb.Portrait: (4, "what number kind stable x1_min period multiplier rate"),
     jb.RegionMap: (6, "curve condition belts nu0 nu1 multiplier residual special"),
     jb.Separatrix: (5, "t x1 x2"),

@@ -135,6 +135,9 @@ class CrossingSliding(AbstractStickCondition):
         return [cls(belt) for belt in (one - other) + (other - one)]
 
 
+TimedCrossing.public = CrossingSliding
+
+
 class Arrival(eqx.Module):
     """An arc that arrives at a boundary.
 

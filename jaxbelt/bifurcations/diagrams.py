@@ -21,20 +21,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..activity import announced, note_progress
-from ..checks import as_whole, outside_of_traces, require
+from ..checks import as_whole, outside_of_traces, require, require_value
 from ..cycles.attractors import MAYBE_SAME, MOMENT, distance
 from ..cycles.chains import Loop, cut
+from ..cycles.clocked import turns_of
 from ..cycles.cycle import Cycle, exactly, polish, warn_of_fast_loops
+from ..cycles.periodic import PeriodicMotion
 from ..cycles.unstable import from_starts
 from ..model.equilibria import candidates
 from ..model.events import signature_name
-from ..model.oscillator import Oscillator
-from ..model.own_units import quantity, rescaled
+from ..model.oscillator import Oscillator, has_clock
+from ..model.own_units import in_own_units, quantity, rescaled
+from ..model.parameters import leaf_index
+from ..model.variations import Variation, as_span, varied
 from ..numerics.compiling import jit
 from ..results import Status, draw
 from ..tables import per_belt, table_of
 from .base import BifurcationPoint, given_point
+from .branches import Row, forced_branches
 from .cells import in_plane_of_paper, region_name
+from .forced import motions_to_begin_from, place_of_motion
 from .labels import Label
 from .path import ParameterPath
 from .scan import by_value, edges_touched, is_at_one_value, search
@@ -64,7 +70,8 @@ class Branch(eqx.Module):
         stick_durations: Time stuck to each belt in one loop, [rows, belts]; NaN where a cycle does
             not stick to that belt.
         stick_velocities: Velocity of the belt over omega, likewise.
-        cycles: A `Cycle` for each row; none for equilibria.
+        cycles: A `Cycle` for each row; none for equilibria. For forced oscillators a
+            `PeriodicMotion` for each row; `multiplier` is then the real part of the larger one.
     """
 
     kind: str = eqx.field(static=True)
@@ -79,7 +86,7 @@ class Branch(eqx.Module):
     multiplier: np.ndarray
     stick_durations: np.ndarray
     stick_velocities: np.ndarray = eqx.field(metadata=quantity("velocity"))
-    cycles: tuple[Cycle, ...]
+    cycles: tuple[Any, ...]
 
     @property
     def amplitude(self) -> np.ndarray:
@@ -214,6 +221,7 @@ def bifurcation_diagram(
     where: Callable[[Oscillator], Any] | None = None,
     span: tuple[float, float] | None = None,
     *,
+    start: Any = None,
     rows: int = 160,
     resolution: int = 96,
 ) -> BifurcationDiagram:
@@ -225,6 +233,11 @@ def bifurcation_diagram(
         span: First and last value of the parameter.
         rows: Approximate number of values of the parameter.
         resolution: As for `scan`, which finds the special points.
+        start: For a forced oscillator only, whose diagram is the branch of one periodic motion,
+            stable and unstable, with the points on it, and the branches that leave it at period
+            doublings (rows and resolution do not count): that motion, or a start (x1, x2) at t = 0
+            that leads to it with the parameter in the middle of the span; None: from where one is
+            found. A branch ends where no motion is found beyond a point.
 
     Returns:
         The `BifurcationDiagram`.
@@ -233,6 +246,9 @@ def bifurcation_diagram(
         ValueError: If an argument is impossible; the message names it.
     """
     rows, resolution = as_whole(rows, "rows"), as_whole(resolution, "resolution")
+    if _is_forced(osc, where, span):
+        return _forced_diagram(osc, where, span, start)
+    require_value(start is None, "start", "left out where there is no forcing", start)
     path = ParameterPath(osc, where, span)
     osc_at_first = path.at(path.first)
     points = search(path, resolution, ahead=[lambda: from_starts(osc_at_first)])
@@ -277,6 +293,89 @@ def bifurcation_diagram(
         name=path.name,
         as_paper=in_plane_of_paper(at_ends),
         is_argument=not path.variation.varies_leaves,
+    )
+
+
+def _is_forced(osc: Any, where: Any, span: Any) -> bool:
+    """Whether what is varied knows the time."""
+    if isinstance(osc, Oscillator) or not callable(osc):
+        return isinstance(osc, Oscillator) and has_clock(osc)
+    first, _ = as_span(span, where)
+    try:
+        made = osc(first)
+    except Exception:  # which is told as of any function
+        return False
+    return isinstance(made, Oscillator) and has_clock(made)
+
+
+def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationDiagram:
+    """`bifurcation_diagram` of a forced oscillator."""
+    if isinstance(osc, Oscillator):
+        leaf_index(osc, where)
+    first, last = as_span(span, where)
+    given = varied(osc, where, (first,))
+    for value in (first, last):
+        given.check(value)
+    ends = np.array([[0.5 * (first + last)], [first], [last]])
+    variation = given.in_own_units(*ends)
+    (unit,), length = variation.own.parameters, variation.own.length
+    limits = np.array([[first, last]]) / unit
+    motion, value = _start_of_branch(variation, limits, start)
+    found, points = forced_branches(variation, (limits[0, 0], limits[0, 1]), motion, value)
+    branches = rescaled(tuple(map(_branch_of_motions, found)), length)
+    return BifurcationDiagram(
+        points=tuple(given_point(point, variation) for point in points),
+        branches=tuple(replace(one, values=one.values * unit) for one in branches),
+        regions=(),
+        oscillator=osc if isinstance(osc, Oscillator) else given.oscillator(np.array([first])),
+        name=variation.names[0],
+        as_paper=False,
+        is_argument=not variation.varies_leaves,
+    )
+
+
+def _start_of_branch(
+    variation: Variation, limits: np.ndarray, start: Any
+) -> tuple[PeriodicMotion, float]:
+    """The motion to begin from, and where it is."""
+    if isinstance(start, PeriodicMotion):
+        status = Status(int(start.status))
+        require(status == Status.OK, "start", "a motion with status OK", status.name)
+        length = variation.own.length
+        own = in_own_units(start.oscillator, length)
+        values = variation.values_of(own, limits)
+        expected = "a motion of an oscillator within the span"
+        inside = values is not None and limits[0, 0] <= values[0] <= limits[0, 1]
+        if values is None or not inside:
+            raise ValueError(f"start must be {expected}, got one of another oscillator")
+        return rescaled(start, 1 / length, lambda _: own), float(values[0])
+    value = float(np.mean(limits))
+    own = in_own_units(variation.oscillator(np.array([value])))
+    motions = motions_to_begin_from(own, start, turns_of(own))
+    expected = "one that leads to a periodic motion in the middle of the span"
+    require_value(len(motions) > 0, "start", expected, start)
+    return motions[0], value
+
+
+def _branch_of_motions(rows: Sequence[Row]) -> Branch:
+    motions = tuple(row.motion for row in rows)
+    places = np.array([place_of_motion(motion) for motion in motions])
+    sticks = np.array([np.asarray(motion.stick_durations) for motion in motions])
+    stuck = np.where(sticks > 0, sticks, np.nan)
+    return Branch(
+        kind="cycle",
+        values=np.array([row.value for row in rows]),
+        stable=np.array([bool(motion.stable) for motion in motions]),
+        neutral=np.zeros(len(rows), bool),
+        x1_min=places[:, 0],
+        x1_max=places[:, 1],
+        x2_min=places[:, 2],
+        x2_max=places[:, 3],
+        period=places[:, 4],
+        multiplier=np.array([float(motion.multipliers[0].real) for motion in motions]),
+        stick_durations=stuck,
+        stick_velocities=np.full_like(stuck, np.nan),
+        cycles=motions,
     )
 
 

@@ -55,7 +55,7 @@ from ..cycles.shooting import jacobian
 from ..model.instants import guards_at, trend_of
 from ..model.modes import STUCK, capacity, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator, at_time, check_clock
-from ..model.own_units import in_own_units
+from ..model.own_units import OwnOscillator, in_own_units, rescaled
 from ..model.variations import Variation
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
@@ -69,7 +69,6 @@ from .systems import (
     Seen,
     on_both_meshes,
     solve_system,
-    velocity_tests,
 )
 
 #: Places of a motion from which a condition is tried, the most promising ones first.
@@ -118,8 +117,7 @@ class TimedSystem(AbstractSystem):
         error = jnp.max(jnp.abs(self.residual(osc, x)))
         motion = motion_at(osc, self.chain, x, error, jnp.asarray(0), jnp.asarray(0))
         exists = (motion.status == Status.OK) & (self.judge(osc, motion) == Status.OK)
-        now = at_time(osc, jnp.zeros(()))
-        return Seen(velocity_tests(now), exists, jnp.real(motion.multipliers[0]), error)
+        return Seen({}, exists, jnp.real(motion.multipliers[0]), error)
 
     def place(self, x):
         used = np.asarray(self.chain.used)
@@ -274,7 +272,16 @@ class Beginning(NamedTuple):
 
 
 class AbstractForcedCondition(AbstractCondition):
-    """A condition on a periodic motion of a forced oscillator."""
+    """A condition on a periodic motion of a forced oscillator.
+
+    public: the class that users know it by, where that serves oscillators without a clock, too.
+    """
+
+    public: ClassVar[type[AbstractCondition] | None] = None
+    ends_at_contact: ClassVar[bool] = True
+
+    def kind_along(self, osc, multiplier):
+        return self.public or type(self)
 
     def check(self, osc):
         super().check(osc)
@@ -283,8 +290,13 @@ class AbstractForcedCondition(AbstractCondition):
     def with_clock(self):
         return self
 
-    def beginnings_of(self, osc: Oscillator, motion: PeriodicMotion) -> Iterator[Beginning]:
-        """Where its system may begin from a motion of a known oscillator in own units."""
+    def beginnings_of(
+        self, osc: Oscillator, motion: PeriodicMotion, known: bool = False
+    ) -> Iterator[Beginning]:
+        """Where its system may begin from a motion of a known oscillator in own units.
+
+        known: the motion is that of one of its points.
+        """
         raise NotImplementedError
 
     def points(
@@ -372,7 +384,7 @@ def forced_point(
     own, turns = in_own_units(near), turns_of(near)
     found = [
         point
-        for motion in _motions(own, start, turns)
+        for motion in motions_to_begin_from(own, start, turns)
         for point in timed.points(variation, value, motion)
     ]
     fine = [point for point in found if int(point.status) == Status.OK]
@@ -399,11 +411,11 @@ def forced_point(
     )
 
 
-def _motions(osc: Oscillator, start: Any, turns: int) -> Sequence[PeriodicMotion]:
+def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequence[PeriodicMotion]:
     """The motions to begin from; of those with an even number of periods also the one between
     their halves, from which they may have left."""
     if isinstance(start, PeriodicMotion):
-        return [start]
+        return [rescaled(start, 1 / osc.units.length, lambda _: osc)]
     if start is not None:
         start = as_array(start, "start", (2,))
         check_finite(start, "start")

@@ -69,6 +69,10 @@ def refine(
     Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`, without the
     second search. `value` and `cycle` are differentiable with respect to the other parameters.
 
+    For forced oscillators the conditions are those on a periodic motion: `PeriodDoubling()`,
+    `Fold()`, `Torus()`, `GrazingSliding(belt)`, `CrossingSliding(belt)`, `SwitchingSliding(belt)`
+    and `AddingSliding(belt)`. The nearest point is taken; not under `jax.vmap` and `jax.jit`.
+
     Args:
         condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`,
             `SlidingExchange(belts)`, `CrossingSliding(belt)`, `SuddenSliding(belt)`,
@@ -82,6 +86,9 @@ def refine(
             None with a function.
         at: With a function: the value of the parameter to begin from.
         max_arcs: Room for the arcs of one loop (default 16; 32 where edges are passed).
+        start: For a forced oscillator only: the motion to begin from, or a start (x1, x2) at t = 0
+            that leads to it; None: motions to which some starts lead, and of those with an even
+            number of periods the one that they may have left.
 
     Returns:
         The `BifurcationPoint`. Without a point near the guess its status says why, and its value is

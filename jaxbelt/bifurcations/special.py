@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..model.oscillator import has_clock
 from ..model.variations import Variation
 from ..numerics.continuation import Stop
 from ..results import draw
@@ -89,7 +90,7 @@ def where_belts_stop(
         near: Distance of a parameter from its value at rest up to which the point counts.
         far: Largest distance of the point from the last row.
     """
-    if len(values) < 3:
+    if len(values) < 3 or has_clock(variation.oscillator(values[-1])):
         return None
     family = variation.family(values[-1])
     belts = range(len(family.oscillator.belts))

@@ -233,6 +233,9 @@ class GrazingSliding(AbstractTangency):
         return [cls(belt) for belt in (one - other) + (other - one)]
 
 
+TimedGrazing.public = GrazingSliding
+
+
 # --- guesses --------------------------------------------------------------------------------------
 
 

@@ -137,7 +137,7 @@ def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:
     return found
 
 
-# --- what a sweep tells of attractors -------------------------------------------------------------
+# --- attractors of the runs of a sweep ------------------------------------------------------------
 
 
 def error_of_runs(numbers: Mapping[str, Any], length: float) -> float:

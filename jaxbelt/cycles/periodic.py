@@ -277,7 +277,8 @@ class Followed(NamedTuple):
         return Loop(
             codes=jnp.asarray(np.pad(self.codes, [(0, more), (0, 0)], constant_values=1.0)),
             ends=jnp.asarray(np.pad(self.ends, (0, more), constant_values=Ends(n).unused)),
-            entries=jnp.asarray(np.pad(self.entries, [(0, more), (0, 0)])),
+            # After the last used arc comes the first one.
+            entries=jnp.asarray(np.concatenate([self.entries, self.entries[[0] * more]])),
             durations=jnp.asarray(np.pad(self.durations, (0, more))),
         )
 

@@ -4,7 +4,8 @@ Beside `step`, `events` and `rounds`, which are for oscillators without a clock,
 Where x2' = 0 the next derivative is not -x2, boundaries may move, and stick phases are not over in
 closed form. So a step asks each guard of its mode by its control points, see `control_points`,
 whether it may vanish; and a mass that sticks is stepped as well, its stages on the belt's course,
-where their x2' is the force that the belts have to hold.
+where their x2' is the force that the belts have to hold. A step has the derivatives of the motion
+at a fixed time; those of events are not in it.
 
 The guards are numbered as in `instants.guards_at`. Of boundaries and edges the values and slopes at
 both ends of a step and the integral are known, as in `step`: these make a polynomial. What stuck
@@ -234,6 +235,15 @@ def _attempt(osc, clock: StepClock, window: Window, lanes: Lanes, rtol, atol, ra
     return _Attempt(h, y1, y2, stages[-1], rate, lax.stop_gradient(error), integrals, needed)
 
 
+def flown(osc, window: Window, ones: Array, lanes: Lanes, h: Array, x1: Array, x2: Array):
+    """The states (x1, x2) that a step of size h leads to from those of the arguments."""
+    a = needed_or_rate(osc, lanes.mode, lanes.t, x1, x2)
+    lanes = replace(lanes, x1=x1, x2=x2, a=a)
+    clock = StepClock.of(osc, ones, lanes.t, h)
+    new = _attempt(osc, clock, window, lanes, jnp.ones(()), jnp.ones(()), None)
+    return new.x1, new.x2
+
+
 def _moves(now: Oscillator) -> bool:
     return any(hasattr(belt, "rate") for belt in now.belts)
 
@@ -440,7 +450,7 @@ def take_step(
     outcome = materialise(jnp.where(lands, 2.0, outcome), ones)
     shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
     theta = materialise(theta, ones)
-    delta = materialise(jnp.where(lands, delta, 0.0), ones)
+    delta = lax.stop_gradient(materialise(jnp.where(lands, delta, 0.0), ones))
     x1 = new.x1 + delta * (new.x2 + 0.5 * delta * new.rate)
     x2 = new.x2 + delta * new.rate
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)

@@ -196,8 +196,8 @@ class Program(eqx.Module):
 
     structure: of the oscillator's tree; mapped: which of its leaves differ from run to run; edges:
     whether a contact edge may be met; captures: whether a run ends where a pseudo-focus captures
-    it; derivatives: whether those of the results are wanted, too. made_of: what tells apart
-    programs whose code of the user's own is the same, and what it reads is not.
+    it; derivatives: whether derivatives of the results are computed, too. made_of: distinguishes
+    programs whose user code is the same, but reads different values.
     """
 
     structure: Any = eqx.field(static=True)

@@ -17,7 +17,7 @@ velocity or load oscillates, stand in `forcing`. The paper's symbols, and ours:
 | sigma0, sigma1 | `Belt.lower`, `Belt.upper` | interval of x1 in which a belt touches |
 | mus, p1, p2, p3 | `Conti.static, residual, quadratic, steepness` | eqs. (7), (16) |
 
-What happens where the field is not smooth is told in `modes`.
+What happens where the field is not smooth is defined in `modes`.
 
 An oscillator that knows the time, see `has_clock`, has no field of (x1, x2) alone. At an instant it
 is one without a clock, with a constant force and belts of constant velocity and load: `at_time`

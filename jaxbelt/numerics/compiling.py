@@ -220,7 +220,7 @@ class _Kept:
         signatures = [told for told, leaf in zip(asked[1], holes) if leaf is programs.HOLE]
         try:
             key = programs.key_of(self.function, template, signatures, options)
-        except Exception:  # what it is made of cannot be told
+        except Exception:  # its fingerprint cannot be known
             return None
         if key not in self.made:
             program = programs.load(key, template)
@@ -450,8 +450,8 @@ def _try_lanes() -> bool:
 
 # --- one piece of machine code --------------------------------------------------------------------
 
-#: How XLA's CPU compiler is told to put a call into one piece of machine code, and not to dissolve
-#: it before. It does so by itself with loops on less than a kilobyte.
+#: Options that make XLA's CPU compiler put a call into one piece of machine code, and not dissolve
+#: it before. It does so without them for loops on less than a kilobyte.
 IN_ONE_PIECE = {"xla_cpu_small_call": "true", "inlineable": "false"}
 #: What is inside of the call would inherit the mark.
 NOT_MARKED = {"xla_cpu_small_call": "false", "inlineable": "true"}
@@ -527,7 +527,7 @@ def _is_possible(jaxpr: Any) -> bool:
 
 def _in_one_piece(jaxpr: Any, *args) -> list[jax.Array]:
     """What the jaxpr gives, as one piece of machine code where it is not in a batch."""
-    # Imported late: `_try_piece` tells where a version of JAX lacks them.
+    # Imported late: `_try_piece` detects a version of JAX that lacks them.
     from jax.experimental.xla_metadata import set_xla_metadata
     from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
@@ -688,10 +688,10 @@ def _degrees(jaxpr: Any, given: Sequence[int]) -> list[int]:
 # --- forked processes -----------------------------------------------------------------------------
 
 # A fork copies the memory of a process but none of its threads, and JAX waits for its threads: most
-# of what it is asked to do in the child never ends. So the child is told at once.
+# of what it is asked to do in the child never ends. So the child raises at once.
 
 _forked = False
-#: Whether jaxbelt computed in this process; noted where nothing else tells that JAX is in use.
+#: Whether jaxbelt computed in this process; noted where nothing else shows that JAX is in use.
 _computed = False
 
 

@@ -30,7 +30,7 @@ LONGEST_NEWTON_STEP = 0.5
 HOLDS = 1e-9
 #: Steps of this length are rounding: unknowns are of size one.
 STEP_ROUNDING = 1e-13
-#: Steps that tell how far unknowns move that do not settle.
+#: Number of last steps that measure how far unknowns still move that do not converge.
 LAST = 4
 #: Larger unknowns are of another size, such as the time stuck to a belt that hardly moves: steps
 #: are measured in parts of them.

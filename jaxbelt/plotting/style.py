@@ -1,6 +1,6 @@
 """Style of the pictures: colours, keys, a journal's page; and axes to draw into.
 
-The colours are those of Okabe and Ito, which colour-blind readers can tell apart. Only the modules
+The colours are those of Okabe and Ito, which colour-blind readers can distinguish. Only the modules
 of this folder import matplotlib, and `import jaxbelt` imports none of them.
 """
 

@@ -25,11 +25,14 @@ from jaxtyping import Array
 from ..kernel.events import event_kinds
 from ..kernel.lanes import Lanes, Observer, choose, materialise
 from ..kernel.step import LANDING
+from ..model.instants import field_at
 from ..model.modes import Mode, mode_acceleration
+from ..model.oscillator import at_time, has_clock
 from ..model.own_units import OwnOscillator
 from .moments import (
     PARTS_OF_STEP,
     AtEvents,
+    AtPhase,
     AtTimes,
     Course,
     Cut,
@@ -90,14 +93,12 @@ class Along(Observer):
         return [
             (i, getattr(moment, "direction", 0), section_of(moment))
             for i, moment in enumerate(self.at)
-            if not isinstance(moment, AtEvents | AtTimes)
+            if not isinstance(moment, AtEvents | AtTimes | AtPhase)
         ]
 
-    def _times(self) -> list[tuple[int, tuple[float, ...]]]:
+    def _times(self) -> list[tuple[int, AtTimes | AtPhase]]:
         return [
-            (i, tuple(moment.times))
-            for i, moment in enumerate(self.at)
-            if isinstance(moment, AtTimes)
+            (i, moment) for i, moment in enumerate(self.at) if isinstance(moment, AtTimes | AtPhase)
         ]
 
     # --- integrals
@@ -106,10 +107,12 @@ class Along(Observer):
         """The reducer's rates, a tree of arrays [lanes], or None if it has none."""
         if not hasattr(self.reducer, "rates"):
             return None
-        residual = mode_acceleration(osc, mode, x1, x2)
+        now = at_time(osc, t)
+        residual = mode_acceleration(now, mode, x1, x2)
         length = osc.units.length
-        a = length * jnp.where(mode.any_stuck, 0.0, residual)
-        forces = jnp.stack([length * f for f in _forces(osc, mode, x2, residual)], axis=-1)
+        a = jnp.where(mode.any_stuck, 0.0, residual)
+        a = length * (_field(osc, mode, t, x1, x2) if has_clock(osc) else a)
+        forces = jnp.stack([length * f for f in _forces(now, mode, x2, residual)], axis=-1)
 
         def rates(osc, x1, x2, *rest):
             return self.reducer.rates(osc, Motion(rest[0], x1, x2, *rest[1:]))
@@ -119,9 +122,9 @@ class Along(Observer):
     def start(self, osc, lanes):
         sides = []
         for _, _, function in self._sections():
-            value, rate = value_and_rate(function, osc, lanes.mode, lanes.x1, lanes.x2)
+            value, rate = _told(function, osc, lanes, lanes.x1, lanes.x2)
             sides.append(side_of(value, rate, jnp.ones_like(value)))
-        passed = tuple(jnp.zeros_like(lanes.events) for _ in self._times())
+        passed = tuple(one.passed_at(osc, lanes.t, lanes.events) for _, one in self._times())
         state = as_given(self.reducer.init, osc, lanes.x1, lanes.x2)
         return _Watched(state, tuple(sides), passed)
 
@@ -137,7 +140,7 @@ class Along(Observer):
         seen: _Watched = lanes.memory
         until = t1
         for (_, times), passed in zip(self._times(), seen.passed, strict=True):
-            until = jnp.minimum(until, _next(times, passed))
+            until = jnp.minimum(until, times.next_time(osc, passed))
         rates = self.rates if hasattr(self.reducer, "rates") else None
         new = take_step(osc, window, ones, lanes, until, rtol, atol, rates)
         h, reach = lax.stop_gradient(new.t - lanes.t), LANDING * jnp.sqrt(rtol)
@@ -163,7 +166,7 @@ class Along(Observer):
         seen, sides = new.memory, []
         parts = zip(self._sections(), seen.sides, cuts, strict=True)
         for (number, direction, function), side, cut in parts:
-            now = value_and_rate(function, osc, new.mode, new.x1, new.x2)
+            now = _told(function, osc, new, new.x1, new.x2)
             now = jnp.where(kept, side_of(*now, side), side)
             # The nearer end; from there a Taylor step leads to the crossing.
             near = choose(cut.at_start, lanes, new)
@@ -176,7 +179,7 @@ class Along(Observer):
             sides.append(now)
         passed = []
         for (number, times), count in zip(self._times(), seen.passed, strict=True):
-            due = kept & (new.t >= _next(times, count))
+            due = kept & (new.t >= times.next_time(osc, count))
             seen = self._ask(seen, osc, new, jnp.zeros_like(new.t), due, number)
             passed.append(count + jnp.where(due, 1, 0))
         memory = replace(seen, sides=tuple(sides), passed=tuple(passed))
@@ -225,7 +228,7 @@ class Along(Observer):
         sides = []
         for (number, direction, function), side in zip(self._sections(), seen.sides, strict=True):
             # Where the field jumps, its extrema jump, too.
-            value = value_and_rate(function, osc, lanes.mode, lanes.x1, lanes.x2)
+            value = _told(function, osc, lanes, lanes.x1, lanes.x2)
             now = jnp.where(busy & ~lanes.done, side_of(*value, side), side)
             wanted = (now != side) & (now * direction >= 0)
             seen = self._ask(seen, osc, lanes, jnp.zeros_like(lanes.t), wanted, number)
@@ -271,10 +274,10 @@ class Along(Observer):
 
         return lax.while_loop(pending, ask, (seen, tables))[0]
 
-    def _due(self, seen: _Watched, after: Lanes) -> Array:
+    def _due(self, seen: _Watched, osc: OwnOscillator, after: Lanes) -> Array:
         """Lanes that have passed a fixed time, also at the start of a run."""
         late = [
-            _next(times, passed) <= after.t
+            times.next_time(osc, passed) <= after.t
             for (_, times), passed in zip(self._times(), seen.passed, strict=True)
         ]
         return (after.run >= 0) & functools.reduce(jnp.logical_or, late, jnp.zeros_like(after.done))
@@ -290,7 +293,7 @@ class Along(Observer):
             theta = jnp.minimum(theta, first)
         exact, passed = before.t + jnp.where(jnp.isfinite(theta), theta, 0.0) * duration, []
         for (moment, times), count in zip(self._times(), seen.passed, strict=True):
-            time = _next(times, count)
+            time = times.next_time(osc, count)
             due = (after.run >= 0) & (time <= after.t)
             time = jnp.where(due, time, after.t)
             earlier = due & ((time - before.t) / safe <= lax.stop_gradient(theta))
@@ -334,19 +337,38 @@ def _first(table: tuple[Array, ...]) -> Array:
 def _state_and_rate(osc: OwnOscillator, lanes: Lanes) -> tuple[Array, Array, Array]:
     """x1, x2 and x2' in the mode of the lanes, which slip; without derivatives."""
     osc, lanes = lax.stop_gradient((osc, lanes))
+    if has_clock(osc):
+        return lanes.x1, lanes.x2, _field(osc, lanes.mode, lanes.t, lanes.x1, lanes.x2)
     return lanes.x1, lanes.x2, mode_acceleration(osc, lanes.mode, lanes.x1, lanes.x2)
+
+
+def _field(osc: OwnOscillator, mode: Mode, t: Array, x1: Array, x2: Array) -> Array:
+    """x2' of an oscillator that knows the time; the mass that sticks goes with its belt."""
+    return field_at(osc, mode, (x1, x2, t))[1]
+
+
+def _told(function, osc: OwnOscillator, lanes: Lanes, x1: Array, x2: Array):
+    """A section's value and rate at a state of lanes."""
+    if not has_clock(osc):
+        return value_and_rate(function, osc, lanes.mode, x1, x2)
+    a = _field(osc, lanes.mode, lanes.t, x1, x2)
+    return value_and_rate(function, osc, lanes.mode, x1, x2, a)
 
 
 def _moved(osc: OwnOscillator, lanes: Lanes, delta: Array) -> tuple[Array, Array]:
     """The state that is `delta` away, by Taylor's formula of order 3 in x1 and 2 in x2."""
 
-    def field(x1, x2):
+    def field(x1, x2, *t):
+        if t:
+            return _field(osc, lanes.mode, *t, x1, x2)
         a = mode_acceleration(osc, lanes.mode, x1, x2)
         return jnp.where(lanes.mode.any_stuck, 0.0, a)
 
     x1, x2 = lanes.x1, lanes.x2
-    a = field(x1, x2)
-    _, jerk, *_ = jax.jvp(field, (x1, x2), (x2, a))
+    clock = (lanes.t,) if has_clock(osc) else ()
+    a = field(x1, x2, *clock)
+    ways = x2, a, *map(jnp.ones_like, clock)
+    _, jerk, *_ = jax.jvp(field, (x1, x2, *clock), ways)
     x1 = x1 + delta * (x2 + delta / 2 * (a + delta / 3 * jerk))
     return x1, x2 + delta * (a + delta / 2 * jerk)
 
@@ -357,7 +379,8 @@ def _to_section(function, osc, lanes: Lanes, delta, low, high) -> Array:
     Its derivatives are those of the implicit function, whatever the bounds.
     """
     delta = lax.stop_gradient(delta)
-    value, rate = value_and_rate(function, osc, lanes.mode, *_moved(osc, lanes, delta))
+    later = replace(lanes, t=lanes.t + delta) if has_clock(osc) else lanes
+    value, rate = _told(function, osc, later, *_moved(osc, lanes, delta))
     step = -value / lax.stop_gradient(jnp.where(rate == 0, 1.0, rate))
     step = jnp.where(rate == 0, 0.0, step)
     return lax.stop_gradient(jnp.clip(delta + step, low, high) - step) + step

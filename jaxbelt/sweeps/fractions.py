@@ -23,7 +23,7 @@ from ..checks import as_positive, as_whole, outside_of_traces
 from ..cycles.attractors import MAYBE_SAME, Runs, distance, error_of_runs, place_of
 from ..cycles.cycle import cycle_from
 from ..model.equilibria import equilibria
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, refuse_clock
 from ..model.own_units import quantity, rescaled
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
@@ -210,6 +210,8 @@ def basin_fractions(
     numbers = settings_of_runs(t1, rtol, atol)
     moves = None if moves is None else as_positive(moves, "moves")
     given = varied(osc, where, (first,))
+    instead = 'jb.sweep with axes x1 and x2 and observe="attractor"'
+    refuse_clock(given.oscillator(np.array([first])), "basin_fractions", instead)
     for value in (first, last):
         given.check(value)
     values = evenly_spaced(first, last, rows)

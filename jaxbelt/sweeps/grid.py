@@ -118,7 +118,7 @@ class Grid:
         values = {
             name: axis[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)
         }
-        start = tuple(self.y0.items())
+        start = {name: np.asarray(value) for name, value in self.y0.items()}
         known = self.make, self.made_of, tuple(self.names), self.mapped, self.edges
         table = _rows(*known, start, derivatives, values)
         return np.asarray(table)[:, :, : len(runs)]
@@ -130,7 +130,8 @@ def _rows(make, made_of, names, mapped, edges, start, derivatives, values):
         osc = make(**{name: values[name] for name in names})
         leaves = jax.tree.leaves(in_units_of_run(osc, edges=edges))
         varying = [leaf for leaf, varies in zip(leaves, mapped, strict=True) if varies]
-        return jnp.stack([*(jnp.asarray(values.get(x, default)) for x, default in start), *varying])
+        starts = [jnp.asarray(values.get(name, start[name])) for name in ("x1", "x2")]
+        return jnp.stack([*starts, *varying])
 
     rows = jax.vmap(row, out_axes=1)
     tables = [rows(values)]

@@ -17,9 +17,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import require_callable, require_one_of, require_value
+from ..checks import as_array, require, require_callable, require_one_of, require_value
 from ..model.modes import Mode, mode_acceleration, without_rounding
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, frequencies, has_clock
 from .observers import as_given
 
 
@@ -85,8 +85,51 @@ class AtTimes:
         require_value(fits, "times", "finite, >= 0 and increasing", times)
         object.__setattr__(self, "times", tuple(times.tolist()))
 
+    def next_time(self, osc: Oscillator, passed: Array) -> Array:
+        """The next of the times when so many are past; inf when all are."""
+        return jnp.asarray((*self.times, np.inf))[jnp.minimum(passed, len(self.times))]
 
-MOMENTS = (AtEvents, AtExtrema, AtSection, AtTimes)
+    def passed_at(self, osc: Oscillator, t: Array, count: Array) -> Array:
+        """How many are past at the start of runs, as numbers like `count`."""
+        if not has_clock(osc):
+            return jnp.zeros_like(count)
+        early = [jnp.where(time < t, 1, 0) for time in self.times]
+        return functools.reduce(jnp.add, early, jnp.zeros_like(count)).astype(count.dtype)
+
+
+@dataclass(frozen=True)
+class AtPhase:
+    """Once in each period of the forcing: a stroboscopic section.
+
+    The moments are the times t at which Omega t is the phase up to whole turns, Omega the frequency
+    of the first force, or, without forces, of the first velocity or load that oscillates. So the
+    phase 0 is at t = 0.
+
+    Attributes:
+        phase: An angle.
+
+    Example:
+        diagram = jb.orbit_diagram(osc, where, (1.6, 1.8), at=jb.AtPhase())
+    """
+
+    phase: float = 0.0
+
+    def __post_init__(self):
+        phase = float(as_array(self.phase, "phase"))
+        require_value(np.isfinite(phase), "phase", "a finite angle", self.phase)
+        object.__setattr__(self, "phase", phase)
+
+    def next_time(self, osc: Oscillator, passed: Array) -> Array:
+        """The time of the moment that so many are before, counted from the turn of t = 0 on."""
+        return (self.phase + 2 * np.pi * passed) / frequencies(osc)[0]
+
+    def passed_at(self, osc: Oscillator, t: Array, count: Array) -> Array:
+        """The number of the first moment at t or later, as numbers like `count`."""
+        turns = (frequencies(osc)[0] * t - self.phase) / (2 * np.pi)
+        return jnp.ceil(turns - 1e-12 * (1 + jnp.abs(turns))).astype(count.dtype)
+
+
+MOMENTS = (AtEvents, AtExtrema, AtSection, AtTimes, AtPhase)
 
 
 def checked(at: Any) -> tuple[Any, ...]:
@@ -95,6 +138,17 @@ def checked(at: Any) -> tuple[Any, ...]:
     names = ", ".join(kind.__name__ for kind in MOMENTS)
     require_value(fits, "observe.at", f"a tuple of {names}", at)
     return at
+
+
+def check_moments(at: tuple[Any, ...], osc: Oscillator) -> None:
+    """Raise a `ValueError` where moments are not for the oscillator."""
+    clock = has_clock(osc)
+    for moment in at:
+        if isinstance(moment, AtPhase):
+            require(clock, "at", "for an oscillator without forcing no AtPhase", repr(moment))
+        if isinstance(moment, AtExtrema) and moment.of == "x2":
+            told = 'AtExtrema("x1") or a section: extrema of x2 are for those without a clock'
+            require(not clock, "at", told, repr(moment))
 
 
 def section_of(moment: AtSection | AtExtrema) -> Callable[..., Array]:

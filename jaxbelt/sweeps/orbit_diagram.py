@@ -29,7 +29,7 @@ from ..checks import (
     require_value,
 )
 from ..cycles.attractors import RUN
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, frequencies, has_clock
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
@@ -38,7 +38,7 @@ from ..tables import table_of
 from .along import Along
 from .attractor import CYCLE, KINDS, UNDECIDED, Attractor
 from .grid import Grid
-from .moments import AtEvents, AtExtrema, AtSection
+from .moments import AtEvents, AtExtrema, AtPhase, AtSection
 from .question import LONG_ENOUGH
 from .reducers import check_sections
 from .work import results_of
@@ -54,6 +54,12 @@ MOMENTS_KEPT = 16
 MOST_RUNS = 64
 #: A run through a loop goes on beyond it by this fraction of the period.
 OUTSIDE = 1e-4
+
+
+#: Of a forced oscillator: periods that are left out at first, points that are kept, and by how much
+#: they may differ, over their size, to be those of a periodic motion.
+TRANSIENT, STROBES = 300, 64
+SAME = 1e-6
 
 
 class OrbitDiagram(eqx.Module):
@@ -150,7 +156,7 @@ def orbit_diagram(
     where: Callable[[Oscillator], Any] | None = None,
     span: tuple[float, float] | None = None,
     *,
-    at: AtExtrema | AtSection | AtEvents | None = None,
+    at: AtExtrema | AtSection | AtEvents | AtPhase | None = None,
     y0: ArrayLike | Sequence[Any] = (3.0, 0.0),
     rows: int = 400,
     rtol: ArrayLike = 1e-8,
@@ -185,14 +191,19 @@ def orbit_diagram(
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
     first, last = as_span(span, where)
-    at = AtExtrema("x1") if at is None else at
-    kinds = AtExtrema | AtSection | AtEvents
-    require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
     starts = _starts_of(y0)
     numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_tolerance(atol, "atol")}
     variation = varied(osc, where, (first,))
     rows = as_whole(rows, "rows", 2)
-    check_sections((at,), variation.oscillator(np.array([first])))
+    example = variation.oscillator(np.array([first]))
+    if has_clock(example):
+        at = AtPhase() if at is None else at
+        require_value(isinstance(at, AtPhase), "at", "an AtPhase, as osc is forced", at)
+    else:
+        at = AtExtrema("x1") if at is None else at
+        kinds = AtExtrema | AtSection | AtEvents
+        require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
+    check_sections((at,), example)
     return Sampling(variation, at, starts, rows, numbers).diagram((first, last))
 
 
@@ -227,6 +238,8 @@ class Sampling:
         values = evenly_spaced(first, last, self.rows)
         grid = Grid(self._make, {"parameter": values}, (0.0, 0.0))
         shape = len(values), len(self.starts)
+        if isinstance(self.at, AtPhase):
+            return self._strobed(grid, values, shape)
         found = self._results(grid, Attractor(), np.tile(self.starts.T, len(values)), LONG_ENOUGH)
         # Codes of runs that are not finite are NaN.
         kind = np.nan_to_num(found["kind"]).astype(int)
@@ -254,11 +267,51 @@ class Sampling:
             is_argument=not self.variation.varies_leaves,
         )
 
+    def _strobed(self, grid: Grid, values: np.ndarray, shape: tuple[int, int]) -> OrbitDiagram:
+        """The diagram of a stroboscopic section: STROBES points behind TRANSIENT periods."""
+        first = [float(frequencies(self._make(value))[0]) for value in values]
+        period = 2 * np.pi / np.repeat(first, shape[1])
+        t1 = float(np.max(period)) * (TRANSIENT + STROBES + 1)
+        observer = Along(_Strobes((self.at,), TRANSIENT, STROBES))
+        states = np.tile(self.starts.T, len(values))
+        found = self._results(grid, observer, states, t1, t0=0.0)
+        pieces = [f" {i}" for i in range(STROBES // 8)]
+        x1, x2 = (
+            np.concatenate([found[name + piece] for piece in pieces], axis=-1)
+            for name in ("x1", "x2")
+        )
+        # Runs of other frequencies may have a period less.
+        status = found["status"].astype(int)
+        good = (status == Status.OK) | (status == Status.STUCK_FOREVER)
+        x1[~good], x2[~good] = np.nan, np.nan
+        turns = _turns_in(x1, x2)
+        kind = np.where(turns > 0, "periodic", KINDS[UNDECIDED])
+        once = (turns[:, None] > 0) & (np.arange(STROBES) >= turns[:, None])
+        x1, x2 = (np.where(once, np.nan, x) for x in (x1, x2))
+        return OrbitDiagram(
+            values=values,
+            kind=kind.reshape(shape),
+            period=np.where(turns > 0, turns * period, np.nan).reshape(shape),
+            status=status.reshape(shape),
+            x1=x1.reshape(*shape, -1),
+            x2=x2.reshape(*shape, -1),
+            at=self.at,
+            name=self.variation.names[0],
+            sampling=self,
+            is_argument=not self.variation.varies_leaves,
+        )
+
     def _make(self, parameter: Any) -> Oscillator:
         return self.variation.make(parameter)
 
     def _results(
-        self, grid: Grid, observer: Any, states: np.ndarray, t1: float, which: Any = None
+        self,
+        grid: Grid,
+        observer: Any,
+        states: np.ndarray,
+        t1: float,
+        which: Any = None,
+        t0: float | None = None,
     ) -> dict[str, np.ndarray]:
         """Results of an observer for runs from states, [2, runs]; which: their numbers, or all."""
         which = np.arange(states.shape[1]) if which is None else which
@@ -267,7 +320,7 @@ class Sampling:
             rows = grid.rows(which[first:last] // len(self.starts))
             return np.concatenate([states[None, :, first:last], rows[:, 2:]], axis=1)
 
-        numbers = {"t1": t1, **self.numbers}
+        numbers = {"t1": t1, "t0": t0, **self.numbers}
         return results_of(grid.program(observer), grid.shared, rows_of, len(which), **numbers)
 
     def _loops(self, grid: Grid, which: np.ndarray, x1_min, x1_max, period):
@@ -327,6 +380,44 @@ class Sampling:
             if not len(remaining):
                 break
         return moments, cut
+
+
+def _turns_in(x1: np.ndarray, x2: np.ndarray) -> np.ndarray:
+    """After how many points rows of them repeat, all of them, half as many at most; 0: not."""
+    turns = np.zeros(len(x1), dtype=int)
+    sizes = [SAME * (np.ptp(x, axis=1) + np.max(np.abs(x), axis=1)) for x in (x1, x2)]
+    for n in reversed(range(1, x1.shape[1] // 2 + 1)):
+        away = [np.max(np.abs(x[:, n:] - x[:, :-n]), axis=1) for x in (x1, x2)]
+        turns[(away[0] <= sizes[0]) & (away[1] <= sizes[1])] = n
+    return turns
+
+
+@dataclass(frozen=True)
+class _Strobes:
+    """The states at the moments of a run behind the first `skipped` ones, `room` of them, a
+    multiple of eight. A reducer, see `sweep.sweep`, as `_LoopPoints`."""
+
+    at: tuple[Any, ...]
+    skipped: int
+    room: int
+
+    def init(self, osc, x1, x2):
+        pieces = tuple(jnp.full(8, jnp.nan) for _ in range(self.room // 8))
+        return pieces, pieces, jnp.zeros((), int) - self.skipped
+
+    def update(self, state, event):
+        kept1, kept2, count = state
+
+        def put(value, pieces):
+            places = (8 * i + jnp.arange(8) for i in range(len(pieces)))
+            pairs = zip(places, pieces, strict=True)
+            return tuple(jnp.where(place == count, value, piece) for place, piece in pairs)
+
+        return put(event.x1, kept1), put(event.x2, kept2), count + 1
+
+    def finish(self, state, end):
+        pairs = zip(("x1", "x2"), state[:2], strict=True)
+        return {f"{name} {i}": piece for name, own in pairs for i, piece in enumerate(own)}
 
 
 #: Numbers of the moments of a loop: extrema of x1, and the moments of the diagram, if different.

@@ -31,6 +31,7 @@ from ..spelling import did_you_mean
 from .along import Along
 from .attractor import Attractor
 from .datasets import Table
+from .exponents import Exponents, ForcedAttractor
 from .grid import Grid
 from .moments import AtEvents, checked
 from .observers import Final, Reduce
@@ -40,6 +41,9 @@ from .reducers import check_reducer
 LONG_ENOUGH = 30_000.0
 #: Observers that have a name.
 NAMED: dict[str, type[Observer]] = {"final": Final, "attractor": Attractor}
+#: And those that have one where the oscillators know the time; attractor runs then end at this t1.
+NAMED_FORCED = NAMED | {"attractor": ForcedAttractor, "lyapunov": Exponents}
+LONG_ENOUGH_FORCED = 2_000.0
 #: Largest number of points of the grid that identify `make`; the same on every machine.
 SAMPLE = 2**14
 
@@ -58,19 +62,22 @@ class Question:
         """Checks the arguments of `sweep`."""
         require_usable_jax()
         grid = Grid(make, axes, y0)
-        _observer(observe)
+        clock = has_clock(grid.example)
+        _observer(observe, clock)
         if t1 is None:
             given = 'given, the end of each run, but for observe="attractor"'
             require(observe == "attractor", "t1", given, "None")
-            t1 = LONG_ENOUGH
+            t1 = LONG_ENOUGH_FORCED if clock else LONG_ENOUGH
         numbers = settings_of_runs(t1, rtol, atol)
-        if has_clock(grid.example):
+        if clock:
             numbers["t0"] = as_start(t0, numbers["t1"])
         else:
             require(t0 == 0.0, "t0", "0 for an oscillator that does not know the time", t0)
         wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
         fits = isinstance(wanted, Sequence)
         require_value(fits, "derivatives", "a tuple of names of axes", wanted)
+        none = "none where the oscillators are forced: differentiate jb.simulate"
+        require(not clock or len(wanted) == 0, "derivatives", none, wanted)
         different = len(set(wanted)) == len(wanted)
         require_value(different, "derivatives", "free of repeats", wanted)
         for name in wanted:
@@ -91,7 +98,7 @@ class Question:
     @functools.cached_property
     def program(self) -> Program:
         """What the kernel is compiled for."""
-        return self.grid.program(_observer(self.observe))
+        return self.grid.program(_observer(self.observe, has_clock(self.grid.example)))
 
     @functools.cached_property
     def table(self) -> Table:
@@ -190,16 +197,19 @@ def as_start(t0: Any, t1: float) -> float:
     return start
 
 
-def _observer(observe: Any) -> Observer:
+def _observer(observe: Any, clock: bool) -> Observer:
+    if isinstance(observe, Attractor):
+        require(not clock, "observe", '"attractor" for oscillators that are forced', observe)
     if isinstance(observe, Observer):
         return observe
+    known = NAMED_FORCED if clock else NAMED
     if isinstance(observe, str):
-        require_one_of(observe, NAMED, "observe", " or an object with init, update, finish")
-        return NAMED[observe]()
+        require_one_of(observe, known, "observe", " or an object with init, update, finish")
+        return known[observe]()
     methods = ("init", "update", "finish")
     fits = all(callable(getattr(observe, name, None)) for name in methods)
     fits = fits and not isinstance(observe, type)
-    names = ", ".join(f'"{name}"' for name in NAMED)
+    names = ", ".join(f'"{name}"' for name in known)
     expected = f"{names} or an object with init, update, finish"
     require_value(fits, "observe", expected, observe)
     if hasattr(observe, "at") or hasattr(observe, "rates"):

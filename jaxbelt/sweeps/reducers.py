@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from ..checks import require, shape_in_words
 from ..model.oscillator import Oscillator
 from .along import Motion
-from .moments import AtSection, checked
+from .moments import AtSection, check_moments, checked
 from .observers import RunEnd, RunEvent
 
 
@@ -23,6 +23,7 @@ def check_reducer(reducer: Any, osc: Oscillator) -> None:
         moment = code
     if hasattr(reducer, "at"):
         check_sections(checked(reducer.at), osc)
+        check_moments(reducer.at, osc)
     if hasattr(reducer, "rates"):
         forces = jax.ShapeDtypeStruct((len(osc.belts),), jnp.float64)
         motion = jax.eval_shape(Motion, number, number, number, number, forces)

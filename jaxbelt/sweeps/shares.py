@@ -176,7 +176,7 @@ def numbers_of_attractors(
     return labels
 
 
-# --- cycles that the runs do not tell apart -------------------------------------------------------
+# --- cycles that the runs do not distinguish ------------------------------------------------------
 
 
 def _without_doubt(

@@ -72,6 +72,7 @@ def results_of(
     t1: float,
     rtol: float,
     atol: float | None,
+    t0: float | None = None,
 ) -> dict[str, np.ndarray]:
     """Results of runs by name, [runs, ...], in the order of the runs; arguments as for
     `threads.run`."""
@@ -81,7 +82,7 @@ def results_of(
     def put(places: np.ndarray, results: np.ndarray) -> None:
         columns[:, places] = results[0]
 
-    run(program, shared, rows_of, runs, put, t1=t1, rtol=rtol, atol=atol)
+    run(program, shared, rows_of, runs, put, t1=t1, rtol=rtol, atol=atol, t0=t0)
     return by_name(shapes, columns)
 
 

@@ -1,0 +1,317 @@
+"""Branches of periodic motions of forced oscillators along one parameter: `forced_branches`.
+
+A branch with a fixed signature is a curve in the unknowns of its motions and the parameter, which
+pseudo-arclength follows, round folds, too. Between two points of it functions of multipliers may
+change their signs; then that point is solved for. Where the motion leaves its signature, the
+conditions on sliding are solved from the last motion before, and the nearest of their points is
+where the branch goes on with another signature: to the other side of the point, or back on the same
+one. At a period doubling the branch that leaves is followed, too.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..activity import note_progress
+from ..cycles.clocked import TimedChain, timed_blocks, turns_of
+from ..cycles.periodic import PeriodicMotion, is_same, motion_at, periodic_from
+from ..cycles.shooting import jacobian
+from ..model.oscillator import Oscillator
+from ..model.own_units import in_own_units
+from ..model.variations import Family, Variation
+from ..numerics.compiling import jit
+from ..numerics.continuation import Corrected, corrected
+from ..results import Status
+from .base import AbstractCondition, BifurcationPoint
+from .crossings import CrossingSliding
+from .forced import (
+    AbstractForcedCondition,
+    AddingSliding,
+    Fold,
+    PeriodDoubling,
+    SwitchingSliding,
+    Torus,
+)
+from .systems import WEIGHT
+from .tangencies import GrazingSliding
+
+#: First, shortest and longest step, of which the parameter's part is measured in parts of the span.
+FIRST, SHORTEST, LONGEST = 2e-3, 1e-7, 2e-2
+#: Cosine of the largest angle between tangents of neighbours.
+STRAIGHT = 0.95
+#: Steps on each side at most.
+MOST_ROWS = 400
+#: How far beyond a point a motion with another signature is looked for, in parts of the span.
+BEYOND = (1e-5, 1e-4, 1e-3)
+#: States that a branch reaches beyond a point are no farther than this from it.
+NEAR = 0.1
+#: How far along the direction that a period doubling shows the motion that leaves is looked for.
+LEAVES = (1e-3, 1e-2, 5e-2)
+
+
+class Row(NamedTuple):
+    """A motion of a branch and where it is."""
+
+    value: float
+    motion: PeriodicMotion
+
+
+class Line(NamedTuple):
+    """What is varied, and between which values."""
+
+    variation: Variation
+    first: float
+    last: float
+    turns: int
+
+    @property
+    def length(self) -> float:
+        return self.last - self.first
+
+    def at(self, value: float) -> Oscillator:
+        return in_own_units(self.variation.oscillator(np.array([value])))
+
+
+def forced_branches(
+    variation: Variation, span: tuple[float, float], start: PeriodicMotion, value: float
+) -> tuple[list[list[Row]], list[BifurcationPoint]]:
+    """The branch of a motion at a value, within a span, to both sides, and those that leave it at
+    period doublings; and the points on them. All in own units."""
+    line = Line(variation, *span, turns_of(start.oscillator))
+    branches, points, waiting = [], [], [(Row(value, start), True)]
+    while waiting:
+        row, is_first = waiting.pop(0)
+        sides = [_side(line, row, sign) for sign in (-1.0, 1.0)]
+        (behind, before), (ahead, after) = sides
+        branches.append([*reversed(behind[1:]), *ahead])
+        for point in (*before, *after):
+            if any(_is_known(point, one, line) for one in points):
+                continue
+            points.append(point)
+            if is_first and isinstance(point.condition, PeriodDoubling):
+                leaving = _leaving(line, point)
+                waiting += [(leaving, False)] if leaving is not None else []
+    return branches, sorted(points, key=lambda point: float(point.value))
+
+
+def _is_known(point: BifurcationPoint, other: BifurcationPoint, line: Line) -> bool:
+    close = abs(float(point.value) - float(other.value)) < 1e-8 * line.length
+    return close and type(point.condition) is type(other.condition) and _same(point, other)
+
+
+def _same(point: BifurcationPoint, other: BifurcationPoint) -> bool:
+    return is_same(point.cycle, other.cycle)
+
+
+# --- one leg: a fixed signature -------------------------------------------------------------------
+
+
+class Leg(NamedTuple):
+    """A fixed signature: its chain, and what the unknowns and the parameter are measured in."""
+
+    line: Line
+    chain: TimedChain
+    weights: Array
+
+    @classmethod
+    def of(cls, line: Line, row: Row) -> tuple["Leg", np.ndarray]:
+        z = np.asarray(row.motion.unknowns)
+        weights = WEIGHT / (1 + np.abs(z.reshape(-1)))
+        u = np.append(weights * z.reshape(-1), row.value / line.length)
+        return cls(line, row.motion.chain, jnp.asarray(weights)), u
+
+    def corrected(self, u: np.ndarray, tangent: np.ndarray, length: float) -> Corrected:
+        """As `continuation.corrected`."""
+        unit = self.line.length
+
+        def attempt(family, unknowns):
+            start, _ = unknowns
+            ahead = length if start is u else 0.0
+            args = family, self.chain, self.weights, jnp.asarray(unit)
+            solved = corrected(_linearized, args, start, tangent, ahead)
+            return solved, (solved.u, unit * solved.u[-1:])
+
+        begun = u, unit * (u + length * tangent)[-1:]
+        solved, settled = self.line.variation.relinearised(attempt, begun)
+        return solved._replace(found=bool(solved.found) and bool(settled))
+
+    def row(self, u: np.ndarray) -> Row:
+        z = (u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
+        value = float(self.line.length * u[-1])
+        return Row(value, _motion_of(self.line.at(value), self.chain, jnp.asarray(z)))
+
+
+def _linearized(u: Array, args: tuple[Family, TimedChain, Array, Array]) -> tuple[Array, Array]:
+    family, chain, weights, unit = args
+    z, p = (u[:-1] / weights).reshape(-1, 4), unit * u[-1:]
+    value, blocks = timed_blocks(family.at(p), jax.jacfwd(family.at)(p), chain, z)
+    own = jacobian(blocks[..., :4]) / weights[None]
+    return value.reshape(-1), jnp.append(own, unit * blocks[..., 4:].reshape(-1, 1), axis=1)
+
+
+@jit
+def _motion_of(osc: Oscillator, chain: TimedChain, z: Array) -> PeriodicMotion:
+    none = jnp.zeros((), int)
+    return motion_at(osc, chain, z, jnp.zeros(()), none, none)
+
+
+def _side(line: Line, row: Row, sign: float) -> tuple[list[Row], list[BifurcationPoint]]:
+    """The branch to one side of a motion: leg by leg."""
+    rows, points = [row], []
+    while len(rows) < MOST_ROWS:
+        note_progress(f"{len(rows)} motions on one side")
+        ahead, found, direction = _leg(line, rows[-1], sign)
+        rows += ahead
+        points += found
+        if direction is None:
+            break
+        further = _beyond(line, rows[-1], found[-1], direction)
+        if further is None:
+            break
+        new, sign = further
+        rows.append(new)
+    return rows, points
+
+
+def _leg(
+    line: Line, row: Row, sign: float
+) -> tuple[list[Row], list[BifurcationPoint], float | None]:
+    """The motions after a row with its signature, the points on the way, and the sense in which the
+    parameter goes where the signature ends in the last one of these; None where there is none."""
+    leg, u = Leg.of(line, row)
+    axis = np.zeros_like(u)
+    axis[-1] = 1.0
+    begun = leg.corrected(u, axis, 0.0)
+    if not begun.found:
+        return [], [], None
+    u, tangent = begun.u, sign * begun.tangent * np.sign(begun.tangent[-1])
+    rows, points, step = [], [], FIRST
+    last = row
+    while len(rows) < MOST_ROWS and step > SHORTEST:
+        solved = leg.corrected(u, tangent, step)
+        if not solved.found or solved.tangent @ tangent < STRAIGHT:
+            step *= 0.5
+            continue
+        new = leg.row(solved.u)
+        if not line.first <= new.value <= line.last:
+            end = line.first if new.value < line.first else line.last
+            rows += _at_end(leg, u, solved.u, end, line)
+            return rows, points, None
+        if int(new.motion.status) != Status.OK:
+            point = _border(line, last, new, solved.u[-1] - u[-1])
+            if point is not None:
+                return rows, [*points, point], float(np.sign(tangent[-1]))
+            step *= 0.5
+            continue
+        points += list(_between(line, last, new))
+        rows.append(new)
+        step = min(LONGEST, 1.5 * step)
+        u, tangent, last = solved.u, solved.tangent, new
+    return rows, points, None
+
+
+def _at_end(leg: Leg, u: np.ndarray, beyond: np.ndarray, end: float, line: Line) -> list[Row]:
+    part = (end / line.length - u[-1]) / (beyond[-1] - u[-1])
+    guess = u + part * (beyond - u)
+    axis = np.zeros_like(u)
+    axis[-1] = 1.0
+    solved = leg.corrected(guess, axis, 0.0)
+    row = leg.row(solved.u) if solved.found else None
+    return [row] if row is not None and int(row.motion.status) == Status.OK else []
+
+
+# --- points ---------------------------------------------------------------------------------------
+
+
+def _tests(motion: PeriodicMotion) -> dict[type[AbstractForcedCondition], float]:
+    """Functions that vanish at the points where multipliers meet the unit circle."""
+    first, second = np.asarray(motion.multipliers)
+    trace, det = (first + second).real, (first * second).real
+    torus = det - 1 if first.imag != 0 else np.nan
+    return {PeriodDoubling: 1 + trace + det, Fold: 1 - trace + det, Torus: torus}
+
+
+def _between(line: Line, one: Row, other: Row) -> Iterator[BifurcationPoint]:
+    """The points of multipliers between two motions of one signature."""
+    before, after = _tests(one.motion), _tests(other.motion)
+    for kind in before:
+        if not before[kind] * after[kind] < 0:
+            continue
+        nearer = min((one, other), key=lambda row: abs(_tests(row.motion)[kind]))
+        found = _points(line, kind(), nearer)
+        fine = [point for point in found if _is_beside(line, point, one, other)]
+        yield from fine[:1]
+
+
+def _points(line: Line, condition: AbstractCondition, row: Row) -> list[BifurcationPoint]:
+    timed = condition.with_clock()
+    found = timed.points(line.variation, np.array([row.value]), row.motion)
+    return [replace(p, condition=condition) for p in found if int(p.status) == Status.OK]
+
+
+def _is_beside(line: Line, point: BifurcationPoint, one: Row, other: Row) -> bool:
+    """Whether a point is as near to two motions as they are to each other, about."""
+    starts = np.asarray(one.motion.start), np.asarray(other.motion.start)
+    apart = np.max(np.abs(starts[0] - starts[1])) + 1e-6
+    reach = 2 * abs(other.value - one.value) + 2 * LONGEST * line.length
+    away = np.max(np.abs(np.asarray(point.cycle.start) - starts[0]))
+    return abs(float(point.value) - one.value) <= reach and bool(away <= 5 * apart + 0.01)
+
+
+def _border(line: Line, last: Row, new: Row, change: float) -> BifurcationPoint | None:
+    """The point in which the signature of the last motion ends before the new one, None where the
+    conditions find none so near."""
+    belts = range(last.motion.chain.codes.shape[-1])
+    kinds: list[Any] = [GrazingSliding, CrossingSliding, SwitchingSliding, AddingSliding]
+    found = [p for k in kinds for belt in belts for p in _points(line, k(belt), last)]
+    near = [p for p in found if _is_beside(line, p, last, new)]
+    ahead = [p for p in near if (float(p.value) - last.value) * change >= -1e-9 * line.length]
+    return min(ahead, key=lambda p: abs(float(p.value) - last.value), default=None)
+
+
+def _beyond(
+    line: Line, last: Row, point: BifurcationPoint, direction: float
+) -> tuple[Row, float] | None:
+    """A motion beyond the point in which a signature ended, and the sense in which to go on."""
+    at, value = np.asarray(point.cycle.start), float(point.value)
+    periods = last.motion.periods
+    moved = at - np.asarray(last.motion.start)
+    for side in (1.0, -1.0):
+        for part in BEYOND:
+            there = value + side * direction * part * line.length
+            if not line.first <= there <= line.last:
+                continue
+            osc = line.at(there)
+            own = last.motion.at(osc) if side < 0 else None
+            for stretch in (0.0, part, -part):
+                motion = periodic_from(osc, at + stretch * moved, periods, line.turns)
+                fine = int(motion.status) == Status.OK and motion.periods == periods
+                if not fine or np.max(np.abs(np.asarray(motion.start) - at)) > NEAR:
+                    continue
+                if own is not None and is_same(own, motion):
+                    continue
+                return Row(there, motion), side * direction
+    return None
+
+
+def _leaving(line: Line, point: BifurcationPoint) -> Row | None:
+    """A motion of twice the period beside a period doubling."""
+    at, value = np.asarray(point.cycle.start), float(point.value)
+    periods = 2 * point.cycle.periods
+    for size in LEAVES:
+        for side in (1.0, -1.0):
+            there = value + side * size**2 * line.length
+            if not line.first <= there <= line.last:
+                continue
+            osc = line.at(there)
+            for angle in np.linspace(0, np.pi, 4, endpoint=False):
+                guess = at + size * np.array([np.cos(angle), np.sin(angle)])
+                motion = periodic_from(osc, guess, periods, line.turns)
+                if int(motion.status) == Status.OK and motion.periods == periods:
+                    return Row(there, motion)
+    return None
